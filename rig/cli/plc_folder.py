@@ -20,13 +20,16 @@ from rig.plc_export.c.exported_optimizer import MANIFEST, manifest_of
 from rig.plc_export.c.optimizer_files import OptimizerExport
 from rig.plc_export.c.solver_files import OdeExport
 from rig.plc_export.kernels.counted import IterationCounts, counted_iterations, counted_updates
-from rig.plc_export.kernels.recorded_problems import LOAD, TICKS, GoldenVector, GoldenVectors, record
+from rig.plc_export.kernels.recorded_problems import LOAD, TICKS, GoldenVector, GoldenVectors, paper_settings, record
 from rig.plc_export.kernels.recorded_updates import GoldenUpdate, UpdateRecorder
+from rig.plc_export.problem_layout import problem_layout
 from rig.plc_export.structured_text.optimizer_files import OptimizerText
+from rig.plc_export.structured_text.pausing import PIECE
 from rig.plc_export.structured_text.plcopen import plcopen_xml
 from rig.plc_export.structured_text.register_table import register_table
-from rig.plc_export.structured_text.solver_files import AT_ONCE, StructuredTextExport
+from rig.plc_export.structured_text.solver_files import AT_ONCE, WORK, StructuredTextExport
 from rig.plc_export.templates import filled, template
+from rig.plc_sizing.budget_tables import problem_of
 from rig.plc_sizing.exported import ITERATION, CallCost, ExportCost, cost_text
 from rig.plc_sizing.profile import PlcProfile
 from rig.settings import Settings
@@ -36,6 +39,9 @@ PROJECT: Final = "solver.xml"
 BESIDE: Final = f"`{OPTIMIZER}/` has the whole optimiser, with a README and a self-test of its own.\n\n"
 FIXED_S: Final = 2.5
 """Updating period of the second half of the golden updates; that of the first is adaptive."""
+CUT: Final = {"work": WORK, "piece": PIECE}
+"""How calls are cut in Structured Text; in C each does all of an iteration."""
+CUTTING: Final = {name.upper(): f"{count:,}" for name, count in CUT.items()}
 COUNTED: Final = 80
 """Golden updates whose operations are counted."""
 
@@ -89,10 +95,10 @@ def structured_text(
     texts, sizes = export.files(), export.sizes()
     if target == "plcopen":
         texts = {PROJECT: plcopen_xml(texts.values(), "the ODE-based solver, golden vectors and a self-test")}
-    parts = {**loading(target), "AT_ONCE": str(AT_ONCE), "CALLS": str(export.calls())}
+    parts = {**loading(target), "AT_ONCE": str(AT_ONCE), **CUTTING}
     needed = {"constants": sizes.constants, "an instance of `cl_solver`, with its problem": sizes.solver,
               "self-test and golden vectors": sizes.self_test}  # fmt: skip
-    return described("structured_text/readme_solver.md", recorded, vectors, texts, parts, needed, profile)
+    return described("structured_text/readme_solver.md", recorded, vectors, texts, parts, needed, profile, CUT)
 
 
 def c99(recorded: GoldenVectors, vectors: list[GoldenVector], profile: PlcProfile | None) -> dict[str, str]:
@@ -101,20 +107,22 @@ def c99(recorded: GoldenVectors, vectors: list[GoldenVector], profile: PlcProfil
     texts, sizes = export.files(vectors), export.sizes(vectors)
     needed = {"constants": sizes.constants, "stack of `solve_problem`, about": sizes.stack,
               "self-test and golden vectors": sizes.self_test}  # fmt: skip
-    return described("c/readme_solver.md", recorded, vectors, texts, {}, needed, profile)
+    return described("c/readme_solver.md", recorded, vectors, texts, {}, needed, profile, {})
 
 
 def described(
     name: str, recorded: GoldenVectors, vectors: list[GoldenVector], texts: Mapping[str, str],
-    parts: Mapping[str, str], needed: dict[str, int], profile: PlcProfile | None,
+    parts: Mapping[str, str], needed: dict[str, int], profile: PlcProfile | None, cut: dict[str, int],
 ) -> dict[str, str]:  # fmt: skip
     """Return the files with a README, the template of this name with its figures, and a manifest with what it costs."""
     problem, count = vectors[0].problem, counted_iterations(recorded.method, vectors)
     iterations = len(vectors) * len(vectors[0].answer.costs)
+    tested = {"iterations": iterations, "operations": count.total}
     cost = ExportCost(variables=len(problem.phi), operations={ITERATION: cost_of(count)}, bytes=needed,
-                      self_test={"iterations": iterations, "operations": count.total})  # fmt: skip
+                      self_test=tested).model_copy(update=cut)  # fmt: skip
     readme = filled(template(name), {
         **parts, "COST": cost_text(cost, profile), "RECORDED": str(iterations),
+        "PROBLEM": problem_layout(*problem_of(paper_settings())),
         "OPTIMIZER": BESIDE if PROCESS.has_bath else "",
         "N": str(len(problem.phi)), "M": str(len(problem.gamma)), "K": str(len(vectors[0].answer.costs)),
         "VECTORS": str(len(vectors)), "FILES": ", ".join(f"`{name}`" for name in texts),
@@ -152,7 +160,7 @@ def whole_optimizer(
     others = {call: CallCost(**found._asdict()) for call, found in
               counted_updates(recorder.optimizer, golden[:COUNTED]).items()}  # fmt: skip
     cost = ExportCost(variables=len(recorded.vectors[0].guess), operations={**others, ITERATION: cost_of(count)},
-                      bytes=needed)  # fmt: skip
+                      bytes=needed).model_copy(update={} if target == "c" else CUT)  # fmt: skip
     texts[README] = filled(template(name), {
         **parts, "COST": cost_text(cost, profile),
         "GOLDEN": str(len(golden)), "COUNTED": str(min(COUNTED, len(golden))),
@@ -187,7 +195,7 @@ def optimizer_in_text(
     texts["registers.md"] = register_table() + "\n"
     needed = {"constants": sizes.constants, "state": sizes.state, "instances of the four blocks": sizes.blocks,
               "self-test and golden updates": sizes.self_test}  # fmt: skip
-    parts = {**loading(target), "DIGEST": str(recorder.optimizer.model_digest)}
+    parts = {**loading(target), **CUTTING, "DIGEST": str(recorder.optimizer.model_digest)}
     return "structured_text/optimizer/readme.md", texts, parts, needed
 
 

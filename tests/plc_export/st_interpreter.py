@@ -24,6 +24,7 @@ STANDARD: Final = {
     "dint_to_real": ("np.float32", "DINT", "REAL"), "bool_to_dint": ("int", "BOOL", "DINT"),
 }  # fmt: skip
 """In Python, with the types of arguments and result."""
+COUNTED: Final = {"sqrt", "expt", "ln"}
 COMPARISONS: Final = {"=": "==", "<>": "!=", "<": "<", ">": ">", "<=": "<=", ">=": ">="}
 LOGICAL: Final = {"AND": "&", "OR": "|"}
 
@@ -68,9 +69,11 @@ class Machine:
     def __init__(self, *texts: str) -> None:
         self.library: Library = parsed(*texts)
         self.globals = SimpleNamespace()
+        self.operations = [0]
+        """Sums, differences, products, quotients, roots, powers and logarithms of REAL so far."""
         self.names: dict[str, Any] = {"np": np, "power": power, "to_integer": to_integer, "logarithm": logarithm,
                                       "dint": dint, "put": put, "quotient": quotient,
-                                      "globals": self.globals, "reals": Reals()}  # fmt: skip
+                                      "globals": self.globals, "reals": Reals(), "count": self.operations}  # fmt: skip
         for variable in self.library.globals.values():
             setattr(self.globals, variable.name, self.initial(variable))
         for unit in self.library.units.values():
@@ -123,6 +126,7 @@ class Translation:
 
     def __init__(self, library: Library, unit: Unit) -> None:
         self.library, self.unit = library, unit
+        self.operations = 0
         for variable in unit.variables.values():
             if variable.section == "VAR_EXTERNAL":
                 there = library.globals.get(variable.name)
@@ -143,7 +147,16 @@ class Translation:
     # -- statements ----------------------------------------------------------------------------------------------------
 
     def block(self, statements: list[Tree]) -> list[str]:
-        return [f" {line}" for each in statements for line in self.statement(each)] or [" pass"]
+        return [f" {line}" for each in statements for line in self.counted(each)] or [" pass"]
+
+    def counted(self, statement: Tree) -> Iterator[str]:
+        """Yield a statement, and before it what counts its own operations; conditions of loops have none."""
+        self.operations, before = 0, self.operations
+        lines = [*self.statement(statement)]
+        own, self.operations = self.operations, before
+        if own and self.unit.kind != "FUNCTION":
+            yield f"count[0] += {own}"
+        yield from lines
 
     def statement(self, statement: Tree) -> Iterator[str]:
         match statement:
@@ -158,6 +171,7 @@ class Translation:
                 yield from self.block(other)
             case "while", condition, list(body):
                 yield f"while {self.of(condition, 'BOOL')}:"
+                assert not self.operations, condition
                 yield from self.block(body)
             case "for", str(name), first, last, int(step), list(body):
                 beyond = f"{self.of(last, 'DINT')} {'+' if step > 0 else '-'} 1"
@@ -196,14 +210,17 @@ class Translation:
         block = self.library.units[self.unit.variables[name].type]
         wanted = {each.name: each for each in block.variables.values() if each.section in {"VAR_INPUT", "VAR_IN_OUT"}}
         assert set(passed) == set(wanted), (name, set(passed) ^ set(wanted))
+        back = []
         for parameter, value in passed.items():
             text, kind = self.typed(value)
             assert kind == wanted[parameter].type, (name, parameter, kind)
             if wanted[parameter].section == "VAR_IN_OUT":
                 assert isinstance(value, tuple)
                 self.writable(str(value[1]))
+                back += [f"{text} = self.{name}.{parameter}"] if kind not in self.library.arrays else []
             yield f"self.{name}.{parameter} = {text}"
         yield f"self.{name}.run_()"
+        yield from back
 
     # -- expressions ---------------------------------------------------------------------------------------------------
 
@@ -244,14 +261,14 @@ class Translation:
     def function(self, name: str, arguments: list[Tree]) -> tuple[str, str]:
         if name in STANDARD:
             called, taken, result = STANDARD[name]
+            self.operations += name in COUNTED
             return f"{called}({', '.join(self.of(each, taken) for each in arguments)})", result
         function = self.library.units[name]
         wanted = [each.type for each in function.variables.values() if each.section == "VAR_INPUT"]
         passed = [self.of(each, kind) for each, kind in zip(arguments, wanted, strict=True)]
         return f"call_{name}({', '.join(passed)})", function.result
 
-    @staticmethod
-    def operation(sign: str, operands: list[tuple[str, str]]) -> tuple[str, str]:
+    def operation(self, sign: str, operands: list[tuple[str, str]]) -> tuple[str, str]:
         (one, kind), (other, other_kind) = operands[0], operands[-1]
         assert kind == other_kind, (sign, kind, other_kind)
         if len(operands) == 1:
@@ -267,4 +284,5 @@ class Translation:
             whole = f"quotient({one}, {other})"
             return (whole if sign == "/" else f"({one} - {whole} * {other})"), kind
         assert sign in {"+", "-", "*", "/"}
+        self.operations += kind == "REAL"
         return f"({one} {sign} {other})", kind

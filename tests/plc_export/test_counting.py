@@ -101,18 +101,22 @@ def test_updates_are_counted() -> None:
 # -- manifest, budget, profile -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    ("target", "call", "remedy"),
+    [("st", "call", "give a call less work"), ("c", "call (iteration)", "set that higher")],
+)
 def test_an_export_says_what_does_not_fit_a_plc_and_the_budget_says_the_same(
-    coldloop: "Coldloop", tmp_path: Path
+    coldloop: "Coldloop", tmp_path: Path, target: str, call: str, remedy: str
 ) -> None:
     small = tmp_path / "small.toml"
     small.write_text('name = "small"\nsource = "a test"\nmemory_bytes = 9000\noperation_ns = 1e5\ncycle_s = 0.5\n')
-    out = tmp_path / "st"
-    assert coldloop("export", "plc", "--target", "st", "--out", out, "--ticks", 600, "--plc", small).code == 0
+    out = tmp_path / target
+    assert coldloop("export", "plc", "--target", target, "--out", out, "--ticks", 600, "--plc", small).code == 0
     for folder in (out, out / "optimizer"):
         outcome = coldloop("budget", "--export", folder, "--plc", small)
         lines = [line for line in outcome.out.splitlines() if line.startswith("small: ")]
         assert sum("memory: it takes " in line for line in lines) == 1
-        assert sum("a call (iteration) takes up to " in line for line in lines) == 1
+        assert sum(f"a {call} takes up to " in line and line.endswith(remedy) for line in lines) == 1
         assert sum("the longest updating period is 5 s" in line for line in lines) == 1
         assert outcome.out in (folder / "README.md").read_text()
     found = json.loads((out / "manifest.json").read_text())["operations"]["iteration"]

@@ -1,6 +1,7 @@
 """The exported Structured Text, executed as text, gives the bits of the kernels; its self-test finds changes."""
 
 import re
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,7 @@ from rig.plc_export.kernels.recorded_problems import ITERATIONS, GoldenVector, G
 from rig.plc_export.structured_text import constants
 from rig.plc_export.structured_text.names import LONGEST, Names, identifier
 from rig.plc_export.structured_text.printer import StructuredTextPrinter
-from rig.plc_export.structured_text.solver_files import StructuredTextExport, sum_of
+from rig.plc_export.structured_text.solver_files import WORK, StructuredTextExport, sum_of
 from rig.plc_export.tree.subset import UnfitKernelError
 from tests.plc_export.st_interpreter import Machine
 
@@ -34,7 +35,7 @@ def files(export: StructuredTextExport) -> dict[str, str]:
     return export.files()
 
 
-def self_test(files: dict[str, str], most: int = 200) -> SimpleNamespace:
+def self_test(files: dict[str, str], most: int = 2000) -> SimpleNamespace:
     """Run the self-test up to its end, or to its first failure."""
     program = Machine(*files.values()).instance("cl_main")
     for _ in range(most):
@@ -45,14 +46,19 @@ def self_test(files: dict[str, str], most: int = 200) -> SimpleNamespace:
     return result
 
 
-def solved(solver: SimpleNamespace, vector: GoldenVector) -> list[tuple[bytes, bytes, int]]:
-    """Return profile, cost and count after the start and after each iteration."""
+def solved(
+    solver: SimpleNamespace, vector: GoldenVector, work: Callable[[], int] = lambda: WORK
+) -> list[tuple[bytes, bytes, int]]:
+    """Return profile, cost and count after the start and after each iteration; each call is given some work."""
     for name in PER_PROBLEM:
         setattr(solver, f"qp_{name}", dict(enumerate(getattr(vector.problem, name))))
     solver.guess, found = dict(enumerate(vector.guess)), []
     for iteration in range(ITERATIONS + 1):
-        solver.start = iteration == 0
-        solver.run_()
+        solver.start, solver.anew, solver.busy = iteration == 0, True, True
+        while solver.busy:
+            solver.remaining = work()
+            solver.run_()
+            solver.anew = False
         z = np.array([*solver.z.values()])
         assert z.dtype == np.float32
         found.append((z.tobytes(), np.asarray(solver.cost).tobytes(), solver.done))

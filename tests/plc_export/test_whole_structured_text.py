@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from optimizer_plc.program import OptimizerProgram
+from rig.plc_export.kernels.recorded_updates import integers_of
 from rig.plc_export.structured_text.constants import LARGEST_LIST
 from rig.plc_export.structured_text.optimizer_files import OptimizerText
 from rig.plc_export.structured_text.plcopen import plcopen_xml
@@ -86,14 +87,81 @@ def test_what_does_not_fit_is_not_accepted(machine: Machine) -> None:
     restart, plan, solve = (machine.instance(f"cl_optimizer_{name}") for name in ("restart", "plan", "solve"))
     machine.globals.cl_state_begun = machine.globals.cl_state_planned = False
     plan.u_before, plan.u, plan.y, plan.x = ({} for _ in range(4))
+    plan.start = solve.start = True
     plan.run_()
-    solve.start = True
     solve.run_()
-    assert (plan.accepted, solve.done, solve.busy) == (False, False, False)
+    assert (plan.accepted, solve.accepted, solve.done) == (False, False, False)
     for ticks in (-1, 1, 21):
         restart.fixed_ticks = ticks
         restart.run_()
         assert not restart.accepted
+
+
+class Site:
+    """The blocks of the interface, with the first of the golden updates before them."""
+
+    def __init__(self, machine: Machine) -> None:
+        self.restart, self.plan, self.solve = (
+            machine.instance(f"cl_optimizer_{name}") for name in ("restart", "plan", "solve")
+        )
+        self.golden, self.machine = recorded_updates(FEW, "e")[0], machine
+        update, plan = self.golden.update, self.plan
+        plan.update, plan.tick, plan.playing = update.update, update.tick, update.playing
+        plan.load, plan.work, self.solve.work = np.float32(update.load), 3000, 3000
+        for name in ("u_before", "u", "y", "x"):
+            setattr(plan, name, dict(enumerate(np.array(getattr(update, name), np.float32))))
+        self.begin()
+
+    def begin(self) -> None:
+        self.restart.fixed_ticks = 0
+        self.restart.run_()
+
+    @staticmethod
+    def call(block: SimpleNamespace, *, start: bool = False) -> bool:
+        """Return whether it is done."""
+        block.start = start
+        block.run_()
+        return bool(block.done)
+
+    def planned(self) -> bool:
+        """Return whether the plan that is under way comes to what is golden."""
+        while not self.call(self.plan):
+            pass
+        _, _, _, _, next_update_tick, suspects, *_ = integers_of(self.golden)
+        return (self.plan.next_update_tick, self.plan.suspects) == (next_update_tick, suspects)
+
+
+def test_what_is_under_way_is_not_begun_again(machine: Machine) -> None:
+    site = Site(machine)
+    assert not site.call(site.solve, start=True)
+    assert not site.solve.accepted, "there is no plan"
+    for block in (site.plan, site.solve):
+        assert not site.call(block, start=block is site.plan)
+    assert site.plan.accepted
+    for block in (site.plan, site.solve):
+        assert not site.call(block, start=True)
+        assert not block.accepted, "a plan is under way"
+    assert site.planned()
+    mismatch = machine.globals.cl_state_belief_mismatch
+    assert not site.call(site.solve, start=True)
+    assert site.solve.accepted
+    site.call(site.plan, start=True)
+    assert not site.plan.accepted, "a solve is under way"
+    while not site.call(site.solve):
+        pass
+    assert site.solve.length == integers_of(site.golden)[9]
+    assert machine.globals.cl_state_belief_mismatch == mismatch, "the estimator took the update once"
+
+
+def test_a_restart_ends_what_is_under_way(machine: Machine) -> None:
+    site = Site(machine)
+    site.call(site.plan, start=True)
+    site.begin()
+    before = dict(vars(machine.globals))
+    assert not any(site.call(site.plan) for _ in range(40))
+    assert vars(machine.globals) == before
+    site.call(site.plan, start=True)
+    assert site.planned()
 
 
 @NEEDS_MATIEC

@@ -78,12 +78,17 @@ class _ListeningOptimizer(OptimizerProgram):
         return super().solve()
 
 
+def paper_settings() -> Settings:
+    """Return the settings of the paper's PLC."""
+    return load_configuration(Settings, environment={}, assignments=SINGLE).settings
+
+
 def record(ticks: int = TICKS, load: str = LOAD, settings: Settings | None = None) -> GoldenVectors:
     """Return the problems of a run of so many ticks under a named load, adaptive updating period, with the answers.
 
     Settings are by default those of the paper's PLC.
     """
-    settings = settings or load_configuration(Settings, environment={}, assignments=SINGLE).settings
+    settings = settings or paper_settings()
     model, rig = load_model(settings.model.file), OneProcessRig(settings, compiled=False)
     optimizer = rig.optimizer = _ListeningOptimizer(model, settings.optimizer_plc.program, settings.limits)
     rig.run(Scenario(ticks, find_load(load, model.w0), 0.0, seed=1), Recorder(ticks, []))

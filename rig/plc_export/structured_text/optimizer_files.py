@@ -26,6 +26,7 @@ from rig.plc_export.structured_text.constants import (
     types_in,
 )
 from rig.plc_export.structured_text.lowering import Lowering, zeroed
+from rig.plc_export.structured_text.pausing import ANEW, PIECE, Pausing
 from rig.plc_export.structured_text.places import Entry, Place, Record, Rows, dotted
 from rig.plc_export.structured_text.printer import (
     StructuredTextPrinter,
@@ -36,7 +37,7 @@ from rig.plc_export.structured_text.printer import (
     size_of,
 )
 from rig.plc_export.structured_text.slicing import an_answer_in_calls
-from rig.plc_export.structured_text.solver_files import AT_ONCE, GENERATED
+from rig.plc_export.structured_text.solver_files import AT_ONCE, GENERATED, WORK
 from rig.plc_export.templates import filled, template
 from rig.plc_export.tree.nodes import ArrayType, Assign, Block, Kind, Literal, Name, Path, RecordType, RowsType, Type
 from rig.plc_export.tree.subset import type_of
@@ -45,6 +46,10 @@ STATE: Final[Path] = ("m", "state")
 FIXED_TICKS: Final[Path] = ("c", "fixed_ticks")
 """Of the session: the one setting that is not constant."""
 BEGUN: Final[Path] = (*STATE, "begun")
+JOBS: Final[Path] = (*STATE, "jobs")
+"""Number of the last plan or solve that was begun."""
+JOB: Final[Path] = (*STATE, "job")
+"""Number of the one that is under way; 0 is none."""
 
 
 class Sizes(NamedTuple):
@@ -59,7 +64,7 @@ class Sizes(NamedTuple):
 
 
 class OptimizerText:
-    """The optimiser of some settings, with its solver an iteration a call.
+    """The optimiser of some settings, with its solver cut into calls.
 
     Args:
         optimizer: Its program.
@@ -73,7 +78,8 @@ class OptimizerText:
         kernels, self.golden = OptimizerKernels(optimizer), golden
         begin, take, solve, note = kernels.entries
         constants, split = in_pieces(constants_of(kernels))
-        self.state = {**dict(state_types(STATE, type_of(optimizer.state))), FIXED_TICKS: Kind.INT, BEGUN: Kind.BOOL}
+        self.state = {**dict(state_types(STATE, type_of(optimizer.state))), FIXED_TICKS: Kind.INT, BEGUN: Kind.BOOL,
+                      JOBS: Kind.INT, JOB: Kind.INT}  # fmt: skip
         self.printer = StructuredTextPrinter(types_in(constants), self.state)
         lowering = Lowering({*constants, *split, *self.state}, split)
         of_session, periods = Name(Kind.INT, dotted(FIXED_TICKS)), len(kernels.rules)
@@ -81,11 +87,13 @@ class OptimizerText:
             "c": Record(("c",)), "m": Record(STATE), "method": Record(("method",)), "latched": Record(("latched",)),
             **{name: Entry(Rows(("r", table), periods), of_session) for name, table in TABLES.items()},
         }  # fmt: skip
-        self.entries = [
+        entries = [
             lowering.block(each, {one.name: places[one.name] for one in each.parameters if one.name in places})
             for each in (begin, take, an_answer_in_calls(solve, "method"), note)
         ]
-        self.blocks = [*lowering.blocks, self._clearing()]
+        pausing = Pausing(entries[1:3])
+        self.entries = [pausing.block(each) for each in entries]
+        self.blocks = [*map(pausing.block, lowering.blocks), self._clearing()]
         self._kernels = "\n".join(map(self.printer.block, self.blocks))
         used = {path for each in lowering.blocks for path in each.constants}
         self.constants = Constants({path: values for path, values in constants.items() if path in used}, self.printer)
@@ -94,7 +102,7 @@ class OptimizerText:
         """Return the block that makes the state zero."""
         body = tuple(zeroed(Name(kind, dotted(path))) if isinstance(kind, ArrayType)
                      else Assign(Name(kind, dotted(path)), Literal(kind, 0)) for path, kind in self.state.items()
-                     if path != FIXED_TICKS)  # fmt: skip
+                     if path not in {FIXED_TICKS, JOBS})  # fmt: skip
         at = Name(Kind.INT, "at.0")
         return Block("clear", "optimizer_plc/session_state.py", "Make the state zero.", (), (), (), (at,),
                      tuple(self.state), body)  # fmt: skip
@@ -119,12 +127,15 @@ class OptimizerText:
                      golden)  # fmt: skip
 
     def _interface(self) -> str:
-        take = self.entries[1]
+        begin, take = self.entries[:2]
         names = interface_names(take, self.printer.type)
-        passed = ",\n".join(f"            {names[each]} := {each.name.rpartition('.')[2]}"
+        passed = ",\n".join(f"            {names[each]} := {each.name.rstrip('.').rpartition('.')[2]}"
                             for each in (*take.inputs, *take.shared))  # fmt: skip
+        begun = ", ".join(f"{name} := {'TRUE' if each == ANEW else name}"
+                          for each, name in interface_names(begin, self.printer.type).items())  # fmt: skip
         return filled(template("structured_text/optimizer/optimizer.st"), {
             **signal_counts(), "LONGEST": str(LONGEST_TICKS), "SHORTEST": str(SHORTEST_TICKS), "LATCHED": passed,
+            "BEGIN": begun, "PIECE": str(PIECE),
             "LOAD_STEP": names[take.outputs[0]],
         })  # fmt: skip
 
@@ -189,7 +200,7 @@ class OptimizerText:
             for each in range(pages)
         )
         parts = {
-            **signal_counts(), **self.constants.summed(), "AT_ONCE": str(AT_ONCE),
+            **signal_counts(), **self.constants.summed(), "AT_ONCE": str(AT_ONCE), "WORK": str(WORK),
             "ROWS": str(SEQUENCE_ROWS * len(INPUT_NAMES)), "SAMPLE": str(TICKS_PER_SAMPLE * len(INPUT_NAMES)),
             **{f"N_{name.upper()}": str(length) for name, length in lengths.items()},
             **{f"AT_{name}": str(place) for name, place in zip(("U", "Y", "X", "PLAN"), places[1:], strict=True)},

@@ -1,6 +1,7 @@
 """Blocks as IEC 61131-3 Structured Text (third edition): REAL and DINT, arrays of one dimension, literals typed."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -21,8 +22,10 @@ from rig.plc_export.tree.nodes import (
     Name,
     Operation,
     Path,
+    PausingCall,
     Return,
     Statement,
+    Switch,
     Type,
     View,
     While,
@@ -141,12 +144,26 @@ class StructuredTextPrinter(TreePrinter):
         for statement in statements:
             yield from ("    " * depth + line for line in self._statement(statement))
 
-    def _statement(self, statement: Statement) -> Iterator[str]:
+    def _statement(self, statement: Statement) -> Iterator[str]:  # noqa: C901 one case a statement
         match statement:
             case Assign(target, value):
                 yield f"{self.expression(target)} := {self.expression(value)};"
             case Call():
                 yield from self._call(statement)
+            case PausingCall(call, anew, busy, following):
+                yield from self._call(replace(call, results=()))
+                yield f"{self._local(anew)} := FALSE;"
+                paused = interface_names(call.block, self.type)[busy]
+                yield f"IF (NOT {self._instance(call.block)}.{paused}) THEN"
+                yield from ("    " + line for line in self._taken(call))
+                yield from self._body(following, 1)
+                yield "END_IF;"
+            case Switch(number, cases):
+                yield f"CASE {self._local(number)} OF"
+                for case, body in cases:
+                    yield f"    {case}:"
+                    yield from self._body(body, 2)
+                yield "END_CASE;"
             case Count(variable, first, last, step, body):
                 by = f" BY {step}" if step != 1 else ""
                 bounds = f"{self.expression(first)} TO {self.expression(last)}{by}"
@@ -173,6 +190,11 @@ class StructuredTextPrinter(TreePrinter):
         passed = [f"{inside[each]} := {self.expression(value)}" for each, value in call.arguments]
         yield f"{instance}({'' if passed else ');'}"
         yield from (f"    {each}{',' if each is not passed[-1] else ');'}" for each in passed)
+        yield from self._taken(call)
+
+    def _taken(self, call: Call) -> Iterator[str]:
+        """Yield the assignments of what a call puts out."""
+        instance, inside = self._instance(call.block), interface_names(call.block, self.type)
         yield from (f"{self._local(variable)} := {instance}.{inside[output]};" for variable, output in call.results)
 
     # -- expressions ---------------------------------------------------------------------------------------------------

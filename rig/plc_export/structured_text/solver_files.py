@@ -18,6 +18,7 @@ from rig.plc_export.structured_text.constants import (
     types_in,
 )
 from rig.plc_export.structured_text.lowering import Lowering
+from rig.plc_export.structured_text.pausing import ANEW, Pausing
 from rig.plc_export.structured_text.places import Record
 from rig.plc_export.structured_text.printer import (
     StructuredTextPrinter,
@@ -29,6 +30,8 @@ from rig.plc_export.structured_text.slicing import one_iteration_a_call
 from rig.plc_export.templates import filled, template
 from rig.plc_export.tree.nodes import RecordType
 
+WORK: Final = 10_000
+"""Operations that a call is given to do in the self-test: it exceeds them by less than a piece."""
 AT_ONCE: Final = 1000
 """Constants that a call of the self-test sums up: less work than an iteration of the solver."""
 NOTES: Final = {
@@ -52,7 +55,7 @@ class Sizes(NamedTuple):
 
 
 class StructuredTextExport:
-    """The solver for the matrices of one problem, an iteration a call.
+    """The solver for the matrices of one problem, cut into calls.
 
     Args:
         method: Constants of the solver, in single precision.
@@ -70,9 +73,12 @@ class StructuredTextExport:
         self.printer = StructuredTextPrinter(types_in(constants))
         function, lowering = one_iteration_a_call(program.entry), Lowering(constants)
         records = {each.name: Record((each.name,)) for each in function.parameters if isinstance(each.type, RecordType)}
-        self.solver = lowering.block(function, records)
+        whole = lowering.block(function, records)
+        pausing = Pausing((whole,))
+        self.solver = pausing.block(whole)
         self.kernels = "\n".join(
-            self.printer.block(each, NOTES if each is self.solver else {}) for each in lowering.blocks
+            self.printer.block(each, NOTES if each is self.solver else {})
+            for each in map(pausing.block, lowering.blocks)
         )
         used = {path for each in lowering.blocks for path in each.constants}
         self.constants = Constants({path: values for path, values in constants.items() if path in used}, self.printer)
@@ -93,12 +99,6 @@ class StructuredTextExport:
         problem = sum(len(getattr(self.vectors[0].problem, name)) for name in PER_PROBLEM) + len(self.vectors[0].guess)
         vector = sum(np.size(values) for values in arrays_in(self.vectors[0]).values())
         return Sizes(self.constants.bytes(), memory(self.solver) + 4 * problem, 4 * vector * (len(self.vectors) + 1))
-
-    def calls(self) -> int:
-        """Return how often the self-test is called until it is done."""
-        return (
-            1 + -(-sum(self.constants.lengths()) // AT_ONCE) + sum(1 + len(each.answer.costs) for each in self.vectors)
-        )
 
     # -- golden vectors and self-test ----------------------------------------------------------------------------------
 
@@ -125,7 +125,7 @@ class StructuredTextExport:
         checks = template("structured_text/checks.st") + "\n"
         return filled(checks + template("structured_text/self_test.st"), {
             **self.constants.summed(),
-            "CALLS": str(self.calls()), "N": str(n), "M": str(m), "K": str(k), "POINTS": str(n * k), "LAST": str(n - 1),
+            "WORK": str(WORK), "N": str(n), "M": str(m), "K": str(k), "POINTS": str(n * k), "LAST": str(n - 1),
             "INSTANCES": "\n".join(f"    golden_{each} : cl_golden_{each};" for each in range(len(self.vectors))),
             "AT_ONCE": str(AT_ONCE), "VECTOR_COUNT": str(len(self.vectors)),
             "VECTORS": "".join(self._loaded(each) for each in range(len(self.vectors))).rstrip(),
@@ -144,7 +144,8 @@ class StructuredTextExport:
     def _problem_passed(self) -> str:
         names = interface_names(self.solver, self.printer.type)
         return ",\n".join(
-            f"                {names[each]} := {each.name.rpartition('.')[2]}" for each in self.solver.shared
+            f"                {names[each]} := {each.name.rstrip('.').rpartition('.')[2]}"
+            for each in (ANEW, *self.solver.shared)
         )
 
 

@@ -275,7 +275,29 @@ class Call:
     """Variable, output."""
 
 
-Statement: TypeAlias = Declare | Assign | Point | Make | Copy | Invoke | For | While | If | Return | Count | Call
+@dataclass(frozen=True)
+class PausingCall:
+    """A call of a block that may pause: its outputs are taken, and what follows is done, once it is no longer busy."""
+
+    call: Call
+    anew: Name
+    """The variable that says that it begins: false from then on."""
+    busy: Name
+    """Its output that says that it has paused."""
+    following: tuple["Statement", ...]
+
+
+@dataclass(frozen=True)
+class Switch:
+    """What is done for each value of a number; only in blocks that pause (`pausing.py`)."""
+
+    number: Name
+    cases: tuple[tuple[int, tuple["Statement", ...]], ...]
+
+
+Statement: TypeAlias = (
+    Declare | Assign | Point | Make | Copy | Invoke | For | While | If | Return | Count | Call | PausingCall | Switch
+)
 
 # -- results -----------------------------------------------------------------------------------------------------------
 
