@@ -13,6 +13,8 @@ from coldloop import __version__
 from coldloop.config import selected
 from coldloop.errors import UsageError
 from coldloop.process.loaded import PROCESS
+from coldloop.process.signals import TICK_S
+from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS
 from optimizer_plc.settings import SHOWN
 from rig.plc_export.c.bus_registers import bus_files
 from rig.plc_export.c.exported_optimizer import FOLDER as OPTIMIZER
@@ -37,7 +39,8 @@ from rig.settings import Settings
 README: Final = "README.md"
 PROJECT: Final = "solver.xml"
 BESIDE: Final = f"`{OPTIMIZER}/` has the whole optimiser, with a README and a self-test of its own.\n\n"
-FIXED_S: Final = 2.5
+ALONE: Final = "The whole optimiser is not here: what a process expects of a load (`forecast`) is not exported.\n\n"
+FIXED_TICKS: Final = max(SHORTEST_TICKS, LONGEST_TICKS // 2)
 """Updating period of the second half of the golden updates; that of the first is adaptive."""
 CUT: Final = {"work": WORK, "piece": PIECE}
 """How calls are cut in Structured Text; in C each does all of an iteration."""
@@ -65,7 +68,7 @@ def export_plc(
     recorded = record(ticks or TICKS)
     vectors = telling(recorded, ticks)
     texts = c99(recorded, vectors, profile) if target == "c" else structured_text(recorded, vectors, profile, target)
-    if PROCESS.has_bath:
+    if not PROCESS.forecasts:
         written = whole_optimizer(target, settings, ticks, profile)
         texts |= {f"{OPTIMIZER}/{name}": text for name, text in written.items()}
     write_whole(folder, texts)
@@ -123,7 +126,7 @@ def described(
     readme = filled(template(name), {
         **parts, "COST": cost_text(cost, profile), "RECORDED": str(iterations),
         "PROBLEM": problem_layout(*problem_of(paper_settings())),
-        "OPTIMIZER": BESIDE if PROCESS.has_bath else "",
+        "OPTIMIZER": ALONE if PROCESS.forecasts else BESIDE,
         "N": str(len(problem.phi)), "M": str(len(problem.gamma)), "K": str(len(vectors[0].answer.costs)),
         "VECTORS": str(len(vectors)), "FILES": ", ".join(f"`{name}`" for name in texts),
     })  # fmt: skip
@@ -152,7 +155,8 @@ def whole_optimizer(
 ) -> dict[str, str]:  # fmt: skip
     """Return the files of the whole optimiser by their names, with its golden updates."""
     recorder = UpdateRecorder(settings)
-    golden = [each for period_s in (0.0, FIXED_S) for each in recorder.record(ticks or TICKS, LOAD, period_s)]
+    periods_s = (0.0, FIXED_TICKS * TICK_S)
+    golden = [each for period_s in periods_s for each in recorder.record(ticks or TICKS, LOAD, period_s)]
     write = optimizer_in_c if target == "c" else optimizer_in_text
     name, texts, parts, needed = write(target, settings, recorder, golden)
     recorded = record(ticks or TICKS, settings=settings)

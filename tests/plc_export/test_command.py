@@ -130,13 +130,6 @@ def test_it_is_the_solver_of_the_process_that_is_named(processes: Processes, tmp
     assert program.test.passed
 
 
-def test_the_c_of_another_process_is_the_solver_alone_and_says_so(processes: Processes, tmp_path: Path) -> None:
-    out = tmp_path / "tank"
-    assert started(processes, "--process", TANK, "export", "plc", "--target", "c", "--out", out).code == 0
-    assert not (out / "optimizer").exists()
-    assert "optimizer/" not in (out / "README.md").read_text()
-
-
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [

@@ -61,7 +61,6 @@ def _recorded_run(options: argparse.Namespace) -> list[Path]:
 
 def _solver(options: argparse.Namespace) -> list[Path]:
     from coldloop.errors import UsageError
-    from coldloop.process.loaded import PROCESS
     from rig.cli.plc_folder import export_plc
     from rig.plc_sizing.profile import find_profile
 
@@ -69,8 +68,6 @@ def _solver(options: argparse.Namespace) -> list[Path]:
         raise UsageError(f"{options.run}: has no target; coldloop export plc --target {options.target} --out FOLDER")
     if options.out is None or options.force:
         raise UsageError("export plc: name a new folder with --out; --force does not replace one")
-    if not PROCESS.has_bath and (options.config or options.assignments):
-        raise UsageError("--config and --set: are of the whole optimiser, and with --process the solver is exported")
     profile = find_profile(options.plc) if options.plc else None
     return export_plc(options.target, options.ticks, options.out, _settings(options), profile)
 

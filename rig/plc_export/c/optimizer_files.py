@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICK_S
 from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.program import OptimizerProgram
@@ -73,7 +73,8 @@ class OptimizerExport:
     def files(self) -> dict[str, str]:
         """Return the texts of the files by their names."""
         sizes = {"INPUTS": len(INPUT_NAMES), "OUTPUTS": len(OUTPUT_NAMES), "STATES": len(STATE_NAMES),
-                 "ROWS": SEQUENCE_ROWS, "LONGEST": LONGEST_TICKS, "SHORTEST": SHORTEST_TICKS}  # fmt: skip
+                 "ROWS": SEQUENCE_ROWS, "LONGEST": LONGEST_TICKS, "SHORTEST": SHORTEST_TICKS,
+                 "TICK_S": TICK_S}  # fmt: skip
         parts = {"GENERATED": GENERATED.rstrip(), **{name: str(size) for name, size in sizes.items()}}
         texts = {name: filled(template(f"c/optimizer/{name}"), parts)
                  for name in ("optimizer.h", "optimizer.c", "self_test.c")}  # fmt: skip

@@ -8,7 +8,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICKS_PER_SAMPLE
+from coldloop.process.load_profile import LOAD_UNIT
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.program import OptimizerProgram
@@ -135,7 +136,7 @@ class OptimizerText:
                           for each, name in interface_names(begin, self.printer.type).items())  # fmt: skip
         return filled(template("structured_text/optimizer/optimizer.st"), {
             **signal_counts(), "LONGEST": str(LONGEST_TICKS), "SHORTEST": str(SHORTEST_TICKS), "LATCHED": passed,
-            "BEGIN": begun, "PIECE": str(PIECE),
+            "TICK_S": str(TICK_S), "UNIT": LOAD_UNIT, "BEGIN": begun, "PIECE": str(PIECE),
             "LOAD_STEP": names[take.outputs[0]],
         })  # fmt: skip
 

@@ -37,9 +37,8 @@ CONTROLLED: Final = tuple(OUTPUT_NAMES.index(one.name) for one in PROCESS.banded
 """Outputs that have a band: L1 and T5 of the cold box."""
 
 
-_OF_THE_COLD_BOX: Final = [one.name for one in COLD_BOX.outputs]
-L1, T1, T2, T5 = (_OF_THE_COLD_BOX.index(name) for name in ("L1", "T1", "T2", "T5"))
-"""Outputs of the cold box: for what there is nowhere else."""
+L1, T1, T2, T5 = map(OUTPUT_NAMES.index, ("L1", "T1", "T2", "T5")) if PROCESS.has_bath else (0, 0, 0, 0)
+"""Outputs of a plant with a bath: for what there is nowhere else."""
 
 STATION_VALVE_NAMES: Final = ("CV956", "CV952", "CV953", "CV167")
 """Bypass, discharge into the buffer, charge out of it, nitrogen feed."""

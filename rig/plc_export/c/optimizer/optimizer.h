@@ -6,7 +6,7 @@
  *     optimizer_solve(&sequence);            then compute the sequence, which begins at plan.next_update_tick
  *     optimizer_answered(late);              when the control PLC has answered
  *
- * A tick is 0.25 s of plant time. There is one optimiser: its state is static. Nothing is allocated, nothing is shared
+ * A tick is @TICK_S@ s of plant time. There is one optimiser: its state is static. Nothing is allocated, nothing is shared
  * between threads.
  */
 #ifndef OPTIMIZER_H
