@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 from collections.abc import Callable, Generator, Iterator, Mapping
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import pytest
@@ -181,6 +182,12 @@ def install(*packages: str) -> None:
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
         if done.returncode != 0:
             pytest.skip(f"`{' '.join(command)}` failed: {done.stderr.strip().splitlines()[-1:]}")
+
+
+def install_libmodbus() -> None:
+    """Install what an exported optimiser is compiled with for the bus, or skip the test."""
+    if not Path("/usr/include/modbus/modbus.h").exists():
+        install("libmodbus-dev")
 
 
 @pytest.fixture(scope="session")

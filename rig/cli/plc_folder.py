@@ -32,7 +32,7 @@ from rig.plc_export.structured_text.register_table import register_table
 from rig.plc_export.structured_text.solver_files import AT_ONCE, WORK, StructuredTextExport
 from rig.plc_export.templates import filled, template
 from rig.plc_sizing.budget_tables import problem_of
-from rig.plc_sizing.exported import ITERATION, CallCost, ExportCost, cost_text
+from rig.plc_sizing.exported import ITERATION, WHOLE, CallCost, Cut, ExportCost, cost_text
 from rig.plc_sizing.profile import PlcProfile
 from rig.settings import Settings
 
@@ -42,9 +42,9 @@ BESIDE: Final = f"`{OPTIMIZER}/` has the whole optimiser, with a README and a se
 ALONE: Final = "The whole optimiser is not here: what a process expects of a load (`forecast`) is not exported.\n\n"
 FIXED_TICKS: Final = max(SHORTEST_TICKS, LONGEST_TICKS // 2)
 """Updating period of the second half of the golden updates; that of the first is adaptive."""
-CUT: Final = {"work": WORK, "piece": PIECE}
+CUT: Final = Cut(WORK, PIECE)
 """How calls are cut in Structured Text; in C each does all of an iteration."""
-CUTTING: Final = {name.upper(): f"{count:,}" for name, count in CUT.items()}
+CUTTING: Final = {"WORK": f"{WORK:,}", "PIECE": f"{PIECE:,}"}
 COUNTED: Final = 80
 """Golden updates whose operations are counted."""
 
@@ -110,19 +110,19 @@ def c99(recorded: GoldenVectors, vectors: list[GoldenVector], profile: PlcProfil
     texts, sizes = export.files(vectors), export.sizes(vectors)
     needed = {"constants": sizes.constants, "stack of `solve_problem`, about": sizes.stack,
               "self-test and golden vectors": sizes.self_test}  # fmt: skip
-    return described("c/readme_solver.md", recorded, vectors, texts, {}, needed, profile, {})
+    return described("c/readme_solver.md", recorded, vectors, texts, {}, needed, profile, WHOLE)
 
 
 def described(
     name: str, recorded: GoldenVectors, vectors: list[GoldenVector], texts: Mapping[str, str],
-    parts: Mapping[str, str], needed: dict[str, int], profile: PlcProfile | None, cut: dict[str, int],
+    parts: Mapping[str, str], needed: dict[str, int], profile: PlcProfile | None, cut: Cut,
 ) -> dict[str, str]:  # fmt: skip
     """Return the files with a README, the template of this name with its figures, and a manifest with what it costs."""
     problem, count = vectors[0].problem, counted_iterations(recorded.method, vectors)
     iterations = len(vectors) * len(vectors[0].answer.costs)
     tested = {"iterations": iterations, "operations": count.total}
     cost = ExportCost(variables=len(problem.phi), operations={ITERATION: cost_of(count)}, bytes=needed,
-                      self_test=tested).model_copy(update=cut)  # fmt: skip
+                      self_test=tested, work=cut.work, piece=cut.piece)  # fmt: skip
     readme = filled(template(name), {
         **parts, "COST": cost_text(cost, profile), "RECORDED": str(iterations),
         "PROBLEM": problem_layout(*problem_of(paper_settings())),
@@ -163,8 +163,9 @@ def whole_optimizer(
     count = counted_iterations(recorded.method, telling(recorded, ticks))
     others = {call: CallCost(**found._asdict()) for call, found in
               counted_updates(recorder.optimizer, golden[:COUNTED]).items()}  # fmt: skip
+    cut = WHOLE if target == "c" else CUT
     cost = ExportCost(variables=len(recorded.vectors[0].guess), operations={**others, ITERATION: cost_of(count)},
-                      bytes=needed).model_copy(update={} if target == "c" else CUT)  # fmt: skip
+                      bytes=needed, work=cut.work, piece=cut.piece)  # fmt: skip
     texts[README] = filled(template(name), {
         **parts, "COST": cost_text(cost, profile),
         "GOLDEN": str(len(golden)), "COUNTED": str(min(COUNTED, len(golden))),

@@ -21,18 +21,13 @@ def problem_layout(problem: PredictiveProblem, prediction: PredictionModel) -> s
             variables.append((_element(N_SLACKS, behind + 2 * band + end), what))
     bands = " and ".join(OUTPUT_NAMES[output] for output in prediction.constrained)
     count = 2 * len(prediction.constrained) * len(design.constraint_instants)
-    rows = [
-        (f"0 to {count - 1}", f"{bands}, each below and above its band, at {_instants(design.constraint_instants)}"),
-        (
-            f"{count} to {len(problem.Gamma) - 1}",
-            "changes of inputs from one decision instant to the next, up and down",
-        ),
-    ]
-    instants = f"\nDecision instants, k from 0: {_instants(design.decision_instants)}.\n"
-    shown = [rows[0], *([rows[1]] if count < len(problem.Gamma) else [])]
-    return "\n".join(
-        [markdown_table(("variable", "what"), variables), instants, markdown_table(("rows", "what"), shown)]
-    )
+    constrained = _instants(design.constraint_instants)
+    rows = [(f"0 to {count - 1}", f"{bands}, each below and above its band, at {constrained}")]
+    if count < len(problem.Gamma):
+        moved = "changes of inputs from one decision instant to the next, up and down"
+        rows.append((f"{count} to {len(problem.Gamma) - 1}", moved))
+    decided = f"\nDecision instants, k from 0: {_instants(design.decision_instants)}.\n"
+    return "\n".join([markdown_table(("variable", "what"), variables), decided, markdown_table(("rows", "what"), rows)])
 
 
 def _element(step: int, first: int) -> str:

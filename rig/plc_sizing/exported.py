@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -37,6 +37,18 @@ class CallCost(BaseModel):
         return self.worst or self.most
 
 
+class Cut(NamedTuple):
+    """How calls are cut."""
+
+    work: int
+    """Operations that a call is given to do; 0 where each call does all of its kind."""
+    piece: int
+    """What it does beyond them at most."""
+
+
+WHOLE: Final = Cut(0, 0)
+
+
 class ExportCost(BaseModel):
     """What an export needs."""
 
@@ -49,10 +61,9 @@ class ExportCost(BaseModel):
     """By what takes them."""
     self_test: dict[str, int] = {}
     """Iterations and operations of the solver in the self-test."""
-    work: Annotated[int, Field(ge=0)] = 0
-    """Operations that a call is given to do; 0 where each call does all that `operations` says."""
-    piece: Annotated[int, Field(ge=0)] = 0
-    """What a call does beyond them at most."""
+    work: Annotated[int, Field(ge=0)] = WHOLE.work
+    piece: Annotated[int, Field(ge=0)] = WHOLE.piece
+    """Of `Cut`."""
 
     @property
     def calls(self) -> dict[str, float]:

@@ -119,15 +119,15 @@ def test_the_solver_has_its_bits_whatever_calls_are_given(solver: Machine, recor
 def test_an_iteration_with_every_row_active_takes_more_calls_and_no_longer_ones(
     solver: Machine, recorded: GoldenVectors
 ) -> None:
-    vector, calls = recorded.vectors[0], list[int]()
+    usual, calls = recorded.vectors[0], list[int]()
 
     def work() -> int:
         calls.append(solver.operations[0])
         return WORK
 
-    for vector_of in (recorded.vectors[0], all_active(recorded, vector)):
+    for vector in (usual, all_active(recorded, usual)):
         calls.clear()
-        solved(solver.instance("cl_solver"), vector_of, work)
+        solved(solver.instance("cl_solver"), vector, work)
         assert max(np.diff(calls)) <= WORK + PIECE
     assert len(calls) > 20 * 10
 

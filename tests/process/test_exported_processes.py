@@ -1,21 +1,19 @@
 """The whole optimiser of another process, exported: its self-tests pass, and on the bus it leaves the trace of ours."""
 
-import shutil
-import subprocess
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 
-from tests.conftest import install
+from tests.conftest import install_libmodbus
 from tests.harness.processes import Processes
+from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, compiled, output
 from tests.plc_export.st_interpreter import Machine
 from tests.plc_export.test_command import FILES
 from tests.process.runs import run, started
 from tests.process.test_disturbances import FILE, pond
 
 SHIPPED = Path(__file__).parents[2] / "examples" / "processes"
-HEADER = Path("/usr/include/modbus/modbus.h")
 AS_EXPORTED = ("--preset", "paper", "--set", "optimizer_plc.program.arithmetic=float32")
 WEATHER = "time_s,rain,draw,leak\n0,0,0,0\n60,1.5,1.0,0\n"
 
@@ -34,20 +32,17 @@ def exported(processes: Processes, file: Path, target: str, out: Path, ticks: in
 PROCESSES = ["quadruple_tank", *(pytest.param(name, marks=pytest.mark.exhaustive) for name in ("wood_berry", "pond"))]
 
 
-@pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler: cc is not installed")
+@pytest.mark.skipif(not COMPILERS, reason=NO_COMPILER)
 @pytest.mark.parametrize("name", PROCESSES)
 def test_in_c_its_self_test_passes_and_on_the_bus_it_leaves_the_trace_and_the_updates_of_ours(
     processes: Processes, tmp_path: Path, name: str
 ) -> None:
-    if not HEADER.exists():
-        install("libmodbus-dev")
+    install_libmodbus()
     file = process_file(name, tmp_path)
     out = exported(processes, file, "c", tmp_path / "out", 600)
     for folder in (out, out / "optimizer"):
-        command = ["cc", "-std=c99", "-ffp-contract=off", *folder.glob("*.c"), "-lm", "-o", folder / "self_test"]
-        subprocess.run(command, check=True)
-        said = subprocess.run([folder / "self_test"], capture_output=True, text=True, check=True).stdout
-        assert said.endswith(", 0 failures\n")
+        code, said = output(compiled(folder, COMPILERS[0], "-O2"))
+        assert (code, said[-13:]) == (0, ", 0 failures\n")
     scenario = (*AS_EXPORTED, "--load", "e", "--duration", "600")
     ours = run(processes, file, tmp_path / "ours", "--in-process", *scenario)
     theirs = run(processes, file, tmp_path / "theirs", "--optimizer", f"export:{out}", *scenario)
@@ -58,9 +53,8 @@ def test_in_c_its_self_test_passes_and_on_the_bus_it_leaves_the_trace_and_the_up
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("name", ["pond"])
-def test_in_structured_text_its_self_test_passes(processes: Processes, tmp_path: Path, name: str) -> None:
-    out = exported(processes, process_file(name, tmp_path), "st", tmp_path / "out", 600)
+def test_in_structured_text_its_self_test_passes(processes: Processes, tmp_path: Path) -> None:
+    out = exported(processes, process_file("pond", tmp_path), "st", tmp_path / "out", 600)
     texts = [name for name in FILES["st"] if name.startswith("optimizer/") and name.endswith(".st")]
     test = Machine(*((out / name).read_text() for name in texts)).instance("cl_self_test")
     test.run = True

@@ -27,7 +27,7 @@ from rig.cosim.session_client import SessionClient
 from rig.plc_export.c import exported_optimizer
 from rig.plc_export.kernels.recorded_problems import SINGLE
 from rig.settings import Settings
-from tests.conftest import Coldloop, install
+from tests.conftest import Coldloop, install_libmodbus
 from tests.harness.processes import Processes
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 PATIENCE_S = 120.0
 RUN = ("--preset", "paper", "--set", "optimizer_plc.program.arithmetic=float32")
 """Settings of the export, for a command."""
-HEADER = Path("/usr/include/modbus/modbus.h")
 
 
 def settings(*assignments: str) -> Settings:
@@ -56,8 +55,7 @@ def export(folder: Path) -> Path:
     """The same, compiled."""
     if shutil.which("cc") is None:
         pytest.skip("no C compiler: cc is not installed")
-    if not HEADER.exists():
-        install("libmodbus-dev")
+    install_libmodbus()
     exported_optimizer.exported_optimizer(f"export:{folder}", settings())
     return folder
 

@@ -34,6 +34,7 @@ from rig.plc_export.structured_text.printer import (
     global_name,
     interface_names,
     memory,
+    passed_by_name,
     section,
     size_of,
 )
@@ -129,15 +130,13 @@ class OptimizerText:
 
     def _interface(self) -> str:
         begin, take = self.entries[:2]
-        names = interface_names(take, self.printer.type)
-        passed = ",\n".join(f"            {names[each]} := {each.name.rstrip('.').rpartition('.')[2]}"
-                            for each in (*take.inputs, *take.shared))  # fmt: skip
+        passed = passed_by_name(take, (*take.inputs, *take.shared), self.printer.type, 12)
         begun = ", ".join(f"{name} := {'TRUE' if each == ANEW else name}"
                           for each, name in interface_names(begin, self.printer.type).items())  # fmt: skip
         return filled(template("structured_text/optimizer/optimizer.st"), {
             **signal_counts(), "LONGEST": str(LONGEST_TICKS), "SHORTEST": str(SHORTEST_TICKS), "LATCHED": passed,
             "TICK_S": str(TICK_S), "UNIT": LOAD_UNIT, "BEGIN": begun, "PIECE": str(PIECE),
-            "LOAD_STEP": names[take.outputs[0]],
+            "LOAD_STEP": interface_names(take, self.printer.type)[take.outputs[0]],
         })  # fmt: skip
 
     def _configuration(self) -> str:

@@ -1,6 +1,6 @@
 """Blocks that pause: a call does a bounded number of operations, and the next one goes on where it has stopped.
 
-A block with more operations than a piece may have becomes steps, each of which is such a piece: `step` says which is
+A block with more operations than a piece may have becomes steps, each of which is such a piece: `STEP` says which is
 next, and all variables keep their values, as those of function blocks do. `remaining` is what a call may still do: each
 piece takes its operations from it, and no further one begins once it is used up. So a call exceeds what it was given by
 less than a piece.
@@ -140,19 +140,16 @@ class Pausing:
             case Count(_, first, last, _, body):
                 return operations_in((first, last)), (replace(statement, body=self.charged(body)),)
             case Call(_, arguments):
-                return operations_in(arguments), (self.once(statement),)
+                return operations_in(arguments), (self.called(statement),)
         return operations_in(statement), (statement,)
 
-    def once(self, statement: Statement) -> Statement:
-        """Return a call as one of the block that is made of it; any other statement as it is."""
-        if not isinstance(statement, Call):
-            return statement
-        block = self.block(statement.block)
+    def called(self, call: Call) -> Call:
+        """Return the call of the block that is made of the one that is called."""
+        block = self.block(call.block)
         given = ((REMAINING, REMAINING),) if REMAINING in block.shared else ()
         anew = ((ANEW, CALL_ANEW),) if ANEW in block.inputs else ()
-        count = len(statement.block.inputs)
-        listed = (*statement.arguments[:count], *anew, *statement.arguments[count:], *given)
-        return Call(block, listed, statement.results)
+        count = len(call.block.inputs)
+        return Call(block, (*call.arguments[:count], *anew, *call.arguments[count:], *given), call.results)
 
 
 class Steps:
@@ -252,8 +249,7 @@ class Steps:
             yield goto(self.entry((place, *behind), after))
             return
         again = self._reserved()
-        made = self.pausing.once(place)
-        assert isinstance(made, Call)  # noqa: S101 by construction
+        made = self.pausing.called(place)
         self._cases[again] = (PausingCall(made, CALL_ANEW, BUSY, (goto(self.entry(behind, after)),)),)
         yield from (Assign(CALL_ANEW, TRUE), goto(again))
 
@@ -296,11 +292,9 @@ def charge(operations: int, times: Expression = ONE) -> tuple[Statement, ...]:
     """Return what takes operations from what is left."""
     if not operations:
         return ()
-    all_ = Literal(Kind.INT, operations)
+    taken: Expression = Operation(Kind.INT, "*", (Literal(Kind.INT, operations), times))
     if isinstance(times, Literal):
-        taken: Expression = Literal(Kind.INT, operations * times.value)
-    else:
-        taken = Operation(Kind.INT, "*", (all_, times))
+        taken = Literal(Kind.INT, operations * times.value)
     return (Assign(REMAINING, Operation(Kind.INT, "-", (REMAINING, taken))),)
 
 

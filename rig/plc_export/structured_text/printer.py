@@ -250,6 +250,13 @@ def interface_names(block: Block, type_of: Callable[[Type], str]) -> dict[Name, 
             for each in (*block.inputs, *block.shared, *block.outputs)}  # fmt: skip
 
 
+def passed_by_name(block: Block, parameters: Iterable[Name], type_of: Callable[[Type], str], indent: int) -> str:
+    """Return arguments of a call, a line each: variables with the last parts of the parameters' names."""
+    names = interface_names(block, type_of)
+    return ",\n".join(f"{' ' * indent}{names[each]} := {each.name.rstrip('.').rpartition('.')[2]}"
+                      for each in parameters)  # fmt: skip
+
+
 def block_name(block: Block) -> str:
     """Return the name of the type of a block."""
     return identifier(f"{PREFIX}{block.name}")

@@ -22,8 +22,8 @@ from rig.plc_export.structured_text.pausing import ANEW, Pausing
 from rig.plc_export.structured_text.places import Record
 from rig.plc_export.structured_text.printer import (
     StructuredTextPrinter,
-    interface_names,
     memory,
+    passed_by_name,
     section,
 )
 from rig.plc_export.structured_text.slicing import one_iteration_a_call
@@ -132,7 +132,7 @@ class StructuredTextExport:
             "GOLDEN_SUMS": "".join(
                 summing(name, scalar_of(values), values.size) for name, values in arrays_in(self.vectors[0]).items()
             ).rstrip(),
-            "SOLVER": self._problem_passed(),
+            "SOLVER": passed_by_name(self.solver, (ANEW, *self.solver.shared), self.printer.type, 16),
         })  # fmt: skip
 
     def _loaded(self, number: int) -> str:
@@ -140,13 +140,6 @@ class StructuredTextExport:
         arrays = ", ".join(f"{name} := {name}" for name in arrays_in(self.vectors[0]))
         return (f"{pad}{number}:\n{pad}    golden_{number}({arrays});\n{pad}    guessed := golden_{number}.guessed;\n"
                 f"{pad}    golden_sum := golden_{number}.golden_sum;\n")  # fmt: skip
-
-    def _problem_passed(self) -> str:
-        names = interface_names(self.solver, self.printer.type)
-        return ",\n".join(
-            f"                {names[each]} := {each.name.rstrip('.').rpartition('.')[2]}"
-            for each in (ANEW, *self.solver.shared)
-        )
 
 
 def bounded(method: OdeMethod, vector: GoldenVector) -> GoldenVector:
