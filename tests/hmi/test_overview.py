@@ -12,7 +12,7 @@ from tests.harness.waiting import eventually
 from tests.hmi.conftest import SERVICES, Site, Witness
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
+    from playwright.sync_api import Page, Route
 
 TICKS = 60
 SHOWN = ("load", *(f"u.{name}" for name in INPUT_NAMES), *(f"y.{name}" for name in OUTPUT_NAMES))
@@ -110,6 +110,23 @@ def test_a_stream_on_which_nothing_comes_is_given_up_for_another(page: "Page", s
     try:
         site.freeze("hmi")
         eventually(lambda: page.is_visible("body") and any("/api/stream" in url for url in asked), "another stream")
+    finally:
+        site.thaw("hmi")
+    eventually(lambda: page.is_hidden("#banner"), "the banner goes")
+
+
+def test_a_server_that_stands_still_while_its_page_is_loading_is_told_from_one_that_answers(
+    page: "Page", site: Site
+) -> None:
+    def answer_and_stand_still(route: "Route") -> None:
+        answer = route.fetch()
+        site.freeze("hmi")
+        route.fulfill(response=answer)
+
+    page.route("**/mimic*.svg", answer_and_stand_still)  # the last thing that is asked for before values are shown
+    try:
+        page.reload()
+        eventually(lambda: "own server" in (page.text_content("#banner") or ""), "it says that its server is silent")
     finally:
         site.thaw("hmi")
     eventually(lambda: page.is_hidden("#banner"), "the banner goes")

@@ -130,8 +130,12 @@ function showMode() {
   for (const one of document.querySelectorAll("[data-mode]")) one.setAttribute("aria-pressed", String(Boolean(asked) && asked.startsWith(one.dataset.mode) && !isStale("control_plc.")));
 }
 
-export async function refreshUser() {
+async function refreshUser() {
   state.me = await ask("api/me");
+  showUser();
+}
+
+export function showUser() {
   byId("login-open").hidden = Boolean(state.me.user);
   byId("logout").hidden = !state.me.user;
   byId("logout").textContent = `Log out ${state.me.user}`;

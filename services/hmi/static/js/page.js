@@ -4,7 +4,7 @@ import { bindAll, bindNames, controlledBar, inputBar, loadBar, measuredBar } fro
 import { hideTrends, initTrends, recolourStrips, recolourTrends, refreshStrips, showTrends } from "./trends.js";
 import { initWhy, pick, recolourWhy, showWhy } from "./why.js";
 import { initAlarms, redrawAlarms } from "./alarms.js";
-import { initCommands, refreshUser } from "./commands.js";
+import { initCommands, showUser } from "./commands.js";
 import { initDetail } from "./detail.js";
 import { initReplay } from "./replay.js";
 
@@ -116,8 +116,8 @@ async function start() {
   links(); overview();
   initTrends((time) => { location.hash = "#why"; pick(`?at=${time}`); });
   initWhy(); initCommands(redrawAlarms); initAlarms(); initReplay();
+  showUser();
   if (first) take(first); else if (!state.me.role) byId("login-open").click();
-  await refreshUser();
   connect(); show();
   addEventListener("hashchange", () => { show(); byId("view").focus({ preventScroll: true }); byId("view").scrollTop = 0; });
 }
