@@ -20,8 +20,11 @@ TOLERANCE: Final = 1e-5
 itself allows nothing."""
 ROUNDING_STEPS: Final = 4
 """Neighbours that are tried when rounding to single precision has crossed a limit; one or two will do."""
-NEVER: Final = -(2**40)
-"""Tick of a change that did not happen."""
+NEVER: Final = -(2**15)
+"""Tick of a change that did not happen: longer ago than any window, and what it is subtracted from has 32 bits."""
+
+PLAYS_ON: Final = False
+"""No sequence begins."""
 
 
 class Limits(NamedTuple):
@@ -69,18 +72,54 @@ class GuardState:
     """Depends on how long before the window the outputs last moved."""
     moved: int = -TICKS_PER_SAMPLE
     """Tick of the last change."""
-    changes: int = 0
-    """Number of changes so far."""
+    oldest: int = 0
+    """Place of the oldest of the last changes, which the next one takes."""
     out_of_bounds: bool = False
     """The outputs applied when the guard began are outside the bounds."""
 
 
 def beginning(limits: Limits, applied: Numbers) -> GuardState:
     """Return the state after `applied` has been constant for ever."""
-    slots = range(limits.slew_ticks)
-    return GuardState(
-        list(applied), list(applied), list(applied), [NEVER for _ in slots], [list(applied) for _ in slots]
-    )
+    rows: list[MutableSequence[float]] = [list(applied) for _ in range(limits.slew_ticks)]
+    state = GuardState(list(applied), list(applied), list(applied), [NEVER for _ in rows], rows)
+    begin(state, limits, applied)
+    return state
+
+
+def begin(state: GuardState, limits: Limits, applied: Numbers) -> None:
+    """Make the state that after `applied` (inputs,) has been constant for ever."""
+    for i in range(N_INPUTS):
+        state.applied[i] = state.anchor[i] = applied[i]
+    for slot in range(limits.slew_ticks):
+        state.moves[slot] = NEVER
+        for i in range(N_INPUTS):
+            state.before[slot][i] = applied[i]
+    state.start, state.share, state.moved, state.oldest = 0, 1.0, -TICKS_PER_SAMPLE, 0
+    state.out_of_bounds = not in_range(limits, applied)
+
+
+def resume(state: GuardState, limits: Limits, tick: int, applied: Numbers) -> None:
+    """Begin again at `tick` from the outputs applied there (inputs,), which count as having moved just then.
+
+    An open window stays open: consecutive breaks would otherwise give a full rate each. A value that is not finite is
+    ignored: the last one stays.
+    """
+    for i in range(N_INPUTS):
+        state.coming[i] = applied[i] if math.isfinite(applied[i]) else state.applied[i]
+    is_open = 0 <= tick - state.start < TICKS_PER_SAMPLE and are_near(limits, state.anchor, state.coming, state.share)
+    for slot in range(limits.slew_ticks):
+        if are_near(limits, state.before[slot], state.coming, 1.0):
+            state.moves[slot] = min(state.moves[slot], tick)
+        else:  # what is further away limits nothing any more
+            state.moves[slot] = NEVER
+    for i in range(N_INPUTS):
+        state.applied[i] = state.coming[i]
+        if not is_open:
+            state.anchor[i] = state.coming[i]
+    if not is_open:
+        state.start = state.moved = tick
+        state.share = rate_share(limits, 0)
+    state.out_of_bounds = not in_range(limits, state.applied)
 
 
 def copy_state(source: GuardState, target: GuardState, limits: Limits) -> None:
@@ -92,7 +131,7 @@ def copy_state(source: GuardState, target: GuardState, limits: Limits) -> None:
         for i in range(N_INPUTS):
             target.before[slot][i] = source.before[slot][i]
     target.start, target.share = source.start, source.share
-    target.moved, target.changes, target.out_of_bounds = source.moved, source.changes, source.out_of_bounds
+    target.moved, target.oldest, target.out_of_bounds = source.moved, source.oldest, source.out_of_bounds
 
 
 def rate_share(limits: Limits, elapsed_ticks: int) -> float:
@@ -117,15 +156,15 @@ def admit(state: GuardState, limits: Limits, tick: int, wanted: Numbers, update:
 
 def change(state: GuardState, limits: Limits, tick: int, wanted: Numbers) -> None:
     """Apply what is nearest to `wanted`, and remember what was applied before if that is another."""
-    applied, slot = state.applied, state.changes % limits.slew_ticks
-    for i in range(N_INPUTS):  # of this slot too, which is the oldest, each is still limited by what it held
+    applied, slot = state.applied, state.oldest
+    for i in range(N_INPUTS):  # of this slot too each is still limited by what it held
         state.coming[i] = nearest(state, limits, tick, wanted[i], i)
     if same(state.coming, applied):
         return
     state.moves[slot] = state.moved = tick
     for i in range(N_INPUTS):
         state.before[slot][i] = applied[i]
-    state.changes += 1
+    state.oldest = slot + 1 if slot + 1 < limits.slew_ticks else 0
     for i in range(N_INPUTS):
         applied[i] = state.coming[i]
 
@@ -173,12 +212,37 @@ def is_reached(state: GuardState, limits: Limits, tick: int, value: float, i: in
     return reached
 
 
+def are_near(limits: Limits, one: Numbers, other: Numbers, share: float) -> bool:
+    """Return whether two rows of outputs are apart by at most a share of the rates."""
+    near = True
+    for i in range(N_INPUTS):
+        near = near and abs(other[i] - one[i]) <= limits.rate[i] * share
+    return near
+
+
 def in_range(limits: Limits, row: Numbers) -> bool:
     """Return whether the outputs are finite and inside the bounds, but for the slack."""
     inside = True
     for i in range(N_INPUTS):
         inside = inside and limits.low[i] - limits.slack[i] <= row[i] <= limits.high[i] + limits.slack[i]
     return inside
+
+
+def judge(
+    state: GuardState, twin: GuardState, limits: Limits, tick: int, meanwhile: Rows, coming: int, first_tick: int,
+    rows: Rows, length: int,
+) -> bool:  # fmt: skip
+    """Return whether a sequence would be applied unchanged from `first_tick` on; `twin` is overwritten.
+
+    From `tick` until then the first `coming` rows of `meanwhile` are played, and what is applied is held thereafter.
+    """
+    copy_state(state, twin, limits)
+    for k in range(first_tick - tick):
+        if k < coming:
+            admit(twin, limits, tick + k, meanwhile[k], PLAYS_ON)
+        else:
+            admit(twin, limits, tick + k, twin.applied, PLAYS_ON)
+    return admits(twin, limits, first_tick, rows, length)
 
 
 def admits(state: GuardState, limits: Limits, first_tick: int, rows: Rows, length: int) -> bool:

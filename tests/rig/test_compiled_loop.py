@@ -215,15 +215,23 @@ def compiled_admit(guard: Any, limits: Any, tick: int, wanted: Any, update: bool
     admit(guard[0], limits, tick, wanted, update)
 
 
-values = st.floats(-1e30, 1e30) | st.floats(0.0, 200.0, width=32) | st.just(0.0)
+values = (
+    st.floats(-1e30, 1e30)
+    | st.floats(0.0, 200.0, width=32)
+    | st.floats(-1e-37, 1e-37, width=32)
+    | st.integers(-149, 126).map(lambda exponent: 2.0**exponent)
+    | st.just(0.0)
+)
 
 
 @given(value=values, target=values)
 def test_single_precision_is_the_same_compiled(value: float, target: float) -> None:
     assert compiled_single(value) == single(value)
     own = single(value)
-    assert compiled_neighbour(own, target) == neighbour(own, target)
-    assert math.copysign(1.0, compiled_neighbour(own, target)) == math.copysign(1.0, neighbour(own, target))
+    found = neighbour(own, target)
+    assert compiled_neighbour(own, target) == found
+    assert math.copysign(1.0, compiled_neighbour(own, target)) == math.copysign(1.0, found)
+    assert found == np.nextafter(np.float32(own), np.float32(math.inf if target > own else -math.inf))
 
 
 anything = st.floats(-20.0, 180.0) | st.floats(allow_nan=True, allow_infinity=True)

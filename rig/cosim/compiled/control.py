@@ -73,7 +73,7 @@ def guard_records(state: GuardState) -> Any:  # noqa: ANN401 records
     """Return the state of the output guard, and room for a twin of it, shape (2,)."""
     guards = np.zeros(2, GUARD)
     g, slots = guards[0], len(state.moves)
-    for name in ("applied", "anchor", "start", "share", "moved", "changes"):
+    for name in ("applied", "anchor", "start", "share", "moved", "oldest"):
         g[name] = getattr(state, name)
     g["moves"][:slots], g["before"][:slots] = state.moves, state.before
     return guards
@@ -84,7 +84,7 @@ def restore_guard(program: ControlProgram, g: Any) -> None:  # noqa: ANN401 a re
     state, slots = program.guard.state, len(program.guard.state.moves)
     state.applied[:], state.anchor[:] = g["applied"].tolist(), g["anchor"].tolist()
     state.moves[:], state.before[:] = g["moves"][:slots].tolist(), g["before"][:slots].tolist()
-    state.start, state.moved, state.changes = int(g["start"]), int(g["moved"]), int(g["changes"])
+    state.start, state.moved, state.oldest = int(g["start"]), int(g["moved"]), int(g["oldest"])
     state.share = float(g["share"])
     program.guard.applied = SequenceRow(*state.applied)
 

@@ -13,7 +13,7 @@ import rig.cosim.compiled.portable  # noqa: F401 it lets kernels call what is pl
 from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
 from coldloop.process.signals import L1, T5
-from control_plc.output_limits import admit, admits, copy_state, in_range
+from control_plc.output_limits import admit, in_range, judge
 from control_plc.sensors import are_inside, count_unchanged, is_frozen
 from optimizer_plc import scheme
 from optimizer_plc.scheme import BY_THE_RULE
@@ -163,11 +163,10 @@ def answer(
     accepted = s.next_update - s.first_tick <= s.length
     for tick in range(length):
         accepted = accepted and in_range(w.limits, offered[tick])
-    copy_state(guard, twin, w.limits)
-    if accepted:
-        for tick in range(s.tick, s.next_update):
-            admit(twin, w.limits, tick, rows[0, tick - s.first_tick], tick == s.first_tick)
-    if not (accepted and admits(twin, w.limits, s.next_update, offered, length)):
+    if not accepted:
+        return False
+    played, left = rows[0, s.tick - s.first_tick :], s.next_update - s.tick
+    if not judge(guard, twin, w.limits, s.tick, played, left, s.next_update, offered, length):
         return False
     report(s, m, reports)
     trigger(w, s, s.tick)

@@ -1,9 +1,8 @@
 """Lets kernels call the control PLC's arithmetic, which is plain Python: that PLC runs without numba.
 
-What it calls on single precision has a form of its own for numba.
+Rounding to single precision has a form of its own for numba.
 """
 
-import math
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -14,12 +13,14 @@ from coldloop.kernels import single_precision
 from control_plc import output_limits, sensors
 
 PORTABLE: Final[tuple[Callable[..., Any], ...]] = (
+    single_precision.neighbour,
     output_limits.admit,
     output_limits.admits,
     output_limits.change,
     output_limits.copy_state,
     output_limits.in_range,
     output_limits.is_reached,
+    output_limits.judge,
     output_limits.nearest,
     output_limits.rate_share,
     output_limits.same,
@@ -36,16 +37,3 @@ for function in PORTABLE:
 @overload(single_precision.single, jit_options={"error_model": "numpy"}, strict=False)
 def _single(value: Any) -> Any:  # noqa: ANN401, ARG001 a type of numba
     return lambda value: np.float64(np.float32(value))
-
-
-@overload(single_precision.neighbour, jit_options={"error_model": "numpy"}, strict=False)
-def _neighbour(value: Any, target: Any) -> Any:  # noqa: ANN401, ARG001 types of numba
-    smallest = single_precision.SMALLEST
-
-    def neighbour(value: float, target: float) -> float:
-        if value == 0.0:
-            return math.copysign(smallest, target)
-        towards = np.float32(np.inf) if target > value else np.float32(-np.inf)
-        return float(np.nextafter(np.float32(value), towards))
-
-    return neighbour

@@ -27,7 +27,7 @@ NOT: Final = -1
 GUARD: Final = np.dtype([
     ("applied", "f8", 3), ("anchor", "f8", 3), ("coming", "f8", 3),
     ("moves", "i8", TICKS_PER_SAMPLE), ("before", "f8", (TICKS_PER_SAMPLE, 3)),
-    ("start", "i8"), ("share", "f8"), ("moved", "i8"), ("changes", "i8"), ("out_of_bounds", "?"),
+    ("start", "i8"), ("share", "f8"), ("moved", "i8"), ("oldest", "i8"), ("out_of_bounds", "?"),
 ])  # fmt: skip
 """`control_plc.output_limits.GuardState`."""
 

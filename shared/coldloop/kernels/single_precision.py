@@ -1,9 +1,13 @@
 """Single precision, in which everything crosses the link, computed with Python's doubles."""
 
-import math
 import struct
+from typing import Final
 
-SMALLEST = float(struct.unpack(">f", b"\0\0\0\1")[0])
+# A number plus 0.625 to 1.25 of the distance to its neighbour is nearest to that neighbour, up and down a power of two.
+STEP: Final = 0.625 * 2.0**-23
+"""Such a share of the number itself."""
+SMALLEST_STEP: Final = 0.625 * 2.0**-149
+"""Of the smallest numbers, which are all as far apart."""
 
 
 def single(value: float) -> float:
@@ -13,8 +17,5 @@ def single(value: float) -> float:
 
 def neighbour(value: float, target: float) -> float:
     """Return the next single-precision number from `value`, which is one, on the way to `target`."""
-    if value == 0.0:
-        return math.copysign(SMALLEST, target)
-    bits: int = struct.unpack(">i", struct.pack(">f", value))[0]
-    away_from_zero = (target > value) == (value > 0.0)
-    return float(struct.unpack(">f", struct.pack(">i", bits + (1 if away_from_zero else -1)))[0])
+    step = max(abs(value) * STEP, SMALLEST_STEP)
+    return single(value + step if target > value else value - step)
