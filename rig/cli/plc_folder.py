@@ -13,18 +13,29 @@ from coldloop import __version__
 from coldloop.config import selected
 from coldloop.errors import UsageError
 from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import TICK_S
+from coldloop.process.signals import INPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS
+from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.settings import SHOWN
 from rig.plc_export.c.bus_registers import bus_files
 from rig.plc_export.c.exported_optimizer import FOLDER as OPTIMIZER
 from rig.plc_export.c.exported_optimizer import MANIFEST, manifest_of
+from rig.plc_export.c.guard_files import GuardExport
 from rig.plc_export.c.optimizer_files import OptimizerExport
 from rig.plc_export.c.solver_files import OdeExport
-from rig.plc_export.kernels.counted import IterationCounts, counted_iterations, counted_updates
+from rig.plc_export.kernels.counted import (
+    IterationCounts,
+    counted_guard,
+    counted_iterations,
+    counted_longest,
+    counted_updates,
+)
+from rig.plc_export.kernels.golden_calls import golden_calls
+from rig.plc_export.kernels.guard_program import GuardKernels
 from rig.plc_export.kernels.recorded_problems import LOAD, TICKS, GoldenVector, GoldenVectors, paper_settings, record
 from rig.plc_export.kernels.recorded_updates import GoldenUpdate, UpdateRecorder
 from rig.plc_export.problem_layout import problem_layout
+from rig.plc_export.structured_text.guard_files import GuardText
 from rig.plc_export.structured_text.optimizer_files import OptimizerText
 from rig.plc_export.structured_text.pausing import PIECE
 from rig.plc_export.structured_text.plcopen import plcopen_xml
@@ -35,11 +46,15 @@ from rig.plc_sizing.budget_tables import problem_of
 from rig.plc_sizing.exported import ITERATION, WHOLE, CallCost, Cut, ExportCost, cost_text
 from rig.plc_sizing.profile import PlcProfile
 from rig.settings import Settings
+from rig.text_tables import markdown_table
 
 README: Final = "README.md"
 PROJECT: Final = "solver.xml"
-BESIDE: Final = f"`{OPTIMIZER}/` has the whole optimiser, with a README and a self-test of its own.\n\n"
-ALONE: Final = "The whole optimiser is not here: what a process expects of a load (`forecast`) is not exported.\n\n"
+GUARD: Final = "output_guard"
+OWN: Final = "with a README and a self-test of its own.\n\n"
+BESIDE: Final = f"`{OPTIMIZER}/` has the whole optimiser, `{GUARD}/` the output guard of the control PLC, each {OWN}"
+ALONE: Final = ("The whole optimiser is not here: what a process expects of a load (`forecast`) is not exported. "
+                f"`{GUARD}/` has the output guard of the control PLC, {OWN}")  # fmt: skip
 FIXED_TICKS: Final = max(SHORTEST_TICKS, LONGEST_TICKS // 2)
 """Updating period of the second half of the golden updates; that of the first is adaptive."""
 CUT: Final = Cut(WORK, PIECE)
@@ -71,6 +86,7 @@ def export_plc(
     if not PROCESS.forecasts:
         written = whole_optimizer(target, settings, ticks, profile)
         texts |= {f"{OPTIMIZER}/{name}": text for name, text in written.items()}
+    texts |= {f"{GUARD}/{name}": text for name, text in output_guard(target, settings).items()}
     write_whole(folder, texts)
     return [folder / name for name in texts]
 
@@ -202,6 +218,31 @@ def optimizer_in_text(
               "self-test and golden updates": sizes.self_test}  # fmt: skip
     parts = {**loading(target), **CUTTING, "DIGEST": str(recorder.optimizer.model_digest)}
     return "structured_text/optimizer/readme.md", texts, parts, needed
+
+
+# -- the output guard --------------------------------------------------------------------------------------------------
+
+
+def output_guard(target: str, settings: Settings) -> dict[str, str]:
+    """Return the files of the control PLC's output guard by their names, with its golden calls."""
+    kernels, golden = GuardKernels(settings.limits), golden_calls(settings.limits)
+    export = GuardExport(kernels, golden) if target == "c" else GuardText(kernels, golden)
+    texts, name = export.files(), "c" if target == "c" else "structured_text"
+    if target == "plcopen":
+        texts = {f"{GUARD}.xml": plcopen_xml(texts.values(), "the output guard and a self-test")}
+    counts = {call: CallCost(**found._asdict()) for call, found in counted_guard(kernels, golden).items()}
+    counts["judgement"] = counts["judgement"].model_copy(update={"worst": counted_longest(kernels)})
+    cost = ExportCost(variables=len(INPUT_NAMES), operations=counts, bytes=export.sizes())
+    parts = {} if target == "c" else loading(target)
+    texts[README] = filled(template(f"{name}/{GUARD}/readme.md"), {
+        **parts, "COST": cost_text(cost), "GOLDEN": str(len(golden)), "ROWS": str(SEQUENCE_ROWS),
+        "FILES": ", ".join(f"`{each}`" for each in texts),
+        "LIMITS": markdown_table(("input", "low", "high", f"most in {TICKS_PER_SAMPLE * TICK_S:g} s"), [
+            (signal, *(f"{each:g}" for each in limits))
+            for signal, *limits in zip(INPUT_NAMES, *kernels.limits[:3], strict=True)
+        ]), "SLEW_S": f"{kernels.limits.slew_ticks * TICK_S:g}",
+    })  # fmt: skip
+    return texts
 
 
 # -- files -------------------------------------------------------------------------------------------------------------

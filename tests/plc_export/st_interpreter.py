@@ -1,4 +1,4 @@
-"""Executes Structured Text: REAL as float32, both operands of AND and OR computed, types strict.
+"""Executes Structured Text: REAL as float32, LREAL as float64, both operands of AND and OR computed, types strict.
 
 Each unit becomes a Python function of the objects that hold its variables. An index beyond its array, an assignment to
 a constant or an input, and operands of two types are errors.
@@ -19,11 +19,14 @@ _POWF, _LOGF = _LIBM.powf, _LIBM.logf
 _POWF.restype, _POWF.argtypes = ctypes.c_float, (ctypes.c_float, ctypes.c_float)
 _LOGF.restype, _LOGF.argtypes = ctypes.c_float, (ctypes.c_float,)
 STANDARD: Final = {
-    "sqrt": ("np.sqrt", "REAL", "REAL"), "abs": ("abs", "REAL", "REAL"), "expt": ("power", "REAL", "REAL"),
+    "sqrt": ("np.sqrt", "REAL", "REAL"), "expt": ("power", "REAL", "REAL"),
     "ln": ("logarithm", "REAL", "REAL"), "real_to_dint": ("to_integer", "REAL", "DINT"),
     "dint_to_real": ("np.float32", "DINT", "REAL"), "bool_to_dint": ("int", "BOOL", "DINT"),
+    "real_to_lreal": ("np.float64", "REAL", "LREAL"), "lreal_to_real": ("np.float32", "LREAL", "REAL"),
+    "dint_to_lreal": ("np.float64", "DINT", "LREAL"), "lreal_to_dint": ("to_integer", "LREAL", "DINT"),
 }  # fmt: skip
-"""In Python, with the types of arguments and result."""
+"""In Python, with the types of arguments and result; ABS has that of its argument."""
+ZEROS: Final = {"REAL": "np.float32(0)", "LREAL": "np.float64(0)", "DINT": "0", "BOOL": "False"}
 COUNTED: Final = {"sqrt", "expt", "ln"}
 COMPARISONS: Final = {"=": "==", "<>": "!=", "<": "<", ">": ">", "<=": "<=", ">=": ">="}
 LOGICAL: Final = {"AND": "&", "OR": "|"}
@@ -55,12 +58,16 @@ def put(array: dict[int, object], index: int, value: object) -> None:
     array[index] = value
 
 
-class Reals(dict[str, np.float32]):
+class Reals(dict[str, np.floating[Any]]):
     """Literals that have been read."""
 
-    def __missing__(self, text: str) -> np.float32:
-        self[text] = np.float32(text)
+    def __missing__(self, text: str) -> np.floating[Any]:
+        kind, _, number = text.partition("#")
+        self[text] = np.float64(number) if kind == "LREAL" else np.float32(number)
         return self[text]
+
+
+REALS: Final = Reals()
 
 
 class Machine:
@@ -70,10 +77,10 @@ class Machine:
         self.library: Library = parsed(*texts)
         self.globals = SimpleNamespace()
         self.operations = [0]
-        """Sums, differences, products, quotients, roots, powers and logarithms of REAL so far."""
+        """Sums, differences, products, quotients, roots, powers and logarithms of REAL and LREAL so far."""
         self.names: dict[str, Any] = {"np": np, "power": power, "to_integer": to_integer, "logarithm": logarithm,
                                       "dint": dint, "put": put, "quotient": quotient,
-                                      "globals": self.globals, "reals": Reals(), "count": self.operations}  # fmt: skip
+                                      "globals": self.globals, "reals": REALS, "count": self.operations}  # fmt: skip
         for variable in self.library.globals.values():
             setattr(self.globals, variable.name, self.initial(variable))
         for unit in self.library.units.values():
@@ -101,10 +108,10 @@ class Machine:
     @staticmethod
     def value(kind: str, written: object) -> object:
         if written is None:
-            return {"REAL": np.float32(0), "DINT": 0, "BOOL": False}[kind]
+            return {"REAL": np.float32(0), "LREAL": np.float64(0), "DINT": 0, "BOOL": False}[kind]
         match kind, written:
-            case "REAL", ("real", str(text)):
-                return np.float32(text.removeprefix("REAL#"))
+            case ("REAL", ("real", str(text))) | ("LREAL", ("lreal", str(text))):
+                return REALS[text]
             case "DINT", ("int", str(text)):
                 return int(text)
             case "DINT", ("operation", "-", ("int", str(text))):
@@ -139,8 +146,7 @@ class Translation:
         if unit.kind != "FUNCTION":
             return "\n".join([f"def run_{unit.name}(self):", *self.block(unit.body)])
         inputs = [each.name for each in unit.variables.values() if each.section == "VAR_INPUT"]
-        zeros = {"REAL": "np.float32(0)", "DINT": "0", "BOOL": "False"}
-        local = [f" {each.name} = {zeros[each.type]}" for each in unit.variables.values() if each.name not in inputs]
+        local = [f" {each.name} = {ZEROS[each.type]}" for each in unit.variables.values() if each.name not in inputs]
         head = f"def call_{unit.name}({', '.join(inputs)}):"
         return "\n".join([head, *local, *self.block(unit.body), f" return {unit.name}"])
 
@@ -231,8 +237,8 @@ class Translation:
 
     def typed(self, expression: object) -> tuple[str, str]:  # noqa: PLR0911 one case a kind
         match expression:
-            case "real", str(text):
-                return f"reals['{text.removeprefix('REAL#')}']", "REAL"
+            case ("real" | "lreal") as kind, str(text):
+                return f"reals['{text}']", kind.upper()
             case "int", str(text):
                 return text, "DINT"
             case "bool", str(text):
@@ -259,6 +265,10 @@ class Translation:
         return f"{'globals' if variable.section == 'VAR_EXTERNAL' else 'self'}.{name}", variable.type
 
     def function(self, name: str, arguments: list[Tree]) -> tuple[str, str]:
+        if name == "abs":
+            ((text, kind),) = map(self.typed, arguments)
+            assert kind in {"REAL", "LREAL"}
+            return f"abs({text})", kind
         if name in STANDARD:
             called, taken, result = STANDARD[name]
             self.operations += name in COUNTED
@@ -277,12 +287,12 @@ class Translation:
         if sign in LOGICAL:
             assert kind == "BOOL"
             return f"({one} {LOGICAL[sign]} {other})", kind
-        assert kind in {"REAL", "DINT"}
+        assert kind in {"REAL", "LREAL", "DINT"}
         if sign in COMPARISONS:
             return f"({one} {COMPARISONS[sign]} {other})", "BOOL"
         if kind == "DINT" and sign in {"/", "MOD"}:
             whole = f"quotient({one}, {other})"
             return (whole if sign == "/" else f"({one} - {whole} * {other})"), kind
         assert sign in {"+", "-", "*", "/"}
-        self.operations += kind == "REAL"
+        self.operations += kind != "DINT"
         return f"({one} {sign} {other})", kind

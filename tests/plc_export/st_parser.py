@@ -6,16 +6,18 @@ from dataclasses import dataclass, field
 from typing import Final
 
 TOKEN: Final = re.compile(r"""
-    (?P<space>\s+|\(\*.*?\*\)) | (?P<real>REAL\#[+-]?\d+\.\d+(?:E[+-]?\d+)?) | (?P<time>T\#\d+ms)
+    (?P<space>\s+|\(\*.*?\*\)) | (?P<lreal>LREAL\#[+-]?\d+\.\d+(?:E[+-]?\d+)?)
+    | (?P<real>REAL\#[+-]?\d+\.\d+(?:E[+-]?\d+)?) | (?P<time>T\#\d+ms)
     | (?P<int>\d+(?!\d|\.\d)) | (?P<name>[A-Za-z][A-Za-z0-9_]*) | (?P<sign>:=|<>|<=|>=|\.\.|[-+*/=<>()\[\],;:.])
 """, re.VERBOSE | re.DOTALL)  # fmt: skip
 SECTIONS: Final = ("VAR_INPUT", "VAR_IN_OUT", "VAR_OUTPUT", "VAR_EXTERNAL", "VAR_GLOBAL", "VAR")
 RESERVED: Final = """
     AND ARRAY AT BOOL BY CASE CONFIGURATION CONSTANT D DINT DO DT ELSE ELSIF END_CASE END_FOR END_IF END_WHILE EXIT
-    FALSE FOR FUNCTION FUNCTION_BLOCK IF L LD LIMIT LN LT MAX MIN MOD MUX N NOT OF ON OR P PROGRAM R REAL RESOURCE
+    FALSE FOR FUNCTION FUNCTION_BLOCK IF L LD LIMIT LN LREAL LT MAX MIN MOD MUX N NOT OF ON OR P PROGRAM R REAL RESOURCE
     RETURN S SD SEL SL SQRT ST STEP T TASK THEN TIME TO TOD TRUE TYPE UNTIL VAR WHILE WITH XOR
 """
 LEVELS: Final = (("OR",), ("AND",), ("=", "<>", "<", ">", "<=", ">="), ("+", "-"), ("*", "/", "MOD"))
+ELEMENTARY: Final = ("REAL", "LREAL", "DINT", "BOOL")
 Tree = tuple[object, ...]
 
 
@@ -121,7 +123,7 @@ class Parser:
             size = self.integer() + 1
             self.take("]")
             self.take("OF")
-            self.library.arrays[name] = size, self.take("REAL", "DINT", "BOOL")
+            self.library.arrays[name] = size, self.take(*ELEMENTARY)
             self.take(";")
 
     def _configuration(self) -> None:
@@ -148,7 +150,7 @@ class Parser:
         self.library.units[unit.name] = unit
 
     def _type(self) -> str:
-        return self.take() if self.next in {"REAL", "DINT", "BOOL"} else self.name()
+        return self.take() if self.next in ELEMENTARY else self.name()
 
     def _section(self) -> Iterator[Variable]:
         section = self.take(*SECTIONS)
@@ -271,7 +273,7 @@ class Parser:
         if self.next in {"-", "NOT"}:
             return "operation", self.take(), self._unary()
         kind, text = self.tokens[self.at]
-        if kind in {"real", "int"} or text in {"TRUE", "FALSE"}:
+        if kind in {"real", "lreal", "int"} or text in {"TRUE", "FALSE"}:
             self.at += 1
             return kind if kind != "name" else "bool", text
         if self.skip("("):

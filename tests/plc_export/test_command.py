@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 TANK = Path(__file__).parents[2] / "examples" / "processes" / "quadruple_tank.toml"
 SOLVER_TEXTS = ["types.st", "functions.st", "kernels.st", "golden.st", "self_test.st", "configuration.st"]
+GUARD_TEXTS = ["types.st", "functions.st", "kernels.st", "output_guard.st", "self_test.st", "configuration.st"]
 DESCRIBED = ["README.md", "manifest.json"]
 FILES = {
     "c": [
@@ -54,6 +55,21 @@ FILES = {
                 "manifest.json",
             )
         ),
+        *(
+            f"output_guard/{name}"
+            for name in (
+                "kernels.h",
+                "kernels.c",
+                "limits.h",
+                "limits.c",
+                "golden.h",
+                "golden.c",
+                "output_guard.h",
+                "output_guard.c",
+                "self_test.c",
+                "README.md",
+            )
+        ),
     ],
     "st": [
         *SOLVER_TEXTS,
@@ -62,6 +78,7 @@ FILES = {
             f"optimizer/{name}"
             for name in (*SOLVER_TEXTS[:3], "optimizer.st", *SOLVER_TEXTS[3:], "registers.md", *DESCRIBED)
         ),
+        *(f"output_guard/{name}" for name in (*GUARD_TEXTS, "README.md")),
     ],
     "plcopen": [
         "solver.xml",
@@ -69,6 +86,8 @@ FILES = {
         "optimizer/optimizer.xml",
         "optimizer/registers.md",
         *(f"optimizer/{name}" for name in DESCRIBED),
+        "output_guard/output_guard.xml",
+        "output_guard/README.md",
     ],
 }
 
@@ -84,7 +103,7 @@ def test_the_sources_and_a_readme_are_written(coldloop: "Coldloop", tmp_path: Pa
     readme = (out / "README.md").read_text()
     assert "@" not in readme
     assert all(name in readme for name in FILES[target] if name not in DESCRIBED and "/" not in name)
-    assert all("@" not in file.read_text() for file in out.rglob("optimizer/**/*.*"))
+    assert all("@" not in file.read_text() for file in out.rglob("*/*") if file.is_file())
     assert [path.name for path in out.parent.iterdir()] == [target]
 
 
@@ -112,7 +131,7 @@ def test_the_written_structured_text_passes_its_self_test_and_no_call_does_more_
 def test_the_written_c_passes_its_self_tests(coldloop: "Coldloop", tmp_path: Path) -> None:
     out = tmp_path / "c"
     assert coldloop("export", "plc", "--target", "c", "--out", out, "--ticks", 600).code == 0
-    for folder in (out, out / "optimizer"):
+    for folder in (out, out / "optimizer", out / "output_guard"):
         command = ["gcc", "-std=c99", "-ffp-contract=off", *folder.glob("*.c"), "-lm", "-o", folder / "self_test"]
         subprocess.run(command, check=True)
         said = subprocess.run([folder / "self_test"], capture_output=True, text=True, check=True).stdout

@@ -9,6 +9,11 @@ from typing import NamedTuple
 
 import pytest
 
+from coldloop.process.limits import InputLimits
+from rig.plc_export.c.guard_files import GuardExport
+from rig.plc_export.kernels.golden_calls import golden_calls
+from rig.plc_export.kernels.guard_program import GuardKernels
+from tests.plc_export.c_programs import write
 from tests.plc_export.test_c99 import STRICT
 
 ROOT = Path(__file__).parents[2]
@@ -54,17 +59,32 @@ def problems(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     return folder
 
 
+def built(target: Target, folder: Path, *sources: str) -> list[str]:
+    """Return the command that runs a program, which is compiled without a warning."""
+    if target.missing:
+        pytest.skip(f"not installed: {', '.join(target.missing)}")
+    program = str(folder / "program")
+    command = [target.compiler, *STRICT, *target.options, *sources, "-lm", "-o", program]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return [*target.runner, program]
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", TARGETS)
+def test_the_output_guard_passes_its_self_test(tmp_path: Path, name: str) -> None:
+    limits = InputLimits(rate=(0.1, 7.7, 1 / 3))
+    write(tmp_path, GuardExport(GuardKernels(limits), golden_calls(limits)).files())
+    program = built(TARGETS[name], tmp_path, *map(str, tmp_path.glob("*.c")))
+    done = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout[-13:]) == (0, ", 0 failures\n")
+
+
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("name", TARGETS)
 def test_problems_of_six_loads_have_the_bits_of_the_kernels(problems: Path, tmp_path: Path, name: str) -> None:
-    target = TARGETS[name]
-    if target.missing:
-        pytest.skip(f"not installed: {', '.join(target.missing)}")
-    program = tmp_path / "solve"
     sources = [problems / "kernels.c", problems / "problem.c", DRIVER]
-    command = [target.compiler, *STRICT, *target.options, f"-I{problems}", *sources, "-lm", "-o", program]
-    built = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert built.returncode == 0, built.stderr
+    program = built(TARGETS[name], tmp_path, f"-I{problems}", *map(str, sources))
     with (problems / "problems").open("rb") as given:
-        done = subprocess.run([*target.runner, program], stdin=given, capture_output=True, check=True)
+        done = subprocess.run(program, stdin=given, capture_output=True, check=True)
     assert done.stdout == (problems / "answers").read_bytes()

@@ -40,7 +40,7 @@ def test_in_c_its_self_test_passes_and_on_the_bus_it_leaves_the_trace_and_the_up
     install_libmodbus()
     file = process_file(name, tmp_path)
     out = exported(processes, file, "c", tmp_path / "out", 600)
-    for folder in (out, out / "optimizer"):
+    for folder in (out, out / "optimizer", out / "output_guard"):
         code, said = output(compiled(folder, COMPILERS[0], "-O2"))
         assert (code, said[-13:]) == (0, ", 0 failures\n")
     scenario = (*AS_EXPORTED, "--load", "e", "--duration", "600")
@@ -53,14 +53,15 @@ def test_in_c_its_self_test_passes_and_on_the_bus_it_leaves_the_trace_and_the_up
 
 
 @pytest.mark.exhaustive
-def test_in_structured_text_its_self_test_passes(processes: Processes, tmp_path: Path) -> None:
+def test_in_structured_text_its_self_tests_pass(processes: Processes, tmp_path: Path) -> None:
     out = exported(processes, process_file("pond", tmp_path), "st", tmp_path / "out", 600)
-    texts = [name for name in FILES["st"] if name.startswith("optimizer/") and name.endswith(".st")]
-    test = Machine(*((out / name).read_text() for name in texts)).instance("cl_self_test")
-    test.run = True
-    while not (test.done or test.failures):
-        test.run_()
-    assert (test.done, test.passed, test.what) == (True, True, 0)
+    for folder in ("optimizer/", "output_guard/"):
+        texts = [name for name in FILES["st"] if name.startswith(folder) and name.endswith(".st")]
+        test = Machine(*((out / name).read_text() for name in texts)).instance("cl_self_test")
+        test.run = True
+        while not (test.done or test.failures):
+            test.run_()
+        assert (test.done, test.passed, test.what) == (True, True, 0)
 
 
 def test_with_a_forecast_it_is_the_solver_alone_and_says_so(processes: Processes, tmp_path: Path) -> None:

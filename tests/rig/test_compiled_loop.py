@@ -218,7 +218,7 @@ def compiled_admit(guard: Any, limits: Any, tick: int, wanted: Any, update: bool
 values = (
     st.floats(-1e30, 1e30)
     | st.floats(0.0, 200.0, width=32)
-    | st.floats(-1e-37, 1e-37, width=32)
+    | st.floats(-(2.0**-122), 2.0**-122, width=32)
     | st.integers(-149, 126).map(lambda exponent: 2.0**exponent)
     | st.just(0.0)
 )

@@ -1,4 +1,4 @@
-"""Lets kernels call the control PLC's arithmetic, which is plain Python: that PLC runs without numba.
+"""Lets kernels call the control PLC's arithmetic, which is plain Python (that PLC runs without numba), and be exported.
 
 Rounding to single precision has a form of its own for numba.
 """
@@ -16,6 +16,8 @@ PORTABLE: Final[tuple[Callable[..., Any], ...]] = (
     single_precision.neighbour,
     output_limits.admit,
     output_limits.admits,
+    output_limits.are_near,
+    output_limits.begin,
     output_limits.change,
     output_limits.copy_state,
     output_limits.in_range,
@@ -23,6 +25,7 @@ PORTABLE: Final[tuple[Callable[..., Any], ...]] = (
     output_limits.judge,
     output_limits.nearest,
     output_limits.rate_share,
+    output_limits.resume,
     output_limits.same,
     sensors.are_inside,
     sensors.is_frozen,

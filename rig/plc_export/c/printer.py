@@ -286,6 +286,8 @@ class Printer(TreePrinter):
         match operation.operator:
             case name if name in OF_MATH:
                 return f"{OF_MATH[name]}{'f' * self.single}({', '.join(parts)})"
+            case "single":
+                return f"(({self.scalars[Kind.REAL]})(float){parts[0]})"
             case "isfinite" | "isinf" | "isnan" as name:
                 return f"({name}({parts[0]}) != 0)"
             case "min" | "max" as name:

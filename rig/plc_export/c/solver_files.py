@@ -11,7 +11,7 @@ from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.interface import Costs
 from optimizer_plc.solvers.ode import OdeMethod
 from rig.plc_export.c.printer import Printer, identifier
-from rig.plc_export.c.text import GENERATED, helpers, records_in
+from rig.plc_export.c.text import GENERATED, KernelFiles
 from rig.plc_export.kernels.ode_program import PER_PROBLEM, OdeProgram, crc, leaves
 from rig.plc_export.kernels.recorded_problems import GoldenVector, arrays_in
 from rig.plc_export.templates import template
@@ -47,10 +47,7 @@ class OdeExport:
         self.printer = Printer(problem.phi.dtype.type)
         self.real = self.printer.scalars[Kind.REAL]
         self.entry = self.program.entry
-        self.kernels = "\n".join(
-            self.printer.function(each, "" if each is self.entry else "static ") for each in self.program.functions
-        )
-        self.records = "\n".join(map(self.printer.structure, records_in(self.program.types)))
+        self.kernels = KernelFiles(self.printer, self.program.functions, [self.entry])
 
     # -- files ---------------------------------------------------------------------------------------------------------
 
@@ -65,8 +62,8 @@ class OdeExport:
     def files(self, vectors: Iterable[GoldenVector]) -> dict[str, str]:
         """Return the texts of the files by their names, with some golden vectors."""
         return {
-            "kernels.h": self._header(), "kernels.c": self._kernels(), "problem.h": self._problem_header(),
-            "problem.c": self._problem(), **self._golden(list(vectors)), "self_test.c": self._self_test(),
+            **self.kernels.texts(), "problem.h": self._problem_header(), "problem.c": self._problem(),
+            **self._golden(list(vectors)), "self_test.c": self._self_test(),
         }  # fmt: skip
 
     def sizes(self, vectors: Iterable[GoldenVector]) -> Sizes:
@@ -77,35 +74,6 @@ class OdeExport:
         )
         golden = sum(word * sum(values.size for values in arrays_in(each).values()) for each in vectors)
         return Sizes(constants, stack(self.entry, word), golden)
-
-    def _header(self) -> str:
-        signature = self.printer.signature(self.entry)
-        return f"""{GENERATED}#ifndef KERNELS_H
-#define KERNELS_H
-
-#include <stdbool.h>
-#include <stdint.h>
-
-#define N_LITERALS {len(self.printer.literals)}
-extern const {self.real} literals[N_LITERALS];
-
-{self.records}
-{signature};
-
-#endif
-"""
-
-    def _kernels(self) -> str:
-        literals = "".join(f"    {each},\n" for each in self.printer.literals)
-        return f"""{GENERATED}#include <math.h>
-
-#include "kernels.h"
-
-const {self.real} literals[N_LITERALS] = {{
-{literals}}};
-
-{helpers(self.real, self.kernels)}
-{self.kernels}"""
 
     def _problem_header(self) -> str:
         n, m, k = len(self.problem.phi), len(self.problem.gamma), len(self.counts)

@@ -1,11 +1,63 @@
 """What a C source has besides its kernels: helpers, and the types of records."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Final
 
-from rig.plc_export.tree.nodes import RecordType, RowsType, StructType, Type
+from rig.plc_export.c.printer import Printer
+from rig.plc_export.tree.nodes import Function, Kind, RecordType, RowsType, StructType, Type
 
 GENERATED: Final = "/* Written by Coldloop from the kernels of its optimiser; changes belong there. */\n"
+
+
+class KernelFiles:
+    """Kernels as two files.
+
+    Args:
+        printer: It gets their literals.
+        functions: Callees before their callers.
+        entries: Those that others call.
+        more: Types of records beside those of the parameters.
+    """
+
+    def __init__(
+        self, printer: Printer, functions: Sequence[Function], entries: Sequence[Function], more: Iterable[Type] = ()
+    ) -> None:  # fmt: skip
+        self._printer, self._entries = printer, entries
+        self._real = printer.scalars[Kind.REAL]
+        self._text = "\n".join(printer.function(each, "" if each in entries else "static ") for each in functions)
+        self.records = records_in([*(one.type for each in functions for one in each.parameters), *more])
+
+    def texts(self) -> dict[str, str]:
+        """Return the texts of the files by their names."""
+        printer = self._printer
+        records = "\n".join(map(printer.structure, self.records))
+        signatures = "\n".join(f"{printer.signature(each)};" for each in self._entries)
+        literals = "".join(f"    {each},\n" for each in printer.literals)
+        return {
+            "kernels.h": f"""{GENERATED}#ifndef KERNELS_H
+#define KERNELS_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#define N_LITERALS {len(printer.literals)}
+extern const {self._real} literals[N_LITERALS];
+
+{records}
+{signatures}
+
+#endif
+""",
+            "kernels.c": f"""{GENERATED}#include <math.h>
+
+#include "kernels.h"
+
+const {self._real} literals[N_LITERALS] = {{
+{literals}}};
+
+{helpers(self._real, self._text)}
+{self._text}""",
+        }
 
 
 def helpers(real: str, kernels: str) -> str:

@@ -5,6 +5,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from coldloop.registers.control_plc import SEQUENCE_ROWS
+from control_plc.output_limits import GuardState, Limits, beginning
 from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.decisions import Latched
 from optimizer_plc.program import OptimizerProgram
@@ -14,6 +16,8 @@ from optimizer_plc.session_state import empty_state
 from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers.interface import Costs
 from optimizer_plc.solvers.ode import OdeMethod, ode_solver
+from rig.plc_export.kernels.golden_calls import Call, GoldenCall
+from rig.plc_export.kernels.guard_program import GuardKernels
 from rig.plc_export.kernels.ode_program import Array, OdeProgram
 from rig.plc_export.kernels.optimizer_program import OptimizerKernels
 from rig.plc_export.kernels.recorded_problems import ITERATIONS, GoldenVector
@@ -127,6 +131,49 @@ def counted_updates(optimizer: OptimizerProgram, golden: Iterable[GoldenUpdate])
     starts = [sum(both) for both in zip(noted["pose"], noted["warm_start"], strict=True)]
     calls = {"plan": noted[take], "start": starts, "finish": noted["deliver"]}
     return {name: counts_of(found) for name, found in calls.items()}
+
+
+def counted_guard(kernels: GuardKernels, golden: Iterable[GoldenCall]) -> Mapping[str, CallCounts]:
+    """Return the operations of the scans and judgements of golden calls of the output guard."""
+    program, limits = CountedProgram(kernels.functions, np.float64), kernels.limits
+    begin, resume, scan, judge, _ = (each.name for each in kernels.entries)
+    state, twin = _guard_state(limits), _guard_state(limits)
+    noted = {"scan": program.noting(scan), "judgement": program.noting(judge)}
+    for each in golden:
+        given = np.array(each.given)
+        match each.call:
+            case Call.RESTART:
+                program[begin](state, limits, given)
+            case Call.SCAN:
+                program[scan](state, limits, each.tick, given, each.update)
+            case Call.RESUME:
+                program[resume](state, limits, each.tick, given)
+            case Call.JUDGE:
+                before, rows = np.array(each.meanwhile), np.array(each.rows)
+                program[judge](state, twin, limits, each.tick, before, len(before), each.first_tick, rows, len(rows))
+    return {name: counts_of(found) for name, found in noted.items()}
+
+
+def counted_longest(kernels: GuardKernels) -> int:
+    """Return the operations of the judgement of the longest sequence, each row of which moves all outputs."""
+    program, limits = CountedProgram(kernels.functions, np.float64), kernels.limits
+    low, high, rate = map(np.array, (limits.low, limits.high, limits.rate))
+    middle, step = (low + high) / 2, np.minimum(rate, high - low) / 1000
+    rows = (middle + np.outer(np.arange(SEQUENCE_ROWS + 1) % 2, step)).astype(np.float32).astype(float)
+    state, twin = _guard_state(limits), _guard_state(limits)
+    program[kernels.begin.name](state, limits, rows[0])
+    program.operations()
+    none = np.zeros((0, len(middle)))
+    assert program[kernels.judge.name](state, twin, limits, 0, none, 0, 0, rows[1:], SEQUENCE_ROWS)  # noqa: S101 by construction
+    return program.operations()
+
+
+def _guard_state(limits: Limits) -> GuardState:
+    """Return a state of the output guard whose rows are arrays."""
+    state = beginning(limits, limits.low)
+    for name in ("applied", "anchor", "coming", "moves", "before"):
+        setattr(state, name, np.array(getattr(state, name)))
+    return state
 
 
 def latched(golden: GoldenUpdate) -> Latched:

@@ -1,5 +1,6 @@
 """Constants of Structured Text: lists that tools take, in pieces where they are larger, and the sum over them."""
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Final
 
@@ -14,6 +15,10 @@ from rig.plc_export.tree.subset import UnfitKernelError, type_of
 LARGEST_LIST: Final = 64 * 1024
 """Bytes of a list of constants: a data block of standard access of an S7-1200 or S7-1500 holds no more."""
 PRIME, FACTOR = 65521, 257
+PARTS: Final = 3
+"""Integers that the bits of a number in double precision are read as."""
+LEAST_EXPONENT: Final = -1100
+"""Below that of the smallest number."""
 
 
 class Constants:
@@ -27,13 +32,19 @@ class Constants:
     def __init__(self, values: Mapping[Path, Array], printer: StructuredTextPrinter) -> None:
         self.values, self.printer = values, printer
 
-    def lengths(self) -> list[int]:
-        """Return the numbers of each one; first that of the literals."""
-        return [len(self.printer.literals), *(max(values.size, 1) for values in self.values.values())]
+    def _weighed(self, of_real: int, of_integer: int) -> list[int]:
+        """Return the numbers of each one, those with a point and the others counted so often; first the literals."""
+        weights = {"f": of_real}
+        return [of_real * len(self.printer.literals), *(weights.get(values.dtype.kind, of_integer) * max(values.size, 1)
+                                                        for values in self.values.values())]  # fmt: skip
+
+    def _sizes(self) -> list[int]:
+        """Return the bytes of each one; first those of the literals."""
+        return self._weighed(4 if self.printer.single else 8, 4)
 
     def bytes(self) -> int:
         """Return the bytes of all of them."""
-        return 4 * sum(self.lengths())
+        return sum(self._sizes())
 
     def declared(self) -> dict[str, tuple[str, str]]:
         """Return type and value of each constant by its name."""
@@ -59,8 +70,7 @@ class Constants:
         """Yield lists of constants, none larger than tools take."""
         listed: dict[str, str] = {}
         room = LARGEST_LIST
-        for (name, (kind, value)), length in zip(self.declared().items(), self.lengths(), strict=True):
-            size = 4 * length
+        for (name, (kind, value)), size in zip(self.declared().items(), self._sizes(), strict=True):
             if size > LARGEST_LIST:
                 raise UnfitKernelError(f"{name}: {size} bytes, and a list of constants has at most {LARGEST_LIST}")
             if size > room:
@@ -72,14 +82,15 @@ class Constants:
 
     def sum(self) -> int:
         """Return the sum over all of them that the self-test computes."""
-        sum_ = sum_of(np.array([float(each.removeprefix("REAL#")) for each in self.printer.literals], np.float32))
+        double = not self.printer.single
+        sum_ = sum_of(np.array([float(each.partition("#")[2]) for each in self.printer.literals]), double=double)
         for values in self.values.values():
-            sum_ = sum_of(values if values.size else np.zeros(1, np.float32), sum_)
+            sum_ = sum_of(values if values.size else np.zeros(1), sum_, double=double)
         return sum_
 
     def summed(self) -> dict[str, str]:
         """Return the parts of a self-test that sum them up: declarations, lengths, a case for each constant."""
-        lengths = self.lengths()
+        lengths = self._weighed(1 if self.printer.single else PARTS, 1)
         self.printer.array_type("DINT", len(lengths))
         declared = self.declared()
         return {
@@ -95,9 +106,12 @@ class Constants:
         if values is not None and values.dtype.kind == "b":
             read = f"IF {name} THEN\n{pad}    item := 1;\n{pad}ELSE\n{pad}    item := 0;\n{pad}END_IF;"
         else:
-            element = f"{name}[offset]" if values is None or values.ndim else name
             real = values is None or values.dtype.kind == "f"
-            read = f"item := {f'cl_bits({element})' if real else element};"
+            double = real and not self.printer.single
+            place = f"(offset / {PARTS})" if double else "offset"
+            element = f"{name}[{place}]" if values is None or values.ndim else name
+            bits = f"cl_lreal_bits({element}, (offset MOD {PARTS}))" if double else f"cl_bits({element})"
+            read = f"item := {bits if real else element};"
         return f"{pad}{part}:\n{pad}    {read.replace(chr(10), chr(10) + '    ')}\n"
 
 
@@ -137,9 +151,11 @@ def scalar_of(values: Array) -> str:
     return "REAL" if values.dtype.kind == "f" else "DINT"
 
 
-def sum_of(values: Array, before: int = 0) -> int:
+def sum_of(values: Array, before: int = 0, *, double: bool = False) -> int:
     """Return the sum over numbers that the self-test computes: no change of one bit leaves it as it is."""
-    if values.dtype.kind == "f":
+    if values.dtype.kind == "f" and double:
+        items = np.array([item for value in values.ravel().tolist() for item in bits_of_double(value)])
+    elif values.dtype.kind == "f":
         single = np.nan_to_num(values.astype(np.float32).ravel(), nan=float(LARGEST))
         items = np.abs(single).view(np.int32).astype(int) * np.where(single < 0, -1, 1)
     else:
@@ -147,6 +163,15 @@ def sum_of(values: Array, before: int = 0) -> int:
     for item in items.tolist():
         before = (before * FACTOR + item % PRIME) % PRIME
     return before
+
+
+def bits_of_double(value: float) -> tuple[int, int, int]:
+    """Return exponent, negative where the number is, and the halves of what is behind the point: `cl_lreal_bits`."""
+    finite = value if np.isfinite(value) else math.copysign(float(LARGEST), value)
+    share, exponent = math.frexp(abs(finite))
+    mantissa, exponent = (2.0 * share - 1.0, exponent - 1) if share else (-1.0, LEAST_EXPONENT)
+    high, low = divmod(int(mantissa * 2**52), 2**26)
+    return (exponent - LEAST_EXPONENT) * (-1 if finite < 0 else 1), high, low
 
 
 def summing(array: str, scalar: str, length: int) -> str:

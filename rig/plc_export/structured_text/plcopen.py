@@ -18,7 +18,7 @@ SECTIONS: Final = {
     "VAR": "localVars",
 }  # fmt: skip
 POUS: Final = {"FUNCTION": "function", "FUNCTION_BLOCK": "functionBlock", "PROGRAM": "program"}
-ELEMENTARY: Final = ("BOOL", "DINT", "REAL")
+ELEMENTARY: Final = ("BOOL", "DINT", "REAL", "LREAL")
 
 _COMMENT = r"\(\*((?:(?!\*\)).)*)\*\)"
 _UNIT = re.compile(

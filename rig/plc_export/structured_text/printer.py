@@ -33,7 +33,8 @@ from rig.plc_export.tree.nodes import (
 from rig.plc_export.tree.printing import TreePrinter
 
 SCALARS: Final = {Kind.REAL: "REAL", Kind.INT: "DINT", Kind.UNSIGNED: "DINT", Kind.BOOL: "BOOL"}
-BYTES: Final = {"REAL": 4, "DINT": 4, "BOOL": 1}
+DOUBLE: Final = {**SCALARS, Kind.REAL: "LREAL"}
+BYTES: Final = {"REAL": 4, "LREAL": 8, "DINT": 4, "BOOL": 1}
 INFIX: Final = {"and": "AND", "or": "OR", "==": "=", "!=": "<>"}
 FUNCTIONS: Final = {
     "sqrt": "SQRT",
@@ -42,7 +43,6 @@ FUNCTIONS: Final = {
     "log": "LN",
     "round": f"{PREFIX}round",
     "copysign": f"{PREFIX}copysign",
-    "isfinite": f"{PREFIX}is_finite",
     "%": f"{PREFIX}floor_mod",
     "//": f"{PREFIX}floor_div",
 }
@@ -59,12 +59,17 @@ class StructuredTextPrinter(TreePrinter):
     Args:
         constants: Types of the fields of records that are global constants.
         state: And of those that are global variables.
+        real: Single or double precision.
     """
 
     table = TABLE
 
-    def __init__(self, constants: Mapping[Path, Type], state: Mapping[Path, Type] = NO_STATE) -> None:
-        super().__init__(np.float32)
+    def __init__(
+        self, constants: Mapping[Path, Type], state: Mapping[Path, Type] = NO_STATE,
+        real: type[np.floating] = np.float32,
+    ) -> None:  # fmt: skip
+        super().__init__(real)
+        self.scalars = SCALARS if self.single else DOUBLE
         self.globals, self.state = {**constants, **state}, state
         self.arrays: dict[str, str] = {}
         """Definition of each type of arrays, by its name."""
@@ -75,7 +80,7 @@ class StructuredTextPrinter(TreePrinter):
     def number(self, value: float) -> str:
         """Return a typed literal with digits enough for its bits; the largest one for what is not finite."""
         finite = value if np.isfinite(value) else LARGEST * (-1 if value < 0 else 1)
-        return f"REAL#{np.float32(finite):.9E}"
+        return f"REAL#{np.float32(finite):.9E}" if self.single else f"LREAL#{float(finite):.16E}"
 
     def literal(self, value: float) -> str:
         """Return the element of the table that has this value."""
@@ -85,9 +90,9 @@ class StructuredTextPrinter(TreePrinter):
     def type(self, kind: Type) -> str:
         """Return the name of a type of numbers or of arrays."""
         if isinstance(kind, Kind):
-            return SCALARS[kind]
+            return self.scalars[kind]
         assert isinstance(kind, ArrayType)  # noqa: S101 blocks have no records
-        return self.array_type(SCALARS[kind.kind], kind.size)
+        return self.array_type(self.scalars[kind.kind], kind.size)
 
     def array_type(self, scalar: str, size: int) -> str:
         """Return the name of a type of arrays, which is then among those to be defined."""
@@ -97,7 +102,7 @@ class StructuredTextPrinter(TreePrinter):
 
     def types(self) -> str:
         """Return the definitions of the types of arrays so far, and of the table of literals."""
-        self.arrays[f"{TABLE}_table"] = f"ARRAY [0..{len(self.literals) - 1}] OF REAL"
+        self.arrays[f"{TABLE}_table"] = f"ARRAY [0..{len(self.literals) - 1}] OF {self.scalars[Kind.REAL]}"
         body = "".join(f"    {name} : {definition};\n" for name, definition in sorted(self.arrays.items()))
         return f"TYPE\n{body}END_TYPE\n"
 
@@ -217,7 +222,7 @@ class StructuredTextPrinter(TreePrinter):
             case Operation():
                 return self._operation(expression)
             case Convert(Kind.REAL, operand):
-                return f"DINT_TO_REAL({self.expression(operand)})"
+                return f"DINT_TO_{self.scalars[Kind.REAL]}({self.expression(operand)})"
             case Convert(Kind.BOOL, operand):
                 return f"({self.expression(operand)} <> 0)"
             case Convert(_, operand) if operand.type is Kind.BOOL:
@@ -226,13 +231,17 @@ class StructuredTextPrinter(TreePrinter):
                 return self.expression(operand)
         raise AssertionError(expression)  # lowering leaves no other
 
-    def _operation(self, operation: Operation) -> str:
+    def _operation(self, operation: Operation) -> str:  # noqa: PLR0911 one case an operator
         parts = [self.expression(each) for each in operation.operands]
         match operation.operator:
             case "min" | "max" as name:
                 return f"{PREFIX}{name}_{self.type(operation.type).lower()}({', '.join(parts)})"
+            case "isfinite":
+                return f"{PREFIX}is_finite{'' if self.single else '_lreal'}({parts[0]})"
             case "isinf" | "isnan":
                 return f"(NOT {PREFIX}is_finite({parts[0]}))"
+            case "single":
+                return f"REAL_TO_LREAL(LREAL_TO_REAL({parts[0]}))"
             case name if name in FUNCTIONS:
                 return f"{FUNCTIONS[name]}({', '.join(parts)})"
             case "negative":
@@ -278,15 +287,15 @@ def comment(text: str) -> str:
     return f"(* {text.replace('*)', '* )')} *)\n"
 
 
-def memory(block: Block) -> int:
+def memory(block: Block, scalars: Mapping[Kind, str] = SCALARS) -> int:
     """Return the bytes of an instance: numbers, arrays and the instances within; without references to arrays."""
-    own = sum(size_of(each.type) for each in (*block.inputs, *block.outputs, *block.variables))
-    return own + sum(map(memory, block.called))
+    own = sum(size_of(each.type, scalars) for each in (*block.inputs, *block.outputs, *block.variables))
+    return own + sum(memory(each, scalars) for each in block.called)
 
 
-def size_of(kind: Type) -> int:
+def size_of(kind: Type, scalars: Mapping[Kind, str] = SCALARS) -> int:
     """Return the bytes of a number or of an array."""
     if isinstance(kind, ArrayType):
-        return max(kind.size, 1) * BYTES[SCALARS[kind.kind]]
+        return max(kind.size, 1) * BYTES[scalars[kind.kind]]
     assert isinstance(kind, Kind)  # noqa: S101 blocks have no records
-    return BYTES[SCALARS[kind]]
+    return BYTES[scalars[kind]]

@@ -3,8 +3,6 @@
 import ast
 from typing import Any, Final, cast
 
-from numba.core.dispatcher import Dispatcher
-
 from rig.plc_export.tree.calls import CallReader, Returned
 from rig.plc_export.tree.expressions import ZERO, element_of
 from rig.plc_export.tree.nodes import (
@@ -25,12 +23,14 @@ from rig.plc_export.tree.nodes import (
     Member,
     Name,
     Point,
+    RecordType,
     Statement,
     Target,
     Type,
     View,
     walk,
 )
+from rig.plc_export.tree.subset import Kernel
 from rig.plc_export.tree.values import (
     DType,
     Elementwise,
@@ -71,11 +71,15 @@ class AssignmentReader(CallReader):
             return self._into_name(target, value, node)
         if isinstance(target, ast.Subscript):
             return self._into_part(target, value, node)
-        place = self.read(target)
-        if not isinstance(place, Member):
-            raise self.source.refusal(target, "records are constant")
+        match place := self.read(target):
+            case Member(kind):
+                pass
+            case Field(Kind() as kind, record) if isinstance(record.type, RecordType) and record.type.mutable:
+                pass
+            case _:
+                raise self.source.refusal(target, "records are constant")
         self.write_to(target, place)
-        return [Assign(place, self.of_type(target, place.type, value, node))]
+        return [Assign(place, self.of_type(target, kind, value, node))]
 
     def of_type(self, target: ast.expr, kind: Kind, value: Value, node: ast.expr) -> Expression:
         """Return a number for a place of this type; a number with a point that is known takes it."""
@@ -91,7 +95,7 @@ class AssignmentReader(CallReader):
         if len(target.elts) != len(value.elts):
             raise self.source.refusal(target, "several values come from as many, or from the call of a kernel")
         written: set[str] = set()
-        members: set[tuple[Type, str]] = set()
+        members: set[tuple[Type, str] | None] = set()
         statements: list[Statement] = []
         for one, part in zip(target.elts, value.elts, strict=True):
             read = {ast.unparse(node) for node in ast.walk(part) if isinstance(node, ast.Name | ast.Attribute)}
@@ -104,16 +108,16 @@ class AssignmentReader(CallReader):
             if statements and len(self.before) > before:
                 raise self.source.refusal(target, "a call behind another assignment: two statements say the order")
             values = walk(tuple(each.value for each in new if isinstance(each, Assign)))
-            if members & {(each.struct.type, each.name) for each in values if isinstance(each, Member)}:
+            if members & set(map(number_of, values)):
                 raise self.source.refusal(target, "a number of a record is read behind its assignment")
             places = [each.target for each in new if isinstance(each, Assign)]
-            members |= {(each.struct.type, each.name) for each in places if isinstance(each, Member)}
+            members |= set(map(number_of, places)) - {None}
             statements += new
         return statements
 
     # -- results of calls ----------------------------------------------------------------------------------------------
 
-    def _several(self, target: ast.expr, value: ast.Call, kernel: Dispatcher) -> list[Statement]:
+    def _several(self, target: ast.expr, value: ast.Call, kernel: Kernel) -> list[Statement]:
         """Return the call of a kernel whose results go where they are to."""
         function, arguments = self.call(value, kernel)
         if function.value:
@@ -276,6 +280,13 @@ class AssignmentReader(CallReader):
         if not isinstance(value.at(first_of(value)), Literal):
             self.before += self.store(variable, value)
         return variable
+
+
+def number_of(node: object) -> tuple[Type, str] | None:
+    """Return the type of record that a number belongs to, and its name there; None of anything else."""
+    if isinstance(node, Member):
+        return node.struct.type, node.name
+    return (node.record.type, node.name) if isinstance(node, Field) and is_number(node) else None
 
 
 def first_of(value: Elementwise) -> tuple[Expression, ...]:

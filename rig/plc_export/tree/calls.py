@@ -30,7 +30,7 @@ from rig.plc_export.tree.nodes import (
     Type,
     View,
 )
-from rig.plc_export.tree.subset import Source
+from rig.plc_export.tree.subset import Kernel, Source
 from rig.plc_export.tree.values import (
     FUNCTIONS,
     NEW_ARRAYS,
@@ -56,8 +56,10 @@ class Specialised(Protocol):
 
     generic: Generic
     platform: frozenset[str]
+    portable: frozenset[Callable[..., Any]]
+    double: bool
 
-    def function(self, kernel: Dispatcher, types: tuple[Type, ...]) -> Function:
+    def function(self, kernel: Kernel, types: tuple[Type, ...]) -> Function:
         """Return the function of a kernel for arguments of these types."""
 
 
@@ -70,7 +72,7 @@ class CallReader(ExpressionReader):
     """
 
     def __init__(self, source: Source, specialised: Specialised) -> None:
-        super().__init__(source, specialised.platform)
+        super().__init__(source, specialised.platform, double=specialised.double)
         self.specialised = specialised
         self.alone: set[int] = set()
         """Nodes of calls that may write: a statement is about their result alone."""
@@ -106,7 +108,7 @@ class CallReader(ExpressionReader):
             node, f"{name} is not in the subset: its order of operations or its bits are not defined"
         )
 
-    def kernel(self, node: ast.Call) -> Dispatcher | None:
+    def kernel(self, node: ast.Call) -> Kernel | None:
         """Return the kernel that is called; of several with one name that for the type of its first argument."""
         of = node.func.value if isinstance(node.func, ast.Attribute) else node.func
         if not isinstance(self.read(of), Python):
@@ -114,7 +116,9 @@ class CallReader(ExpressionReader):
         called = self.read(node.func)
         if not isinstance(called, Python):
             return None
-        if isinstance(called.value, Dispatcher):
+        if isinstance(called.value, Dispatcher) or (
+            callable(called.value) and called.value in self.specialised.portable
+        ):
             return called.value
         chosen = self.specialised.generic.get(called.value) if callable(called.value) else None
         return None if chosen is None else chosen[named(self.storage(node.args[0]).type)]
@@ -189,7 +193,7 @@ class CallReader(ExpressionReader):
             made = ArrayType(dtype.kind, tuple(map(self.known_integer, lengths)))
         return Elementwise(made, lambda _indices: Literal(made.kind, 0))
 
-    def call(self, node: ast.Call, kernel: Dispatcher) -> tuple[Function, tuple[Expression, ...]]:
+    def call(self, node: ast.Call, kernel: Kernel) -> tuple[Function, tuple[Expression, ...]]:
         """Return the function that is called, and its arguments; those that are new arrays get names."""
         self.alone |= {id(argument) for argument in node.args}
         arguments = tuple(self._argument(argument) for argument in node.args)
@@ -234,7 +238,7 @@ class CallReader(ExpressionReader):
                 return self.is_constant(array)
         return False
 
-    def _invocation(self, node: ast.Call, kernel: Dispatcher) -> Value:
+    def _invocation(self, node: ast.Call, kernel: Kernel) -> Value:
         alone = id(node) in self.alone
         function, arguments = self.call(node, kernel)
         if function.written and not alone:

@@ -1,4 +1,4 @@
-"""Counts the operations of the typed tree by executing it: as Python that adds them up, in single precision.
+"""Counts the operations of the typed tree by executing it: as Python that adds them up.
 
 Additions, subtractions, multiplications, divisions, roots, powers and logarithms of numbers with a point count one
 each; comparisons, minima, maxima, signs, conversions and what is done with integers count nothing.
@@ -42,10 +42,11 @@ from rig.plc_export.tree.nodes import (
 )
 
 COUNTED: Final = {"+", "-", "*", "/", "sqrt", "power", "log"}
-DTYPES: Final = {Kind.REAL: np.float32, Kind.INT: np.int64, Kind.UNSIGNED: np.int64, Kind.BOOL: np.bool_}
+INTEGERS: Final = {Kind.INT: np.int64, Kind.UNSIGNED: np.int64, Kind.BOOL: np.bool_}
+KINDS: Final = [Kind.REAL, *INTEGERS]
 CALLED: Final = {
     "sqrt": "np.sqrt", "abs": "abs", "log": "_log", "copysign": "np.copysign", "round": "np.rint", "not": "not ",
-    "negative": "-", "isfinite": "np.isfinite", "isinf": "np.isinf", "isnan": "np.isnan",
+    "negative": "-", "single": "_single", "isfinite": "np.isfinite", "isinf": "np.isinf", "isnan": "np.isnan",
 }  # fmt: skip
 
 
@@ -54,13 +55,15 @@ class CountedProgram:
 
     Args:
         functions: Callees before their callers.
+        real: Single or double precision.
     """
 
-    def __init__(self, functions: Iterable[Function]) -> None:
+    def __init__(self, functions: Iterable[Function], real: type[np.floating] = np.float32) -> None:
         self._count = [0]
         self._known: dict[str, Any] = {
             "np": np, "SimpleNamespace": SimpleNamespace, "_n": self._count, "_log": _log, "_copy": _copied,
-            "_part": _part, "_of": self._of, "_r": np.float32, "_t": list(DTYPES.values()),
+            "_part": _part, "_of": self._of, "_r": real, "_t": [real, *INTEGERS.values()],
+            "_single": lambda value: real(np.float32(value)),
         }  # fmt: skip
         for function in functions:
             exec("\n".join(_Printer(function).lines()), self._known)  # noqa: S102 text of this file
@@ -129,7 +132,7 @@ class _Printer:
             yield f"_n[0] += {count}"
         match statement:
             case Declare(Name(ArrayType(kind, shape), name), _):
-                yield f"{name} = np.zeros({shape}, _t[{list(DTYPES).index(kind)}])"
+                yield f"{name} = np.zeros({shape}, _t[{KINDS.index(kind)}])"
             case Declare(variable, value):
                 yield f"{variable.name} = {self._of(value or Literal(variable.type, 0))}"  # type: ignore[arg-type]
             case Assign(target, value):

@@ -9,6 +9,7 @@ import numpy as np
 
 from rig.plc_export.tree.nodes import (
     ArrayType,
+    Convert,
     Element,
     Expression,
     Field,
@@ -55,10 +56,11 @@ class ExpressionReader:
     Args:
         source: The kernel.
         platform: Operators whose bits are the platform's library's and that are accepted all the same.
+        double: What has no type is in double precision.
     """
 
-    def __init__(self, source: Source, platform: frozenset[str]) -> None:
-        self.source, self.platform = source, platform
+    def __init__(self, source: Source, platform: frozenset[str], *, double: bool) -> None:
+        self.source, self.platform, self.double = source, platform, double
         self.scopes: list[dict[str, Value]] = [{}]
         self.before: list[Statement] = []
         """Statements that an expression needs before it: calls whose results are arrays."""
@@ -81,6 +83,8 @@ class ExpressionReader:
         """Return an integer or a truth value; a number with a point has no type of its own."""
         if isinstance(known.value, bool | np.bool_):
             return Literal(Kind.BOOL, bool(known.value))
+        if self.double and isinstance(known.value, float):
+            return Literal(Kind.REAL, known.value)
         if not isinstance(known.value, int | np.integer):
             raise self.source.refusal(
                 node, "a literal without a type would be computed in double: z.dtype.type(...) gives it one"
@@ -263,6 +267,8 @@ class ExpressionReader:
 
     def operation(self, node: ast.AST, sign: str, one: Expression, other: Expression) -> Expression:
         """Return an operation whose operands have one type."""
+        if self.double and sign == "/" and one.type is other.type is Kind.INT:
+            one, other = (Convert(Kind.REAL, each) for each in (one, other))
         if one.type is not other.type:
             raise self.source.refusal(node, f"{named(one.type)} {sign} {named(other.type)} would be computed in double")
         if one.type is Kind.BOOL or (one.type is Kind.UNSIGNED and sign == "-"):

@@ -51,12 +51,14 @@ class RowsType:
 
 @dataclass(frozen=True)
 class RecordType:
-    """A NamedTuple: constant, and so are its arrays, unless it is a state."""
+    """A NamedTuple: constant, and so are its arrays, unless it is a state. Or a dataclass, which is one."""
 
     name: str
     fields: tuple[tuple[str, "Type"], ...]
     state: bool = False
-    """It has arrays of records of numbers: all of its arrays are its own, and may be written to."""
+    """It has arrays of records of numbers, or is a dataclass: all of its arrays are its own, and may be written to."""
+    mutable: bool = False
+    """A dataclass: so may its numbers."""
 
 
 Type: TypeAlias = Kind | ArrayType | StructType | RowsType | RecordType
@@ -164,7 +166,7 @@ class Invocation:
 Place: TypeAlias = Name | Field | View | Item | Member | Element
 Expression: TypeAlias = Literal | Place | Operation | Select | Convert | Invocation
 Storage: TypeAlias = Name | Field | View | Item
-Target: TypeAlias = Name | Element | Member
+Target: TypeAlias = Name | Element | Member | Field
 
 # -- statements --------------------------------------------------------------------------------------------------------
 

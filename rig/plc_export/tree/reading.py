@@ -2,10 +2,9 @@
 
 import ast
 from collections import Counter
+from collections.abc import Callable
 from types import MappingProxyType
-from typing import cast
-
-from numba.core.dispatcher import Dispatcher
+from typing import Any, cast
 
 from rig.plc_export.tree.assignments import SAME, AssignmentReader
 from rig.plc_export.tree.calls import Generic, Returned, rooted
@@ -28,7 +27,7 @@ from rig.plc_export.tree.nodes import (
     Type,
     While,
 )
-from rig.plc_export.tree.subset import Source
+from rig.plc_export.tree.subset import Kernel, Source
 from rig.plc_export.tree.values import DType, Known, Python, Record, Shape, Value, is_number, named
 
 
@@ -38,16 +37,21 @@ class Program:
     Args:
         platform: Operators whose bits are the platform's library's and that are accepted all the same.
         generic: Functions that stand for several kernels.
+        portable: Functions of plain Python that are read as kernels are.
+        double: Numbers with a point are in double precision, as are those without a type, and quotients of integers.
     """
 
-    def __init__(self, platform: frozenset[str] = frozenset(), generic: Generic = MappingProxyType({})) -> None:
-        self.platform, self.generic = platform, generic
+    def __init__(
+        self, platform: frozenset[str] = frozenset(), generic: Generic = MappingProxyType({}),
+        portable: frozenset[Callable[..., Any]] = frozenset(), *, double: bool = False,
+    ) -> None:  # fmt: skip
+        self.platform, self.generic, self.portable, self.double = platform, generic, portable, double
         self.functions: list[Function] = []
         """Callees before their callers."""
         self._names: Counter[str] = Counter()
-        self._known: dict[tuple[Dispatcher, tuple[Type, ...]], Function | None] = {}
+        self._known: dict[tuple[Kernel, tuple[Type, ...]], Function | None] = {}
 
-    def function(self, kernel: Dispatcher, types: tuple[Type, ...]) -> Function:
+    def function(self, kernel: Kernel, types: tuple[Type, ...]) -> Function:
         """Return the function of a kernel for arguments of these types.
 
         Raises:
@@ -189,7 +193,7 @@ class KernelReader(AssignmentReader):
         stored = [each for target, part in zip(results, kept, strict=True) for each in self.store(target, part)]
         return [*stored, Return()]
 
-    def _return_call(self, node: ast.Return, value: ast.Call, kernel: Dispatcher) -> list[Statement]:
+    def _return_call(self, node: ast.Return, value: ast.Call, kernel: Kernel) -> list[Statement]:
         function, arguments = self.call(value, kernel)
         if function.value:
             return self._return_number(node, Invocation(function.value, function, arguments))

@@ -5,7 +5,8 @@ import inspect
 import re
 import textwrap
 from collections.abc import Callable
-from typing import Any
+from dataclasses import fields, is_dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
 from numba.core.dispatcher import Dispatcher
@@ -14,6 +15,8 @@ from coldloop.errors import UsageError
 from rig.plc_export.tree.nodes import ArrayType, Kind, RecordType, RowsType, StructType, Type
 
 KINDS = {"f": Kind.REAL, "i": Kind.INT, "u": Kind.UNSIGNED, "b": Kind.BOOL}
+Kernel: TypeAlias = Dispatcher | Callable[..., Any]
+"""A kernel, or a function of plain Python that is one for the exporter."""
 RESERVED = re.compile(r"(new|result|at|stop)_\d")
 
 
@@ -24,11 +27,8 @@ class UnfitKernelError(UsageError):
 class Source:
     """Syntax tree of a kernel, with what its names mean where it was written."""
 
-    def __init__(self, function: object) -> None:
-        if not isinstance(function, Dispatcher):
-            name = getattr(function, "__qualname__", repr(function))
-            raise UnfitKernelError(f"{name} is called and is not a kernel: decorate it with coldloop.kernels.compiled")
-        python: Callable[..., Any] = function.py_func
+    def __init__(self, function: Kernel) -> None:
+        python: Callable[..., Any] = function.py_func if isinstance(function, Dispatcher) else function
         self.name = python.__name__
         self.file = inspect.getsourcefile(python) or python.__module__
         lines, first = inspect.getsourcelines(python)
@@ -63,12 +63,12 @@ def rows_of(name: str, value: object) -> RowsType | None:
     """Return the type of a structured array, whose records get this name; of anything else None."""
     if not (isinstance(value, np.ndarray) and value.dtype.fields):
         return None
-    fields = tuple((field, KINDS[kind.kind]) for field, (kind, *_) in value.dtype.fields.items())
-    return RowsType(StructType(name, fields), len(value))
+    numbers = tuple((field, KINDS[kind.kind]) for field, (kind, *_) in value.dtype.fields.items())
+    return RowsType(StructType(name, numbers), len(value))
 
 
-def type_of(value: object) -> Type:
-    """Return the type of an argument: an array, a NamedTuple, or a number.
+def type_of(value: object) -> Type:  # noqa: PLR0911 one case a type
+    """Return the type of an argument: an array, numbers in a row, a NamedTuple, a dataclass, or a number.
 
     Raises:
         UnfitKernelError: It is something else.
@@ -77,10 +77,15 @@ def type_of(value: object) -> Type:
         return ArrayType(KINDS[value.dtype.kind], value.shape)
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         own = type(value).__name__
-        fields = tuple((name, rows_of(f"{own}{name.capitalize()}", part) or type_of(part))
-                       for name, part in zip(value._fields, value, strict=True))  # fmt: skip
-        state = any(isinstance(kind, RowsType) or (isinstance(kind, RecordType) and kind.state) for _, kind in fields)
-        return RecordType(own, fields, state)
+        parts = tuple((name, rows_of(f"{own}{name.capitalize()}", part) or type_of(part))
+                      for name, part in zip(value._fields, value, strict=True))  # fmt: skip
+        state = any(isinstance(kind, RowsType) or (isinstance(kind, RecordType) and kind.state) for _, kind in parts)
+        return RecordType(own, parts, state)
+    if is_dataclass(value) and not isinstance(value, type):
+        parts = tuple((each.name, type_of(getattr(value, each.name))) for each in fields(value))
+        return RecordType(type(value).__name__, parts, state=True, mutable=True)
+    if isinstance(value, list | tuple) and (numbers := np.array(value)).dtype.kind in KINDS:
+        return ArrayType(KINDS[numbers.dtype.kind], numbers.shape)
     if isinstance(value, bool | np.bool_):
         return Kind.BOOL
     if isinstance(value, int | np.integer):

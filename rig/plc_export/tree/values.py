@@ -8,6 +8,7 @@ from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
+from coldloop.kernels.single_precision import single
 from rig.plc_export.tree.nodes import ArrayType, Expression, Kind, Name, RecordType, RowsType, StructType, Type
 
 BINARY: Final[dict[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]]] = {
@@ -21,7 +22,8 @@ COMPARISONS: Final[dict[type[ast.cmpop], str]] = {
 OF_INTEGERS, OF_REALS = ("+", "-", "*", "%", "//"), ("+", "-", "*", "/", "power")
 FUNCTIONS: Final[dict[object, str]] = {
     abs: "abs", min: "min", max: "max", np.sqrt: "sqrt", math.sqrt: "sqrt", np.isfinite: "isfinite",
-    np.isinf: "isinf", math.isnan: "isnan", math.log: "log", math.copysign: "copysign", round: "round",
+    math.isfinite: "isfinite", np.isinf: "isinf", math.isnan: "isnan", math.log: "log", math.copysign: "copysign",
+    round: "round", single: "single",
 }  # fmt: skip
 OPERANDS: Final = {"min": 2, "max": 2, "copysign": 2}
 """At least, of functions that take more than one."""
