@@ -41,6 +41,7 @@ from rig.plc_export.structured_text.pausing import PIECE
 from rig.plc_export.structured_text.plcopen import plcopen_xml
 from rig.plc_export.structured_text.register_table import register_table
 from rig.plc_export.structured_text.solver_files import AT_ONCE, WORK, StructuredTextExport
+from rig.plc_export.structured_text.verdict import verdict_table
 from rig.plc_export.templates import filled, template
 from rig.plc_sizing.budget_tables import problem_of
 from rig.plc_sizing.exported import ITERATION, WHOLE, CallCost, Cut, ExportCost, cost_text
@@ -114,7 +115,7 @@ def structured_text(
     texts, sizes = export.files(), export.sizes()
     if target == "plcopen":
         texts = {PROJECT: plcopen_xml(texts.values(), "the ODE-based solver, golden vectors and a self-test")}
-    parts = {**loading(target), "AT_ONCE": str(AT_ONCE), **CUTTING}
+    parts = {**loading(target), "AT_ONCE": str(AT_ONCE), **CUTTING, "VERDICT": verdict_table(export.outputs)}
     needed = {"constants": sizes.constants, "an instance of `cl_solver`, with its problem": sizes.solver,
               "self-test and golden vectors": sizes.self_test}  # fmt: skip
     return described("structured_text/readme_solver.md", recorded, vectors, texts, parts, needed, profile, CUT)
@@ -216,7 +217,8 @@ def optimizer_in_text(
     texts["registers.md"] = register_table() + "\n"
     needed = {"constants": sizes.constants, "state": sizes.state, "instances of the four blocks": sizes.blocks,
               "self-test and golden updates": sizes.self_test}  # fmt: skip
-    parts = {**loading(target), **CUTTING, "DIGEST": str(recorder.optimizer.model_digest)}
+    parts = {**loading(target), **CUTTING, "DIGEST": str(recorder.optimizer.model_digest),
+             "VERDICT": verdict_table(export.outputs)}  # fmt: skip
     return "structured_text/optimizer/readme.md", texts, parts, needed
 
 
@@ -233,7 +235,7 @@ def output_guard(target: str, settings: Settings) -> dict[str, str]:
     counts = {call: CallCost(**found._asdict()) for call, found in counted_guard(kernels, golden).items()}
     counts["judgement"] = counts["judgement"].model_copy(update={"worst": counted_longest(kernels)})
     cost = ExportCost(variables=len(INPUT_NAMES), operations=counts, bytes=export.sizes())
-    parts = {} if target == "c" else loading(target)
+    parts = {**loading(target), "VERDICT": verdict_table(GuardText.outputs)} if target != "c" else {}
     texts[README] = filled(template(f"{name}/{GUARD}/readme.md"), {
         **parts, "COST": cost_text(cost), "GOLDEN": str(len(golden)), "ROWS": str(SEQUENCE_ROWS),
         "FILES": ", ".join(f"`{each}`" for each in texts),

@@ -175,10 +175,12 @@ def test_what_is_read_back_is_the_structured_text(texts: dict[str, str], project
 
 
 def test_what_is_read_back_passes_its_self_test(project: ET.Element) -> None:
-    program = Machine(text_of(project)).instance("cl_main")
+    machine = Machine(text_of(project))
+    program = machine.instance("cl_main")
     while not program.test.done:
         program.run_()
     assert program.test.passed
+    assert [*machine.globals.cl_verdict.values()][:4] == [1, 1, 0, 0], "done, passed, failures, what"
 
 
 def test_blocks_and_interfaces_keep_what_is_said_of_them(project: ET.Element) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from rig.plc_export.kernels.ode_program import Array
 from rig.plc_export.structured_text.lowering import Split
 from rig.plc_export.structured_text.printer import LARGEST, TABLE, StructuredTextPrinter, global_name, section
+from rig.plc_export.structured_text.verdict import LENGTH, VERDICT
 from rig.plc_export.tree.nodes import Path, Type
 from rig.plc_export.tree.subset import UnfitKernelError, type_of
 
@@ -90,6 +91,7 @@ class Constants:
 
     def summed(self) -> dict[str, str]:
         """Return the parts of a self-test that sum them up: declarations, lengths, a case for each constant."""
+        self.printer.array_type("DINT", LENGTH)
         lengths = self._weighed(1 if self.printer.single else PARTS, 1)
         self.printer.array_type("DINT", len(lengths))
         declared = self.declared()
@@ -117,8 +119,9 @@ class Constants:
 
 def configuration(lists: Iterator[str]) -> str:
     """Return a configuration with these lists of variables, and one task that runs `cl_main`."""
+    verdict = section("VAR_GLOBAL", {VERDICT: f"cl_dints_{LENGTH}"})
     return f"""CONFIGURATION cl_configuration
-{"".join(lists)}RESOURCE cl_resource ON PLC
+{"".join(lists)}{verdict}RESOURCE cl_resource ON PLC
     TASK cl_task(INTERVAL := T#250ms, PRIORITY := 1);
     PROGRAM cl_program WITH cl_task : cl_main;
 END_RESOURCE

@@ -1,7 +1,7 @@
 """The control PLC's output guard as Structured Text: blocks of its kernels in LREAL, interface, limits, a self-test."""
 
 from collections.abc import Sequence
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from rig.plc_export.structured_text.printer import (
     size_of,
 )
 from rig.plc_export.structured_text.solver_files import AT_ONCE, GENERATED
+from rig.plc_export.structured_text.verdict import main_program
 from rig.plc_export.templates import filled, template
 from rig.plc_export.tree.nodes import Block, Kind, Name, Path
 from rig.plc_export.tree.subset import type_of
@@ -50,6 +51,9 @@ class GuardText:
     Raises:
         UnfitKernelError: A kernel uses what is not in the subset.
     """
+
+    outputs: ClassVar[tuple[str, ...]] = ()
+    """Of the self-test, beside those of each."""
 
     def __init__(self, kernels: GuardKernels, golden: Sequence[GoldenCall]) -> None:
         self._tables = tables_of(golden)
@@ -118,7 +122,7 @@ class GuardText:
         checks = template("structured_text/checks.st")
         checks = checks[checks.index("(* Sums up") :] + "\n"  # the other ones are of single precision
         integers, reals, rows = self._tables.values()
-        return filled(checks + template("structured_text/output_guard/self_test.st"), {
+        return filled(checks + template("structured_text/output_guard/self_test.st") + main_program(self.outputs), {
             **self._printed_counts(), **self.constants.summed(), "AT_ONCE": str(AT_ONCE),
             "OF_REALS": str(reals.shape[1]), "N_INTEGERS": str(integers.size), "N_REALS": str(reals.size),
             "N_ROWS": str(rows.size), "VECTOR_COUNT": str(len(integers)),

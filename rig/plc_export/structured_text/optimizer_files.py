@@ -4,7 +4,7 @@ Its state is global, as there is one optimiser; so are its constants.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
@@ -40,6 +40,7 @@ from rig.plc_export.structured_text.printer import (
 )
 from rig.plc_export.structured_text.slicing import an_answer_in_calls
 from rig.plc_export.structured_text.solver_files import AT_ONCE, GENERATED, WORK
+from rig.plc_export.structured_text.verdict import main_program
 from rig.plc_export.templates import filled, template
 from rig.plc_export.tree.nodes import ArrayType, Assign, Block, Kind, Literal, Name, Path, RecordType, RowsType, Type
 from rig.plc_export.tree.subset import type_of
@@ -75,6 +76,9 @@ class OptimizerText:
     Raises:
         UnfitKernelError: A kernel uses what is not in the subset.
     """
+
+    outputs: ClassVar[tuple[str, ...]] = ("element",)
+    """Of the self-test, beside those of each."""
 
     def __init__(self, optimizer: OptimizerProgram, golden: Sequence[GoldenUpdate]) -> None:
         kernels, self.golden = OptimizerKernels(optimizer), golden
@@ -211,7 +215,7 @@ class OptimizerText:
             ).rstrip(),
         }  # fmt: skip
         checks = template("structured_text/checks.st") + "\n"
-        return filled(checks + template("structured_text/optimizer/self_test.st"), parts)
+        return filled(checks + template("structured_text/optimizer/self_test.st") + main_program(self.outputs), parts)
 
 
 TABLES: Final = {"rule": "rules", "starts": "starts"}

@@ -1,7 +1,7 @@
 """The ODE-based solver as Structured Text: types, function blocks, constants, golden vectors, a self-test."""
 
 from collections.abc import Iterable
-from typing import Final, NamedTuple
+from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from rig.plc_export.structured_text.printer import (
     section,
 )
 from rig.plc_export.structured_text.slicing import one_iteration_a_call
+from rig.plc_export.structured_text.verdict import main_program
 from rig.plc_export.templates import filled, template
 from rig.plc_export.tree.nodes import RecordType
 
@@ -65,6 +66,9 @@ class StructuredTextExport:
     Raises:
         UnfitKernelError: A kernel uses what is not in the subset, or a matrix is too large.
     """
+
+    outputs: ClassVar[tuple[str, ...]] = ("iteration", "element", "iterations_done", "total_us", "longest_us")
+    """Of the self-test, beside those of each."""
 
     def __init__(self, method: OdeMethod, problem: QuadraticProblem, vectors: Iterable[GoldenVector]) -> None:
         self.vectors = [bounded(method, each) for each in vectors]
@@ -123,7 +127,7 @@ class StructuredTextExport:
         problem, answer = self.vectors[0].problem, self.vectors[0].answer
         n, m, k = len(problem.phi), len(problem.gamma), len(answer.costs)
         checks = template("structured_text/checks.st") + "\n"
-        return filled(checks + template("structured_text/self_test.st"), {
+        return filled(checks + template("structured_text/self_test.st") + main_program(self.outputs), {
             **self.constants.summed(),
             "WORK": str(WORK), "N": str(n), "M": str(m), "K": str(k), "POINTS": str(n * k), "LAST": str(n - 1),
             "INSTANCES": "\n".join(f"    golden_{each} : cl_golden_{each};" for each in range(len(self.vectors))),
