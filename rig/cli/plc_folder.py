@@ -12,6 +12,7 @@ import numpy as np
 from coldloop import __version__
 from coldloop.config import selected
 from coldloop.errors import UsageError
+from coldloop.process.limits import RateReference
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS
@@ -56,6 +57,10 @@ OWN: Final = "with a README and a self-test of its own.\n\n"
 BESIDE: Final = f"`{OPTIMIZER}/` has the whole optimiser, `{GUARD}/` the output guard of the control PLC, each {OWN}"
 ALONE: Final = ("The whole optimiser is not here: what a process expects of a load (`forecast`) is not exported. "
                 f"`{GUARD}/` has the output guard of the control PLC, {OWN}")  # fmt: skip
+REFERENCES: Final = {
+    RateReference.PER_UPDATE: "Each update may use this rate, however soon it follows the one before.",
+    RateReference.ELAPSED: "An update may use the share of this rate for which the outputs have stood still before it.",
+}
 FIXED_TICKS: Final = max(SHORTEST_TICKS, LONGEST_TICKS // 2)
 """Updating period of the second half of the golden updates; that of the first is adaptive."""
 CUT: Final = Cut(WORK, PIECE)
@@ -242,7 +247,8 @@ def output_guard(target: str, settings: Settings) -> dict[str, str]:
         "LIMITS": markdown_table(("input", "low", "high", f"most in {TICKS_PER_SAMPLE * TICK_S:g} s"), [
             (signal, *(f"{each:g}" for each in limits))
             for signal, *limits in zip(INPUT_NAMES, *kernels.limits[:3], strict=True)
-        ]), "SLEW_S": f"{kernels.limits.slew_ticks * TICK_S:g}",
+        ]),
+        "REFERENCE": REFERENCES[settings.limits.rate_reference], "SLEW_S": f"{kernels.limits.slew_ticks * TICK_S:g}",
     })  # fmt: skip
     return texts
 

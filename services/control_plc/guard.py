@@ -47,12 +47,15 @@ class OutputGuard:
         Args:
             rows: One row a tick.
             first_tick: Tick of the first one.
-            meanwhile: What will be played in the ticks before, where something will be.
+            meanwhile: What will be played in the ticks before, where something will be: rows of one sequence in a row.
         """
-        played = [row for row in meanwhile if row is not None]  # the end of a sequence is held
+        played = [row for row in meanwhile if row is not None]
+        waiting = next((k for k, row in enumerate(meanwhile) if row is not None), 0)
         first_tick -= self._lag
         tick = first_tick - len(meanwhile)
-        passes = judge(self.state, self._twin, self.limits, tick, played, len(played), first_tick, rows, len(rows))
+        passes = judge(
+            self.state, self._twin, self.limits, tick, played, waiting, len(played), first_tick, rows, len(rows)
+        )
         return Verdict.ACCEPTED if passes else Verdict.RATE_EXCEEDED
 
     def out_of_range(self, rows: Sequence[SequenceRow]) -> bool:

@@ -229,17 +229,18 @@ def in_range(limits: Limits, row: Numbers) -> bool:
 
 
 def judge(
-    state: GuardState, twin: GuardState, limits: Limits, tick: int, meanwhile: Rows, coming: int, first_tick: int,
-    rows: Rows, length: int,
+    state: GuardState, twin: GuardState, limits: Limits, tick: int, meanwhile: Rows, waiting: int, coming: int,
+    first_tick: int, rows: Rows, length: int,
 ) -> bool:  # fmt: skip
     """Return whether a sequence would be applied unchanged from `first_tick` on; `twin` is overwritten.
 
-    From `tick` until then the first `coming` rows of `meanwhile` are played, and what is applied is held thereafter.
+    Until then, `waiting` ticks after `tick`, the first `coming` rows of `meanwhile` are played; before and behind them
+    what is applied is held.
     """
     copy_state(state, twin, limits)
     for k in range(first_tick - tick):
-        if k < coming:
-            admit(twin, limits, tick + k, meanwhile[k], PLAYS_ON)
+        if 0 <= k - waiting < coming:
+            admit(twin, limits, tick + k, meanwhile[k - waiting], PLAYS_ON)
         else:
             admit(twin, limits, tick + k, twin.applied, PLAYS_ON)
     return admits(twin, limits, first_tick, rows, length)

@@ -6,7 +6,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from coldloop.process.limits import InputLimits, RateReference
-from coldloop.registers.control_plc import SequenceRow
+from coldloop.registers.control_plc import SequenceRow, Verdict
 from control_plc.guard import OutputGuard
 
 INITIAL = SequenceRow(43.0, 75.0, 36.0)
@@ -122,6 +122,35 @@ def test_a_value_that_can_be_reached_is_reached_and_then_held(reference: RateRef
     for value, wanted, low, high, first in zip(guard.applied, target, limits.low, limits.high, INITIAL, strict=True):
         reachable = first if not math.isfinite(wanted) else min(max(wanted, low), high)
         assert value == pytest.approx(reachable, rel=1e-6)
+
+
+def at(first: float) -> SequenceRow:
+    return SequenceRow(first, *INITIAL[1:])
+
+
+@pytest.mark.parametrize("idle", [0, 3, 4, 7])
+def test_a_sequence_is_judged_behind_rows_that_begin_later(idle: int) -> None:
+    """After the rack has gone back, the sequence being played begins some ticks from now."""
+    limits = InputLimits()
+    rows = [INITIAL, INITIAL, at(43.5)]
+    offered = [at(44.0)] * 3
+    for elapsed in (False, True):
+        guard = OutputGuard(limits, INITIAL)
+        guard.begin_at(4, INITIAL)
+        first = 4 + idle + len(rows) + (20 if elapsed else 0)
+        meanwhile = [*[None] * idle, *rows, *[None] * (first - 4 - idle - len(rows))]
+        verdict = guard.judge(offered, first, meanwhile)
+        applied = [guard.admit(4 + k, row or guard.applied, update=False) for k, row in enumerate(meanwhile)]
+        assert applied[-1] == rows[-1]
+        played = [guard.admit(first + k, row, update=k == 0) for k, row in enumerate(offered)]
+        assert (verdict is Verdict.ACCEPTED) == (played == offered)
+
+
+def test_a_move_at_the_end_of_what_is_played_limits_what_follows() -> None:
+    guard = OutputGuard(InputLimits(), INITIAL)
+    guard.begin_at(4, INITIAL)
+    meanwhile = [*[None] * 4, *[INITIAL] * 7, at(43.5)]
+    assert guard.judge([at(44.0)], 16, meanwhile) is Verdict.RATE_EXCEEDED
 
 
 def test_what_is_inside_the_limits_passes_unchanged() -> None:

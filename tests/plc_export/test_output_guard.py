@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from coldloop.process.limits import InputLimits, RateReference
 from coldloop.registers.control_plc import SequenceRow, Verdict
 from control_plc.guard import OutputGuard
+from control_plc.output_limits import begin
 from rig.plc_export.c.guard_files import GuardExport
 from rig.plc_export.kernels.counted import counted_guard, counted_longest
 from rig.plc_export.kernels.golden_calls import Call, GoldenCall, Judgement, golden_calls
@@ -67,8 +68,11 @@ def test_golden_calls_have_all_that_can_be_asked_and_said(limits: InputLimits) -
 @each_limits
 def test_golden_calls_are_answered_as_by_the_guard_of_the_control_plc(limits: InputLimits) -> None:
     golden = golden_calls(limits)
-    guard = OutputGuard(limits, SequenceRow(*golden[0].given))
-    for each in golden[1:]:
+    for each in golden:
+        if each.call is Call.RESTART:
+            guard = OutputGuard(limits, MIDDLE)
+            begin(guard.state, guard.limits, each.given)
+            continue
         assert answered(guard, each) == (each.applied, each.judgement)
 
 
@@ -87,7 +91,7 @@ def answered(guard: OutputGuard, call: GoldenCall) -> tuple[tuple[float, ...], J
         verdict = guard.judge(rows, call.first_tick, meanwhile)
         good = Judgement.ACCEPTED if verdict is Verdict.ACCEPTED else Judgement.RATE_EXCEEDED
         judgement = Judgement.OUT_OF_RANGE if guard.out_of_range(rows) else good
-    return tuple(guard.applied), judgement
+    return tuple(guard.state.applied), judgement
 
 
 # -- C99 ---------------------------------------------------------------------------------------------------------------
@@ -118,6 +122,40 @@ def test_a_changed_bit_in_c_is_found(tmp_path: Path, name: str, share: float) ->
     code, said = output(compiled(tmp_path, COMPILERS[0], "-O1"))
     assert code == 1
     assert "is not what was written" in said
+
+
+CHANGES = {
+    "an output is not compared": ("admits", "i < 3", "i < 2"),
+    "the end of a sequence is not": ("admits", "k < stop", "k < 8 && k < stop"),
+    "what is no number is wanted": ("nearest", "!(isfinite(wanted) != 0)", "wanted == INFINITY"),
+    "what is no number was applied": ("resume", "(isfinite(applied[i]) != 0)", "true"),
+    "what is no number is in range": ("in_range", "inside && (", "(inside && isnan(row[i])) ? true : inside && ("),
+    "in range is out of bounds": ("resume", "!in_range(", "in_range("),
+    "far moves still limit": ("resume", "state->moves[slot] = -32768", "state->moves[slot] = state->moves[slot]"),
+    "what is played before counts as updates": ("judge", "false);", "true);"),
+    "not all that is played before counts": ("judge", "k < stop", "k < 4 && k < stop"),
+    "no slack": ("in_range", "(limits->high[i] + limits->slack[i])", "limits->high[i]"),
+    "a longer window": ("admit", ">= 20", ">= 21"),
+    "another window for what is judged": ("copy_state", "target->anchor[i] = source->anchor[i]",
+                                          "target->anchor[i] = source->applied[i]"),
+    "one slot less": ("nearest", "slot < stop", "slot + 1 < stop"),
+    "no way back from beyond the bounds": ("admit", "&& (!state->out_of_bounds)", ""),
+}  # fmt: skip
+
+
+@needs_a_compiler
+@pytest.mark.parametrize(("kernel", "old", "new"), CHANGES.values(), ids=CHANGES)
+def test_a_guard_in_c_that_does_something_else_is_found(tmp_path: Path, kernel: str, old: str, new: str) -> None:
+    texts = in_c(InputLimits())
+    whole = texts["kernels.c"]
+    first = whole.index(f" {kernel}(\n")
+    body = whole[first : whole.index("\n}\n", first)]
+    assert old in body
+    texts["kernels.c"] = whole.replace(body, body.replace(old, new, 1))
+    write(tmp_path, texts)
+    code, said = output(compiled(tmp_path, COMPILERS[0], "-O1"))
+    assert code == 1
+    assert "of golden call" in said
 
 
 @pytest.fixture(scope="module")
@@ -161,10 +199,11 @@ def test_whatever_is_asked_the_guard_in_c_has_the_bits_of_ours(
             assert theirs.guard_resume(tick, floats(*row))
             ours.begin_at(tick, wanted)
         elif what == "judge":
+            ahead = 3 * ticks
             rows = [wanted if k >= 10 or flag else ours.applied for k in range(ticks)]
-            expected = ours.judge(rows, tick + 3, [wanted, None, None])
+            expected = ours.judge(rows, tick + ahead, [wanted, *[None] * (ahead - 1)])
             offered = floats(*(each for one in rows for each in one))
-            said = theirs.guard_judge(tick, floats(*row), 1, tick + 3, offered, ticks)
+            said = theirs.guard_judge(tick, floats(*row), 1, tick + ahead, offered, ticks)
             if ours.out_of_range(rows):
                 assert said == Judgement.OUT_OF_RANGE
             else:
@@ -191,7 +230,7 @@ def test_what_cannot_be_is_refused_in_c(loaded: Callable[[str], ctypes.CDLL]) ->
         assert not guard.guard_resume(tick, row)
     refused = 3
     for tick, coming, first_tick, length in (
-        (-1, 0, 5, 1), (5, 0, 4, 1), (5, 0, 5, 0), (5, 0, 5, 241), (5, 2, 6, 1), (5, -1, 6, 1), (5, 0, 26, 1),
+        (-1, 0, 5, 1), (5, 0, 4, 1), (5, 0, 5, 0), (5, 0, 5, 241), (5, 2, 6, 1), (5, -1, 6, 1), (5, 0, 246, 1),
     ):  # fmt: skip
         assert guard.guard_judge(tick, rows, coming, first_tick, rows, length) == refused
     assert guard.guard_judge(5, rows, 1, 6, rows, 240) == Judgement.ACCEPTED

@@ -52,6 +52,8 @@ REFUSED = {
     "an argument that is returned": "    return z  #!",
     "a break": "    while k > 0:\n        break  #!",
     "a swap": "    x = z[0]\n    y = z[1]\n    x, y = y, x  #!",
+    "a value that is read behind its assignment": "    z[0] = z[1] = z[0] + z[1]  #!",
+    "a comparison with a literal that is not exact": "    while z[0] > 0.1:  #!\n        z[0] = z[1]",
     "a call behind another assignment": "    x, y = z[0], doubled(z)  #!\n    return x + y[0]",
     "a text": "    y = 'gamma'  #!",
     "a lambda": "    y = lambda: k  #!",

@@ -166,7 +166,7 @@ def answer(
     if not accepted:
         return False
     played, left = rows[0, s.tick - s.first_tick :], s.next_update - s.tick
-    if not judge(guard, twin, w.limits, s.tick, played, left, s.next_update, offered, length):
+    if not judge(guard, twin, w.limits, s.tick, played, 0, left, s.next_update, offered, length):
         return False
     report(s, m, reports)
     trigger(w, s, s.tick)

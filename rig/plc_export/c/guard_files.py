@@ -6,7 +6,6 @@ from typing import Final
 import numpy as np
 
 from coldloop.process.signals import INPUT_NAMES, TICK_S
-from coldloop.process.updating_periods import LONGEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from rig.plc_export.c.constants import ConstantRecords
 from rig.plc_export.c.optimizer_files import size_of
@@ -39,7 +38,7 @@ class GuardExport:
 
     def files(self) -> dict[str, str]:
         """Return the texts of the files by their names."""
-        sizes = {"INPUTS": len(INPUT_NAMES), "ROWS": SEQUENCE_ROWS, "LONGEST": LONGEST_TICKS, "TICK_S": TICK_S}
+        sizes = {"INPUTS": len(INPUT_NAMES), "ROWS": SEQUENCE_ROWS, "TICK_S": TICK_S}
         parts = {"GENERATED": GENERATED.rstrip(), **{name: str(size) for name, size in sizes.items()}}
         texts = {name: filled(template(f"c/output_guard/{name}"), parts) for name in TEMPLATES}
         return {**self._kernels.texts(), **self._limit_files(), **self._golden_files(), **texts}
@@ -47,9 +46,10 @@ class GuardExport:
     def sizes(self) -> dict[str, int]:
         """Return the bytes of what a PLC needs."""
         state = next(each for each in self._kernels.records if each.name == "GuardState")
-        rows = 8 * len(INPUT_NAMES) * (SEQUENCE_ROWS + LONGEST_TICKS)
+        rows = 2 * 8 * len(INPUT_NAMES) * SEQUENCE_ROWS
         golden = sum(values.nbytes for values in self._tables.values())
-        return {"constants": self.constants.bytes(), "state and rows that are judged": 2 * size_of(state, 8) + rows,
+        judged = 2 * size_of(state, 8) + rows
+        return {"constants": self.constants.bytes(), "state and rows that are judged, about": judged,
                 "self-test and golden calls": golden}  # fmt: skip
 
     def _limit_files(self) -> dict[str, str]:

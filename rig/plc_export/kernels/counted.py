@@ -150,21 +150,23 @@ def counted_guard(kernels: GuardKernels, golden: Iterable[GoldenCall]) -> Mappin
                 program[resume](state, limits, each.tick, given)
             case Call.JUDGE:
                 before, rows = np.array(each.meanwhile), np.array(each.rows)
-                program[judge](state, twin, limits, each.tick, before, len(before), each.first_tick, rows, len(rows))
+                ahead = (each.tick, before, 0, len(before), each.first_tick)
+                program[judge](state, twin, limits, *ahead, rows, len(rows))
     return {name: counts_of(found) for name, found in noted.items()}
 
 
 def counted_longest(kernels: GuardKernels) -> int:
-    """Return the operations of the judgement of the longest sequence, each row of which moves all outputs."""
+    """Return the operations of the judgement of the longest sequence after another one, all rows of which move."""
     program, limits = CountedProgram(kernels.functions, np.float64), kernels.limits
     low, high, rate = map(np.array, (limits.low, limits.high, limits.rate))
     middle, step = (low + high) / 2, np.minimum(rate, high - low) / 1000
-    rows = (middle + np.outer(np.arange(SEQUENCE_ROWS + 1) % 2, step)).astype(np.float32).astype(float)
+    rows = (middle + np.outer(np.arange(2 * SEQUENCE_ROWS + 1) % 2, step)).astype(np.float32).astype(float)
     state, twin = _guard_state(limits), _guard_state(limits)
     program[kernels.begin.name](state, limits, rows[0])
     program.operations()
-    none = np.zeros((0, len(middle)))
-    assert program[kernels.judge.name](state, twin, limits, 0, none, 0, 0, rows[1:], SEQUENCE_ROWS)  # noqa: S101 by construction
+    meanwhile, offered = rows[1 : SEQUENCE_ROWS + 1], rows[SEQUENCE_ROWS + 1 :]
+    ahead = (0, meanwhile, 0, SEQUENCE_ROWS, SEQUENCE_ROWS)
+    assert program[kernels.judge.name](state, twin, limits, *ahead, offered, SEQUENCE_ROWS)  # noqa: S101 by construction
     return program.operations()
 
 

@@ -1,5 +1,6 @@
 """Calls of the control PLC's output guard with its answers: what is and what is not allowed, with a fixed seed."""
 
+import math
 import random
 from collections.abc import Iterator, Sequence
 from enum import IntEnum
@@ -10,9 +11,8 @@ import numpy as np
 from coldloop.kernels.single_precision import single
 from coldloop.process.limits import InputLimits
 from coldloop.process.signals import INPUT_NAMES
-from coldloop.process.updating_periods import LONGEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS
-from control_plc.output_limits import Limits, admit, beginning, copy_state, in_range, judge, plain, resume
+from control_plc.output_limits import Limits, admit, begin, beginning, copy_state, in_range, judge, plain, resume
 from rig.plc_export.kernels.ode_program import Array
 
 N: Final = len(INPUT_NAMES)
@@ -53,24 +53,24 @@ class GoldenCall(NamedTuple):
     rows: tuple[Row, ...] = ()
 
 
-INTEGERS: Final = 7
-CALLS: Final = 250
-MOST_NUMBERS: Final = 7_000
-"""Of all golden calls: each table of them is in one list of constants."""
-MOST_ROWS: Final = min(8, SEQUENCE_ROWS)
-"""Of a sequence that is judged."""
-MOST_MEANWHILE: Final = min(4, LONGEST_TICKS)
+CALLS: Final = 800
+MOST_NUMBERS: Final = 8_000
+"""Of the rows of all golden calls, and of what is given and applied: each table is in one list of constants."""
+LONGEST: Final = min(SEQUENCE_ROWS, MOST_NUMBERS // (10 * N))
+"""Rows of a sequence that is judged."""
+FARTHEST: Final = min(30, LONGEST)
 """Ticks until it begins."""
+LATEST: Final = 2_000_000_000
 SEED: Final = 0
+NOT_FINITE: Final = (math.nan, math.inf, -math.inf)
 
 
 def golden_calls(limits: InputLimits) -> list[GoldenCall]:
     """Return calls that want what is and what is not allowed, with the answers of the control PLC's own guard."""
-    drawing = _Drawing(plain(limits), random.Random(SEED))  # noqa: S311 no secret
-    calls, numbers = list[GoldenCall](), 0
+    drawing, calls, rows = _Drawing(plain(limits), random.Random(SEED)), list[GoldenCall](), 0  # noqa: S311 no secret
     for call in drawing.calls():
-        numbers += INTEGERS + 1 + N * (2 + len(call.meanwhile) + len(call.rows))
-        if len(calls) == CALLS or numbers > MOST_NUMBERS:
+        rows += len(call.meanwhile) + len(call.rows)
+        if len(calls) == CALLS or N * max(rows, 2 * len(calls)) > MOST_NUMBERS:
             break
         calls.append(call)
     return calls
@@ -83,7 +83,7 @@ class _Drawing:
         self.limits, self.random = limits, source
         self.state = beginning(limits, self._row(0.2, 0.8))
         self.twin = beginning(limits, self.state.applied)
-        self.tick = source.randrange(1000)
+        self.tick = source.randrange(LATEST)
 
     def _row(self, low: float, high: float) -> Row:
         """Return outputs between shares of their ranges, as they cross the link."""
@@ -91,72 +91,111 @@ class _Drawing:
         bounds = zip(drawn, self.limits.low, self.limits.high, strict=True)
         return tuple(single(bottom + share * (top - bottom)) for share, bottom, top in bounds)
 
+    def _chance(self, probability: float) -> bool:
+        return self.random.random() < probability
+
+    def _changed(self, row: Row, values: Sequence[float]) -> Row:
+        """Return a row with one of these values in the place of one output."""
+        place = self.random.randrange(N)
+        return (*row[:place], self.random.choice(values), *row[place + 1 :])
+
     def _applied(self) -> Row:
         return tuple(self.state.applied)
 
     def calls(self) -> Iterator[GoldenCall]:
-        yield GoldenCall(Call.RESTART, 0, self._applied(), self._applied())
+        """Yield calls without end."""
+        yield from self._restarted()
         while True:
-            kinds = (self._scans, self._updates, self._resumed, self._judged)
-            yield from self.random.choices(kinds, (4, 3, 1, 4))[0]()
+            kinds = (self._scans, self._updates, self._resumed, self._judged, self._restarted)
+            yield from self.random.choices(kinds, (8, 6, 6, 14, 1))[0]()
 
-    def _scanned(self, wanted: Row, *, update: bool) -> GoldenCall:
+    def _restarted(self) -> Iterator[GoldenCall]:
+        found = self._row(-0.01, 1.01)
+        begin(self.state, self.limits, found)
+        self.tick = self.random.choice((0, self.random.randrange(LATEST)))
+        yield GoldenCall(Call.RESTART, 0, found, self._applied())
+
+    def _scanned(self, wanted: Row, *, update: bool = False) -> GoldenCall:
         admit(self.state, self.limits, self.tick, wanted, update)
         self.tick += 1
         return GoldenCall(Call.SCAN, self.tick - 1, wanted, self._applied(), update)
 
-    def _scans(self) -> Iterator[GoldenCall]:
-        """Yield scans that want something, often too much, now and then what is no number."""
+    def _wanted(self) -> Row:
+        """Return what may be wanted: often too much, now and then what is no number."""
         wanted = self._row(-0.3, 1.3)
-        if self.random.random() < 0.2:
-            wanted = (float("inf"), *wanted[1:])
+        return self._changed(wanted, NOT_FINITE) if self._chance(0.3) else wanted
+
+    def _scans(self) -> Iterator[GoldenCall]:
+        wanted = self._wanted()
         for _ in range(self.random.randrange(1, 6)):
-            yield self._scanned(wanted, update=False)
+            yield self._scanned(wanted)
 
     def _updates(self) -> Iterator[GoldenCall]:
         for _ in range(self.random.randrange(1, 4)):
-            yield self._scanned(self._row(0.0, 1.0), update=True)
+            yield self._scanned(self._wanted(), update=True)
         self.tick += self.random.randrange(30)
 
     def _resumed(self) -> Iterator[GoldenCall]:
-        """Yield a break, after which the outputs are elsewhere, now and then outside their bounds."""
-        self.tick += self.random.randrange(5)
-        found = self._row(0.0, 1.0) if self.random.random() < 0.8 else self._row(-0.05, 1.05)
+        """Yield a break behind a move; the outputs are elsewhere then, now and then outside their bounds."""
+        yield self._scanned(self._wanted(), update=True)
+        self.tick += self.random.randrange(3)
+        found = self._row(-0.2, 1.2) if self._chance(0.4) else self._row(0.0, 1.0)
+        if self._chance(0.4):
+            found = self._changed(self._applied(), (*NOT_FINITE, *found))
         resume(self.state, self.limits, self.tick, found)
         yield GoldenCall(Call.RESUME, self.tick, found, self._applied())
+        for _ in range(self.random.randrange(1, 4)):
+            yield self._scanned(self._applied() if self._chance(0.5) else self._wanted())
 
     def _judged(self) -> Iterator[GoldenCall]:
-        """Yield the judgement of a sequence that may be played, or that is changed somewhere."""
+        """Yield the judgement of a sequence that may be played, or that is changed in one place."""
         copy_state(self.state, self.twin, self.limits)
-        coming = self.random.randrange(MOST_MEANWHILE + 1)
-        first_tick = self.tick + self.random.randrange(coming, MOST_MEANWHILE + 1)
-        meanwhile = tuple(self._played(self.tick + k, update=False) for k in range(coming))
+        long = self._chance(0.08)
+        ahead, length = (FARTHEST, LONGEST) if long else (min(4, FARTHEST), min(8, LONGEST))
+        coming = self.random.randrange(ahead + 1)
+        first_tick = self.tick + self.random.randrange(coming, ahead + 1)
+        meanwhile = tuple(self._played(self.tick + k, moves=0.5, as_wanted=self._chance(0.5)) for k in range(coming))
         for k in range(self.tick + coming, first_tick):
             admit(self.twin, self.limits, k, self.twin.applied, update=False)
-        length = self.random.randrange(1, MOST_ROWS + 1)
-        rows = [self._played(first_tick + k, update=k == 0) for k in range(length)]
-        change = self.random.random()
-        if change < 0.5:
-            changed = self.random.randrange(length)
-            rows[changed] = self._row(0.0, 1.0) if change < 0.35 else self._row(0.9, 1.1)
+        length = self.random.randrange(1, length + 1)
+        rows = [self._played(first_tick + k, moves=4.0 / length, update=k == 0) for k in range(length)]
+        if self._chance(0.6):
+            changed = self.random.choice((length - 1, self.random.randrange(length)))
+            others = (self._row(0.0, 1.0)[0], *self._at_a_bound(), *NOT_FINITE)
+            rows[changed] = self._moved(rows[changed]) if self._chance(0.6) else self._changed(rows[changed], others)
         yield GoldenCall(
             Call.JUDGE, self.tick, self._applied(), self._applied(), meanwhile=meanwhile, first_tick=first_tick,
             rows=tuple(rows), judgement=self._judgement(meanwhile, first_tick, rows),
         )  # fmt: skip
+
+    def _moved(self, row: Row) -> Row:
+        """Return a row with one output moved by about its rate."""
+        place = self.random.randrange(N)
+        by = self.limits.rate[place] * self.random.uniform(-1.2, 1.2)
+        low, high = self.limits.low[place], self.limits.high[place]
+        return (*row[:place], single(min(max(row[place] + by, low), high)), *row[place + 1 :])
+
+    def _at_a_bound(self) -> Row:
+        """Return outputs a little beyond their bounds: by less than the slack, or by more."""
+        beyond = self.random.uniform(0.0, 2.0)
+        sides = zip(self.limits.low, self.limits.high, self.limits.slack, strict=True)
+        return tuple(
+            single(self.random.choice((low - beyond * slack, high + beyond * slack))) for low, high, slack in sides
+        )
 
     def _judgement(self, meanwhile: Sequence[Row], first_tick: int, rows: Sequence[Row]) -> Judgement:
         """Return what the guard says of a sequence, as the control PLC does."""
         limits, state, twin, tick = self.limits, self.state, self.twin, self.tick
         if not all(in_range(limits, row) for row in rows):
             return Judgement.OUT_OF_RANGE
-        passes = judge(state, twin, limits, tick, meanwhile, len(meanwhile), first_tick, rows, len(rows))
+        passes = judge(state, twin, limits, tick, meanwhile, 0, len(meanwhile), first_tick, rows, len(rows))
         return Judgement.ACCEPTED if passes else Judgement.RATE_EXCEEDED
 
-    def _played(self, tick: int, *, update: bool) -> Row:
-        """Return what the twin applies of something that is wanted."""
-        wanted = self._row(-0.1, 1.1) if self.random.random() < 0.5 else tuple(self.twin.applied)
+    def _played(self, tick: int, *, moves: float, update: bool = False, as_wanted: bool = False) -> Row:
+        """Return what the twin applies, where now and then something new is wanted; or that."""
+        wanted = self._row(-0.1, 1.1) if self._chance(moves) else tuple(self.twin.applied)
         admit(self.twin, self.limits, tick, wanted, update)
-        return tuple(self.twin.applied)
+        return wanted if as_wanted else tuple(self.twin.applied)
 
 
 def tables_of(golden: Sequence[GoldenCall]) -> dict[str, Array]:

@@ -2,7 +2,6 @@
 
 from coldloop.process.limits import InputLimits
 from coldloop.process.signals import INPUT_NAMES
-from coldloop.process.updating_periods import LONGEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from control_plc import output_limits
 from control_plc.output_limits import beginning, plain
@@ -23,14 +22,14 @@ class GuardKernels:
         self.limits = plain(limits)
         state = type_of(beginning(self.limits, self.limits.low))
         n, tick, of = len(INPUT_NAMES), Kind.INT, type_of(self.limits)
-        row, meanwhile, rows = (ArrayType(Kind.REAL, shape) for shape in ((n,), (LONGEST_TICKS, n), (SEQUENCE_ROWS, n)))
+        row, rows = ArrayType(Kind.REAL, (n,)), ArrayType(Kind.REAL, (SEQUENCE_ROWS, n))
         program = Program(portable=frozenset(PORTABLE), double=True)
         self.begin, self.resume, self.admit, self.judge, self.in_range = self.entries = tuple(
             program.function(function, types) for function, types in (
                 (output_limits.begin, (state, of, row)),
                 (output_limits.resume, (state, of, tick, row)),
                 (output_limits.admit, (state, of, tick, row, Kind.BOOL)),
-                (output_limits.judge, (state, state, of, tick, meanwhile, tick, tick, rows, tick)),
+                (output_limits.judge, (state, state, of, tick, rows, tick, tick, tick, rows, tick)),
                 (output_limits.in_range, (of, row)),
             )
         )  # fmt: skip

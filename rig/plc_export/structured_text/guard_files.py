@@ -6,7 +6,6 @@ from typing import ClassVar, Final
 import numpy as np
 
 from coldloop.process.signals import INPUT_NAMES
-from coldloop.process.updating_periods import LONGEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from control_plc.output_limits import beginning
 from rig.plc_export.kernels.golden_calls import GoldenCall, tables_of
@@ -38,7 +37,7 @@ BEGUN: Final[Path] = (*STATE, "begun")
 PLACES: Final = {"state": Record(STATE), "twin": Record(TWIN), "limits": Record(("c", "limits"))}
 ROW: Final = {"applied": "wide", "wanted": "wide", "row": "row"}
 """Variables of the interface's blocks that are handed to parameters of the kernels."""
-ROWS: Final = {"meanwhile": "before", "rows": "wide"}
+ROWS: Final = {"meanwhile": "before", "rows": "wide", "waiting": "0"}
 
 
 class GuardText:
@@ -70,8 +69,8 @@ class GuardText:
         self._kernels = "\n".join(map(self.printer.block, lowering.blocks))
         self.constants = Constants(constants, self.printer)
         n = len(INPUT_NAMES)
-        self._counts = {"INPUTS": n, "LAST": n - 1, "MEANWHILE": n * LONGEST_TICKS, "NUMBERS": n * SEQUENCE_ROWS,
-                        "LONGEST": LONGEST_TICKS, "ROWS": SEQUENCE_ROWS}  # fmt: skip
+        self._counts = {"INPUTS": n, "LAST": n - 1, "NUMBERS": n * SEQUENCE_ROWS,
+                        "ROWS": SEQUENCE_ROWS}  # fmt: skip
 
     def files(self) -> dict[str, str]:
         """Return the texts of the files by their names, in the order in which they are loaded."""
@@ -87,7 +86,7 @@ class GuardText:
     def sizes(self) -> dict[str, int]:
         """Return the bytes of what a PLC needs."""
         golden = sum((8 if values.dtype.kind == "f" else 4) * values.size for values in self._tables.values())
-        rows = 8 * (self._counts["NUMBERS"] + self._counts["MEANWHILE"])
+        rows = 2 * 8 * self._counts["NUMBERS"]
         return {
             "constants": self.constants.bytes() - golden,
             "state": sum(size_of(kind, DOUBLE) for kind in self.state.values()),
@@ -96,7 +95,7 @@ class GuardText:
         }
 
     def _interface(self) -> str:
-        for size in ("INPUTS", "MEANWHILE", "NUMBERS"):
+        for size in ("INPUTS", "NUMBERS"):
             self.printer.array_type("REAL", self._counts[size])
         begin, resume, admit, judge, in_range = self.entries
         return filled(template("structured_text/output_guard/output_guard.st"), {

@@ -241,7 +241,7 @@ class StructuredTextPrinter(TreePrinter):
             case "isinf" | "isnan":
                 return f"(NOT {PREFIX}is_finite({parts[0]}))"
             case "single":
-                return f"REAL_TO_LREAL(LREAL_TO_REAL({parts[0]}))"
+                return parts[0] if self.single else f"REAL_TO_LREAL(LREAL_TO_REAL({parts[0]}))"
             case name if name in FUNCTIONS:
                 return f"{FUNCTIONS[name]}({', '.join(parts)})"
             case "negative":

@@ -1,6 +1,7 @@
 """Assignments in a kernel: to variables, elements, parts of arrays and numbers of records; results of calls."""
 
 import ast
+from collections.abc import Sequence
 from typing import Any, Final, cast
 
 from rig.plc_export.tree.calls import CallReader, Returned
@@ -81,6 +82,13 @@ class AssignmentReader(CallReader):
         self.write_to(target, place)
         return [Assign(place, self.of_type(target, kind, value, node))]
 
+    def into_all(self, targets: Sequence[ast.expr], node: ast.expr) -> list[Statement]:
+        """Return the assignments of one value to several places, none of which it reads."""
+        if set(map(root_of, targets)) & names_in(node):
+            raise self.source.refusal(node, "a value is read behind its assignment: two statements say the order")
+        value = self.read(node)
+        return [each for one in targets for each in self.into(one, value, node)]
+
     def of_type(self, target: ast.expr, kind: Kind, value: Value, node: ast.expr) -> Expression:
         """Return a number for a place of this type; a number with a point that is known takes it."""
         if isinstance(value, Known) and kind is Kind.REAL and isinstance(value.value, float):
@@ -98,11 +106,9 @@ class AssignmentReader(CallReader):
         members: set[tuple[Type, str] | None] = set()
         statements: list[Statement] = []
         for one, part in zip(target.elts, value.elts, strict=True):
-            read = {ast.unparse(node) for node in ast.walk(part) if isinstance(node, ast.Name | ast.Attribute)}
-            if written & read:
+            if written & names_in(part):
                 raise self.source.refusal(target, "a value is read behind its assignment: two statements say the order")
-            root = one.value if isinstance(one, ast.Subscript) else one
-            written.add(ast.unparse(root))
+            written.add(root_of(one))
             before = len(self.before)
             new = self.assigned(one, part)
             if statements and len(self.before) > before:
@@ -280,6 +286,18 @@ class AssignmentReader(CallReader):
         if not isinstance(value.at(first_of(value)), Literal):
             self.before += self.store(variable, value)
         return variable
+
+
+def root_of(target: ast.expr) -> str:
+    """Return the array, variable or number of a record that is written to, as it is spelt."""
+    while isinstance(target, ast.Subscript):
+        target = target.value
+    return ast.unparse(target)
+
+
+def names_in(node: ast.expr) -> set[str]:
+    """Return all that an expression reads, as it is spelt."""
+    return {ast.unparse(each) for each in ast.walk(node) if isinstance(each, ast.Name | ast.Attribute)}
 
 
 def number_of(node: object) -> tuple[Type, str] | None:

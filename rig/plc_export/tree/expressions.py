@@ -386,4 +386,4 @@ def is_real(value: Value) -> bool:
 
 def is_exact(known: Known) -> bool:
     """Return whether a number is the same in single precision, so that comparing it needs no type."""
-    return not isinstance(known.value, bool) and bool(np.float32(known.value) == known.value)
+    return not isinstance(known.value, bool) and float(np.float32(known.value)) == known.value

@@ -127,8 +127,7 @@ class KernelReader(AssignmentReader):
                 return self.assigned(target, value)
             case ast.Assign(targets=targets, value=value) if all(isinstance(one, ast.Subscript | ast.Attribute)
                                                                  for one in targets):  # fmt: skip
-                read = self.read(value)
-                return [each for one in targets for each in self.into(one, read, value)]
+                return self.into_all(targets, value)
             case ast.AugAssign(target=ast.Name() | ast.Subscript() | ast.Attribute() as target, op=sign, value=value):
                 return self._augmented(target, sign, value)
             case ast.For(target=ast.Name(id=name), iter=ast.Call() as counted, orelse=[]):

@@ -1,13 +1,16 @@
 """What the actuators allow: one setting that the QP, its solvers and the control PLC's guard share."""
 
 from enum import StrEnum
-from typing import Annotated, Self
+from typing import Annotated, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from coldloop.process.loaded import PROCESS
 from coldloop.process.per_signal import PerInput
 from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
+
+LARGEST: Final = 1e38
+"""Of a bound."""
 
 
 class RateReference(StrEnum):
@@ -46,6 +49,8 @@ class InputLimits(BaseModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        if max(map(abs, (*self.low, *self.high))) > LARGEST:
+            raise ValueError(f"a low or high beyond {LARGEST:g}: it does not cross the link, in single precision")
         if any(low >= high for low, high in zip(self.low, self.high, strict=True)):
             raise ValueError("each low must be below its high")
         if min(self.rate) <= 0:

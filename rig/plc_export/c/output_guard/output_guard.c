@@ -55,9 +55,9 @@ bool guard_scan(int32_t tick, bool update, const float wanted[N_INPUTS], float a
 
 Judgement guard_judge(int32_t tick, const float (*meanwhile)[N_INPUTS], int32_t coming, int32_t first_tick,
                       const float (*rows)[N_INPUTS], int32_t length) {
-    static double before[MOST_MEANWHILE * N_INPUTS], wide[MOST_ROWS * N_INPUTS];
+    static double before[MOST_ROWS * N_INPUTS], wide[MOST_ROWS * N_INPUTS];
     if (!in_time(tick) || !in_time(first_tick) || length < 1 || length > MOST_ROWS || coming < 0 ||
-        first_tick - tick > MOST_MEANWHILE || coming > first_tick - tick) {
+        first_tick - tick > MOST_ROWS || coming > first_tick - tick) {
         return GUARD_REFUSED;
     }
     for (int32_t k = 0; k < coming; k += 1) {
@@ -69,6 +69,6 @@ Judgement guard_judge(int32_t tick, const float (*meanwhile)[N_INPUTS], int32_t 
             return GUARD_OUT_OF_RANGE;
         }
     }
-    const bool passes = judge(&state, &twin, &limits, tick, before, coming, first_tick, wide, length);
+    const bool passes = judge(&state, &twin, &limits, tick, before, 0, coming, first_tick, wide, length);
     return passes ? GUARD_ACCEPTED : GUARD_RATE_EXCEEDED;
 }

@@ -15,9 +15,8 @@
 #include <stdint.h>
 
 #define N_INPUTS @INPUTS@
+/* Rows of a sequence; also ticks until it begins. */
 #define MOST_ROWS @ROWS@
-/* Longest updating period: rows that may be played before a sequence begins. */
-#define MOST_MEANWHILE @LONGEST@
 /* Largest tick: integers have 32 bits. */
 #define LARGEST_TICK (INT32_MAX - 0x10000)
 

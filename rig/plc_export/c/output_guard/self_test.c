@@ -19,6 +19,11 @@ static void report(const char *what, int32_t call) {
 static void check_platform(void) {
     volatile double large = 9007199254740992.0;
     volatile double sum = large + 1.0;
+    volatile float smallest = FLT_MIN;
+    volatile float half = smallest / 2;
+    if (!(half > 0)) {
+        report("this platform takes the smallest numbers for zero (flush to zero)", -1);
+    }
     if (sizeof(double) != 8 || FLT_EVAL_METHOD != 0 || sum != large) {
         report("this platform computes with another precision than that of double (FLT_EVAL_METHOD)", -1);
     }
