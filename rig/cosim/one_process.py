@@ -1,7 +1,7 @@
 """The three programs in one process, by direct calls; what would cross the bus is rounded as the bus would round it."""
 
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from coldloop.errors import LoadFileError
 from coldloop.kernels.first_use import kernels_of
@@ -15,7 +15,6 @@ from coldloop.registers.plant import LoadStep, Measurement, PlantSample, Station
 from control_plc.program import ControlProgram
 from control_plc.program import make_program as make_control_program
 from optimizer_plc.program import OptimizerProgram
-from plant.cold_box.program import ColdBoxProgram
 from plant.kinds import plant_maker
 from plant.own_model import own_header
 from plant.program import PlantProgram
@@ -26,6 +25,9 @@ from rig.settings import Settings
 
 if TYPE_CHECKING:
     from rig.cosim.compiled.stretches import CompiledStretches
+
+SHORT: Final = 10_000
+"""Ticks of another process than the cold box below which the programs are done before a loop would be compiled."""
 
 
 class Listener(Protocol):
@@ -124,13 +126,15 @@ class OneProcessRig:
     def _plant(self, load: LoadProfile, seed: int) -> PlantProgram:
         return plant_maker(self._header, self._settings.plant)(load, seed)
 
-    def _stretches(self, plant: PlantProgram, load: LoadProfile) -> "CompiledStretches | None":
-        """Return what runs ahead in compiled loops, where there are any: of the cold box and the refrigerator."""
-        if not (self._compiled and isinstance(plant, ColdBoxProgram)) or self._settings.plant.mismatch.beside_the_box:
+    def _stretches(self, plant: PlantProgram, load: LoadProfile, ticks: int) -> "CompiledStretches | None":
+        """Return what runs ahead in compiled loops, where there are any."""
+        if not self._compiled or (self._header.process and ticks < SHORT):
             return None
-        from rig.cosim.compiled.stretches import CompiledStretches  # noqa: PLC0415 not for other processes
+        from rig.cosim.compiled.plants import compiled_plant  # noqa: PLC0415 only where something is compiled
+        from rig.cosim.compiled.stretches import CompiledStretches  # noqa: PLC0415
 
-        return CompiledStretches(plant, self.control, self.optimizer, load)
+        compiled = compiled_plant(plant)
+        return CompiledStretches(plant, compiled, self.control, self.optimizer, load) if compiled else None
 
     def _run(self, scenario: Scenario, recorder: Recorder) -> None:
         load = load_table(scenario.load)
@@ -139,7 +143,7 @@ class OneProcessRig:
         self.optimizer.restart(scenario.updating_period_s)
         noted = self.control.journal.count
         self.control.restart(session=1)
-        stretches = self._stretches(plant, load)
+        stretches = self._stretches(plant, load, scenario.ticks)
         recorder.begin()
         while self.control.tick < scenario.ticks:
             stretch = stretches.ahead(scenario.ticks) if stretches else None

@@ -26,7 +26,10 @@ FEW = int(P1 == 0)
 MOVES_AS_ONE = PROCESS.moves_as_one
 MOVES = 240
 """Ticks in which an output that is not controlled must have moved before it can be frozen."""
-FIRST_RESTS = [0 if output in CONTROLLED else -MOVES for output in range(len(OUTPUT_NAMES))]
+IS_CONTROLLED = [output in CONTROLLED for output in range(len(OUTPUT_NAMES))]
+FIRST_RESTS = [0 if controlled else -MOVES for controlled in IS_CONTROLLED]
+UNKNOWN, NOT_MOVED = -2, -1
+"""In the place of the tick since which the inputs have moved."""
 RECOVERY_TICKS = 8
 """A sensor is good again when its measurements have been good for so long."""
 
@@ -86,6 +89,7 @@ def count_unchanged(
     y: Numbers,
     elapsed: int,
     least: Numbers,
+    controlled: Numbers,
 ) -> None:
     """Count for how many ticks each output is unchanged while most of the others moved.
 
@@ -94,18 +98,18 @@ def count_unchanged(
 
     `before` (22) becomes `y`, the measurements `elapsed` ticks later. `rests` (22), first `FIRST_RESTS`, are the
     longest such times of those that are not controlled, without the times for which they were frozen; below 0: the
-    moves that are missing until they count.
+    moves that are missing until they count. `least` is as `SensorMonitor` has it; `controlled` says which are.
     """
     most = 2 * moved(before, y, 0, len(y)) > len(y) - FEW
     temperatures, pressures = moved(before, y, FIRST_OF_KIND, P1), moved(before, y, P1, len(y))
     most_of_each = (P1 == 0 or 2 * temperatures > P1 - FIRST_OF_KIND) and 2 * pressures > len(y) - P1 - FEW
     for output in range(len(y)):
         if y[output] == before[output]:
-            unchanged[output] += elapsed * (most if output in CONTROLLED else most_of_each)
+            unchanged[output] += elapsed * (most if controlled[output] else most_of_each)
             continue
         if rests[output] < 0:
             rests[output] += bool(abs(y[output] - before[output]) > 0.0)  # from or to no number is no move
-        elif output not in CONTROLLED and not is_frozen(unchanged[output], rests[output], least[output]):
+        elif not controlled[output] and not is_frozen(unchanged[output], rests[output], least[output]):
             rests[output] = max(unchanged[output], rests[output])
         unchanged[output] = 0
     before[:] = y
@@ -129,9 +133,38 @@ def moved(before: Numbers, y: Numbers, first: int, end: int) -> int:
     return count
 
 
-def have_moved(inputs: Sequence[float], before: Sequence[float], moves: Sequence[float]) -> bool:
+def have_moved(inputs: Numbers, before: Numbers, moves: Numbers) -> bool:
     """Return whether an input has moved so far that something is to be seen of it."""
-    return any(abs(now - then) > move for now, then, move in zip(inputs, before, moves, strict=True))
+    moved_far = False
+    for i in range(len(moves)):
+        moved_far = moved_far or abs(inputs[i] - before[i]) > moves[i]
+    return moved_far
+
+
+def note_moves(
+    unchanged: Numbers,
+    last: Sequence[MutableSequence[float]],
+    since: MutableSequence[int],
+    inputs: Numbers,
+    moves: Numbers,
+    tick: int,
+) -> None:
+    """Note what the inputs were when each output moved last, and at which tick they had moved from there.
+
+    `last` has a row an output; `since`, of each, is at first `UNKNOWN`, then `NOT_MOVED` or a tick.
+    """
+    for output in range(len(unchanged)):
+        if unchanged[output] == 0 or since[output] == UNKNOWN:
+            since[output] = NOT_MOVED
+            for i in range(len(moves)):
+                last[output][i] = inputs[i]
+        elif since[output] == NOT_MOVED and have_moved(inputs, last[output], moves):
+            since[output] = tick
+
+
+def is_to_move(since: int, tick: int, least: float) -> bool:
+    """Return whether the inputs have moved, and for so long that the output should have moved too."""
+    return since >= 0 and tick - since >= least
 
 
 class ImageWatch:
@@ -149,21 +182,22 @@ class ImageWatch:
 
     def begin(self) -> None:
         """Reset: nothing is known of earlier ticks."""
-        self._image: tuple[Sequence[float], ...] = ()
-        self._inputs: Sequence[float] = ()
-        self._unchanged = 0
-        self._moved = False
+        self.last: tuple[Sequence[float], ...] = ()
+        self.inputs: Sequence[float] = ()
+        """Applied when the image changed last."""
+        self.count = 0
+        self.has_moved = False
 
     def unchanged(self, inputs: Sequence[float], *image: Sequence[float], elapsed: int) -> int:
         """Return for how many ticks the image (all measurements) is unchanged although the inputs have moved."""
-        if image != self._image:  # NaN is not the same as NaN: a sensor that fails is for others to find
-            self._image, self._inputs = image, inputs
-            self._unchanged, self._moved = 0, not self._may_rest
+        if image != self.last:  # NaN is not the same as NaN: a sensor that fails is for others to find
+            self.last, self.inputs = image, inputs
+            self.count, self.has_moved = 0, not self._may_rest
             return 0
-        self._unchanged += elapsed
-        if not self._moved:
-            self._moved = have_moved(inputs, self._inputs, self._moves)
-        return self._unchanged if self._moved else 0
+        self.count += elapsed
+        if not self.has_moved:
+            self.has_moved = have_moved(inputs, self.inputs, self._moves)
+        return self.count if self.has_moved else 0
 
 
 class SensorMonitor:
@@ -192,13 +226,14 @@ class SensorMonitor:
         self._now = 0
         self.unchanged = [0] * len(initial)
         self.rests = FIRST_RESTS.copy()
-        self._moves = moves
-        self._may_rest = settings.may_rest
-        self._inputs: list[Sequence[float]] = [()] * len(initial)
+        self.moves = moves
+        self.may_rest = settings.may_rest
+        self.each_may_rest = settings.may_rest and not MOVES_AS_ONE
+        self.inputs = [[0.0] * len(moves) for _ in initial]
         """Inputs when each output moved last, ..."""
-        self._inputs_moved: list[int | None] = [None] * len(initial)
-        """... and since which tick they have been others."""
-        self._image = ImageWatch(moves, may_rest=settings.may_rest)
+        self.inputs_moved = [UNKNOWN] * len(initial)
+        """... and since which tick they have been others: `note_moves`."""
+        self.image = ImageWatch(moves, may_rest=settings.may_rest)
         self._recovering: dict[int, int] = {}
         """Output, and since which tick its measurements have been good again."""
         self.bad: dict[int, int] = {}
@@ -221,14 +256,15 @@ class SensorMonitor:
             standing: Outputs that may be constant while others move.
         """
         elapsed = 1 if self._tick is None else max(0, tick - self._tick)
-        count_unchanged(self.unchanged, self.rests, self.before, y, elapsed, self.least)
+        count_unchanged(self.unchanged, self.rests, self.before, y, elapsed, self.least, IS_CONTROLLED)
         self._tick = self._now = tick
         history = zip(self.unchanged, self.rests, self.least, strict=True)
         frozen: Collection[int] = [output for output, each in enumerate(history) if is_frozen(*each)]
         frozen = [output for output in frozen if output not in standing and not may_stand(output, y)]
-        if self._may_rest and not MOVES_AS_ONE:
-            frozen = self._not_at_rest(frozen, inputs)
-        if self._image.unchanged(inputs, y, *others, elapsed=elapsed) >= self.frozen_ticks:
+        if self.each_may_rest:
+            note_moves(self.unchanged, self.inputs, self.inputs_moved, inputs, self.moves, tick)
+            frozen = [output for output in frozen if is_to_move(self.inputs_moved[output], tick, self.least[output])]
+        if self.image.unchanged(inputs, y, *others, elapsed=elapsed) >= self.frozen_ticks:
             frozen = range(len(y))
         if not self.bad and not frozen and are_inside(y, self.low, self.high):
             self._good[:] = y
@@ -239,22 +275,12 @@ class SensorMonitor:
                 self._good[output] = value
         return tuple(self._good)
 
-    def _not_at_rest(self, unchanged: Collection[int], inputs: Sequence[float]) -> Collection[int]:
-        """Return those that should have moved since the inputs did: the load alone may not reach each output."""
-        for output, count in enumerate(self.unchanged):
-            if not count or not self._inputs[output]:  # of one that has not moved yet, those at first
-                self._inputs[output], self._inputs_moved[output] = inputs, None
-            elif self._inputs_moved[output] is None and have_moved(inputs, self._inputs[output], self._moves):
-                self._inputs_moved[output] = self._now
-        since = self._inputs_moved
-        return [one for one in unchanged if (at := since[one]) is not None and self._now - at >= self.least[one]]
-
     def set_back(self, tick: int) -> None:
         """Set the time back to `tick`: conditions that hold now begin there."""
         self._tick = None
         self.bad = {output: min(since, tick) for output, since in self.bad.items()}
         self._recovering = {output: min(since, tick) for output, since in self._recovering.items()}
-        self._inputs_moved = [at if at is None else min(at, tick) for at in self._inputs_moved]
+        self.inputs_moved = [min(at, tick) for at in self.inputs_moved]
 
     def _judge(self, output: int, *, ok: bool) -> None:
         if not ok:
@@ -265,10 +291,10 @@ class SensorMonitor:
             if self._now - since + 1 >= RECOVERY_TICKS:
                 del self.bad[output], self._recovering[output]
 
-    def seen(self, tick: int, y: Sequence[float]) -> None:
+    def seen(self, tick: int, y: Sequence[float], *others: Sequence[float]) -> None:
         """Note that all outputs y (22) have been good up to `tick`, and what was measured there."""
         self._tick = self._now = tick
-        self._image.begin()
+        self.image.last = (y, *others)
         self._good[:] = self.before[:] = y
 
     @property

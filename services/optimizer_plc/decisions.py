@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import CONTROLLED, TICKS_PER_SAMPLE
+from coldloop.process.signals import L1
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.estimator import begin_at_rest, forget
 from optimizer_plc.qp.profile import hold, shift, shifted
@@ -28,8 +28,6 @@ FIRST: Final = -1
 """In the place of a q: that of a first period."""
 AFTER_A_STEP: Final = -2
 """That of a period which begins with a load step."""
-LEVEL: Final = CONTROLLED[0]
-"""The output that `rest_map` is given."""
 
 
 class Latched(NamedTuple):
@@ -65,7 +63,8 @@ def begin_session(c: Constants, m: OptimizerState) -> None:
     forget(m.belief)
     now, played, real = m.numbers[0], m.playing.numbers[0], m.u.dtype.type
     now.guessed_before = now.delivered_before = real(np.inf)
-    played.ticks, played.share = TICKS_PER_SAMPLE, c.rate_shares[TICKS_PER_SAMPLE]
+    sample = c.fitting.shape[0] - 1
+    played.ticks, played.share = sample, c.rate_shares[sample]
 
 
 @kernel
@@ -122,7 +121,7 @@ def begin_again(c: Constants, m: OptimizerState, latched: Latched, u: Array) -> 
     """
     estimator, played, zero = c.estimator, m.playing.numbers[0], m.u.dtype.type(0.0)
     load = latched.load - estimator.w0 if estimator.load_known else zero
-    level = latched.y[LEVEL] - estimator.y0[LEVEL] if np.isfinite(latched.y[LEVEL]) else zero
+    level = latched.y[L1] - estimator.y0[L1] if np.isfinite(latched.y[L1]) else zero
     begin_at_rest(c.rest, m.belief, u, load, estimator.load_known, level)
     hold(u, c.input_scale, c.n_inputs, m.playing.z)
     m.playing.u_before[:] = u
@@ -146,7 +145,7 @@ def follow_sequence(c: Constants, m: OptimizerState, latched: Latched, u: Array)
         late = latched.tick - now.tick
     if late >= c.shifts.shape[0]:
         real = m.u.dtype.type
-        far = shift(c.knots, real(late) / real(TICKS_PER_SAMPLE))
+        far = shift(c.knots, real(late) / real(c.fitting.shape[0] - 1))
         m.playing.z[:] = shifted(far, m.playing.z, c.n_inputs)
     elif late > 0:
         m.playing.z[:] = shifted(c.shifts[late], m.playing.z, c.n_inputs)

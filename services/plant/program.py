@@ -111,6 +111,10 @@ class PlantProgram:
             "noise_state": noise_state,
         }  # fmt: skip
 
+    def take_over(self, tick: int, x: RealArray, u: RealArray, y: RealArray) -> None:
+        """Go on from another tick: with what state and measurements are there, and the inputs held up to it."""
+        self.tick, self._x, self._u, self._measured = tick, x.copy(), u.copy(), tuple(y.tolist())
+
     @contextmanager
     def noise(self, ticks: int) -> Iterator[RealArray]:
         """Lend the draws of the next `ticks` ticks, shape (ticks, outputs), or (0, outputs) without.

@@ -4,17 +4,18 @@ from typing import Any
 
 import numpy as np
 
+from coldloop.process.signals import CONTROLLED, TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import Mode, OperatorMode, Process, SequenceHeader, SequenceRow, Update
 from coldloop.registers.safety import AlarmKind, CapacityCause
 from coldloop.safety.sequence import InputSequence, with_checksum
+from control_plc.alarm_settings import BANDS
 from control_plc.output_limits import GuardState
 from control_plc.program import ControlProgram
 from rig.cosim.compiled.records import GUARD, NOT, SCAN, Alarms, Array, Trace, empty_rows, record
 
-BANDS = (AlarmKind.LEVEL_BAND, AlarmKind.T5_BAND)
 OF_PLANS = (AlarmKind.CAPACITY, AlarmKind.SENSOR_SUSPECT)
 """Alarms of what plans say."""
-LONGEST_SILENCE = 22
+LONGEST_SILENCE = TICKS_PER_SAMPLE + 2
 """Ticks between two signs of life of an optimiser that answers every update."""
 
 
@@ -26,6 +27,7 @@ def is_ordinary(program: ControlProgram) -> bool:
         and program.optimizer_present
         and program.player.is_ordinary(program.tick)
         and not program.sensors.bad
+        and program.sensors.image.count + 1 < program.sensors.frozen_ticks
         and not program.guard.state.out_of_bounds
         and program.alarms.are_quiet
         and program.alarms.reported(AlarmKind.CAPACITY) == CapacityCause.of(program.shortage)
@@ -42,15 +44,16 @@ def due(program: ControlProgram) -> float:
 
 
 def alarms_of(program: ControlProgram) -> Alarms:
-    """Return the two band alarms as they are."""
-    settings, panel = program.alarm_settings, program.alarms
-    level, t5 = (bool(panel.rows[kind].active) for kind in BANDS)
-    return Alarms(settings.level_band, settings.t5_band, level, t5, *map(panel.delay, BANDS))
+    """Return the band alarms as they are."""
+    low, high = np.array(program.alarm_settings.bands, dtype=np.float64).T
+    rows, delays = (program.alarms.rows[kind] for kind in BANDS), map(program.alarms.delay, BANDS)
+    causes = [row.cause if row.active else NOT for row in rows]
+    return Alarms(low.copy(), high.copy(), np.array(CONTROLLED), np.array(causes), np.array(list(delays)))
 
 
 def scan_record(program: ControlProgram) -> Any:  # noqa: ANN401 a record
     """Return the state of player, sensors, alarms and watchdog, shape (1,)."""
-    scans, player = record(SCAN), program.player
+    scans, player, sensors = record(SCAN), program.player, program.sensors
     s, update, playing = scans[0], player.update, player.sequence
     if update is None or playing is None:
         raise RuntimeError("an ordinary tick plays a sequence")
@@ -62,9 +65,13 @@ def scan_record(program: ControlProgram) -> Any:  # noqa: ANN401 a record
         header.number, header.first_tick, header.length, header.tau_u
     )  # fmt: skip
     s["triggered"], s["lowest"] = program.watchdog.triggered, program.watchdog.lowest
-    s["level_since"], s["t5_since"] = (NOT if since is None else since for since in program.alarms.pending(*BANDS))
-    s["unchanged"], s["seen"] = program.sensors.unchanged, program.sensors.before
-    s["rests"] = program.sensors.rests
+    s["since"] = [NOT if since is None else since for since in program.alarms.pending(*BANDS)]
+    s["unchanged"], s["rests"], s["seen"] = sensors.unchanged, sensors.rests, sensors.before
+    s["inputs"], s["inputs_moved"] = sensors.inputs, sensors.inputs_moved
+    _, s["seen_x"], (s["seen_load"],) = sensors.image.last
+    s["image_inputs"], s["image_count"], s["image_moved"] = (
+        sensors.image.inputs, sensors.image.count, sensors.image.has_moved
+    )  # fmt: skip
     s["short"], s["suspects"] = np.sign(program.shortage), program.suspects
     return scans
 
@@ -93,13 +100,17 @@ def restore_scan(program: ControlProgram, s: Any, trace: Trace) -> None:  # noqa
     """Restore sensors, alarms, watchdog and process after the ticks of a record (at least one)."""
     last = int(s["tick"]) - 1
     row = last - int(s["first"])
-    y = tuple(trace.y[row].tolist())
+    u, y, x = (tuple(values[row].tolist()) for values in (trace.u, trace.y, trace.x))
+    load, sensors = float(trace.load[row]), program.sensors
     program.tick, program.alarms.now = last + 1, last
-    program.process = Process(last, float(trace.load[row]), tuple(trace.u[row].tolist()), y)
-    program.sensors.unchanged[:], program.sensors.rests[:] = s["unchanged"].tolist(), s["rests"].tolist()
-    program.sensors.seen(last, y)
+    program.process = Process(last, load, u, y)
+    for name in ("unchanged", "rests", "inputs", "inputs_moved"):
+        getattr(sensors, name)[:] = s[name].tolist()
+    sensors.image.inputs, sensors.image.count = tuple(s["image_inputs"].tolist()), int(s["image_count"])
+    sensors.image.has_moved = bool(s["image_moved"])
+    sensors.seen(last, y, x, (load,))
     program.watchdog.triggered, program.watchdog.lowest = int(s["triggered"]), int(s["lowest"])
-    for kind, since in zip(BANDS, (int(s["level_since"]), int(s["t5_since"])), strict=True):
+    for kind, since in zip(BANDS, s["since"].tolist(), strict=True):
         program.alarms.set_pending(kind, None if since == NOT else since)
 
 
@@ -125,7 +136,7 @@ def played_sequence(s: Any, update: int, rows: Array, model_digest: int) -> Inpu
 
 
 def sequence_rows(sequence: InputSequence) -> Array:
-    """Return the rows of a sequence, and room for those of the next one, shape (2, 240, 3)."""
+    """Return the rows of a sequence, and room for those of the next one, shape (2, 240, inputs)."""
     rows = empty_rows()
     rows[0, : len(sequence.rows)] = sequence.rows
     return rows

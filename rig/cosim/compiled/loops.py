@@ -12,9 +12,9 @@ import numpy as np
 import rig.cosim.compiled.portable  # noqa: F401 it lets kernels call what is plain Python
 from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import L1, T5
-from control_plc.output_limits import admit, in_range, judge
-from control_plc.sensors import are_inside, count_unchanged, is_frozen
+from coldloop.registers.plant import MAX_STATE
+from control_plc.output_limits import N_INPUTS, admit, in_range, judge
+from control_plc.sensors import are_inside, count_unchanged, have_moved, is_frozen, is_to_move, note_moves
 from optimizer_plc import scheme
 from optimizer_plc.scheme import BY_THE_RULE
 from optimizer_plc.session_state import OptimizerState
@@ -38,30 +38,58 @@ def look(w: World, alarms: Alarms, s: Any, plant: PlantState, trace: Trace) -> b
     y, x = trace.y[row], trace.x[row]
     known = w.least_load <= load <= w.largest_load
     for i in range(x.shape[0]):
-        known = known and np.isfinite(x[i])
+        known = known and abs(x[i]) <= MAX_STATE
     interrupted = s.load_step > 0.0 and abs(load - s.update_load) > s.load_step
-    frozen = False
+    frozen, same = False, load == (trace.load[row - 1] if row > 0 else s.seen_load)
     for i in range(y.shape[0]):
-        frozen = frozen or (y[i] == s.seen[i] and is_frozen(s.unchanged[i] + 1, s.rests[i], w.least[i]))
-    changes = is_due(alarms.level_band, alarms.level_active, alarms.level_delay, s.level_since, s.tick, y[L1])
-    changes = changes or is_due(alarms.t5_band, alarms.t5_active, alarms.t5_delay, s.t5_since, s.tick, y[T5])
+        rests = y[i] == s.seen[i]
+        same = same and rests
+        still = rests and is_frozen(s.unchanged[i] + 1, s.rests[i], w.least[i])
+        frozen = frozen or (still and (not w.each_may_rest or is_to_move(s.inputs_moved[i], s.tick, w.least[i])))
+    if same:
+        for i in range(x.shape[0]):
+            same = same and x[i] == (trace.x[row - 1, i] if row > 0 else s.seen_x[i])
+        frozen = frozen or (same and s.image_count + 1 >= w.frozen_ticks)
+    s.same = same
+    changes = is_due(alarms, 0, s.since[0], s.tick, y) or is_due(alarms, 1, s.since[1], s.tick, y)
     return known and not (interrupted or frozen or changes) and are_inside(y, w.low, w.high)
 
 
 @kernel
-def is_due(band: tuple[float, float], active: bool, delay: int, since: int, tick: int, value: float) -> bool:  # noqa: FBT001
-    """Return whether a band alarm follows its condition at this tick, `delay` ticks after it has changed."""
-    if (not band[0] <= value <= band[1]) == active:
-        return False
-    return tick - (tick if since == NOT else since) >= delay
+def cause_of(alarms: Alarms, kind: int, y: Array) -> int:
+    """Return the cause of a band alarm, or NOT where all its outputs are within their bands."""
+    for place in range(kind, alarms.places.shape[0] if kind else 1):
+        if not alarms.low[place] <= y[alarms.places[place]] <= alarms.high[place]:
+            return place - kind
+    return NOT
 
 
 @kernel
-def pending(band: tuple[float, float], active: bool, since: int, tick: int, value: float) -> int:  # noqa: FBT001
+def is_due(alarms: Alarms, kind: int, since: int, tick: int, y: Array) -> bool:
+    """Return whether a band alarm follows its condition at this tick, after its delay, or another cause at once."""
+    cause, shown = cause_of(alarms, kind, y), alarms.causes[kind]
+    if (cause == NOT) == (shown == NOT):
+        return bool(cause != shown)
+    return bool(tick - (tick if since == NOT else since) >= alarms.delays[kind])
+
+
+@kernel
+def pending(alarms: Alarms, kind: int, since: int, tick: int, y: Array) -> int:
     """Return since when the condition of a band alarm has been another than the alarm shows, or NOT."""
-    if (not band[0] <= value <= band[1]) == active:
+    if (cause_of(alarms, kind, y) == NOT) == (alarms.causes[kind] == NOT):
         return NOT
     return tick if since == NOT else since
+
+
+@kernel
+def note_image(w: World, s: Any, u: Array) -> None:  # noqa: ANN401
+    """Count for how many ticks the image is unchanged, and note whether the inputs have moved meanwhile."""
+    if s.same:
+        s.image_count += 1
+        s.image_moved = s.image_moved or have_moved(u, s.image_inputs, w.moves)
+    else:
+        s.image_inputs[:] = u
+        s.image_count, s.image_moved = 0, not w.may_rest
 
 
 @kernel
@@ -78,9 +106,12 @@ def scan(
         for i in range(plant.y.shape[0]):
             plant.y[i] = plant.y[i] + w.biases[i] + w.deviations[i] * plant.noise[row, i]
     y = trace.y[row]
-    count_unchanged(s.unchanged, s.rests, s.seen, y, 1, w.least)
-    s.level_since = pending(alarms.level_band, alarms.level_active, s.level_since, tick, y[L1])
-    s.t5_since = pending(alarms.t5_band, alarms.t5_active, s.t5_since, tick, y[T5])
+    count_unchanged(s.unchanged, s.rests, s.seen, y, 1, w.least, w.controlled)
+    if w.each_may_rest:
+        note_moves(s.unchanged, s.inputs, s.inputs_moved, u, w.moves, tick)
+    note_image(w, s, u)
+    for kind in range(2):
+        s.since[kind] = pending(alarms, kind, s.since[kind], tick, y)
     s.tick = tick + 1
 
 
@@ -89,7 +120,7 @@ def play(
     w: World, alarms: Alarms, scans: Any, guards: Any, rows: Array, plant: PlantState, trace: Trace, until: int  # noqa: ANN401
 ) -> int:  # fmt: skip
     """Play the sequence up to the next updating instant; return DONE at the tick `until`, UNUSUAL or UPDATE."""
-    w, rows, plant, trace = borrowed(w), borrowed(rows), borrowed(plant), borrowed(trace)
+    w, alarms, rows, plant, trace = borrowed(w), borrowed(alarms), borrowed(rows), borrowed(plant), borrowed(trace)
     s, guard = scans[0], guards[0]
     while s.tick < until:
         if s.tick == s.next_update:
@@ -117,12 +148,12 @@ def run_block(
 
     An answer is computed when the programs would deliver it: at its instant, or at once where a load step may cut it
     off. One that has not begun when something unusual happens is not reported: it is computed again, with the same
-    bits. `rows` (2, 240, 3) are those of the sequence being played, and of the one that was offered.
+    bits. `rows` (2, 240, inputs) are those of the sequence being played, and of the one that was offered.
     """
-    w, o, rows, plant = borrowed(w), borrowed(o), borrowed(rows), borrowed(plant)
+    w, alarms, o, rows, plant = borrowed(w), borrowed(alarms), borrowed(o), borrowed(rows), borrowed(plant)
     trace, reports = borrowed(trace), borrowed(reports)
     s, guard, twin = scans[0], guards[0], guards[1]
-    u_before, answered = np.empty(3), False
+    u_before, answered = np.empty(N_INPUTS), False
     outcome = DONE
     while s.tick < until:
         tick, instant = s.tick, s.tick == s.next_update

@@ -28,7 +28,10 @@ PORTABLE: Final[tuple[Callable[..., Any], ...]] = (
     output_limits.resume,
     output_limits.same,
     sensors.are_inside,
+    sensors.have_moved,
     sensors.is_frozen,
+    sensors.is_to_move,
+    sensors.note_moves,
     sensors.moved,
     sensors.count_unchanged,
 )

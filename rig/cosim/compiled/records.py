@@ -11,13 +11,9 @@ from control_plc.output_limits import Limits
 from optimizer_plc.rules import UpdatingRule
 from optimizer_plc.scheme import Constants
 from optimizer_plc.session_state import OptimizerState
-from plant.cold_box.physics import ColdBox
-from plant.helium.properties import Helium
-from plant.refrigerator.physics import Refrigerator
-from plant.refrigerator.station_law import StationLaw
-from plant.refrigerator.tick import RefrigeratorMemory
 
 Array = NDArray[np.float64]
+N_U, N_Y, N_X = len(INPUT_NAMES), len(OUTPUT_NAMES), len(STATE_NAMES)
 
 BLOCK_TICKS: Final = 512
 """Ticks that a loop does at most before it returns: a signal waits for no more."""
@@ -25,86 +21,45 @@ NOT: Final = -1
 """Tick of what is not."""
 
 GUARD: Final = np.dtype([
-    ("applied", "f8", 3), ("anchor", "f8", 3), ("coming", "f8", 3),
-    ("moves", "i8", TICKS_PER_SAMPLE), ("before", "f8", (TICKS_PER_SAMPLE, 3)),
+    ("applied", "f8", (N_U,)), ("anchor", "f8", (N_U,)), ("coming", "f8", (N_U,)),
+    ("moves", "i8", TICKS_PER_SAMPLE), ("before", "f8", (TICKS_PER_SAMPLE, N_U)),
     ("start", "i8"), ("share", "f8"), ("moved", "i8"), ("oldest", "i8"), ("out_of_bounds", "?"),
 ])  # fmt: skip
 """`control_plc.output_limits.GuardState`."""
 
 SCAN: Final = np.dtype([
     ("first", "i8"), ("tick", "i8"), ("next_update", "i8"), ("updates", "i8"), ("update_tick", "i8"),
-    ("update_load", "f8"), ("load_step", "f8"), ("u_before", "f8", 3), ("number", "i8"), ("first_tick", "i8"),
-    ("length", "i8"), ("tau_u", "i8"), ("accepted", "i8"), ("triggered", "i8"), ("lowest", "i8"),
-    ("level_since", "i8"), ("t5_since", "i8"), ("unchanged", "i8", len(OUTPUT_NAMES)),
-    ("rests", "i8", len(OUTPUT_NAMES)), ("seen", "f8", len(OUTPUT_NAMES)), ("load_index", "i8"), ("solved", "i8"),
+    ("update_load", "f8"), ("load_step", "f8"), ("u_before", "f8", (N_U,)), ("number", "i8"), ("first_tick", "i8"),
+    ("length", "i8"), ("tau_u", "i8"), ("accepted", "i8"), ("triggered", "i8"), ("lowest", "i8"), ("since", "i8", 2),
+    ("unchanged", "i8", (N_Y,)), ("rests", "i8", (N_Y,)), ("seen", "f8", (N_Y,)), ("seen_x", "f8", (N_X,)),
+    ("seen_load", "f8"), ("same", "?"), ("image_count", "i8"), ("image_moved", "?"), ("image_inputs", "f8", (N_U,)),
+    ("inputs", "f8", (N_Y, N_U)), ("inputs_moved", "i8", (N_Y,)), ("load_index", "i8"), ("solved", "i8"),
     ("short", "f8"), ("suspects", "i8"),
 ])  # fmt: skip
 """The control PLC and the load.
 
 first: tick of the trace's first row. tick: the next scan. next_update, updates: tick and number of the next update.
-update_tick, update_load, u_before: the one under way, and what was applied before it. load_step: change of the load (W)
-that interrupts it, or 0. number, first_tick, length, tau_u: the sequence being played. accepted: sequences accepted.
-triggered, lowest: the optimiser's watchdog. level_since, t5_since: since when a band alarm is about to change.
-unchanged, rests, seen: of the sensor check. load_index: step of the load that holds. solved: reports made. short,
-suspects: sign of the shortage, and suspects, of the last plan."""
+update_tick, update_load, u_before: the one under way, and what was applied before it. load_step: change of the load
+(W) that interrupts it, or 0. number, first_tick, length, tau_u: the sequence being played. accepted: sequences
+accepted. triggered, lowest: the optimiser's watchdog. since: since when each band alarm is about to change.
+unchanged, rests, seen, inputs, inputs_moved: of the sensor check. image_count, image_moved, image_inputs: of its
+watch of the image. seen_x, seen_load: of the tick before the trace's first row. same: the image is unchanged.
+load_index: step of the load that holds. solved: reports made. short, suspects: sign of the shortage, and suspects, of
+the last plan."""
 
+PlantState = Any
+"""A plant between two ticks, a named tuple with these arrays and its own ones.
 
-class BoxConstants(NamedTuple):
-    """A cold box alone."""
-
-    box: ColdBox
-    helium: Helium
-
-
-class BoxState(NamedTuple):
-    """A cold box alone between two ticks."""
-
-    x: Array
-    """Shape (28,)."""
-    y: Array
-    """Outputs, shape (22,)."""
-    station: Array
-    """Nothing, shape (0,)."""
-    noise: Array
-    """Draws for the sensors, a row for each tick of the trace, shape (N, 22) or (0, 22)."""
-    slope: Array
-    """dx/dt at x under `held`, shape (28,)."""
-    held: Array
-    """Inputs and load of the tick before, shape (4,); NaN where they are not known."""
-
-
-class RefrigeratorConstants(NamedTuple):
-    """The whole refrigerator and its station's controller."""
-
-    plant: Refrigerator
-    helium: Helium
-    law: StationLaw
-
-
-class RefrigeratorState(NamedTuple):
-    """A refrigerator between two ticks."""
-
-    x: Array
-    """States of the cold box, the first 28 of `memory.x`."""
-    y: Array
-    """As in `BoxState`."""
-    station: Array
-    """Signals, mode and alarms of the station, shape (21,)."""
-    noise: Array
-    """As in `BoxState`."""
-    memory: RefrigeratorMemory
-    ahead: Array
-    """Disturbances at each tick of the trace and at the one behind it, without load, shape (N + 1, 16)."""
-
-
-PlantConstants = BoxConstants | RefrigeratorConstants
-PlantState = BoxState | RefrigeratorState
+x, y: states and outputs. station: signals, mode and alarms of a compression station, shape (21,) or (0,). noise: draws
+for the sensors, a row for each tick of the trace, or no rows.
+"""
 
 
 class World(NamedTuple):
     """What does not change in a run."""
 
-    plant: PlantConstants
+    plant: Any
+    """Of its kind."""
     biases: Array
     """What the sensors show too much, shape (22,)."""
     deviations: Array
@@ -118,6 +73,16 @@ class World(NamedTuple):
     high: Array
     least: NDArray[np.int64]
     """Ticks for which each output is at least unchanged before it is frozen, shape (22,)."""
+    controlled: NDArray[np.bool_]
+    """Which outputs have a band, shape (22,)."""
+    moves: Array
+    """How far an input must have moved for something to be seen of it, shape (3,)."""
+    may_rest: bool
+    """Nothing may be measured to move while the inputs do not."""
+    each_may_rest: bool
+    """Nor need an output move while others do, then."""
+    frozen_ticks: int
+    """Ticks for which the image is at least unchanged before it is an old one."""
     least_load: float
     largest_load: float
     watchdog: int
@@ -138,15 +103,17 @@ class Optimizer(NamedTuple):
 
 
 class Alarms(NamedTuple):
-    """The two band alarms as they are until one of them changes."""
+    """The band alarms as they are until one of them changes: that of the first band, and that of all others."""
 
-    level_band: tuple[float, float]
-    t5_band: tuple[float, float]
-    level_active: bool
-    t5_active: bool
-    level_delay: int
-    """Ticks until the alarm follows its condition."""
-    t5_delay: int
+    low: Array
+    """Of each band, shape (bands,)."""
+    high: Array
+    places: NDArray[np.int64]
+    """The output of each, shape (bands,)."""
+    causes: NDArray[np.int64]
+    """Of each alarm, NOT where it is not active, shape (2,)."""
+    delays: NDArray[np.int64]
+    """Ticks until each alarm follows its condition, shape (2,)."""
 
 
 class Trace(NamedTuple):
@@ -171,8 +138,8 @@ class Reports(NamedTuple):
 
 def empty_trace(station: int) -> Trace:
     """Return room for a block, with so many columns of the station."""
-    sizes = (len(INPUT_NAMES), len(OUTPUT_NAMES), len(STATE_NAMES), station)
-    return Trace(np.empty(BLOCK_TICKS, np.float32), *(np.empty((BLOCK_TICKS, size), np.float32) for size in sizes))
+    rooms = (np.empty((BLOCK_TICKS, size), np.float32) for size in (N_U, N_Y, N_X, station))
+    return Trace(np.empty(BLOCK_TICKS, np.float32), *rooms)
 
 
 def empty_reports() -> Reports:
@@ -182,7 +149,7 @@ def empty_reports() -> Reports:
 
 def empty_rows() -> Array:
     """Return room for two of the longest sequences."""
-    return np.zeros((2, SEQUENCE_ROWS, len(INPUT_NAMES)))
+    return np.zeros((2, SEQUENCE_ROWS, N_U))
 
 
 def record(kind: Any) -> Any:  # noqa: ANN401 numpy's types of records

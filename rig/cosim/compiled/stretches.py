@@ -5,13 +5,16 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from coldloop.process.load_profile import LOAD_SPAN, LoadProfile
+from coldloop.process.loaded import PROCESS
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from control_plc.program import ControlProgram
+from control_plc.sensors import IS_CONTROLLED
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.solvers import KernelSolver
-from plant.cold_box.program import ColdBoxProgram
-from rig.cosim.compiled import control, loops, plants
+from plant.program import PlantProgram
+from rig.cosim.compiled import control, loops
+from rig.cosim.compiled.plants import CompiledPlant
 from rig.cosim.compiled.records import BLOCK_TICKS, Optimizer, PlantState, Reports, World, empty_reports, empty_trace
 from rig.results.recorded import NO_STATION, STATION_COLUMNS, SampleBlock
 
@@ -30,24 +33,32 @@ class CompiledStretches:
     """Runs the programs of one session ahead while nothing unusual happens.
 
     Args:
-        plant: Of either kind.
+        plant: The plant.
+        compiled: The same for the loop.
         control: The control PLC.
         optimizer: The optimiser, in its session.
         load: What the plant's load follows.
     """
 
     def __init__(
-        self, plant: ColdBoxProgram, control_plc: ControlProgram, optimizer_plc: OptimizerProgram, load: LoadProfile
-    ) -> None:  # fmt: skip
-        self._plant, self._control, self._optimizer = plant, control_plc, optimizer_plc
+        self,
+        plant: PlantProgram,
+        compiled: CompiledPlant,
+        control_plc: ControlProgram,
+        optimizer_plc: OptimizerProgram,
+        load: LoadProfile,
+    ) -> None:
+        self._plant, self._compiled, self._control, self._optimizer = plant, compiled, control_plc, optimizer_plc
         self._is_compiled = _is_compiled(optimizer_plc)
         self._trace, self._reports = empty_trace(STATION_COLUMNS if plant.station else 0), empty_reports()
         self._pause_until = 0
         sensors = control_plc.sensors
         self._world = World(
-            plants.constants_of(plant), plant.biases, plant.deviations, np.array(load.times), np.array(load.watts),
+            compiled.constants, plant.biases, plant.deviations, np.array(load.times), np.array(load.watts),
             control_plc.guard.limits, np.array(sensors.low), np.array(sensors.high), np.array(sensors.least),
-            *LOAD_SPAN, control_plc.watchdog.time, optimizer_plc.settings.interrupting_load_step_w,
+            np.array(IS_CONTROLLED), np.array(sensors.moves), sensors.may_rest, sensors.each_may_rest,
+            sensors.frozen_ticks, *LOAD_SPAN, control_plc.watchdog.time,
+            optimizer_plc.settings.interrupting_load_step_w,
         )  # fmt: skip
 
     def ahead(self, until: int) -> Stretch | None:
@@ -58,11 +69,13 @@ class CompiledStretches:
         whole = self._is_compiled and not answered and _is_ordinary(self._optimizer)
         if not whole and not answered and self._control.player.load_step:
             return None  # the programs deliver at once what a load step may cut off
+        if not whole:
+            until = min(until, self._control.player.next_update_tick)
         until = min(until, (self._control.tick // BLOCK_TICKS + 1) * BLOCK_TICKS)
         until = int(min(until, control.due(self._control)))
         ticks = until - self._control.tick
         with self._plant.noise(ticks) as noise:
-            plant = plants.state_of(self._plant, noise, ticks)
+            plant = self._compiled.state(noise, ticks)
             stretch = self._updates_too(plant, until) if whole else self._ticks_alone(plant, until)
         if stretch is None:  # the programs run alone to the next updating instant
             self._pause_until = self._control.player.next_update_tick
@@ -107,7 +120,7 @@ class CompiledStretches:
 
     def _give_back(self, plant: PlantState, s: np.void, guard: np.void) -> SampleBlock:
         """Hand the state of the loop back to plant and control PLC; return the ticks it has run."""
-        plants.restore(self._plant, plant, int(s["tick"]), guard["applied"])
+        self._compiled.restore(plant, int(s["tick"]), guard["applied"])
         control.restore_guard(self._control, guard)
         control.restore_scan(self._control, s, self._trace)
         ticks = int(s["tick"]) - int(s["first"])
@@ -116,10 +129,10 @@ class CompiledStretches:
 
 
 def _is_compiled(program: OptimizerProgram) -> bool:
-    """Tell whether the program's updates have a compiled form: those of a solver, rule and estimator of our own."""
+    """Tell whether the program's updates have a compiled form: solver, rule and estimator of our own, no forecast."""
     if type(program) is not OptimizerProgram:  # who has made another kind of it wants to be asked
         return False
-    return isinstance(program.solver, KernelSolver) and not program.plans_by_steps
+    return isinstance(program.solver, KernelSolver) and not (program.plans_by_steps or PROCESS.forecasts)
 
 
 def _is_ordinary(program: OptimizerProgram) -> bool:

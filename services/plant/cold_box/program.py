@@ -64,10 +64,10 @@ class ColdBoxProgram(PlantProgram):
         """Return the state, its slope, and the inputs and the load that the slope is for."""
         return self._x.copy(), self._slope.copy(), np.array(self._held)
 
-    def take_over(self, tick: int, x: RealArray, slope: RealArray, held: RealArray, y: RealArray) -> None:
-        """Resume at another tick with what `between_ticks` and `measure` would return there."""
-        self.tick, self._x, self._slope, self._u = tick, x.copy(), slope.copy(), held[:3].copy()
-        self._held, self._measured = tuple(held.tolist()), tuple(y.tolist())
+    def take_over_slope(self, tick: int, x: RealArray, slope: RealArray, held: RealArray, y: RealArray) -> None:
+        """Go on from another tick with what `between_ticks` and `measure` would return there."""
+        self.take_over(tick, x, held[:3], y)
+        self._slope, self._held = slope.copy(), tuple(held.tolist())
 
     @property
     def model_range(self) -> int:

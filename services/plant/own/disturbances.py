@@ -33,6 +33,10 @@ class Disturbances:
         """Return what they are from `tick` to the next, shape (k,)."""
         return np.array([course.value(tick) for course in self.courses])
 
+    def ahead(self, tick: int, ticks: int) -> RealArray:
+        """Return what they are at `ticks` ticks from `tick` on, and at the one behind them, shape (ticks + 1, k)."""
+        return np.array([[each.value(tick + later) for each in self.courses] for later in range(ticks + 1)])
+
     def shown(self, tick: int) -> RealArray:
         """Return those that are measured."""
         return np.array([course.value(tick) for course, seen in zip(self.courses, self.measured, strict=True) if seen])
@@ -50,13 +54,13 @@ class DisturbedPlant(PlantProgram):
     """
 
     def __init__(self, disturbances: Disturbances, **arguments: Any) -> None:  # noqa: ANN401 of the base
-        self._disturbances = disturbances
+        self.disturbances = disturbances
         super().__init__(**arguments)
 
     @property
     def _own(self) -> RealArray:
         """States without the disturbances."""
-        return self._x[: len(self._x) - len(self._disturbances.courses)]
+        return self._x[: len(self._x) - len(self.disturbances.courses)]
 
     def _own_outputs(self, w: RealArray) -> RealArray:
         """Return the outputs without the disturbances; `w` is load and disturbances."""
@@ -67,12 +71,12 @@ class DisturbedPlant(PlantProgram):
         raise NotImplementedError
 
     def _outside(self, w: float) -> RealArray:
-        return np.append(w, self._disturbances.at(self.tick))
+        return np.append(w, self.disturbances.at(self.tick))
 
     def _read(self, w: float) -> RealArray:
-        return np.append(self._own_outputs(self._outside(w)), self._disturbances.shown(self.tick))
+        return np.append(self._own_outputs(self._outside(w)), self.disturbances.shown(self.tick))
 
     def _step(self, w: float) -> tuple[RealArray, RealArray]:
         x, y = self._own_step(self._outside(w))
-        met, next_tick = self._disturbances, self.tick + 1
+        met, next_tick = self.disturbances, self.tick + 1
         return np.append(x, met.at(next_tick)), np.append(y, met.shown(next_tick))

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import ModelFileError
+from coldloop.kernels.first_use import kernels_of
+from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import ModelHeader
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
@@ -78,16 +80,18 @@ def own_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlan
         lags = lags_of(header.plant_parameters["lags"])
 
         def make(load: HeatLoad, seed: int) -> PlantProgram:
-            return TransferFunctionPlant(
-                lags, y0=header.y0, u0=header.u0, w0=w0, load=load, disturbances=disturbances,
-                noise=noise_of_seed(seed),
-            )  # fmt: skip
+            with kernels_of(f"the {PROCESS.name}", about_s=3):
+                return TransferFunctionPlant(
+                    lags, y0=header.y0, u0=header.u0, w0=w0, load=load, disturbances=disturbances,
+                    noise=noise_of_seed(seed),
+                )  # fmt: skip
 
     else:
         model = load_model(header.file)
 
         def make(load: HeatLoad, seed: int) -> PlantProgram:
-            return LinearPlant(model, load, noise_of_seed(seed), disturbances)
+            with kernels_of(f"the {PROCESS.name}", about_s=3):
+                return LinearPlant(model, load, noise_of_seed(seed), disturbances)
 
     return make
 

@@ -4,12 +4,13 @@ Dead times are whole ticks here, exactly; the prediction model approximates them
 hides its states.
 """
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from coldloop.kernels.compiled import kernel
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICK_S
 from plant.numeric import RealArray
@@ -30,6 +31,56 @@ class Lag(NamedTuple):
 def lags_of(documents: Sequence[Mapping[str, Any]]) -> tuple[Lag, ...]:
     """Return the lags of a model file."""
     return tuple(Lag(**document) for document in documents)
+
+
+class LagTable(NamedTuple):
+    """The lags side by side."""
+
+    places: NDArray[np.int64]
+    """Outputs that they move."""
+    sources: NDArray[np.int64]
+    """What they follow: inputs, then load and disturbances."""
+    delays: NDArray[np.int64]
+    """Ticks."""
+    decay: RealArray
+    """Of what each has reached, in a tick."""
+    gain: RealArray
+    about: RealArray
+    """Inputs, load and disturbances at the operating point."""
+    y0: RealArray
+    """Outputs there."""
+    measured: NDArray[np.int64]
+    """Disturbances that are outputs, the last ones."""
+
+
+class LagMemory(NamedTuple):
+    """What a tick changes."""
+
+    response: RealArray
+    """Of each lag."""
+    under_way: RealArray
+    """What each source was in the ticks of the longest dead time and now, in turn; shape (sources, ticks)."""
+
+
+@kernel
+def advance_lags(c: LagTable, m: LagMemory, tick: int, u: RealArray, w: RealArray, y: RealArray) -> None:
+    """Go one tick forward from `tick` with u and w held; y are the outputs then, without disturbances."""
+    ticks = m.under_way.shape[1]
+    for i in range(c.about.shape[0]):
+        m.under_way[i, tick % ticks] = (u[i] if i < u.shape[0] else w[i - u.shape[0]]) - c.about[i]
+    for k in range(c.decay.shape[0]):
+        arriving = m.under_way[c.sources[k], (tick - c.delays[k]) % ticks]
+        m.response[k] = c.decay[k] * m.response[k] + (1.0 - c.decay[k]) * c.gain[k] * arriving
+    read_lags(c, m, y)
+
+
+@kernel
+def read_lags(c: LagTable, m: LagMemory, y: RealArray) -> None:
+    """Write the outputs without disturbances."""
+    for i in range(y.shape[0]):
+        y[i] = c.y0[i]
+    for k in range(c.places.shape[0]):
+        y[c.places[k]] += m.response[k]
 
 
 class TransferFunctionPlant(DisturbedPlant):
@@ -56,40 +107,44 @@ class TransferFunctionPlant(DisturbedPlant):
         disturbances: Disturbances = NO_DISTURBANCES,
         noise: MeasurementNoise | None = None,
     ) -> None:
-        self._y0, self._about = np.array(y0), np.array([*u0, *w0])
-        self._places = [OUTPUT_NAMES.index(lag.output) for lag in lags]
         count = len(disturbances.courses)
         sources = (*INPUT_NAMES, PROCESS.load.name, *STATE_NAMES[len(STATE_NAMES) - count :])
-        self._sources = [sources.index(lag.source) for lag in lags]
-        self._decay = np.exp([-TICK_S / lag.time_constant_s for lag in lags])
-        self._gain = np.array([lag.gain for lag in lags])
-        self._response = np.zeros(len(lags))
-        self._under_way = [deque([0.0] * round(lag.delay_s / TICK_S)) for lag in lags]
+        delays = [round(lag.delay_s / TICK_S) for lag in lags]
+        self.constants = LagTable(
+            places=np.array([OUTPUT_NAMES.index(lag.output) for lag in lags]),
+            sources=np.array([sources.index(lag.source) for lag in lags]),
+            delays=np.array(delays),
+            decay=np.exp([-TICK_S / lag.time_constant_s for lag in lags]),
+            gain=np.array([lag.gain for lag in lags]),
+            about=np.array([*u0, *w0]),
+            y0=np.array(y0),
+            measured=np.flatnonzero(disturbances.measured),
+        )
+        self.memory = LagMemory(np.zeros(len(lags)), np.zeros((len(sources), max(delays) + 1)))
         x0 = [*[0.0] * (len(STATE_NAMES) - count), *w0[1:]]
         super().__init__(disturbances, x0=x0, u0=u0, load=load, noise=noise)
 
     def _warm_up(self) -> None:
-        """Do nothing: a tick would move what is under way."""
+        memory, self.memory = self.memory, LagMemory(*(part.copy() for part in self.memory))
+        super()._warm_up()
+        self.memory = memory
+
+    def _room(self) -> RealArray:
+        return np.empty(len(OUTPUT_NAMES) - sum(self.disturbances.measured))
 
     def _own_outputs(self, w: RealArray) -> RealArray:  # noqa: ARG002 nothing acts at once
-        y = self._y0[: len(self._y0) - sum(self._disturbances.measured)].copy()
-        for place, response in zip(self._places, self._response, strict=True):
-            y[place] += response
+        y = self._room()
+        read_lags(self.constants, self.memory, y)
         return y
 
     def _own_step(self, w: RealArray) -> tuple[RealArray, RealArray]:
-        moved = np.append(self._u, w) - self._about
-        arriving = np.empty(len(self._response))
-        for k, (source, under_way) in enumerate(zip(self._sources, self._under_way, strict=True)):
-            under_way.append(moved[source])
-            arriving[k] = under_way.popleft()
-        self._response = self._decay * self._response + (1.0 - self._decay) * self._gain * arriving
-        return self._own, self._own_outputs(w)
+        y = self._room()
+        advance_lags(self.constants, self.memory, self.tick, self._u, w, y)
+        return self._own, y
 
     def retained(self) -> dict[str, Any]:
         """Return what `resume` needs, as plain data."""
-        own = {"response": self._response.tolist(), "under_way": [list(each) for each in self._under_way]}
-        return {**super().retained(), "own": own}
+        return {**super().retained(), "own": {name: part.tolist() for name, part in self.memory._asdict().items()}}
 
     def resume(
         self,
@@ -101,8 +156,8 @@ class TransferFunctionPlant(DisturbedPlant):
         own: Mapping[str, Any] | None = None,
     ) -> None:
         """Resume from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
-        if own is None or len(own["under_way"]) != len(self._under_way):
+        kept = LagMemory(**{name: np.array((own or {})[name], dtype=np.float64) for name in LagMemory._fields})
+        if any(part.shape != ours.shape for part, ours in zip(kept, self.memory, strict=True)):
             raise ValueError("the retained state is that of another plant")
         super().resume(tick, x, u, y, noise_state)
-        self._response = np.array(own["response"], dtype=np.float64)
-        self._under_way = [deque(map(float, each)) for each in own["under_way"]]
+        self.memory = kept

@@ -186,8 +186,8 @@ class RefrigeratorProgram(ColdBoxProgram):
 
     def take_over_whole(self, tick: int, u: RealArray, memory: RefrigeratorMemory, y: RealArray) -> None:
         """Resume at another tick with what `memory` and `measure` would return there; `u` was held up to it."""
-        self.tick, self._u, self._memory = tick, u.copy(), memory
-        self._x, self._measured = memory.x[:BOX_STATES], tuple(y.tolist())
+        self.take_over(tick, memory.x[:BOX_STATES], u, y)
+        self._memory = memory
 
     def resume(
         self,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, TICK_S
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, P1, TICK_S, V1
 from plant.components.passes import COLUMNS
 from plant.helium.properties import Helium, helium_of
 from plant.numeric import RealArray
@@ -49,7 +49,6 @@ from plant.refrigerator.station_law import (
 HP, LP, BUFFER, NITROGEN, LOST = (SIGNAL_NAMES.index(name) for name in ("P12", "P11", "P13", "L_N2", "lost"))
 TO_BOX, COMPRESSED = SIGNAL_NAMES.index("M12"), SIGNAL_NAMES.index("M_NC")
 CV956, CV952, CV953 = (STATE_NAMES.index(name) for name in ("CV956", "CV952", "CV953"))
-P1, V1 = OUTPUT_NAMES.index("P1"), OUTPUT_NAMES.index("V1")
 BLOCKED_SHARES: Final = len(INPUT_NAMES) + len(DISTURBANCE_NAMES)
 ACTED: Final = BLOCKED_SHARES + ACTING - BLOCKED
 MODE: Final = 0

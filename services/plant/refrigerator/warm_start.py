@@ -16,7 +16,6 @@ from plant.helium.properties import Helium, saturation, vapour_enthalpy_and_cp
 from plant.numeric import RealArray
 from plant.refrigerator.physics import BOX_STATES, STATE_NAMES, STATION, Refrigerator, high_pressure_mass, inventory
 
-FIRST_CELL: Final = STATE_NAMES.index("T_nef1_1")
 COIL, M_LOST = STATE_NAMES.index("T_nef5"), STATE_NAMES.index("M_lost")
 TRIALS: Final = 20
 
@@ -39,7 +38,7 @@ def warm_state(
     h, _ = vapour_enthalpy_and_cp(low_pressure, ambient, saturated.T, helium.vapour)
     x = np.zeros(len(STATE_NAMES))
     x[0], x[1] = low_pressure, (saturated.h_v - h) / SUPERHEAT * bath.volume
-    x[FIRST_CELL:BOX_STATES] = x[BOX_STATES : COIL + 1] = ambient
+    x[STATE_NAMES.index("T_nef1_1") : BOX_STATES] = x[BOX_STATES : COIL + 1] = ambient
     lp_line = gas_mass(station.lp, low_pressure, ambient)
     elsewhere = total - lp_line - content(bath, x[0], x[1], helium).mass
     pressure = low_pressure

@@ -42,8 +42,9 @@ COMPILED_PACKAGES = ("plant", "optimizer_plc")
 COMPILED_MODULES = (
     "coldloop.kernels.borrowing", "coldloop.kernels.compiled", "coldloop.kernels.single_precision",
     "coldloop.process.cold_box", "coldloop.process.signals", "control_plc.output_limits",
-    "control_plc.sensors", "rig.cosim.compiled.loops",
-    "rig.cosim.compiled.plants", "rig.cosim.compiled.portable", "rig.cosim.compiled.records",
+    "control_plc.sensors", "rig.cosim.compiled.cold_box_plants", "rig.cosim.compiled.loops",
+    "rig.cosim.compiled.own_plants", "rig.cosim.compiled.plants", "rig.cosim.compiled.portable",
+    "rig.cosim.compiled.records",
 )  # fmt: skip
 """What kernels call from other packages."""
 

@@ -37,7 +37,9 @@ CONTROLLED: Final = tuple(OUTPUT_NAMES.index(one.name) for one in PROCESS.banded
 """Outputs that have a band: L1 and T5 of the cold box."""
 
 
-L1, T1, T2, T5 = map(OUTPUT_NAMES.index, ("L1", "T1", "T2", "T5")) if PROCESS.has_bath else (0, 0, 0, 0)
+L1, V1, T1, T2, T5, P1 = (
+    map(OUTPUT_NAMES.index, ("L1", "V1", "T1", "T2", "T5", "P1")) if PROCESS.has_bath else (0, 0, 0, 0, 0, 0)
+)
 """Outputs of a plant with a bath: for what there is nowhere else."""
 
 STATION_VALVE_NAMES: Final = ("CV956", "CV952", "CV953", "CV167")
