@@ -144,7 +144,7 @@ CASES: Final = {
     "column, load steps that interrupt": Case("column", (STEPS, LONG)),
     "column, single precision": Case("column", (f'{PROGRAM}arithmetic="float32"',)),
     "column, a borrowed solver": Case("column", (f'{PROGRAM}solver="osqp"', LONG), updates=0),
-    "column, frozen sensors": Case("column", ("control_plc.sensors.frozen_s=6",), ticks=0, updates=0),
+    "column, frozen sensors": Case("column", ("control_plc.sensors.frozen_s=24",), events=ALARMS | {"SENSOR"}),
     "small, noise": Case("small", (NOISE,), "0:0"),
     "small, at rest": Case("small", (), "0:0", ticks=0, updates=0),
     "large, alarms of several outputs": Case("large", events=ALARMS),
