@@ -70,6 +70,9 @@ class Constants(NamedTuple):
     """Of what the model holds, W."""
     approach: float
     """T2 - T1 at which CV155 is opened no further, K; infinite is any."""
+    t1: int
+    t2: int
+    """Which outputs these are: kernels are shared by processes, and have none of theirs in them."""
     opening_per_k: float
     opening_from: float
     """A deviation, %."""
@@ -111,6 +114,8 @@ def constants_of(
         largest_load=real(settings.holdable_load_w[1] - estimator.w0),
         reserve=real(settings.capacity_reserve_w),
         approach=real(settings.cold_end.approach_k or np.inf),
+        t1=T1,
+        t2=T2,
         opening_per_k=real(settings.cold_end.opening_per_k),
         opening_from=real(settings.cold_end.opening_from - estimator.u0[CV155]),
         load_step=real(settings.interrupting_load_step_w), sequence_ticks=settings.sequence_ticks,
@@ -274,7 +279,7 @@ def most_open(c: Constants, u: Array, y: Array) -> float:
     """Return how far CV155 may be opened, a scaled deviation, by the inputs (3,), deviations, and the outputs (22,)."""
     if np.isinf(c.approach):
         return c.approach
-    approach = y[T2] - y[T1]
+    approach = y[c.t2] - y[c.t1]
     if math.isnan(approach):
         approach = y.dtype.type(0.0)
     limit: float = max(u[CV155] + c.opening_per_k * (c.approach - approach), c.opening_from) / c.input_scale[CV155]

@@ -8,6 +8,7 @@ import json
 import sys
 from types import FunctionType
 
+import numpy as np
 from numba.core.dispatcher import Dispatcher
 
 import rig.cosim.compiled.cold_box_plants
@@ -28,7 +29,9 @@ def kernels() -> set[FunctionType]:
 def constants(function: FunctionType) -> dict[str, str]:
     """Return what a function reads of its module."""
     read = {name: function.__globals__.get(name) for name in function.__code__.co_names}
-    return {name: repr(value) for name, value in read.items() if isinstance(value, int | float | tuple | list)}
+    return {
+        name: repr(value) for name, value in read.items() if isinstance(value, int | float | tuple | list | np.ndarray)
+    }
 
 
 if __name__ == "__main__":

@@ -198,10 +198,10 @@ def test_kernels_that_processes_share_have_nothing_of_one_of_them_in_them(proces
     shared = {each for each in cold_box.keys() & other.keys() if not each.startswith(alone)}
     differing = {(each, name) for each in shared for name in other[each] if cold_box[each][name] != other[each][name]}
     assert len(shared) > 100
-    assert {each for each, _ in differing if each.startswith("optimizer_plc")} == {"optimizer_plc.scheme.most_open"}
+    assert not {each for each, _ in differing if each.startswith("optimizer_plc")}
     assert {name for each, name in differing if each.startswith("control_plc")} <= {
         "N_INPUTS", "TICKS_PER_SAMPLE", "FEW", "FIRST_OF_KIND", "P1",
     }  # fmt: skip
     assert {each.rpartition(".")[0] for each, _ in differing} == {
-        "control_plc.output_limits", "control_plc.sensors", "optimizer_plc.scheme",
+        "control_plc.output_limits", "control_plc.sensors",
     }  # fmt: skip
