@@ -81,6 +81,11 @@ class Constants:
             room -= size
         yield section("VAR_GLOBAL CONSTANT", listed)
 
+    def configuration(self, *more: str) -> str:
+        """Return the configuration with these lists, more of them, and room for the verdict of the self-test."""
+        verdict = section("VAR_GLOBAL", {VERDICT: self.printer.array_type("DINT", LENGTH)})
+        return configuration(iter([*self.lists(), *more, verdict]))
+
     def sum(self) -> int:
         """Return the sum over all of them that the self-test computes."""
         double = not self.printer.single
@@ -91,7 +96,6 @@ class Constants:
 
     def summed(self) -> dict[str, str]:
         """Return the parts of a self-test that sum them up: declarations, lengths, a case for each constant."""
-        self.printer.array_type("DINT", LENGTH)
         lengths = self._weighed(1 if self.printer.single else PARTS, 1)
         self.printer.array_type("DINT", len(lengths))
         declared = self.declared()
@@ -119,9 +123,8 @@ class Constants:
 
 def configuration(lists: Iterator[str]) -> str:
     """Return a configuration with these lists of variables, and one task that runs `cl_main`."""
-    verdict = section("VAR_GLOBAL", {VERDICT: f"cl_dints_{LENGTH}"})
     return f"""CONFIGURATION cl_configuration
-{"".join(lists)}{verdict}RESOURCE cl_resource ON PLC
+{"".join(lists)}RESOURCE cl_resource ON PLC
     TASK cl_task(INTERVAL := T#250ms, PRIORITY := 1);
     PROGRAM cl_program WITH cl_task : cl_main;
 END_RESOURCE

@@ -11,7 +11,7 @@ from control_plc.output_limits import beginning
 from rig.plc_export.kernels.golden_calls import GoldenCall, tables_of
 from rig.plc_export.kernels.guard_program import GuardKernels
 from rig.plc_export.kernels.ode_program import leaves
-from rig.plc_export.structured_text.constants import Constants, configuration, types_in
+from rig.plc_export.structured_text.constants import Constants, types_in
 from rig.plc_export.structured_text.lowering import VALUE, Lowering
 from rig.plc_export.structured_text.optimizer_files import state_types
 from rig.plc_export.structured_text.places import Record
@@ -129,4 +129,4 @@ class GuardText:
 
     def _configuration(self) -> str:
         state = section("VAR_GLOBAL", {global_name(path): self.printer.type(kind) for path, kind in self.state.items()})
-        return configuration(iter([*self.constants.lists(), state]))
+        return self.constants.configuration(state)

@@ -19,7 +19,6 @@ from rig.plc_export.kernels.recorded_updates import GoldenUpdate, integers_of, r
 from rig.plc_export.structured_text.constants import (
     LARGEST_LIST,
     Constants,
-    configuration,
     in_pieces,
     scalar_of,
     sum_of,
@@ -145,7 +144,7 @@ class OptimizerText:
 
     def _configuration(self) -> str:
         state = section("VAR_GLOBAL", {global_name(path): self.printer.type(kind) for path, kind in self.state.items()})
-        return configuration(iter([*self.constants.lists(), state]))
+        return self.constants.configuration(state)
 
     # -- golden updates and self-test ----------------------------------------------------------------------------------
 

@@ -11,7 +11,6 @@ from rig.plc_export.kernels.ode_program import PER_PROBLEM, OdeProgram
 from rig.plc_export.kernels.recorded_problems import GoldenVector, answered, arrays_in
 from rig.plc_export.structured_text.constants import (
     Constants,
-    configuration,
     scalar_of,
     sum_of,
     summing,
@@ -93,7 +92,7 @@ class StructuredTextExport:
         """Return the texts of the files by their names, in the order in which they are loaded."""
         golden = "\n".join(self._golden(number, each) for number, each in enumerate(self.vectors))
         test = self._self_test()
-        functions, lists = template("structured_text/functions.st"), configuration(self.constants.lists())
+        functions, lists = template("structured_text/functions.st"), self.constants.configuration()
         texts = {"types.st": self.printer.types(), "functions.st": functions, "kernels.st": self.kernels,
                  "golden.st": golden, "self_test.st": test, "configuration.st": lists}  # fmt: skip
         return {name: GENERATED + text for name, text in texts.items()}
