@@ -146,7 +146,7 @@ CASES: Final = {
     "column, a borrowed solver": Case("column", (f'{PROGRAM}solver="osqp"', LONG), updates=0),
     "column, frozen sensors": Case("column", ("control_plc.sensors.frozen_s=24",), events=ALARMS | {"SENSOR"}),
     "small, noise": Case("small", (NOISE,), "0:0"),
-    "small, at rest": Case("small", (), "0:0", ticks=0, updates=0),
+    "small, at rest": Case("small", (), "0:0"),
     "large, alarms of several outputs": Case("large", events=ALARMS),
     "matrices": Case("matrices"),
     "matrices, noise, load steps that interrupt": Case("matrices", (NOISE, STEPS)),

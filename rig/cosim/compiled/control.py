@@ -27,7 +27,6 @@ def is_ordinary(program: ControlProgram) -> bool:
         and program.optimizer_present
         and program.player.is_ordinary(program.tick)
         and not program.sensors.bad
-        and program.sensors.image.count + 1 < program.sensors.frozen_ticks
         and not program.guard.state.out_of_bounds
         and program.alarms.are_quiet
         and program.alarms.reported(AlarmKind.CAPACITY) == CapacityCause.of(program.shortage)

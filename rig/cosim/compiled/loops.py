@@ -13,7 +13,7 @@ import rig.cosim.compiled.portable  # noqa: F401 it lets kernels call what is pl
 from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
 from coldloop.registers.plant import MAX_STATE
-from control_plc.output_limits import N_INPUTS, admit, in_range, judge
+from control_plc.output_limits import N_INPUTS, admit, copy_state, in_range, judge
 from control_plc.sensors import are_inside, count_unchanged, have_moved, is_frozen, is_to_move, note_moves
 from optimizer_plc import scheme
 from optimizer_plc.scheme import BY_THE_RULE
@@ -49,7 +49,6 @@ def look(w: World, alarms: Alarms, s: Any, plant: PlantState, trace: Trace) -> b
     if same:
         for i in range(x.shape[0]):
             same = same and x[i] == (trace.x[row - 1, i] if row > 0 else s.seen_x[i])
-        frozen = frozen or (same and s.image_count + 1 >= w.frozen_ticks)
     s.same = same
     changes = is_due(alarms, 0, s.since[0], s.tick, y) or is_due(alarms, 1, s.since[1], s.tick, y)
     return known and not (interrupted or frozen or changes) and are_inside(y, w.low, w.high)
@@ -79,6 +78,19 @@ def pending(alarms: Alarms, kind: int, since: int, tick: int, y: Array) -> int:
     if (cause_of(alarms, kind, y) == NOT) == (alarms.causes[kind] == NOT):
         return NOT
     return tick if since == NOT else since
+
+
+@kernel
+def is_old_image(w: World, s: Any, guard: Any, twin: Any, wanted: Array, begins: bool) -> bool:  # noqa: ANN401, FBT001
+    """Return whether the image that `look` has seen is one that the sensor check no longer believes.
+
+    It has been unchanged for long although the inputs have moved, with those of this tick, where `wanted` is asked for.
+    """
+    if not s.same or s.image_count + 1 < w.frozen_ticks:
+        return False
+    copy_state(guard, twin, w.limits)
+    admit(twin, w.limits, s.tick, wanted, begins)
+    return s.image_moved or have_moved(twin.applied, s.image_inputs, w.moves)
 
 
 @kernel
@@ -121,11 +133,14 @@ def play(
 ) -> int:  # fmt: skip
     """Play the sequence up to the next updating instant; return DONE at the tick `until`, UNUSUAL or UPDATE."""
     w, alarms, rows, plant, trace = borrowed(w), borrowed(alarms), borrowed(rows), borrowed(plant), borrowed(trace)
-    s, guard = scans[0], guards[0]
+    s, guard, twin = scans[0], guards[0], guards[1]
     while s.tick < until:
+        place = s.tick - s.first_tick
         if s.tick == s.next_update:
             return UPDATE
-        if s.tick - s.first_tick >= s.length or not look(w, alarms, s, plant, trace):
+        if place >= s.length or not look(w, alarms, s, plant, trace):
+            return UNUSUAL
+        if is_old_image(w, s, guard, twin, rows[place], place == 0):
             return UNUSUAL
         scan(w, alarms, s, guard, rows, plant, trace)
     return DONE
@@ -164,11 +179,13 @@ def run_block(
             answered = s.next_update <= until and answer(w, o, s, guard, twin, rows, reports)
             if not answered:
                 break
+        place = 0 if instant else tick - s.first_tick
+        ended = not instant and place >= s.length
+        if ended or is_old_image(w, s, guard, twin, rows[int(instant), place], place == 0):
+            break
         if instant:
             begin_sequence(s, rows, o.memory)
             answered = False
-        if tick - s.first_tick >= s.length:
-            break
         u_before[:] = guard.applied
         scan(w, alarms, s, guard, rows[0], plant, trace)
         outcome = DONE
