@@ -100,7 +100,7 @@ def note_image(w: World, s: Any, u: Array) -> None:  # noqa: ANN401
         s.image_count += 1
         s.image_moved = s.image_moved or have_moved(u, s.image_inputs, w.moves)
     else:
-        for i in range(u.shape[0]):
+        for i in range(u.shape[0]):  # a slice would be more machine code to load
             s.image_inputs[i] = u[i]
         s.image_count, s.image_moved = 0, not w.may_rest
 
