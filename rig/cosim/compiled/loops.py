@@ -11,7 +11,7 @@ import numpy as np
 
 import rig.cosim.compiled.portable  # noqa: F401 it lets kernels call what is plain Python
 from coldloop.kernels.borrowing import borrowed
-from coldloop.kernels.compiled import kernel
+from coldloop.kernels.compiled import inlined, kernel
 from coldloop.registers.plant import MAX_STATE
 from control_plc.output_limits import N_INPUTS, admit, copy_state, in_range, judge
 from control_plc.sensors import are_inside, count_unchanged, have_moved, is_frozen, is_to_move, note_moves
@@ -27,7 +27,7 @@ UPDATE: Final = 2
 """An updating instant, which the caller does itself."""
 
 
-@kernel
+@inlined
 def look(w: World, alarms: Alarms, s: Any, plant: PlantState, trace: Trace) -> bool:  # noqa: ANN401 a record
     """Write load, outputs and state of the present tick into the trace; return whether the tick is an ordinary one."""
     row = s.tick - s.first
@@ -105,7 +105,7 @@ def note_image(w: World, s: Any, u: Array) -> None:  # noqa: ANN401
         s.image_count, s.image_moved = 0, not w.may_rest
 
 
-@kernel
+@inlined
 def scan(
     w: World, alarms: Alarms, s: Any, guard: Any, rows: Array, plant: PlantState, trace: Trace  # noqa: ANN401 records
 ) -> None:  # fmt: skip

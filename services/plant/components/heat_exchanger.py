@@ -114,11 +114,13 @@ def exchange(
         T_low, h_next, cp_low = take_up(
             LowPressureFlow(sweeping, low.P, T_low, h_low), cp_low, drive, UA, sat, helium.vapour
         )
-        given[i] = low.mass_flow * (h_next - h_low)
+        heat = low.mass_flow * (h_next - h_low)
         h_low = h_next
         if is_supply_held:
             h_before, rho_cp_before, c_wall_before = supply_cell(high.P, T_before, helium)
             capacity = (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells
-            given[i] = (high.mass_flow * (h_before - h_cell) - given[i]) / capacity
+            given[i] = (high.mass_flow * (h_before - h_cell) - heat) / capacity
             h_cell, rho_cp, c_wall = h_before, rho_cp_before, c_wall_before
+        else:
+            given[i] = heat
     return LowPressureFlow(low.mass_flow, low.P, T_low, h_low)
