@@ -231,9 +231,10 @@ def write_rows(c: Constants, z: Array, ticks: int, rows: NDArray[np.float32]) ->
     samples = (length + per_sample - 1) // per_sample
     inputs = np.empty((rows.shape[0] // per_sample, rows.shape[1]), z.dtype)
     write_inputs(c.weights, z, c.input_scale, c.estimator.u0, c.rate, samples, inputs)
-    for tick in range(length):
-        for i in range(inputs.shape[1]):
-            rows[tick, i] = inputs[tick // per_sample, i]
+    for sample in range(samples):
+        for tick in range(sample * per_sample, min((sample + 1) * per_sample, length)):
+            for i in range(inputs.shape[1]):
+                rows[tick, i] = inputs[sample, i]
     return length
 
 

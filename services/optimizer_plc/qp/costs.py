@@ -194,10 +194,11 @@ def violation_cost(outputs: Array, through_w: Array, w: float, bands: Array) -> 
     """
     zero, count = outputs.dtype.type(0.0), bands.shape[1]
     total = zero
-    for i in range(outputs.shape[0]):
-        y, band = outputs[i] + through_w[i] * w, i % count
-        miss = max(y - bands[1, band], zero) + max(bands[0, band] - y, zero)
-        total += bands[2, band] * miss * miss
+    for first in range(0, outputs.shape[0], count):
+        for band in range(count):
+            y = outputs[first + band] + through_w[first + band] * w
+            miss = max(y - bands[1, band], zero) + max(bands[0, band] - y, zero)
+            total += bands[2, band] * miss * miss
     return total
 
 
