@@ -43,6 +43,8 @@ class Left(NamedTuple):
     trace: str
     updates: list[Any]
     events: list[Any]
+    sensors: list[Any]
+    """What the control PLC's check of sensors goes on with."""
     late: int
     """Kernels that were compiled after its beginning."""
 
@@ -52,11 +54,14 @@ def left_by(settings: Settings, load: LoadProfile, ticks: int, *, compiled: bool
     sink = MemorySink()
     recorder = FirstTick(ticks, [sink])
     period_s = settings.optimizer_plc.program.updating_period_s
-    one_process.OneProcessRig(settings, compiled=compiled).run(Scenario(ticks, load, period_s, seed=3), recorder)
+    rig = one_process.OneProcessRig(settings, compiled=compiled)
+    rig.run(Scenario(ticks, load, period_s, seed=3), recorder)
     recorder.close()
     recording = sink.recording(recorder.link)
     events = [(service, event.tick, event.kind, event.subject, event.cause) for service, event in sink.events]
-    return Left(recording.trace_sha256, recording.updates, events, compiled_kernels() - recorder.before)
+    sensors = rig.control.sensors
+    history = [sensors.unchanged, sensors.rests, sensors.inputs, sensors.inputs_moved, vars(sensors.image)]
+    return Left(recording.trace_sha256, recording.updates, events, history, compiled_kernels() - recorder.before)
 
 
 def main(ticks: str, steps: str, assignments: Sequence[str]) -> None:

@@ -183,7 +183,7 @@ def printed(module: str, model: Path | None, *words: str) -> Any:  # noqa: ANN40
 def test_compiled_loops_leave_what_the_programs_leave(name: str, processes: Processes, tmp_path: Path) -> None:
     case = CASES[name]
     left = printed("both_ways", model_of(case.process, tmp_path, processes), "1500", case.load, *case.assignments)
-    assert left["same"] == [True, True, True], "trace, updates, events"
+    assert left["same"] == [True] * 4, "trace, updates, events, sensors"
     assert left["late"] == 0, "kernels that were compiled in the session of the programs"
     assert left["ticks"] >= case.ticks
     assert left["updates"] >= case.updates * left["all_updates"]
