@@ -43,8 +43,10 @@ def _rest(made: Made) -> list[str]:
     m, process = made.model, made.process
     load = "" if not m.F.any() and not m.G.any() else f"; load {m.load_name} {m.w0:.5g} {m.load_unit}".rstrip()
     problem = len(process.decision_instants) * (len(process.inputs) + 2 * len(process.bands))
+    named = ((m.input_names, "input"), (m.output_names, "output"), (m.state_names, "state"))
+    counted = ", ".join(f"{len(names)} {noun}{'s' * (len(names) != 1)}" for names, noun in named)
     sizes = (
-        f"{process.name}: {len(m.input_names)} inputs, {len(m.output_names)} outputs, {len(m.state_names)} states; "
+        f"{process.name}: {counted}; "
         f"tick {process.tick_s:g} s, sampling period {process.tick_s * process.ticks_per_sample:g} s, horizon "
         f"{process.decision_instants[-1] * process.tick_s * process.ticks_per_sample:g} s, {problem} variables"
     )

@@ -197,7 +197,7 @@ def test_the_command_prints_it_and_writes_nothing_that_is_half_made(tmp_path: Pa
     made(tmp_path)
     done = coldloop("process", tmp_path / "process.toml", "--out", tmp_path / "model.json")
     assert done.code == 0, done.complaints
-    assert "heater: 1 inputs, 1 outputs, 1 states" in done.out
+    assert "heater: 1 input, 1 output, 1 state; " in done.out
     assert Process.of(made(tmp_path).model.process).inputs[0].name == "power"
     (tmp_path / "process.toml").write_text("name = 3", encoding="utf-8")
     failed = coldloop("process", tmp_path / "process.toml", "--out", tmp_path / "other.json")
