@@ -8,7 +8,8 @@ import argparse
 import math
 from typing import NamedTuple, cast
 
-from coldloop.process.signals import L1, OUTPUT_NAMES, OUTPUT_UNITS, T5, TICK_S
+from coldloop.process.cold_box import L1, T5
+from coldloop.process.signals import OUTPUT_NAMES, OUTPUT_UNITS, TICK_S
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Mode
 from plant.kinds import plant_maker

@@ -6,9 +6,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from coldloop.errors import ModelFileError, printable
+from coldloop.process.cold_box import L1, T5
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel, load
-from coldloop.process.signals import L1, STATION_SIGNAL_NAMES, STATION_VALVE_NAMES, T5
+from coldloop.process.signals import STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
 from optimizer_plc.qp.design import ControlDesign
 from plant.cold_box.capacity import held_loads
 from plant.cold_box.diagnosis import operating_point

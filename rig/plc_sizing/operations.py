@@ -200,7 +200,7 @@ def instance(sizes: PreparationSizes) -> Operations:
 
 
 def target(inputs: int) -> Operations:
-    """Return those of a target: all points of its plane where up to two bounds meet, of the inputs and of T5."""
+    """Return those of a target: all points of its plane where up to two bounds meet, of inputs and outlet."""
     rows = inputs + 1
     bounds, corners = 2 * rows, 2 * rows * (rows - 1)
     judged = 5 * rows + 3

@@ -15,6 +15,7 @@ from pydantic import (
 )
 
 from coldloop.config import load_configuration
+from coldloop.process.declaration import Bath
 
 MOST_SIGNALS: Final = 32
 """Outputs at most: registers have a bit for each."""
@@ -262,6 +263,7 @@ class ProcessFile(_Section):
     disturbances: Annotated[tuple[DisturbanceSection, ...], Field(max_length=MOST_SIGNALS)] = ()
     states: tuple[StateSection, ...] = ()
     """Process noises of states by name; of others 1 % of what they move by with the inputs, a sample."""
+    bath: Bath | None = None
     prediction: PredictionSection = PredictionSection()
     mimic: str | None = None
     """SVG file with a drawing for the operator's page, beside the process file."""

@@ -55,10 +55,13 @@ def made_from(path: Path) -> Made:
     file = with_units(read_process_file(path), path.parent)
     linear = linearised(file, path.parent)
     file = _with_sensors(file)
-    process = replace(
-        _process(file, linear), forecasts=forecasts_of(file, path.parent), mimic=_drawing(file, path.parent)
-    )
+    try:
+        process = _process(file, linear)
+    except ValueError as error:
+        raise UsageError(f"{error}") from error
+    process = replace(process, forecasts=forecasts_of(file, path.parent), mimic=_drawing(file, path.parent))
     _check_room(process)
+    _check_level(process, linear)
     _check_rest(file, linear)
     tick = discretise(linear.A, linear.B, linear.F[:, 0], file.tick_s)
     played = courses_of(file, path.parent)
@@ -105,7 +108,7 @@ def _process(file: ProcessFile, linear: Linearised) -> Process:
         decision_instants=file.prediction.decision_instants,
         constraint_instants=file.prediction.constraint_instants,
         constants=_constants(file, linear),
-        iterations=iteration_shares(_sizes(file, len(linear.states))),
+        iterations=iteration_shares(_sizes(file, len(linear.states))), bath=file.bath,
     )  # fmt: skip
 
 
@@ -210,6 +213,20 @@ def _check_room(process: Process) -> None:
             f"{inputs} inputs, {outputs} outputs and {states} states are too many: {longest} is {words[longest]} "
             f"registers, and one Modbus request carries {REGISTERS_OF_A_REQUEST}"
         )
+
+
+def _check_level(process: Process, linear: Linearised) -> None:
+    """Check that the state that weighs as the level of a bath is seen in it.
+
+    Raises:
+        UsageError: It is not.
+    """
+    bath = process.bath
+    if bath is None or not bath.level_state:
+        return
+    level = [one.name for one in process.outputs].index(bath.level)
+    if not linear.C[level, list(linear.states).index(bath.level_state)]:
+        raise UsageError(f"bath: {bath.level} does not show {bath.level_state}; name the state that is its level")
 
 
 def _check_rest(file: ProcessFile, linear: Linearised) -> None:

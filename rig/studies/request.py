@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
-from coldloop.process.cold_box import COLD_BOX
+from coldloop.process.cold_box import COLD_BOX, L1, T5
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.signals import L1, STATION_SIGNAL_NAMES, T5, TICK_S
+from coldloop.process.signals import STATION_SIGNAL_NAMES, TICK_S
 from optimizer_plc.solvers import make_solver
 from rig.cosim.linear_plant import LinearRig
 from rig.cosim.local_services import run_on_localhost

@@ -1,9 +1,11 @@
-"""The cool-down of a cold box: a sequence of steps from a warm plant to a filled bath.
+"""The cool-down of a plant with a bath: a sequence of steps from a warm plant to a filled bath.
 
-    TURBINE   until T5 is at its set point
+    TURBINE   until the turbine's outlet is at its set point
     BATH      until there is liquid
-    FILLING   until L1 is in its band
-    SETTLING  until L1 and T5 have stayed in their bands for a while
+    FILLING   until the level is in its band
+    SETTLING  until level and outlet have stayed in their bands for a while
+
+The level of the cold box is L1, the turbine's outlet T5.
 
 Pure: measured outputs in, wanted inputs out. How far the turbine may open is its governor's decision.
 """
@@ -14,12 +16,13 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from coldloop.process.limits import InputLimits
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import CONTROLLED, L1, OUTPUT_NAMES, T1, T5, TICK_S
+from coldloop.process.signals import BATH, CONTROLLED, INPUT_NAMES, OUTPUT_NAMES, TICK_S
 from coldloop.registers.control_plc import CoolDownStep, SequenceRow
 
-CV155, HEATER, CV156 = range(3)
-"""Inputs of the cold box."""
+LEVEL, TEMPERATURE, TURBINE_OUTLET = (
+    map(OUTPUT_NAMES.index, (BATH.level, BATH.temperature, BATH.turbine_outlet)) if BATH else (0, 0, 0)
+)
+FEED, HEATER, TURBINE_VALVE = map(INPUT_NAMES.index, BATH.inputs) if BATH else (0, 0, 0)
 
 
 class CoolDownSettings(BaseModel):
@@ -28,22 +31,23 @@ class CoolDownSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     warm_k: Annotated[float, Field(ge=5, le=300)] = 20.0
-    """T1 at the beginning of a session, or after a restart, above which a bath without liquid is cooled down."""
+    """Its temperature at the beginning of a session, or after a restart, above which a bath without liquid is cooled
+    down."""
     liquid_pct: Annotated[float, Field(gt=0, lt=50)] = 1.0
-    """L1 from which on there is liquid, and the bath is filled."""
+    """Level from which on there is liquid, and the bath is filled."""
     settled_s: Annotated[float, Field(ge=0, le=36_000)] = 600.0
-    """How long L1 and T5 have to stay in their bands until the optimiser is invited, plant time."""
+    """How long level and turbine's outlet have to stay in their bands until the optimiser is invited, plant time."""
 
 
 class CoolDown:
-    """The sequence of a session; it begins with the first measurement of a warm cold box, or never, or is under way.
+    """The sequence of a session; it begins with the first measurement of a warm plant, or never, or is under way.
 
     Args:
         settings: Its limits.
         limits: Bounds of the inputs.
         inputs: At the operating point.
         outputs: At the operating point.
-        bands: Of L1 and T5.
+        bands: Of the outputs that have one.
         step: Which it had reached before a restart.
     """
 
@@ -58,7 +62,7 @@ class CoolDown:
     ) -> None:
         self._settings, self._limits = settings, limits
         self._inputs, self._outputs, self._bands = inputs, outputs, bands
-        self._has_begun = step is not CoolDownStep.FINISHED
+        self._has_begun = BATH is None or step is not CoolDownStep.FINISHED
         self._settled_since: int | None = None
         self.step = step
 
@@ -72,15 +76,15 @@ class CoolDown:
         """Outputs whose loops are open."""
         match self.step:
             case CoolDownStep.TURBINE:
-                return L1, T5
+                return LEVEL, TURBINE_OUTLET
             case CoolDownStep.BATH | CoolDownStep.FILLING:
-                return (L1,)
+                return (LEVEL,)
             case _:
                 return ()
 
     @property
     def standing(self) -> Collection[int]:
-        """Outputs that may be constant for long without being frozen: all but L1 and T5 once the bath fills."""
+        """Outputs that may be constant for long without being frozen: all without a band once the bath fills."""
         if not self.is_active:
             return ()
         filling = self.step in (CoolDownStep.FILLING, CoolDownStep.SETTLING)
@@ -94,14 +98,14 @@ class CoolDown:
 
     def _next(self, tick: int, y: Sequence[float]) -> CoolDownStep:
         if not self._has_begun:
-            warm = PROCESS.has_bath and y[T1] > self._settings.warm_k and y[L1] < self._settings.liquid_pct
+            warm = y[TEMPERATURE] > self._settings.warm_k and y[LEVEL] < self._settings.liquid_pct
             return CoolDownStep.TURBINE if warm else CoolDownStep.FINISHED
         match self.step:
-            case CoolDownStep.TURBINE if y[T5] <= self._outputs[T5]:
+            case CoolDownStep.TURBINE if y[TURBINE_OUTLET] <= self._outputs[TURBINE_OUTLET]:
                 return CoolDownStep.BATH
-            case CoolDownStep.BATH if y[L1] >= self._settings.liquid_pct:
+            case CoolDownStep.BATH if y[LEVEL] >= self._settings.liquid_pct:
                 return CoolDownStep.FILLING
-            case CoolDownStep.FILLING if y[L1] >= self._bands[0][0]:
+            case CoolDownStep.FILLING if y[LEVEL] >= self._bands[CONTROLLED.index(LEVEL)][0]:
                 return CoolDownStep.SETTLING
             case CoolDownStep.SETTLING if self._has_settled(tick, y):
                 return CoolDownStep.FINISHED
@@ -117,11 +121,11 @@ class CoolDown:
         """Return the wanted inputs, where the closed loops want `by_loops`; the output guard moves towards them."""
         row = list(by_loops)
         if self.step in (CoolDownStep.TURBINE, CoolDownStep.BATH):
-            row[CV155] = self._limits.high[CV155]
+            row[FEED] = self._limits.high[FEED]
         else:
-            row[CV155] = self._inputs[CV155]
-        if L1 in self.open_loops:
+            row[FEED] = self._inputs[FEED]
+        if LEVEL in self.open_loops:
             row[HEATER] = self._limits.low[HEATER]
-        if T5 in self.open_loops:
-            row[CV156] = self._inputs[CV156]
+        if TURBINE_OUTLET in self.open_loops:
+            row[TURBINE_VALVE] = self._inputs[TURBINE_VALVE]
         return SequenceRow(*row)

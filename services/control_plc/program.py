@@ -229,7 +229,7 @@ class ControlProgram:
 
     @property
     def _usable(self) -> bool:
-        """MPC can work with what is measured: it continues without L1 or T5, and does not begin without them.
+        """MPC can work with what is measured: it continues without an output of a band, and does not begin without one.
 
         Nor does it begin before the plant is cold.
         """

@@ -11,14 +11,15 @@ from typing import Annotated, Self
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import CONTROLLED, OUTPUT_NAMES, STRETCH, TICK_S
+from coldloop.process.signals import BATH, CONTROLLED, OUTPUT_NAMES, STRETCH, TICK_S
 from control_plc.numbers import Numbers
 
 Range = tuple[FiniteFloat, FiniteFloat]
 QUANTITIES = [output.quantity for output in PROCESS.outputs]
 FIRST_OF_KIND, P1 = (QUANTITIES.index(kind) if kind in QUANTITIES else 0 for kind in ("temperature", "pressure"))
 """First of the pressures, which are the last outputs; the temperatures are before them. Other outputs have one kind."""
-V1, P5, P6 = map(OUTPUT_NAMES.index, ("V1", "P5", "P6")) if PROCESS.has_bath else (-1, 0, 0)
+_TURBINE = (BATH.turbine_speed, *BATH.turbine_pressures) if BATH and BATH.turbine_speed else ()
+TURBINE_SPEED, BEFORE, BEHIND = map(OUTPUT_NAMES.index, _TURBINE) if _TURBINE else (-1, 0, 0)
 STANDSTILL_RATIO = 1.1
 """Of the pressures before and behind the turbine's nozzle, below which it may stand; it is some ten in operation."""
 FEW = int(P1 == 0)
@@ -122,7 +123,7 @@ def is_frozen(unchanged: float, rest: float, least: float) -> bool:
 
 def may_stand(output: int, y: Sequence[float]) -> bool:
     """Return whether an output is the speed of a turbine that stands, for all that the pressures say."""
-    return output == V1 and y[V1] == 0.0 and y[P6] < STANDSTILL_RATIO * y[P5]
+    return output == TURBINE_SPEED and y[output] == 0.0 and y[BEFORE] < STANDSTILL_RATIO * y[BEHIND]
 
 
 def moved(before: Numbers, y: Numbers, first: int, end: int) -> int:

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import L1
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.estimator import begin_at_rest, forget
 from optimizer_plc.qp.profile import hold, shift, shifted
@@ -121,7 +120,7 @@ def begin_again(c: Constants, m: OptimizerState, latched: Latched, u: Array) -> 
     """
     estimator, played, zero = c.estimator, m.playing.numbers[0], m.u.dtype.type(0.0)
     load = latched.load - estimator.w0 if estimator.load_known else zero
-    level = latched.y[L1] - estimator.y0[L1] if np.isfinite(latched.y[L1]) else zero
+    level = latched.y[c.level] - estimator.y0[c.level] if np.isfinite(latched.y[c.level]) else zero
     begin_at_rest(c.rest, m.belief, u, load, estimator.load_known, level)
     hold(u, c.input_scale, c.n_inputs, m.playing.z)
     m.playing.u_before[:] = u

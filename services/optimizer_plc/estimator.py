@@ -144,9 +144,9 @@ def forget(belief: Belief) -> None:
 
 @kernel
 def begin_at_rest(rest: Array, belief: Belief, u: Array, load: float, load_known: bool, level: float) -> None:  # noqa: FBT001
-    """Begin where the plant would rest with the inputs u (3,), load and L1, deviations; `rest` is `rest_map`'s.
+    """Begin where the plant would rest with the inputs u (3,), load and level, deviations; `rest` is `rest_map`'s.
 
-    A load that is measured may have moved just now: it then says more than what would let L1 rest.
+    A load that is measured may have moved just now: it then says more than what would let the level rest.
     """
     forget(belief)
     last, inputs = rest.shape[0] - 1, u.shape[0]

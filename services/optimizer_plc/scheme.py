@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import T1, T2
+from coldloop.process.signals import BATH, OUTPUT_NAMES
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.estimator import Estimator, begin_prediction, correct, predict
 from optimizer_plc.plausibility import suspects_of
@@ -19,7 +19,7 @@ from optimizer_plc.qp.costs import OutputMaps, augmented_cost, output_maps, pred
 from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.qp.profile import shifted, write_inputs
-from optimizer_plc.qp.target import CV155, TargetSearch, bounds_at, find_target, least_warm_load, loads_held
+from optimizer_plc.qp.target import TargetSearch, bounds_at, find_target, least_warm_load, loads_held
 from optimizer_plc.rules.assessment import Assessment, Observation, assessed
 from optimizer_plc.rules.interface import UpdatingRule, decide_by
 from optimizer_plc.session_state import Delivery, OptimizerState
@@ -29,10 +29,13 @@ from optimizer_plc.solvers.kernel_solver import solve_by
 
 Array = NDArray[np.float64]
 
-LEAST_LOAD_ERROR_W: Final = 25.0
-"""Taken off the model's least load with T5 in its band: it is too high until the constant error of T5 has followed."""
 BY_THE_RULE: Final = 0
 """The q that `plan` is given when the rule is to decide it."""
+
+
+LEVEL, TEMPERATURE, FEED_TEMPERATURE = (
+    map(OUTPUT_NAMES.index, (BATH.level, BATH.temperature, BATH.feed_temperature)) if BATH else (0, 0, 0)
+)
 
 
 class Constants(NamedTuple):
@@ -68,11 +71,18 @@ class Constants(NamedTuple):
     largest_load: float
     reserve: float
     """Of what the model holds, W."""
+    least_load_error: float
+    """Taken off the model's least load with the turbine's outlet in its band: it is too high until the constant error
+    of that has followed, W."""
     approach: float
-    """T2 - T1 at which CV155 is opened no further, K; infinite is any."""
-    t1: int
-    t2: int
-    """Which outputs these are: kernels are shared by processes, and have none of theirs in them."""
+    """How much warmer than the bath helium before the feed is at which that is opened no further, K; infinite is any.
+    """
+    level: int
+    """Which output is the level of the bath, ..."""
+    temperature: int
+    """... which its temperature, ..."""
+    feed_temperature: int
+    """... and which that before its feed."""
     opening_per_k: float
     opening_from: float
     """A deviation, %."""
@@ -113,11 +123,11 @@ def constants_of(
         least_load=real(settings.holdable_load_w[0] - estimator.w0),
         largest_load=real(settings.holdable_load_w[1] - estimator.w0),
         reserve=real(settings.capacity_reserve_w),
+        least_load_error=real(BATH.least_load_error if BATH else 0.0),
         approach=real(settings.cold_end.approach_k or np.inf),
-        t1=T1,
-        t2=T2,
+        level=LEVEL, temperature=TEMPERATURE, feed_temperature=FEED_TEMPERATURE,
         opening_per_k=real(settings.cold_end.opening_per_k),
-        opening_from=real(settings.cold_end.opening_from - estimator.u0[CV155]),
+        opening_from=real(settings.cold_end.opening_from - estimator.u0[target.feed]),
         load_step=real(settings.interrupting_load_step_w), sequence_ticks=settings.sequence_ticks,
         fixed_ticks=0, most=len(budget.ladder), periods=np.array([0, *budget.ladder]),
         fitting=np.array([budget.iterations(ticks) for ticks in range(MAX_PERIOD_TICKS + 1)]),
@@ -136,11 +146,12 @@ def problem_at(
 ) -> QuadraticProblem:  # fmt: skip
     """Return the instance of the problem at a state, a load and the input before, about a target.
 
-    With a limit of CV155; all are deviations.
+    With a limit of the feed; all are deviations.
     """
     phi, gamma, low, high, constant = instance(c.maps, x, w, u_before, share, target)
-    for i in range(CV155, c.n_inputs, u_before.shape[0]):
-        high[i] = min(high[i], max(most_open, low[CV155]))  # the first knot's low is as far as the rate lets it close
+    feed = c.target.feed
+    for i in range(feed, c.n_inputs, u_before.shape[0]):
+        high[i] = min(high[i], max(most_open, low[feed]))  # the first knot's low is as far as the rate lets it close
     return QuadraticProblem(c.Phi, phi, c.Gamma, gamma, low, high, constant)
 
 
@@ -260,9 +271,9 @@ def shortage(c: Constants, x: Array, w: float, load: float, most_open: float, no
     """Return what the load is above what can be held, W; negative: below what is needed; `none`, that is 0, otherwise.
 
     The estimate w (a deviation) has what the plant lacks beside its model, so it is compared with what the model holds
-    at rest within the inputs' bounds and the limit of CV155, less a reserve, and with the least that it holds without
-    T5 getting too cold, by the constant error of T5. The load itself (W), where it is measured, is compared with what
-    the plant holds that is as its model.
+    at rest within the inputs' bounds and the limit of the feed, less a reserve, and with the least that it holds
+    without the turbine's outlet getting too cold, by the constant error of that. The load itself (W), where it is
+    measured, is compared with what the plant holds that is as its model.
     """
     if not c.target.limited:
         return none
@@ -270,20 +281,21 @@ def shortage(c: Constants, x: Array, w: float, load: float, most_open: float, no
     low, high = bounds_at(c.target, x, most_open)
     _, most = loads_held(c.target, low, high)
     too_much = max(w + c.reserve - most, measured - c.largest_load)
-    warm = least_warm_load(c.target, low, high) - x.dtype.type(LEAST_LOAD_ERROR_W)
+    warm = least_warm_load(c.target, low, high) - c.least_load_error
     too_little = min(w - warm, min(w, measured) - c.least_load)
     return max(too_much, none) + min(too_little, none)
 
 
 @kernel
 def most_open(c: Constants, u: Array, y: Array) -> float:
-    """Return how far CV155 may be opened, a scaled deviation, by the inputs (3,), deviations, and the outputs (22,)."""
+    """Return how far the feed may be opened, a scaled deviation, by inputs (3,), deviations, and outputs (22,)."""
     if np.isinf(c.approach):
         return c.approach
-    approach = y[c.t2] - y[c.t1]
+    approach = y[c.feed_temperature] - y[c.temperature]
     if math.isnan(approach):
         approach = y.dtype.type(0.0)
-    limit: float = max(u[CV155] + c.opening_per_k * (c.approach - approach), c.opening_from) / c.input_scale[CV155]
+    feed = c.target.feed
+    limit: float = max(u[feed] + c.opening_per_k * (c.approach - approach), c.opening_from) / c.input_scale[feed]
     return limit
 
 

@@ -9,8 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator,
 from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, Endpoint
 from coldloop.modbus.settings import ServerSettings
 from coldloop.process.limits import InputLimits
+from coldloop.process.load_profile import LOAD_SPAN
 from coldloop.process.model_settings import ModelSettings
-from coldloop.process.signals import STRETCH, TICK_S
+from coldloop.process.signals import BATH, STRETCH, TICK_S
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.process.whole_ticks import TOLERANCE, whole_ticks
 from coldloop.registers.codec import WordOrder
@@ -124,11 +125,11 @@ class ProgramSettings(BaseModel):
     """Fixed updating period, a multiple of 0.25 s; 0 is adaptive."""
     interrupting_load_step_w: Annotated[float, Field(ge=0)] = 0.0
     """A load step of more than this ends an updating period at once, whatever decides its length; 0 is never."""
-    holdable_load_w: tuple[FiniteFloat, FiniteFloat] = (128.0, 553.0)
-    """Loads that some inputs within their limits hold at rest within the bands, W: of the cold box, by steady states of
-    its nonlinear plant. A load outside raises the alarm `capacity`."""
-    capacity_reserve_w: Annotated[float, Field(ge=0)] = 25.0
-    """So does an estimated load this near the largest one that the linear model holds with CV155 at its limit."""
+    holdable_load_w: tuple[FiniteFloat, FiniteFloat] = (BATH and BATH.holdable_load) or LOAD_SPAN
+    """Loads that some inputs within their limits hold at rest within the bands, in the load's unit: of the cold box, by
+    steady states of its nonlinear plant. With a bath, a load outside raises the alarm `capacity`."""
+    capacity_reserve_w: Annotated[float, Field(ge=0)] = BATH.load_reserve if BATH else 0.0
+    """So does an estimated load this near the largest one that the linear model holds with the feed at its limit."""
     sequence_ticks: Annotated[int, Field(ge=2, le=SEQUENCE_ROWS)] = 18
     """Shortest sequence sent; 18 rows fit into one Modbus request with their header. It is never shorter than two
     updating periods: one to be played, one in case the next sequence is late."""
@@ -136,8 +137,8 @@ class ProgramSettings(BaseModel):
     design: ControlDesign = ControlDesign()
     cold_end: ColdEndSettings = ColdEndSettings()
     preset: Preset = Preset.TUNED
-    """Penalties, start of the ODE-based solver, disturbances, limit of CV155, margin of the bands, limit of residuals,
-    if not set."""
+    """Penalties, start of the ODE-based solver, disturbances, limit of the feed, margin of the bands, limit of
+    residuals, if not set."""
     penalties: PenaltySettings = PenaltySettings()
     budget: BudgetSettings = BudgetSettings()
     estimator: EstimatorSettings = EstimatorSettings()
@@ -188,7 +189,7 @@ class ProgramSettings(BaseModel):
     @classmethod
     def _least_first(cls, value: tuple[float, float]) -> tuple[float, float]:
         if value[0] >= value[1]:
-            raise ValueError("give the least load that can be held, then the largest, in W")
+            raise ValueError("give the least load that can be held, then the largest")
         return value
 
     @model_validator(mode="after")

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from coldloop.process.signals import L1
+from coldloop.process.cold_box import L1
 from plant.cold_box.physics import ColdBox
 from plant.cold_box.program import ColdBoxProgram
 from plant.numeric import RealArray

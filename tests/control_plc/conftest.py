@@ -4,10 +4,10 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
+from coldloop.process.cold_box import L1, T5
 from coldloop.process.limits import InputLimits
 from coldloop.process.model_file import read_header
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
-from coldloop.process.signals import L1, T5
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Acknowledgement, Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.plant import Actuators, Measurement

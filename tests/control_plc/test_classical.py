@@ -8,11 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.errors import ConfigurationError
+from coldloop.process.cold_box import L1, T5
 from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import read_header
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
-from coldloop.process.signals import L1, T5, TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Mode, SequenceRow
 from coldloop.registers.plant import Measurement

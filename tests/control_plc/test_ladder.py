@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from coldloop.process.cold_box import L1, T5
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import L1, OUTPUT_NAMES, T5
+from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.audit import EventKind
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Cause, Heartbeat, Mode, Operator, OperatorMode, SequenceRow, Update, Verdict

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from coldloop.process.cold_box import L1, T5
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import L1, T5
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Mode, Operator, OperatorMode, SequenceRow, Verdict
 from coldloop.session.time_base import TimeBase

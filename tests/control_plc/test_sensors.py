@@ -3,7 +3,7 @@
 import pytest
 
 from control_plc import sensors
-from control_plc.sensors import MOVES, P5, P6, V1, SensorCheckSettings, SensorMonitor
+from control_plc.sensors import BEFORE, BEHIND, MOVES, TURBINE_SPEED, SensorCheckSettings, SensorMonitor
 
 REST = tuple(10.0 + place for place in range(22))
 INPUTS = (43.0, 75.0, 36.0)
@@ -46,13 +46,13 @@ SPEED = 2350.0
 def turning(tick: int, speed: float, before: float) -> tuple[float, ...]:
     """Return measurements, all of which move but perhaps the speed of the turbine, with so much (bar) before it."""
     y = list(others_moved(tick))
-    y[0], y[V1], y[P5], y[P6] = y[0] + 1e-3 * tick, speed, 1.1 + 1e-5 * tick, before + 1e-5 * tick
+    y[0], y[TURBINE_SPEED], y[BEHIND], y[BEFORE] = y[0] + 1e-3 * tick, speed, 1.1 + 1e-5 * tick, before + 1e-5 * tick
     return tuple(y)
 
 
 @pytest.mark.parametrize(
     ("shown", "before", "bad"),
-    [(0.0, 1.1, []), (0.0, 11.0, [V1]), (SPEED, 1.1, [V1])],
+    [(0.0, 1.1, []), (0.0, 11.0, [TURBINE_SPEED]), (SPEED, 1.1, [TURBINE_SPEED])],
     ids=["it stands", "dead", "frozen while it stands"],
 )
 def test_a_speed_of_none_is_believed_of_a_turbine_without_a_pressure_difference(
@@ -62,9 +62,9 @@ def test_a_speed_of_none_is_believed_of_a_turbine_without_a_pressure_difference(
     monitor = SensorMonitor(SensorCheckSettings(), REST)
     for tick in range(MOVES + 1):
         monitor.check(tick, turning(tick, SPEED + tick / 512, 11.0))
-    assert monitor.rests[V1] == 0
+    assert monitor.rests[TURBINE_SPEED] == 0
     for tick in range(MOVES + 1, 10 * MOVES):
         monitor.check(tick, turning(tick, shown, before))
     assert list(monitor.bad) == bad
     monitor.check(10 * MOVES, turning(10 * MOVES, shown, 11.0))
-    assert list(monitor.bad) == [V1], "it is to turn again, and shows nothing"
+    assert list(monitor.bad) == [TURBINE_SPEED], "it is to turn again, and shows nothing"

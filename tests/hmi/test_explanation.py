@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from coldloop.process.signals import OUTPUT_NAMES, T5
+from coldloop.process.cold_box import T5
+from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, UpdatingRuleKind, UpdatingRuleStatus

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.modbus.settings import ServerSettings
-from coldloop.process.signals import L1
+from coldloop.process.cold_box import L1
 from coldloop.registers.audit import EventKind
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import Cause, Mode, Operator, OperatorMode, Status

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.process.signals import OUTPUT_NAMES, T5
+from coldloop.process.cold_box import T5
+from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.common import Identity
 from coldloop.registers.plant import PLANT_MAP, Measurement
 from tests.conftest import install

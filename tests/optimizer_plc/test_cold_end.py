@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from coldloop.process.cold_box import T1, T2
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import T1, T2
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.qp.penalties import Preset
 from optimizer_plc.scheme import Constants, most_open, problem_at

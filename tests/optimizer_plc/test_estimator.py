@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from coldloop.process.cold_box import L1
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import L1
 from coldloop.registers.control_plc import Update
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, NoiseReference
 from optimizer_plc.estimator import begin_at_rest, begin_prediction, correct, estimator_of, no_belief, predict

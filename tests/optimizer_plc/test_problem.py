@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from coldloop.process.cold_box import L1, T5
 from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import L1, T5
 from optimizer_plc.qp import costs
 from optimizer_plc.qp.costs import augmented_cost, indicators, matrices_of, quadratic_cost
 from optimizer_plc.qp.design import ControlDesign, trivial_design

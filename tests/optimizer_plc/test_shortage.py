@@ -6,7 +6,7 @@ import pytest
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import INPUT_NAMES
 from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.scheme import LEAST_LOAD_ERROR_W, Constants, shortage
+from optimizer_plc.scheme import Constants, shortage
 from optimizer_plc.settings import ProgramSettings
 from tests.optimizer_plc.test_target import LIMITS
 
@@ -76,12 +76,12 @@ def test_a_turbine_that_is_colder_needs_more_load(c: Constants) -> None:
     coldest = c.estimator.w0 - 23.0 * PER_CENT_W[0] - 75.0 + 24.0 * PER_CENT_W[2]
     lacking = 2.0 - 1.3835 + 23.0 * PER_CENT_K[0] - 24.0 * PER_CENT_K[2]
     opened = (lacking + 40.0 * PER_CENT_K[2]) / PER_CENT_K[0]
-    least = coldest - 40.0 * PER_CENT_W[2] + opened * PER_CENT_W[0] - LEAST_LOAD_ERROR_W
+    least = coldest - 40.0 * PER_CENT_W[2] + opened * PER_CENT_W[0] - 25.0
     assert 20.0 < 20.0 + opened < 60.0
     assert short(c, least + 0.5, 400.0, colder=2.0) == 0.0
     assert short(c, least - 7.0, 400.0, colder=2.0) == pytest.approx(-7.0, abs=0.2)
 
 
 def test_a_turbine_that_no_inputs_warm_enough_needs_the_load_with_which_it_is_warmest(c: Constants) -> None:
-    warmest = c.estimator.w0 + 17.0 * PER_CENT_W[0] - 75.0 - 16.0 * PER_CENT_W[2] - LEAST_LOAD_ERROR_W
+    warmest = c.estimator.w0 + 17.0 * PER_CENT_W[0] - 75.0 - 16.0 * PER_CENT_W[2] - 25.0
     assert short(c, 400.0, 400.0, colder=20.0) == pytest.approx(400.0 - warmest, abs=0.2)

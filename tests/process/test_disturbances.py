@@ -1,5 +1,9 @@
 """Disturbances beside the load, and setpoints: in the model, on the simulated plant, over the link."""
 
+import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Final
 
@@ -12,7 +16,7 @@ from plant.own.disturbances import Disturbances
 from rig.process_file.judgement import described
 from rig.process_file.making import Made, made_from
 from tests.harness.processes import Processes
-from tests.process.runs import run
+from tests.process.runs import run, started
 
 POND: Final = '''
 class Pond:
@@ -81,6 +85,15 @@ at = 0.0
 span = [-30.0, 30.0]
 noise = 0.1
 """
+REST: Final = """
+from coldloop.process.lti_model import load
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from optimizer_plc.qp.prediction import PredictionModel
+from optimizer_plc.qp.rest import rest_map
+prediction = PredictionModel(load(DEFAULT_MODEL_FILE))
+print(rest_map(prediction)[: len(prediction.model.x0), 0].tolist())
+"""
+"""Prints what the states are at rest with one more unit of the first input."""
 WEATHER: Final = "time_s,rain,draw\n0,0,0\n300,1.5,0\n600,1.5,2.0\n"
 
 
@@ -114,6 +127,18 @@ def test_disturbances_are_states_that_hold_and_outputs_where_they_are_measured(t
     assert "after 300 s of +1 l/s rain: lower 1 cm  upper 1 cm" in text
     assert "modes      -0.1  -0.1 /s" in text
     assert "warning" not in text
+
+
+def test_a_session_begins_without_disturbances_however_far_the_inputs_are_from_the_operating_point(
+    processes: Processes, tmp_path: Path
+) -> None:
+    """One more l/s of the pump fills both tanks of the pond by 1 cm."""
+    model = tmp_path / "model.json"
+    assert started(processes, "process", pond(tmp_path), "--out", model).code == 0
+    environment, command = os.environ | {"COLDLOOP_PROCESS": str(model)}, [sys.executable, "-c", REST]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == pytest.approx([1.0, 1.0, 0.0, 0.0, 0.0], abs=1e-9)
 
 
 def test_a_setpoint_is_the_middle_of_its_tolerance_and_what_the_fallback_goes_to(tmp_path: Path) -> None:

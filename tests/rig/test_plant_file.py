@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from coldloop.errors import ModelFileError
-from coldloop.process.cold_box import T5_BAND
+from coldloop.process.cold_box import L1, T5, T5_BAND
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE, ModelSettings
-from coldloop.process.signals import L1, T5
 from optimizer_plc.qp.design import ControlDesign
 from plant.cold_box.plant_file import PlantFile
 from plant.load import find_load

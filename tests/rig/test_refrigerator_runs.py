@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import pyarrow.parquet as pq
 import pytest
 
-from coldloop.process.signals import L1, STATION_SIGNAL_NAMES
+from coldloop.process.cold_box import L1
+from coldloop.process.signals import STATION_SIGNAL_NAMES
 from rig import simulate
 
 if TYPE_CHECKING:

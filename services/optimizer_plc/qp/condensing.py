@@ -29,9 +29,9 @@ class Condensed(NamedTuple):
     constant_map: Array
     """Shape (n_x + 1, n_x + 1)."""
     outputs_z: Array
-    """L1 and T5 at the end of each sample, as deviations, shape (N, 2, n)."""
+    """Outputs with a band at the end of each sample, as deviations, shape (N, bands, n)."""
     outputs_s: Array
-    """Shape (N, 2, n_x + 1)."""
+    """Shape (N, bands, n_x + 1)."""
 
 
 def condense(prediction: PredictionModel, design: ControlDesign, weights: Array) -> Condensed:

@@ -11,6 +11,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, 
 
 from coldloop.process.loaded import PROCESS
 from coldloop.process.per_signal import PerBand, PerInput, PositivePerBand
+from coldloop.process.signals import BATH
 
 N_INPUTS = len(PROCESS.inputs)
 N_SLACKS = 2 * len(PROCESS.bands)
@@ -67,6 +68,8 @@ class ControlDesign(BaseModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        if self.target is not Target.OPERATING_POINT and BATH is None:
+            raise ValueError("target: a process without a bath has only operating-point")
         if self.constraint_instants[-1] > self.horizon:
             raise ValueError("constraint_instants end behind the last of decision_instants, which is the horizon")
         if any(low >= high for low, high in zip(self.output_low, self.output_high, strict=True)):
@@ -80,19 +83,27 @@ class ControlDesign(BaseModel):
 
 
 class ColdEndSettings(BaseModel):
-    """How far CV155 may be opened: where helium before it is warmer than the bath, opening it further cools less.
+    """How far the feed of a bath may be opened: where helium before it is warmer than the bath, more of it cools less.
 
-    The linear model does not know that. T2 - T1 is measured whatever the valves pass and the exchangers transfer.
+    The linear model does not know that. Of the cold box it is CV155, and T2 - T1 is measured whatever the valves pass
+    and the exchangers transfer.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     approach_k: Annotated[float, Field(ge=0.0)] = 0.0
-    """T2 - T1 at which CV155 is opened no further; 0 is any. Capacity is largest at 0.3 K with CV156 at 36 %."""
+    """T2 - T1 at which the feed is opened no further; 0 is any. Capacity of the cold box is largest at 0.3 K with CV156
+    at 36 %."""
     opening_per_k: PositiveFloat = 70.0
-    """How far CV155 may be from where it is, in % for each K that T2 - T1 is from it. Less slows load steps."""
+    """How far the feed may be from where it is, in % for each K that T2 - T1 is from it. Less slows load steps."""
     opening_from: FiniteFloat = 50.0
     """Opening, %, that is allowed in any case: should T1 or T2 be wrong."""
+
+    @model_validator(mode="after")
+    def _of_a_bath(self) -> Self:
+        if self.approach_k and BATH is None:
+            raise ValueError("approach_k limits the feed of a bath, and the process has none; leave it out")
+        return self
 
 
 def trivial_design(design: ControlDesign) -> ControlDesign:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import CONTROLLED, L1, STATE_NAMES, TICKS_PER_SAMPLE
+from coldloop.process.signals import BATH, CONTROLLED, OUTPUT_NAMES, STATE_NAMES, TICKS_PER_SAMPLE
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.linear_algebra import multiply
@@ -191,14 +191,16 @@ def state_weights(model: LtiModel, design: ControlDesign) -> Array:
 
     Pressure, level and the mean of the temperatures weigh alike; further states and those of other processes nothing.
     """
-    if not PROCESS.has_bath:
-        return np.zeros(len(model.x0))
-    n = len(STATE_NAMES)
-    scales = np.full(n, design.temperature_scale)
-    scales[0] = design.pressure_scale
-    scales[1] = design.level_scale / model.C[L1, 1]
-    shares = np.full(n, 1.0 / (n - 2))
-    shares[:2] = 1.0
-    weights = np.zeros(model.A.shape[0])
-    weights[:n] = design.state_weight * shares / scales**2
+    weights = np.zeros(len(model.x0))
+    if BATH is None:
+        return weights
+    if BATH.pressure_state:
+        weights[STATE_NAMES.index(BATH.pressure_state)] = design.state_weight / design.pressure_scale**2
+    if BATH.level_state:
+        place = STATE_NAMES.index(BATH.level_state)
+        scale = design.level_scale / model.C[OUTPUT_NAMES.index(BATH.level), place]
+        weights[place] = design.state_weight / scale**2
+    for name in BATH.temperature_states:
+        share = 1.0 / len(BATH.temperature_states)
+        weights[STATE_NAMES.index(name)] = design.state_weight * share / design.temperature_scale**2
     return weights

@@ -1,12 +1,13 @@
 """The target: where the plant, as it is estimated to be, should rest.
 
-Of the inputs at which the estimated plant rests with L1 at its operating point those are the target that cost least, as
-deviations from the operating point. They are within their bounds; within these they hold the load, or as much of it as
-they can; then they have T5 within its rows, or as near as they can.
+Of the inputs at which the estimated plant rests with the level of its bath at the operating point those are the target
+that cost least, as deviations from the operating point. They are within their bounds; within these they hold the load,
+or as much of it as they can; then they have the turbine's outlet (T5 of the cold box) within its rows, or as near as
+they can.
 
 Inputs are deviations over `input_scale`, and those that act: with the estimated constants of inputs added.
 
-For the cold box alone: of other processes the target is the operating point, and what they hold is not known.
+For a plant with a bath: of other processes the target is the operating point, and what they hold is not known.
 """
 
 from typing import NamedTuple
@@ -15,10 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.limits import InputLimits
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import T5
+from coldloop.process.signals import BATH, CONTROLLED, INPUT_NAMES, OUTPUT_NAMES
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.design import N_INPUTS, ControlDesign, Target
 from optimizer_plc.qp.prediction import PredictionModel, state_cost
@@ -26,22 +25,23 @@ from optimizer_plc.qp.rest import rest_map
 
 Array = NDArray[np.float64]
 
-CV155 = [one.name for one in COLD_BOX.inputs].index("CV155")
+TURBINE_OUTLET, FEED = (OUTPUT_NAMES.index(BATH.turbine_outlet), INPUT_NAMES.index(BATH.feed)) if BATH else (0, 0)
 TOLERANCES = {8: 1e-8, 4: 1e-4}
 """What a bound may be missed by, scaled, by the bytes of a number: in single precision a corner of bounds is met no
 better than within 1e-5."""
 
 NO_EFFECT = 1e-9
-"""K of T5 per W held: an input that warms it by less does so by rounding, whose sign is another on another machine."""
+"""K of the turbine's outlet per W held: an input that warms it by less does so by rounding, whose sign is another on
+another machine."""
 
 
 class Rest(NamedTuple):
-    """What is at rest with L1 at its operating point, by the scaled inputs."""
+    """What is at rest with the level at its operating point, by the scaled inputs."""
 
     states: Array
     """States and load held: as a map of the inputs, shape (3, n_x + 1). Disturbances are none."""
     temperature: Array
-    """T5, shape (3,)."""
+    """Of the turbine's outlet, shape (3,)."""
 
 
 class TargetSearch(NamedTuple):
@@ -60,29 +60,31 @@ class TargetSearch(NamedTuple):
     plane: Array
     """Inputs that hold nothing, orthonormal in what they cost, shape (3, 2)."""
     rows: Array
-    """The inputs and T5 on that plane, shape (4, 2)."""
+    """The inputs and the turbine's outlet on that plane, shape (4, 2)."""
     temperature: Array
     """Shape (3,)."""
     low: Array
-    """Of inputs and T5, shape (4,)."""
+    """Of inputs and the turbine's outlet, shape (4,)."""
     high: Array
     margin: float
-    """How far inside its band T5's rows are, K."""
+    """How far inside its band the rows of the turbine's outlet are, K."""
     constants: NDArray[np.int64]
-    """Which states are the constants of inputs and T5, shape (4,); -1 is none."""
+    """Which states are the constants of inputs and the turbine's outlet, shape (4,); -1 is none."""
     scale: Array
     """Of the constants: input_scale and 1, shape (4,)."""
     tolerance: float
     """What a bound may be missed by."""
+    feed: int
+    """Which input fills the bath; kernels are shared by processes, and have no places of theirs in them."""
 
 
 def rest_of(prediction: PredictionModel, design: ControlDesign) -> Rest:
-    """Return where the model rests."""
+    """Return where the model of a plant with a bath rests."""
     n, scale = len(prediction.model.x0), np.array(design.input_scale)
     by_inputs = rest_map(prediction)[:, :N_INPUTS] * scale
     states = np.zeros((N_INPUTS, prediction.n_states + 1))
     states[:, :n], states[:, -1] = by_inputs[:n].T, by_inputs[n]
-    C, D, G = prediction.C[T5], prediction.D[T5], prediction.G[T5]
+    C, D, G = (M[TURBINE_OUTLET] for M in (prediction.C, prediction.D, prediction.G))
     return Rest(states, states[:, :-1] @ C + D * scale + states[:, -1] * G)
 
 
@@ -90,7 +92,7 @@ def target_search(
     prediction: PredictionModel, design: ControlDesign, limits: InputLimits, real: Real = DOUBLE
 ) -> TargetSearch:
     """Return what targets of this problem are found with."""
-    if not PROCESS.has_bath:
+    if BATH is None:
         return no_target_search(real)
     rest, n, scale = rest_of(prediction, design), len(prediction.model.x0), np.array(design.input_scale)
     held, states = rest.states[:, -1], rest.states[:, :n]
@@ -99,17 +101,18 @@ def target_search(
     across = np.linalg.svd(held[None])[2][1:].T
     root = np.linalg.cholesky(across.T @ cost @ across)
     plane = np.ascontiguousarray(np.linalg.solve(root, across.T).T)
-    y0, margin, u0 = float(prediction.y0[T5]), design.band_margin[1], np.array(prediction.u0)
+    band = CONTROLLED.index(TURBINE_OUTLET)
+    y0, margin, u0 = float(prediction.y0[TURBINE_OUTLET]), design.band_margin[band], np.array(prediction.u0)
     places = {signal: n + place for place, signal in enumerate(prediction.disturbances)}
-    signals = (*range(len(prediction.y0), len(prediction.y0) + N_INPUTS), T5)
+    signals = (*range(len(prediction.y0), len(prediction.y0) + N_INPUTS), TURBINE_OUTLET)
     arrays = {
         "held": held,
         "cheapest": inverse @ held / (held @ inverse @ held),
         "plane": plane,
         "rows": np.vstack([plane, rest.temperature @ plane]),
         "temperature": rest.temperature,
-        "low": np.array([*(limits.low - u0) / scale, design.output_low[1] + margin - y0]),
-        "high": np.array([*(limits.high - u0) / scale, design.output_high[1] - margin - y0]),
+        "low": np.array([*(limits.low - u0) / scale, design.output_low[band] + margin - y0]),
+        "high": np.array([*(limits.high - u0) / scale, design.output_high[band] - margin - y0]),
         "scale": np.array([*scale, 1.0]),
     }
     return TargetSearch(
@@ -119,6 +122,7 @@ def target_search(
         margin=real(margin),
         constants=np.array([places.get(signal, -1) for signal in signals]),
         tolerance=real(TOLERANCES[np.dtype(real).itemsize]),
+        feed=FEED,
         **{name: np.ascontiguousarray(array).astype(real, copy=False) for name, array in arrays.items()},
     )
 
@@ -129,13 +133,13 @@ def no_target_search(real: Real) -> TargetSearch:
     return TargetSearch(
         followed=False, limited=False, of_load=real(0.0), held=inputs, cheapest=inputs,
         plane=np.zeros((N_INPUTS, 2), real), rows=np.zeros((N_INPUTS + 1, 2), real), temperature=inputs, low=rows,
-        high=rows, margin=real(0.0), constants=np.full(N_INPUTS + 1, -1), scale=rows, tolerance=real(0.0),
+        high=rows, margin=real(0.0), constants=np.full(N_INPUTS + 1, -1), scale=rows, tolerance=real(0.0), feed=0,
     )  # fmt: skip
 
 
 @kernel
 def find_target(c: TargetSearch, x: Array, w: float, mismatch: float, most_open: float, target: Array) -> None:
-    """Write the target (3,) for estimated states (n_x,), load and its mismatch, and a limit of CV155."""
+    """Write the target (3,) for estimated states (n_x,), load and its mismatch, and a limit of the feed."""
     if not c.followed:
         return
     low, high = bounds_at(c, x, most_open)
@@ -156,9 +160,9 @@ def find_target(c: TargetSearch, x: Array, w: float, mismatch: float, most_open:
 
 @kernel
 def bounds_at(c: TargetSearch, x: Array, most_open: float) -> tuple[Array, Array]:
-    """Return the bounds (4,), (4,) of the inputs that act and of T5 without its constant, with a limit of CV155."""
+    """Return bounds (4,), (4,) of inputs that act, with a limit of the feed, and of the outlet less its constant."""
     low, high = c.low.copy(), c.high.copy()
-    high[CV155] = max(min(high[CV155], most_open), low[CV155])
+    high[c.feed] = max(min(high[c.feed], most_open), low[c.feed])
     one = x.dtype.type(1.0)
     for i in range(low.shape[0]):
         if c.constants[i] >= 0:
@@ -182,10 +186,10 @@ def loads_held(c: TargetSearch, low: Array, high: Array) -> tuple[float, float]:
 
 @kernel
 def least_warm_load(c: TargetSearch, low: Array, high: Array) -> float:
-    """Return the least load that inputs within these bounds hold at rest with T5 within its band, a deviation in W.
+    """Return the least load that these bounds let hold with the turbine's outlet within its band, a deviation in W.
 
-    From the inputs that hold least those move that warm T5 the most for each watt. Where that is not enough it is the
-    load with which T5 is warmest.
+    From the inputs that hold least those move that warm the outlet the most for each watt. Where that is not enough it
+    is the load with which it is warmest.
     """
     last = c.held.shape[0]
     room, load, lacking = np.empty(last, low.dtype), low.dtype.type(0.0), low[last] - c.margin

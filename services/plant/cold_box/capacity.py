@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coldloop.process import signals
+from coldloop.process.cold_box import T5
 from plant.cold_box.equilibrium import Equilibrium, NoEquilibriumError, find_equilibrium, rest_near
 from plant.cold_box.physics import ColdBox
 from plant.helium.properties import Helium
@@ -35,7 +35,7 @@ def held_loads(
     rests = [
         rest
         for rest in steady_states(box, helium, level, cv155, heater[0], cv156)
-        if warmth[0] <= rest.y[signals.T5] <= warmth[1]
+        if warmth[0] <= rest.y[T5] <= warmth[1]
     ]
     least, largest = min(rests, key=lambda rest: rest.w), max(rests, key=lambda rest: rest.w)
     by = heater[1] - heater[0]

@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from coldloop.process.declaration import Band, Input, Load, Loop, Output, Process, State
+from coldloop.process.declaration import Band, Bath, Input, Load, Loop, Output, Process, State
 
 LEVEL_BAND: Final = (59.0, 61.0)
 """Band of L1, % (paper, section IV)."""
@@ -32,7 +32,7 @@ _HEATER: Final = Input(
 
 _HEAT_LOAD: Final = Load(
     name="NCR22_HL", unit="W", span=(0, 10_000.0), walk=3.0, noun="Heat load", word="heat load", bar=(200.0, 600.0),
-    has_named_loads=True, too_much="the bath will run dry", too_little="the turbine gets too cold and the bath floods",
+    has_named_loads=True,
 )  # fmt: skip
 _BANDED: Final = {
     "L1": (
@@ -48,6 +48,12 @@ def _output(name: str, unit: str, quantity: str) -> Output:
     return Output(name=name, unit=unit, quantity=quantity, band=band, bar=bar)
 
 
+_TEMPERATURES: Final = tuple(
+    State(name=f"T_{exchanger}_{i}", unit="K")
+    for exchanger, cells in (("nef1", 8), ("nef2", 6), ("nef34", 12))
+    for i in range(1, cells + 1)
+)
+
 COLD_BOX: Final = Process(
     name="cold-box",
     tick_s=0.25,
@@ -62,15 +68,29 @@ COLD_BOX: Final = Process(
     states=(
         State(name="P1", unit="Pa"),
         State(name="V_l", unit="m3"),
-        *(State(name=f"T_nef1_{i}", unit="K") for i in range(1, 9)),
-        *(State(name=f"T_nef2_{i}", unit="K") for i in range(1, 7)),
-        *(State(name=f"T_nef34_{i}", unit="K") for i in range(1, 13)),
+        *_TEMPERATURES,
     ),
     load=_HEAT_LOAD,
     constants=("V1", *(f"T{i}" for i in range(1, 11)), *(f"P{i}" for i in range(1, 11))),
     decision_instants=(1, 2, 4, 8, 16, 50, 100),
     constraint_instants=(1, 2, 3, 4, 6, 8, 16, 24, 32, 48, 60, 72, 84, 100),
-    has_bath=True,
+    bath=Bath(
+        level="L1",
+        temperature="T1",
+        feed="CV155",
+        feed_temperature="T2",
+        heater="NCR22_A",
+        turbine_valve="CV156",
+        turbine_outlet="T5",
+        turbine_speed="V1",
+        turbine_pressures=("P6", "P5"),
+        pressure_state="P1",
+        level_state="V_l",
+        temperature_states=tuple(state.name for state in _TEMPERATURES),
+        holdable_load=(128.0, 553.0),
+        load_reserve=25.0,
+        least_load_error=25.0,
+    ),
     moves_as_one=True,
     tuned={
         "estimator": {"disturbances": ("outputs",), "load_walk_w": 1.0},
@@ -83,3 +103,6 @@ COLD_BOX: Final = Process(
     decimals={"%": 2, "K": 3, "bar": 3, "W": 1, "Hz": 1},
     notable={"W": 2.0, "%": 0.2, "Hz": 5.0, "K": 0.05, "bar": 0.005},
 )
+
+L1, V1, T1, T2, T5, P1 = map([output.name for output in COLD_BOX.outputs].index, ("L1", "V1", "T1", "T2", "T5", "P1"))
+"""Places of its outputs: for its plants, its studies and its tests. Services ask the process."""

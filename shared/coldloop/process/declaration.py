@@ -5,10 +5,10 @@ declared in `coldloop.process.cold_box`; others come with their model file, from
 Needs the standard library only.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from types import MappingProxyType
-from typing import Any, Final, Self, get_args, get_type_hints
+from typing import Any, ClassVar, Final, Self, get_args, get_type_hints
 
 VARIABLE: Final = "COLDLOOP_PROCESS"
 """Of the environment: the model file that a program is loaded with."""
@@ -122,10 +122,6 @@ class Load:
     """What operators call it; its name where this is empty."""
     bar: Range | None = None
     """Ends of its bar on the operator's page; its span where they are not given."""
-    too_much: str = ""
-    """What follows if there is more of it than can be held, for the alarm `capacity`; empty where it is not known."""
-    too_little: str = ""
-    """What follows if there is less than is needed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,6 +135,71 @@ class Forecast:
     values: tuple[float, ...]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Bath:
+    """A bath of liquid that the cold end of a refrigerator fills, and the load boils off: the signals that make it one.
+
+    Its level integrates. Targets, the limit of the feed, the weights of states and the cool-down are laws of such a
+    plant, whatever its signals are called and in which order they are. All but states are names of inputs and outputs.
+    """
+
+    __pydantic_config__: ClassVar = {"extra": "forbid"}
+    """For process files, whose section `bath` this is."""
+
+    level: str
+    """Output with a band that integrates."""
+    temperature: str
+    """Output: of what leaves the bath, as warm as the liquid where there is some."""
+    feed: str
+    """Input: opening of the valve that fills it, a Joule-Thomson valve."""
+    feed_temperature: str
+    """Output: before that valve."""
+    heater: str
+    """Input: power that boils liquid off beside the load."""
+    turbine_valve: str
+    """Input: opening of the valve before the turbine."""
+    turbine_outlet: str
+    """Output with a band: temperature behind the turbine, which falls with cold in excess."""
+    turbine_speed: str = ""
+    """Output that may be 0 while all others move; empty where it is not measured."""
+    turbine_pressures: tuple[str, ...] = ()
+    """Outputs: before and behind the turbine, by which it is known whether it may stand; with `turbine_speed`."""
+    pressure_state: str = ""
+    """State that weighs as a pressure in the cost; none where it is empty, here and below."""
+    level_state: str = ""
+    """State that weighs as the level."""
+    temperature_states: tuple[str, ...] = ()
+    """States whose mean weighs as a temperature."""
+    holdable_load: Range | None = None
+    """Loads that some inputs hold at rest within the bands, in the load's unit; its span where it is not known."""
+    load_reserve: float = 0.0
+    """How near an estimated load may come to the largest one that the linear model holds."""
+    least_load_error: float = 0.0
+    """What the least load that the linear model holds is too high by, until the error of the turbine's outlet is known.
+    """
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """All inputs of such a plant."""
+        return self.feed, self.heater, self.turbine_valve
+
+    @property
+    def banded(self) -> tuple[str, ...]:
+        """Outputs that have a band."""
+        return self.level, self.turbine_outlet
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """All outputs that it names."""
+        speed = (self.turbine_speed,) if self.turbine_speed else ()
+        return (*self.banded, self.temperature, self.feed_temperature, *speed, *self.turbine_pressures)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """The states that it names."""
+        return (*filter(None, (self.pressure_state, self.level_state)), *self.temperature_states)
+
+
 NO_LOAD: Final = Load(name="no load", unit="", span=(0.0, 1.0), walk=1e-6)
 """The load of a process that has none."""
 
@@ -148,7 +209,7 @@ class Process:
     """A process with its time, its signals and its control problem.
 
     Raises:
-        ValueError: Names are used twice, or a loop has no input.
+        ValueError: Names are used twice, or a loop or a bath names signals that there are not.
     """
 
     name: str
@@ -171,11 +232,8 @@ class Process:
     """Drawing for the operator's page, an SVG text; empty where there is none."""
     shipped_mimic: str = ""
     """Path of a drawing that comes with the page, whose values name their registers."""
-    has_bath: bool = False
-    """Whether it is a bath with a cold end as the cold box has them, by the same names of signals and order of states:
-    a level L1 that integrates, T5 that falls with cold in excess, CV155 that fills the bath. Targets, the weights of
-    states, the cool-down and what `export plc` writes of the whole optimiser are laws of such a plant. There is one:
-    which of its signals is which is not declared, but known to them."""
+    bath: Bath | None = None
+    """Which signals are those of a bath with a cold end; None where it is another kind of plant."""
     moves_as_one: bool = False
     """Whether all outputs move when any do: one that rests meanwhile is frozen, whatever the inputs do."""
     tuned: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
@@ -197,6 +255,34 @@ class Process:
             loop = output.band.loop if output.band else None
             if loop is not None and loop.input not in known:
                 raise ValueError(f"the loop of {output.name} moves {loop.input}, which is no input")
+        if self.bath is not None:
+            self._check_bath(self.bath)
+
+    def _check_bath(self, bath: Bath) -> None:
+        inputs = [one.name for one in self.inputs]
+        if sorted(bath.inputs) != sorted(inputs):
+            raise ValueError(
+                f"bath: its inputs are feed, heater and turbine_valve, each once; the process has {', '.join(inputs)}"
+            )
+        self._check_names("output", bath.outputs, self.outputs)
+        self._check_names("output with a band", bath.banded, self.banded)
+        self._check_names("state", bath.states, self.states)
+        if len(bath.turbine_pressures) != 2 * bool(bath.turbine_speed):
+            raise ValueError("bath: give turbine_speed with two turbine_pressures, before and behind it, or neither")
+        if not self.has_load:
+            raise ValueError("bath: declare the load that boils it off")
+        if bath.holdable_load is not None and bath.holdable_load[0] >= bath.holdable_load[1]:
+            raise ValueError("bath: holdable_load: give the least load that can be held, then the largest")
+        if min(bath.load_reserve, bath.least_load_error) < 0.0:
+            raise ValueError("bath: load_reserve and least_load_error are 0 or more")
+
+    @staticmethod
+    def _check_names(what: str, names: Sequence[str], declared: Sequence[Output | State]) -> None:
+        for name in names:
+            if name not in [each.name for each in declared]:
+                raise ValueError(f"bath: {name} is no {what}")
+            if names.count(name) > 1:
+                raise ValueError(f"bath: {name} is named twice")
 
     @property
     def has_station(self) -> bool:

@@ -35,12 +35,8 @@ STATE_UNITS: Final = tuple(one.unit for one in PROCESS.states)
 
 CONTROLLED: Final = tuple(OUTPUT_NAMES.index(one.name) for one in PROCESS.banded)
 """Outputs that have a band: L1 and T5 of the cold box."""
-
-
-L1, V1, T1, T2, T5, P1 = (
-    map(OUTPUT_NAMES.index, ("L1", "V1", "T1", "T2", "T5", "P1")) if PROCESS.has_bath else (0, 0, 0, 0, 0, 0)
-)
-"""Outputs of a plant with a bath: for what there is nowhere else."""
+BATH: Final = PROCESS.bath
+"""Which of the signals are those of a bath with a cold end; None where there is none."""
 
 STATION_VALVE_NAMES: Final = ("CV956", "CV952", "CV953", "CV167")
 """Bypass, discharge into the buffer, charge out of it, nitrogen feed."""

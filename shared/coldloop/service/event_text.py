@@ -146,9 +146,10 @@ _WORDINGS: Final[Mapping[int, _Wording]] = {
 _FURTHER_BANDS: Final = [output.name for output in PROCESS.banded[1:]]
 _SHORTAGE: Final = (
     "",
-    ", or ".join(filter(None, ("too much load: reduce it", PROCESS.load.too_much))),
-    ", or ".join(filter(None, ("too little load: raise it", PROCESS.load.too_little))),
+    "too much load: reduce it, or the bath will run dry",
+    "too little load: raise it, or the turbine gets too cold and the bath floods",
 )
+"""Of a plant with a bath: of others it is not known."""
 _ALARM_CAUSES: Final[Mapping[int, Words]] = {
     AlarmKind.T5_BAND: _listed(_FURTHER_BANDS if len(_FURTHER_BANDS) > 1 else ("",)),
     AlarmKind.STATE_NOT_RETAINED: _listed(("", "the previous one was set aside")),
