@@ -5,6 +5,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.process_file.bath import exchanged
 from rig.process_file.making import Made
 
 Array = NDArray[np.float64]
@@ -132,6 +133,8 @@ def _warnings(made: Made) -> list[str]:
         found.append("controllability: the inputs do not move the outputs with a band independently within the horizon")
     if made.linear.error > ROUGH:
         found.append(f"kink: derivatives differ by {made.linear.error:.1e} with the step; the model holds for one side")
+    if process.bath is not None:
+        found += exchanged(m, process.bath, process.decision_instants[-1] * sample_s)
     found += [f"loop: {text}" for text in _loops(made, effect)]
     found += [f"dead time: {text}" for text in _dead_times(made)]
     steady = m.A_tick - np.eye(len(m.A))

@@ -11,6 +11,7 @@ from coldloop.errors import UsageError
 from coldloop.process.declaration import NO_LOAD, Band, Input, Load, Loop, Output, Process, State
 from coldloop.process.lti_model import LtiModel, discretise
 from rig.plc_sizing.problem_sizes import ProblemSizes, iteration_shares
+from rig.process_file.bath import check_bath
 from rig.process_file.courses import courses_of, forecasts_of
 from rig.process_file.declaration import OutputSection, ProcessFile, read_process_file
 from rig.process_file.fmu_model import with_units
@@ -58,10 +59,9 @@ def made_from(path: Path) -> Made:
     try:
         process = _process(file, linear)
     except ValueError as error:
-        raise UsageError(f"{error}") from error
+        raise UsageError(f"{path}: {error}") from error
     process = replace(process, forecasts=forecasts_of(file, path.parent), mimic=_drawing(file, path.parent))
     _check_room(process)
-    _check_level(process, linear)
     _check_rest(file, linear)
     tick = discretise(linear.A, linear.B, linear.F[:, 0], file.tick_s)
     played = courses_of(file, path.parent)
@@ -77,6 +77,8 @@ def made_from(path: Path) -> Made:
         load_name=process.load.name, load_unit=process.load.unit, parameters_digest=linear.digest, plant=linear.kind,
         note=f"made from {path.name}", plant_parameters=linear.parameters | played, process=process.document(),
     )  # fmt: skip
+    if process.bath is not None:
+        check_bath(file, model, process.bath)
     return Made(model, process, linear, len(file.disturbances))
 
 
@@ -213,20 +215,6 @@ def _check_room(process: Process) -> None:
             f"{inputs} inputs, {outputs} outputs and {states} states are too many: {longest} is {words[longest]} "
             f"registers, and one Modbus request carries {REGISTERS_OF_A_REQUEST}"
         )
-
-
-def _check_level(process: Process, linear: Linearised) -> None:
-    """Check that the state that weighs as the level of a bath is seen in it.
-
-    Raises:
-        UsageError: It is not.
-    """
-    bath = process.bath
-    if bath is None or not bath.level_state:
-        return
-    level = [one.name for one in process.outputs].index(bath.level)
-    if not linear.C[level, list(linear.states).index(bath.level_state)]:
-        raise UsageError(f"bath: {bath.level} does not show {bath.level_state}; name the state that is its level")
 
 
 def _check_rest(file: ProcessFile, linear: Linearised) -> None:

@@ -116,8 +116,17 @@ class RunFolder:
 
     @property
     def process(self) -> Process:
-        """The process that was run, as it was then."""
-        return Process.of(self._process) if self._process else COLD_BOX
+        """The process that was run, as it was then.
+
+        Raises:
+            UsageError: Its declaration is none that this version makes.
+        """
+        try:
+            return Process.of(self._process) if self._process else COLD_BOX
+        except (KeyError, TypeError, ValueError) as error:
+            raise UsageError(
+                f"{self.path / str(self._model)}: process: {error}; use the version of Coldloop that made this run"
+            ) from None
 
     @property
     def remedy(self) -> str:

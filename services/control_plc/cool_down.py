@@ -11,17 +11,20 @@ Pure: measured outputs in, wanted inputs out. How far the turbine may open is it
 """
 
 from collections.abc import Collection, Sequence
-from typing import Annotated
+from typing import Annotated, Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from coldloop.process.limits import InputLimits
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import BATH, CONTROLLED, INPUT_NAMES, OUTPUT_NAMES, TICK_S
 from coldloop.registers.control_plc import CoolDownStep, SequenceRow
 
 LEVEL, TEMPERATURE, TURBINE_OUTLET = (
     map(OUTPUT_NAMES.index, (BATH.level, BATH.temperature, BATH.turbine_outlet)) if BATH else (0, 0, 0)
 )
+BANDS: Final = dict(zip(CONTROLLED, PROCESS.bands, strict=True))
+"""By output."""
 FEED, HEATER, TURBINE_VALVE = map(INPUT_NAMES.index, BATH.inputs) if BATH else (0, 0, 0)
 
 
@@ -47,7 +50,6 @@ class CoolDown:
         limits: Bounds of the inputs.
         inputs: At the operating point.
         outputs: At the operating point.
-        bands: Of the outputs that have one.
         step: Which it had reached before a restart.
     """
 
@@ -57,11 +59,10 @@ class CoolDown:
         limits: InputLimits,
         inputs: Sequence[float],
         outputs: Sequence[float],
-        bands: Sequence[tuple[float, float]],
         step: CoolDownStep = CoolDownStep.FINISHED,
     ) -> None:
         self._settings, self._limits = settings, limits
-        self._inputs, self._outputs, self._bands = inputs, outputs, bands
+        self._inputs, self._outputs = inputs, outputs
         self._has_begun = BATH is None or step is not CoolDownStep.FINISHED
         self._settled_since: int | None = None
         self.step = step
@@ -105,14 +106,14 @@ class CoolDown:
                 return CoolDownStep.BATH
             case CoolDownStep.BATH if y[LEVEL] >= self._settings.liquid_pct:
                 return CoolDownStep.FILLING
-            case CoolDownStep.FILLING if y[LEVEL] >= self._bands[CONTROLLED.index(LEVEL)][0]:
+            case CoolDownStep.FILLING if y[LEVEL] >= BANDS[LEVEL].low:
                 return CoolDownStep.SETTLING
             case CoolDownStep.SETTLING if self._has_settled(tick, y):
                 return CoolDownStep.FINISHED
         return self.step
 
     def _has_settled(self, tick: int, y: Sequence[float]) -> bool:
-        inside = all(low <= y[output] <= high for output, (low, high) in zip(CONTROLLED, self._bands, strict=True))
+        inside = all(BANDS[output].low <= y[output] <= BANDS[output].high for output in (LEVEL, TURBINE_OUTLET))
         if not inside or self._settled_since is None or tick < self._settled_since:
             self._settled_since = tick if inside else None
         return inside and (tick - (self._settled_since or 0)) * TICK_S >= self._settings.settled_s

@@ -172,9 +172,8 @@ class ControlProgram:
             self._section.sensors, self._point.outputs, [SEEN * rate for rate in self._limits.rate]
         )
         self.cool_down = CoolDown(
-            self._section.cool_down, self._limits, self._point.inputs, self._point.outputs, self.alarm_settings.bands,
-            cool_down,
-        )  # fmt: skip
+            self._section.cool_down, self._limits, self._point.inputs, self._point.outputs, cool_down
+        )
         self._unknown = False
         """The load or the state that was measured last makes no sense."""
         self._failed_handshake = -math.inf

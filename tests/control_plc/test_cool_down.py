@@ -27,7 +27,7 @@ def outputs(level: float, bath: float, exhaust: float) -> list[float]:
 
 def make() -> CoolDown:
     rest = outputs(60.0, 4.44, 10.4)
-    return CoolDown(CoolDownSettings(settled_s=10.0), InputLimits(), INPUTS, rest, ((59.0, 61.0), (9.0, 16.0)))
+    return CoolDown(CoolDownSettings(settled_s=10.0), InputLimits(), INPUTS, rest)
 
 
 def test_a_cold_plant_is_not_cooled_down_even_if_its_bath_runs_dry_later() -> None:

@@ -8,47 +8,69 @@ import sys
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coldloop.process.limits import InputLimits
 from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import load
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
-from coldloop.process.signals import OUTPUT_NAMES
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES
 from coldloop.registers.control_plc import SequenceRow
 from control_plc.cool_down import CoolDown, CoolDownSettings
 from control_plc.sensors import may_stand
-from optimizer_plc.computing_settings import SIGNALS, EstimatorSettings
-from optimizer_plc.qp.design import ControlDesign, Target
-from optimizer_plc.qp.prediction import PredictionModel, state_weights
-from optimizer_plc.qp.target import bounds_at, find_target, least_warm_load, loads_held, target_search
+from optimizer_plc.computing_settings import SIGNALS
+from optimizer_plc.decisions import Latched, begin_again
+from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.qp.prediction import state_weights
+from optimizer_plc.qp.target import bounds_at, find_target, least_warm_load, loads_held
+from optimizer_plc.scheme import most_open, problem_at, shortage
+from optimizer_plc.settings import ProgramSettings
+
+Array = NDArray[np.float64]
 
 MODEL = load(DEFAULT_MODEL_FILE)
-
-
-def targets(given: dict[str, Any], design: ControlDesign) -> list[list[float]]:
-    """Return for each situation its target, the least and largest load that can be held, and the least warm one."""
-    disturbed = EstimatorSettings(disturbances=tuple(given["disturbed"])).disturbed
-    prediction = PredictionModel(MODEL).with_disturbances(disturbed)
-    search = target_search(prediction, design, InputLimits())
-    found = []
-    for each in given["situations"]:
-        x = np.array([*each["states"], *(each["constants"][SIGNALS[place]] for place in disturbed)])
-        target = np.zeros(len(PROCESS.inputs))
-        find_target(search, x, each["w"], each["mismatch"], each["most_open"], target)
-        low, high = bounds_at(search, x, each["most_open"])
-        found.append([*target.tolist(), *loads_held(search, low, high), least_warm_load(search, low, high)])
-    return found
 
 
 def measured(y: dict[str, float]) -> list[float]:
     return [y[name] for name in OUTPUT_NAMES]
 
 
+class Laws:
+    """What an optimiser says of a situation."""
+
+    def __init__(self, settings: dict[str, Any]) -> None:
+        self.program = OptimizerProgram(MODEL, ProgramSettings.model_validate(settings), InputLimits())
+        self.c = self.program.constants
+
+    def of(self, given: dict[str, Any]) -> dict[str, list[float]]:
+        """Return it by inputs, by states, and by nothing."""
+        c = self.c
+        x = np.array([*given["states"], *(given["constants"][SIGNALS[place]] for place in self.program.disturbances)])
+        u, w = np.array([given["u"][name] for name in INPUT_NAMES]), given["w"]
+        y = MODEL.y0 + np.array([given["y"].get(name, 0.0) for name in OUTPUT_NAMES])
+        limit = most_open(c, u, y)
+        target = np.zeros(len(PROCESS.inputs))
+        find_target(c.target, x, w, given["mismatch"], limit, target)
+        low, high = bounds_at(c.target, x, limit)
+        loads = [*loads_held(c.target, low, high), least_warm_load(c.target, low, high)]
+        loads += [shortage(c, x, w, MODEL.w0 + part * w, limit, 0.0) for part in (0.0, 1.0, 3.0)]
+        problem = problem_at(c, x, w, u, 1.0, target, limit)
+        return {
+            "by input": [*target, *problem.high[: c.n_inputs]], "loads": loads, "limit": [limit],
+            "rest": self.rest(MODEL.w0 + w, u, y).tolist(),
+        }  # fmt: skip
+
+    def rest(self, watts: float, u: Array, y: Array) -> Array:
+        """Return where the plant is believed to rest."""
+        state, nothing = self.program.state, np.zeros(0)
+        begin_again(self.c, state, Latched(0, 0, 0, watts, MODEL.u0 + u, MODEL.u0 + u, y, MODEL.x0, nothing), u)
+        return state.belief.x[: len(MODEL.x0)]
+
+
 def cool_down(courses: list[dict[str, float]], by_loops: list[float]) -> list[list[float]]:
     """Return after each measurement the step and the wanted inputs."""
-    bands = tuple((band.low, band.high) for band in PROCESS.bands)
     inputs = tuple(MODEL.u0.tolist())
-    sequence = CoolDown(CoolDownSettings(settled_s=0.0), InputLimits(), inputs, MODEL.y0.tolist(), bands)
+    sequence = CoolDown(CoolDownSettings(settled_s=0.0), InputLimits(), inputs, MODEL.y0.tolist())
     found = []
     for tick, y in enumerate(courses):
         sequence.observe(tick, measured(y))
@@ -58,16 +80,16 @@ def cool_down(courses: list[dict[str, float]], by_loops: list[float]) -> list[li
 
 def main() -> None:
     given = json.loads(sys.argv[1])
-    design = ControlDesign(target=Target.LOAD, band_margin=(0.1, 0.1), **given["design"])
+    laws = Laws(given["settings"])
     answer = {
-        "weights": state_weights(MODEL, design).tolist(),
-        "targets": targets(given, design),
+        "weights": state_weights(MODEL, laws.program.settings.design).tolist(),
+        "situations": [laws.of(each) for each in given["situations"]],
         "cool down": cool_down(given["courses"], given["by loops"]),
         "may stand": [
             [name for place, name in enumerate(OUTPUT_NAMES) if may_stand(place, measured(y))] for y in given["courses"]
         ],
     }
-    sys.stdout.write(json.dumps(answer) + "\n")
+    sys.stdout.write(json.dumps(answer, default=float) + "\n")
 
 
 if __name__ == "__main__":

@@ -129,12 +129,18 @@ def test_disturbances_are_states_that_hold_and_outputs_where_they_are_measured(t
     assert "warning" not in text
 
 
+IN_M3: Final = POND.replace("= w\n", "= w[0], 1e3 * w[1], 1e3 * w[2], w[3]\n")
+"""The same pond with rain and what is drawn in m3/s, of which 1 is much in a tick."""
+
+
+@pytest.mark.parametrize("text", [POND, IN_M3], ids=["l/s", "m3/s"])
 def test_a_session_begins_without_disturbances_however_far_the_inputs_are_from_the_operating_point(
-    processes: Processes, tmp_path: Path
+    text: str, processes: Processes, tmp_path: Path
 ) -> None:
     """One more l/s of the pump fills both tanks of the pond by 1 cm."""
-    model = tmp_path / "model.json"
-    assert started(processes, "process", pond(tmp_path), "--out", model).code == 0
+    model, file = tmp_path / "model.json", pond(tmp_path)
+    (tmp_path / "pond.py").write_text(text, encoding="utf-8")
+    assert started(processes, "process", file, "--out", model).code == 0
     environment, command = os.environ | {"COLDLOOP_PROCESS": str(model)}, [sys.executable, "-c", REST]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

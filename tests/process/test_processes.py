@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 import pytest
 
+from coldloop.process.model_file import read_document, write_document
 from coldloop.registers.control_plc import Mode
 from tests.harness.processes import Processes
 from tests.process.runs import run, started
@@ -119,9 +120,18 @@ def test_a_run_is_repeated_with_its_process_as_it_was_then(processes: Processes,
         assert code != 0
         assert "a run of quadruple-tank" in complaints
         assert complaints.endswith(f"{remedy}\n")
-    code, told, _ = started(processes, "--process", folder / "inputs" / "model.json", "rerun", folder)
+    model = folder / "inputs" / "model.json"
+    code, told, _ = started(processes, "--process", model, "rerun", folder)
     assert code == 0, told
     assert "the same trace" in told
+    declared = read_document(model, "")
+    declared["process"]["has_pond"] = True
+    write_document(model, declared)
+    for words in (("report",), ("plot",), ("compare", folder)):
+        code, _, complaints = started(processes, *words, folder)
+        assert code != 0
+        assert complaints.count("\n") == 1
+        assert "has_pond is unknown; use the version of Coldloop that made this run" in complaints
 
 
 @pytest.mark.exhaustive

@@ -267,8 +267,20 @@ class Process:
         self._check_names("output", bath.outputs, self.outputs)
         self._check_names("output with a band", bath.banded, self.banded)
         self._check_names("state", bath.states, self.states)
+        units = dict.fromkeys((bath.level, bath.feed), "%") | dict.fromkeys(
+            (bath.temperature, bath.feed_temperature, bath.turbine_outlet), "K"
+        )
+        declared = {one.name: one.unit for one in self.inputs} | {one.name: one.unit for one in self.outputs}
+        for name, unit in units.items():
+            if declared.get(name, unit) != unit:
+                raise ValueError(f"bath: {name} has to be in {unit}, not in '{declared[name]}'")
         if len(bath.turbine_pressures) != 2 * bool(bath.turbine_speed):
             raise ValueError("bath: give turbine_speed with two turbine_pressures, before and behind it, or neither")
+        loops = {bath.level: bath.heater, bath.turbine_outlet: bath.turbine_valve}
+        for name, moved in loops.items():
+            band = next(output.band for output in self.banded if output.name == name)
+            if band and band.loop and band.loop.input != moved:
+                raise ValueError(f"bath: the loop of {name} moves {band.loop.input}; a cool-down needs it on {moved}")
         if not self.has_load:
             raise ValueError("bath: declare the load that boils it off")
         if bath.holdable_load is not None and bath.holdable_load[0] >= bath.holdable_load[1]:
@@ -280,7 +292,7 @@ class Process:
     def _check_names(what: str, names: Sequence[str], declared: Sequence[Output | State]) -> None:
         for name in names:
             if name not in [each.name for each in declared]:
-                raise ValueError(f"bath: {name} is no {what}")
+                raise ValueError(f"bath: {name or 'an empty name'} is no {what}")
             if names.count(name) > 1:
                 raise ValueError(f"bath: {name} is named twice")
 

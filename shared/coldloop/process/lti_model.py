@@ -121,6 +121,16 @@ class LtiModel:
             raise ValueError("w0 is not finite")
 
     @property
+    def moved(self) -> NDArray[np.intp]:
+        """The states that move by themselves, by inputs or by the load; others are disturbances, and what these do."""
+        found = np.arange(len(self.A))
+        while True:
+            moves = np.hstack([self.A[np.ix_(found, found)], self.B[found], self.F[found, None]]).any(axis=1)
+            if moves.all():
+                return found
+            found = found[moves]
+
+    @property
     def digest(self) -> str:
         """SHA-256 of the content, in hexadecimal: the model's identity on the bus."""
         return digest_of(self._document())
