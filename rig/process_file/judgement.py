@@ -16,8 +16,6 @@ SMALL: Final = 1e-6
 """Singular value, over the largest, below which a direction counts as none."""
 NOTHING: Final = 1e-12
 """What is smaller is rounding."""
-SETTLED: Final = 3.0
-"""Time constants after which a mode has settled."""
 
 
 def described(made: Made) -> str:
@@ -61,7 +59,7 @@ def _rest(made: Made) -> list[str]:
 
 def _modes(made: Made) -> list[str]:
     values = sorted(np.linalg.eigvals(made.own_A), key=lambda value: -value.real)
-    values = [complex(v.real * (abs(v.real) > NOTHING), v.imag) for v in values]
+    values = [complex(v.real if abs(v.real) > NOTHING else 0.0, v.imag) for v in values]
     texts = [f"{v.real:.3g}" if abs(v.imag) < 1e-12 else f"{v.real:.3g}{v.imag:+.3g}i" for v in values]
     lines = [f"modes      {'  '.join(texts[i : i + 8])} /s" for i in range(0, len(texts), 8)]
     if made.linear.error:
@@ -118,7 +116,7 @@ def _warnings(made: Made) -> list[str]:
     fastest, slowest = -poles.real.min(), -poles.real.max()
     if poles.real.max() > NOTHING:
         found.append(f"unstable: a mode grows with {poles.real.max():.3g} /s; nothing may be late for longer")
-    elif slowest * SETTLED > 0 and process.decision_instants[-1] * sample_s * slowest < 1.0:
+    elif slowest > NOTHING and process.decision_instants[-1] * sample_s * slowest < 1.0:
         found.append(f"horizon: it ends before the slowest mode, {1 / slowest:.3g} s, has moved much")
     if fastest * sample_s > 20.0:
         found.append(f"sampling: the fastest mode, {1 / fastest:.2g} s, is over within a sampling period")

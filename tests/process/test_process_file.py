@@ -105,11 +105,13 @@ def test_what_is_wrong_with_a_process_is_said_in_words(tmp_path: Path) -> None:
     assert "kink" in described(made(tmp_path, plant=kink)) or "controllability" in described(made(tmp_path, plant=kink))
 
 
-def test_an_integrator_that_grows_by_rounding_alone_is_not_called_unstable(tmp_path: Path) -> None:
+def test_an_integrator_that_grows_or_shrinks_by_rounding_alone_is_neither_unstable_nor_slow(tmp_path: Path) -> None:
     found = made(tmp_path)
-    text = described(replace(found, linear=found.linear._replace(A=np.array([[1.73e-18]]))))
-    assert "modes      0 /s" in text
-    assert "unstable" not in text
+    for mode in (1.73e-18, -1.73e-18):
+        text = described(replace(found, linear=found.linear._replace(A=np.array([[mode]]))))
+        assert "modes      0 /s" in text
+        assert "unstable" not in text
+        assert "horizon:" not in text
 
 
 def changed(before: str, after: str) -> str:
