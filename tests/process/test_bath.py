@@ -45,7 +45,7 @@ class Order(NamedTuple):
 
     @property
     def names(self) -> dict[str, str]:
-        """What each signal of the cold box is called there."""
+        """What each signal and state of the cold box is called there; P1, which is both, as the state."""
         kinds = (("in", INPUTS, self.inputs), ("out", OUTPUTS, self.outputs), ("x", STATES, self.states))
         return {known[one]: f"{kind}{place}" for kind, known, order in kinds for place, one in enumerate(order, 1)}
 

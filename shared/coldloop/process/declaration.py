@@ -267,15 +267,19 @@ class Process:
         self._check_names("output", bath.outputs, self.outputs)
         self._check_names("output with a band", bath.banded, self.banded)
         self._check_names("state", bath.states, self.states)
+        if len(bath.turbine_pressures) != 2 * bool(bath.turbine_speed):
+            raise ValueError("bath: give turbine_speed with two turbine_pressures, before and behind it, or neither")
+        self._check_laws(bath)
+
+    def _check_laws(self, bath: Bath) -> None:
+        """Check that units, loops and loads are those that the laws of a bath are written for."""
         units = dict.fromkeys((bath.level, bath.feed), "%") | dict.fromkeys(
             (bath.temperature, bath.feed_temperature, bath.turbine_outlet), "K"
         )
         declared = {one.name: one.unit for one in self.inputs} | {one.name: one.unit for one in self.outputs}
         for name, unit in units.items():
-            if declared.get(name, unit) != unit:
+            if declared[name] != unit:
                 raise ValueError(f"bath: {name} has to be in {unit}, not in '{declared[name]}'")
-        if len(bath.turbine_pressures) != 2 * bool(bath.turbine_speed):
-            raise ValueError("bath: give turbine_speed with two turbine_pressures, before and behind it, or neither")
         loops = {bath.level: bath.heater, bath.turbine_outlet: bath.turbine_valve}
         for name, moved in loops.items():
             band = next(output.band for output in self.banded if output.name == name)
