@@ -13,7 +13,7 @@ from coldloop.config import load_configuration
 from coldloop.errors import ConfigurationError, UsageError
 from rig.plc_sizing.reference_plc import Array, fitted
 
-LISTING: Final = "docs/budget.md lists the keys"
+LISTING: Final = "docs/keys.md lists the keys"
 SHIPPED: Final = files("rig.plc_sizing") / "profiles"
 FEWEST_SIZES: Final = 3
 """Of a factorisation, for a curve of three coefficients."""
@@ -29,9 +29,10 @@ SHORTEST_MS, LONGEST_MS = 1e-6, 1e9
 class PlcProfile(BaseModel):
     """What decides whether a controller runs on a PLC."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     name: Annotated[str, Field(min_length=1, max_length=80)]
+    """As sentences and tables have it."""
     source: Annotated[str, Field(min_length=1)]
     """Where the figures are from."""
     memory_bytes: Annotated[int, Field(strict=True, ge=1, le=10**15)]

@@ -1,4 +1,4 @@
-"""What a process file says, checked when it is read; `docs/your-plant.md` is its reference."""
+"""What a process file says, checked when it is read; `docs/keys.md` is made of what is said of its keys here."""
 
 from keyword import iskeyword
 from pathlib import Path
@@ -19,7 +19,7 @@ from coldloop.process.declaration import Bath
 
 MOST_SIGNALS: Final = 32
 """Outputs at most: registers have a bit for each."""
-LISTING: Final = "docs/your-plant.md lists all keys"
+LISTING: Final = "docs/keys.md lists all keys"
 
 RESERVED: Final = frozenset((
     "tick", "session", "holder", "generation", "crc", "mode", "update", "u", "time_s", "load", "load_w", "cause",
@@ -32,7 +32,7 @@ Span = tuple[FiniteFloat, FiniteFloat]
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
 
 def _rising(span: Span, what: str) -> None:
@@ -44,23 +44,30 @@ class LoopSection(_Section):
     """A PI loop of the fallback, u = gain (e + 1/T_i integral of e) with e = setpoint - y."""
 
     input: Name
+    """That it moves; each loop has its own."""
     gain: FiniteFloat
     """In the unit of the input per unit of the output, with the sign of the process."""
     integral_time_s: PositiveFloat
+    """T_i, s."""
 
 
 class InputSection(_Section):
     """A manipulated input."""
 
     name: Name
+    """Letters, digits and underscores; of all signals another one."""
     variable: str | None = None
     """Its name in an FMU, if it is not `name`."""
     unit: str = ""
+    """Shown with every value; an FMU may have it."""
     description: str = ""
+    """Of its register."""
     at: FiniteFloat
     """At the operating point."""
     low: FiniteFloat
+    """Least value that the actuator takes."""
     high: FiniteFloat
+    """Largest value."""
     rate: PositiveFloat
     """Largest change in a sampling period."""
     safe: FiniteFloat | None = None
@@ -81,9 +88,11 @@ class OutputSection(_Section):
     """A measured output."""
 
     name: Name
+    """Letters, digits and underscores; of all signals another one."""
     variable: str | None = None
     """Its name in an FMU, if it is not `name`."""
     unit: str = ""
+    """Shown with every value; an FMU may have it."""
     range: Span
     """Of its sensor: what is outside is no measurement."""
     noise: PositiveFloat
@@ -104,6 +113,7 @@ class OutputSection(_Section):
     weight: NonNegativeFloat = 0.0
     """In the cost, per square of its deviation from the operating point."""
     loop: LoopSection | None = None
+    """The PI loop of the fallback that controls it; none if not given."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -141,11 +151,15 @@ class _OutsideSection(_Section):
     """What acts on the plant and is no input."""
 
     name: Name
+    """Letters, digits and underscores; of all signals another one."""
     variable: str | None = None
     """Its name in an FMU, if it is not `name`."""
     unit: str = ""
+    """Shown with every value; an FMU may have it."""
     at: FiniteFloat
+    """At the operating point."""
     span: Span
+    """Within which it stays."""
     walk: PositiveFloat | None = None
     """Random walk that the estimator expects, of the load of what is not measured of it, per square root of a sampling
     period; 1 % of the span if not given."""
@@ -182,10 +196,15 @@ class LagSection(_Section):
     """gain exp(-delay s) / (time constant s + 1) from an input, the load or another disturbance, to an output."""
 
     output: Name
+    """That it moves."""
     source: Name
+    """An input, the load or another disturbance."""
     gain: FiniteFloat
+    """At rest, in the unit of the output per unit of the source."""
     time_constant_s: PositiveFloat
+    """Of the lag, s."""
     delay_s: NonNegativeFloat = 0.0
+    """Dead time, s; whole ticks on the simulated plant."""
 
 
 class PlantSection(_Section):
@@ -194,10 +213,12 @@ class PlantSection(_Section):
     python: Annotated[str, Field(pattern=r"^[^:]+\.py:[A-Za-z_]\w*$")] | None = None
     """`file.py:Class`, the file beside the process file."""
     matrices: str | None = None
-    """NPZ file with A, B, C and, where there are such, D, F, G: dx/dt = A x + B u + F w, in deviations and seconds.
+    """NPZ file with A, B, C and, where there are such, D, F, G: dx/dt = A x + B u + F w, y = C x + D u + G w.
 
-    F and G have a column for the load and one for each other disturbance."""
+    All are deviations from the operating point, time in seconds. F and G have a column for the load and one for each
+    other disturbance."""
     transfer_functions: tuple[LagSection, ...] | None = None
+    """First-order lags with dead times."""
     step_test: str | None = None
     """CSV file with columns time_s, inputs, load and other disturbances (those that moved), outputs: the plant is the
     model that is found in it."""
@@ -224,6 +245,7 @@ class StateSection(_Section):
     """Process noise of a state."""
 
     name: Name
+    """Of the plant's states."""
     walk: PositiveFloat
     """Per square root of a sampling period."""
 
@@ -232,9 +254,11 @@ class PredictionSection(_Section):
     """Decision and constraint instants, in sampling periods, and where the model is from, if not from the plant."""
 
     step_test: str | None = None
-    """CSV file with columns as `PlantSection.step_test`: the model is found in it, and the plant hides its states."""
+    """CSV file as of `plant.step_test`: the controller's model is found in it, and the plant hides its states."""
     decision_instants: tuple[Annotated[int, Field(ge=1, le=400)], ...] = (1, 2, 4, 8, 16, 30, 60)
+    """At which the inputs are free, rising; the last one is the horizon."""
     constraint_instants: tuple[Annotated[int, Field(ge=1, le=400)], ...] = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 44, 60)
+    """At which bands and setpoints count, rising, within the horizon; `coldloop design` compares sets."""
 
     @model_validator(mode="after")
     def _rising(self) -> Self:
@@ -257,14 +281,21 @@ class ProcessFile(_Section):
     ticks_per_sample: Annotated[int, Field(ge=2, le=100)] = 20
     """Ticks of a sampling period of the prediction model, which is the longest updating period."""
     plant: PlantSection
+    """Where the plant comes from."""
     inputs: Annotated[tuple[InputSection, ...], Field(min_length=1, max_length=MOST_SIGNALS)]
+    """What the controller moves."""
     outputs: Annotated[tuple[OutputSection, ...], Field(min_length=1, max_length=MOST_SIGNALS)]
+    """What is measured; at least one has a band or a setpoint."""
     load: LoadSection | None = None
+    """The disturbance that operators and `--load` set."""
     disturbances: Annotated[tuple[DisturbanceSection, ...], Field(max_length=MOST_SIGNALS)] = ()
+    """Others."""
     states: tuple[StateSection, ...] = ()
     """Process noises of states by name; of others 1 % of what they move by with the inputs, a sample."""
     bath: Bath | None = None
+    """Which signals are those of a bath that the cold end of a refrigerator fills; leave it out for other plants."""
     prediction: PredictionSection = PredictionSection()
+    """The problem that is solved on-line."""
     mimic: str | None = None
     """SVG file with a drawing for the operator's page, beside the process file."""
 

@@ -7,10 +7,14 @@ from pathlib import Path
 
 import pytest
 import yaml
+from pydantic import BaseModel
 
 from coldloop.registers.maps import MAPS
 from rig.cli import make_parser
+from rig.cli.key_listing import key_listing
 from rig.cli.register_listing import FORMATS
+from rig.plc_sizing.profile import PlcProfile
+from rig.process_file.declaration import ProcessFile
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -19,6 +23,13 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 def test_the_register_page_is_what_the_command_prints() -> None:
     page = (ROOT / "docs" / "registers.md").read_text(encoding="utf-8")
     assert page.endswith(FORMATS["markdown"](list(MAPS.values())))
+
+
+@pytest.mark.parametrize("model", [ProcessFile, PlcProfile])
+def test_the_page_of_keys_is_what_the_commands_print(model: type[BaseModel]) -> None:
+    tables = key_listing(model)
+    assert tables in (ROOT / "docs" / "keys.md").read_text(encoding="utf-8")
+    assert "|  |\n" not in tables, "each key has a meaning"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -35,6 +35,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
                         help="with --export: a PLC took so many microseconds for the iterations of the solver's"
                         " self-test; prints its profile")  # fmt: skip
     parser.add_argument("--list", action="store_true", help="list the shipped PLCs")
+    parser.add_argument("--keys", action="store_true", help="list the keys of a PLC's profile, as Markdown")
     parser.add_argument("--load", dest="loads", nargs="+", metavar="LOAD", default=[],
                         help="with --plc: whether an adaptive updating period pays there under these loads, against "
                         "--updating-period or the best fixed one")  # fmt: skip
@@ -82,10 +83,18 @@ def execute(options: argparse.Namespace) -> int:
         raise UsageError("--load: says whether an adaptive period pays on a PLC; name one with --plc")
     if options.took and not options.export:
         raise UsageError("--took: is of an export's self-test; name its folder with --export")
-    shown = (_listing() if options.list else _exported(options) if options.export else _certified(options)
-             if options.certify else _tables(options))  # fmt: skip
-    sys.stdout.write(shown)
+    sys.stdout.write(_shown(options))
     return 0
+
+
+def _shown(options: argparse.Namespace) -> str:
+    if options.list:
+        return _listing()
+    if options.keys:
+        return _keys()
+    if options.export:
+        return _exported(options)
+    return _certified(options) if options.certify else _tables(options)
 
 
 def _listing() -> str:
@@ -93,6 +102,13 @@ def _listing() -> str:
     from rig.text_tables import aligned
 
     return aligned([(name, find_profile(name).name) for name in shipped_profiles()])
+
+
+def _keys() -> str:
+    from rig.cli.key_listing import key_listing
+    from rig.plc_sizing.profile import PlcProfile
+
+    return key_listing(PlcProfile)
 
 
 def _exported(options: argparse.Namespace) -> str:

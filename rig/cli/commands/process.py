@@ -7,7 +7,9 @@ from pathlib import Path
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("file", type=Path, metavar="FILE", help="process file (TOML)")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("file", type=Path, nargs="?", metavar="FILE", help="process file (TOML)")
+    what.add_argument("--keys", action="store_true", help="list the keys of process files, as Markdown")
     parser.add_argument("--out", type=Path, metavar="MODEL",
                         help="write the model file; then --process MODEL, or COLDLOOP_PROCESS=MODEL")  # fmt: skip
 
@@ -20,6 +22,10 @@ def execute(options: argparse.Namespace) -> int:
     from rig.process_file.making import made_from
 
     out: Path | None = options.out
+    if options.keys:
+        if out is not None:
+            raise UsageError("--out: writes the model of a process file; name that file, and leave out --keys")
+        return _list_keys()
     if out is not None:
         require_regular_file(out)
         if out.resolve() == options.file.resolve():
@@ -32,4 +38,12 @@ def execute(options: argparse.Namespace) -> int:
         except OSError as error:
             raise UsageError(f"{out}: {error.strerror}; name a file that can be written with --out") from None
         sys.stdout.write(f"written to {out}\n")
+    return 0
+
+
+def _list_keys() -> int:
+    from rig.cli.key_listing import key_listing
+    from rig.process_file.declaration import ProcessFile
+
+    sys.stdout.write(key_listing(ProcessFile))
     return 0

@@ -143,7 +143,7 @@ class Bath:
     plant, whatever its signals are called and in which order they are. All but states are names of inputs and outputs.
     """
 
-    __pydantic_config__: ClassVar = {"extra": "forbid"}
+    __pydantic_config__: ClassVar = {"extra": "forbid", "use_attribute_docstrings": True}
     """For process files, whose section `bath` this is."""
 
     level: str
