@@ -212,11 +212,14 @@ class PlantSection(_Section):
 
     python: Annotated[str, Field(pattern=r"^[^:]+\.py:[A-Za-z_]\w*$")] | None = None
     """`file.py:Class`, the file beside the process file."""
+    installed: str | None = None
+    """Such a class of a package that is installed: the name of its entry point, of the group `coldloop.plants`."""
     matrices: str | None = None
-    """NPZ file with A, B, C and, where there are such, D, F, G: dx/dt = A x + B u + F w, y = C x + D u + G w.
+    """NPZ or JSON file with A, B, C and, where there are such, D, F, G: dx/dt = A x + B u + F w, y = C x + D u + G w.
 
     All are deviations from the operating point, time in seconds. F and G have a column for the load and one for each
-    other disturbance."""
+    other disturbance. Or `file.py:NAME`, a state space in continuous time, as of python-control, whose inputs are those
+    of the file, then the load and the other disturbances."""
     transfer_functions: tuple[LagSection, ...] | None = None
     """First-order lags with dead times."""
     step_test: str | None = None
@@ -233,7 +236,7 @@ class PlantSection(_Section):
 
     @model_validator(mode="after")
     def _one(self) -> Self:
-        sources = ("python", "matrices", "transfer_functions", "step_test", "fmu")
+        sources = ("python", "installed", "matrices", "transfer_functions", "step_test", "fmu")
         if sum(getattr(self, each) is not None for each in sources) != 1:
             raise ValueError(f"plant: give one of {', '.join(sources)}")
         if self.fmu is None and (self.start or self.steps_per_tick or self.rest_s):

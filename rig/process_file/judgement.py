@@ -5,6 +5,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from coldloop.process.declaration import Input, Output, Process
 from rig.process_file.bath import exchanged
 from rig.process_file.making import Made
 
@@ -14,6 +15,8 @@ ROUGH: Final = 1e-4
 """Error of the derivatives from which on the plant has a kink, or noise, at its operating point."""
 SMALL: Final = 1e-6
 """Singular value, over the largest, below which a direction counts as none."""
+SHARE: Final = 0.01
+"""Of a rate or a band, that is still to be told apart."""
 NOTHING: Final = 1e-12
 """What is smaller is rounding."""
 
@@ -98,6 +101,25 @@ def _loops(made: Made, effect: Array) -> list[str]:
     return found
 
 
+def _coarse(process: Process) -> list[str]:
+    """Return what registers and on-line arithmetic, which have single precision, do not resolve."""
+    found = []
+    for one in process.inputs:
+        found += _too_coarse(one, (one.low, one.high), SHARE * one.rate, "its rate")
+    for signal in process.outputs:
+        found += _too_coarse(signal, signal.range, signal.noise, "the noise of its sensor")
+    for band, signal in zip(process.bands, process.banded, strict=True):
+        found += _too_coarse(signal, signal.range, SHARE * (band.high - band.low), "its band")
+    return found
+
+
+def _too_coarse(signal: Input | Output, ends: tuple[float, float], least: float, what: str) -> list[str]:
+    step = float(np.spacing(np.float32(max(map(abs, ends)))))
+    if step <= least:
+        return []
+    return [f"{signal.name} has steps of {step:.2g} {signal.unit}, too coarse for {what}; count it from another zero"]
+
+
 def _dead_times(made: Made) -> list[str]:
     """Return which dead times are not whole ticks; the simulated plant has the nearest that is."""
     tick_s, lags = made.process.tick_s, made.linear.parameters.get("lags", ())
@@ -135,6 +157,7 @@ def _warnings(made: Made) -> list[str]:
         found += exchanged(m, process.bath, process.decision_instants[-1] * sample_s)
     found += [f"loop: {text}" for text in _loops(made, effect)]
     found += [f"dead time: {text}" for text in _dead_times(made)]
+    found += [f"single precision: {text}" for text in _coarse(process)]
     steady = m.A_tick - np.eye(len(m.A))
     if _rank_deficit(np.vstack([steady, m.C])):
         found.append("observability: the outputs do not show where some state rests")

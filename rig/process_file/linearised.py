@@ -3,7 +3,7 @@
 import warnings
 from math import factorial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from coldloop.errors import UsageError
 from coldloop.process.lti_model import discretise
 from plant.own.disturbances import outside
-from plant.own.maker import FMU, LINEAR, PYTHON, TRANSFER_FUNCTIONS
+from plant.own.maker import FMU, PYTHON, TRANSFER_FUNCTIONS
 from plant.own.python_class import Equations, equations_of, evaluated
 from rig.process_file.declaration import LagSection, PlantSection, ProcessFile
 from rig.process_file.fmu_model import from_fmu
 from rig.process_file.linear_model import Linearised, given_outputs, jacobian, operating_point, with_disturbances
+from rig.process_file.matrices import from_matrices
+from rig.process_file.source import installed_source, source_of
 from rig.process_file.step_test import from_step_test, record_compared
 
 Array = NDArray[np.float64]
@@ -38,9 +40,11 @@ def linearised(file: ProcessFile, folder: Path) -> Linearised:
     """
     plant = file.plant
     if plant.python is not None:
-        found = _from_equations(file, folder, plant.python)
+        found = _from_equations(file, plant.python, *source_of(folder, plant.python))
+    elif plant.installed is not None:
+        found = _from_equations(file, plant.installed, *installed_source(plant.installed))
     elif plant.matrices is not None:
-        found = _from_matrices(file, folder / plant.matrices)
+        found = from_matrices(file, folder, plant.matrices)
     elif plant.step_test is not None:
         found = from_step_test(file, folder / plant.step_test)
     elif plant.fmu is not None:
@@ -84,8 +88,7 @@ def _gains_compared(file: ProcessFile, plant: Linearised, model: Linearised) -> 
 # -- a class with equations ------------------------------------------------------------------------------------------
 
 
-def _from_equations(file: ProcessFile, folder: Path, place: str) -> Linearised:
-    source, name = _source(folder, place)
+def _from_equations(file: ProcessFile, place: str, source: str, name: str) -> Linearised:
     equations = equations_of(source, name, place)
     u, w = operating_point(file)
     n, m = len(equations.states), len(u)
@@ -107,15 +110,6 @@ def _from_equations(file: ProcessFile, folder: Path, place: str) -> Linearised:
         J[:, :n], J[:, n : n + m], J[:, n + m :], H[:, :n], H[:, n : n + m], H[:, n + m :], x, u, w, y,
         dict(equations.states), PYTHON, parameters, "", max(one, other),
     )  # fmt: skip
-
-
-def _source(folder: Path, place: str) -> tuple[str, str]:
-    """Return the text of the file that `file.py:Class` names, and the class."""
-    file, _, name = place.partition(":")
-    try:
-        return (folder / file).read_text(encoding="utf-8"), name
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{folder / file}: {error}; a plant's file is looked for beside the process file") from None
 
 
 def _sizes(x: Array, equations: Equations) -> Array:
@@ -155,34 +149,7 @@ def _rest(equations: Equations, u: Array, w: Array, place: str, sample_s: float)
     return np.array(found.x * size, dtype=np.float64)
 
 
-# -- matrices and transfer functions ---------------------------------------------------------------------------------
-
-
-def _from_matrices(file: ProcessFile, path: Path) -> Linearised:
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            M = {name: np.array(stored[name], dtype=np.float64) for name in stored.files}
-    except (OSError, ValueError, EOFError) as error:
-        raise UsageError(f"{path}: not a readable NPZ file ({error}); write it with numpy.savez(A=..., ...)") from error
-    missing = {"A", "B", "C"} - set(M)
-    if missing:
-        raise UsageError(f"{path}: no {' and '.join(sorted(missing))}; it needs A, B and C")
-    n, m, p = len(np.atleast_2d(M["A"])), len(file.inputs), len(file.outputs)
-    k = 1 + len(file.disturbances)
-    shapes = {"A": (n, n), "B": (n, m), "F": (n, k), "C": (p, n), "D": (p, m), "G": (p, k)}
-    full: dict[str, Any] = {name: M.get(name, np.zeros(shape)) for name, shape in shapes.items()}
-    full |= {name: full[name][:, np.newaxis] for name in ("F", "G") if full[name].ndim == 1}
-    for name, shape in shapes.items():
-        if full[name].shape != shape:
-            raise UsageError(
-                f"{path}: {name} has shape {full[name].shape}, and not {shape} for {n} states, {m} inputs, {p} outputs"
-                + (f", {k} disturbances" if k > 1 else "")
-            )
-    u, w = operating_point(file)
-    return Linearised(
-        **full, x0=np.zeros(n), u0=u, w0=w, y0=given_outputs(file), states={f"x{i}": "" for i in range(1, n + 1)},
-        kind=LINEAR, parameters={}, digest="", error=0.0,
-    )  # fmt: skip
+# -- transfer functions ----------------------------------------------------------------------------------------------
 
 
 def _from_lags(file: ProcessFile, plant: PlantSection) -> Linearised:

@@ -10,12 +10,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from coldloop.process.signals import TICKS_PER_SAMPLE
+from coldloop.process.signals import SAMPLING_PERIOD_S, TICKS_PER_SAMPLE
+from optimizer_plc.budget import PlcBudget
 from optimizer_plc.qp.design import ControlDesign
 from rig.cosim.ideal_loop import run_ideal_loop
 from rig.plc_sizing.budget_tables import counted_sizes, problem_of
 from rig.plc_sizing.memory import estimator_memory, footprint
-from rig.plc_sizing.solver_counts import SOLVERS
+from rig.plc_sizing.solver_counts import SOLVERS, iteration_s
 from rig.settings import Settings
 from rig.studies.intervals import geometric_mean
 from rig.studies.loop_cost import ADAPTIVE, loop_cost, require_costs
@@ -42,6 +43,8 @@ class Judged(NamedTuple):
     """Of an iteration of the configured solver, zeros left out."""
     memory: int
     """Bytes in single precision."""
+    iterations: int
+    """Done in a sampling period by a PLC of the configured power, whose time for one goes with its operations."""
     costs: tuple[float, ...]
     """J_BF of each load."""
 
@@ -79,25 +82,26 @@ def judged(settings: Settings, names: Sequence[str], done: Callable[[int, int], 
     Raises:
         StudyError: The loop costs nothing.
     """
-    sets = candidates(settings.optimizer_plc.program.design)
-    found = []
+    sets, found = candidates(settings.optimizer_plc.program.design), list[Judged]()
     for number, (label, design) in enumerate(sets.items()):
         done(number, len(sets))
-        found.append(_judged(settings.with_program(design=design), label, names))
+        found.append(_judged(settings.with_program(design=design), label, names, found[0].flops if found else None))
     return found
 
 
-def _judged(settings: Settings, label: str, names: Sequence[str]) -> Judged:
+def _judged(settings: Settings, label: str, names: Sequence[str], configured: float | None) -> Judged:
+    """Return a set with what it costs; `configured`: operations of an iteration with the configured one, if not it."""
     program = settings.optimizer_plc.program
     problem, prediction = problem_of(settings)
     run = partial(run_ideal_loop, settings, ticks=TICKS_PER_SAMPLE)
-    sizes = counted_sizes(problem).without_zeros
+    flops = SOLVERS[program.solver].operations(counted_sizes(problem).without_zeros).flops
+    plc = PlcBudget(program.budget, iteration_s(program) * flops / (configured or flops))
     costs = tuple(loop_cost(settings, name, ADAPTIVE, run) for name in names)
     require_costs(costs)
     return Judged(
         label, program.design, problem.size, len(problem.Gamma), float(np.linalg.cond(problem.Phi.astype(float))),
-        SOLVERS[program.solver].operations(sizes).flops,
-        footprint(problem, estimator_memory(prediction, program.estimator), program.solver).total, costs,
+        flops, footprint(problem, estimator_memory(prediction, program.estimator), program.solver).total,
+        plc.iterations(TICKS_PER_SAMPLE) if plc.is_enough(TICKS_PER_SAMPLE) else 0, costs,
     )  # fmt: skip
 
 
@@ -114,13 +118,28 @@ def proposed(found: Sequence[Judged]) -> Judged:
 
 def table(found: Sequence[Judged], names: Sequence[str]) -> str:
     """Return the comparison as text, and the lines of a configuration with the set that is proposed."""
-    rows = [("decisions and constraints", "variables", "rows", "condition", "operations", "kB", *names, "loss")]
+    rows = [
+        (
+            "decisions and constraints",
+            "variables",
+            "rows",
+            "condition",
+            "operations",
+            "iterations",
+            "kB",
+            *names,
+            "loss",
+        )
+    ]
     rows += [
         (one.label, f"{one.variables}", f"{one.rows}", f"{one.condition:.2g}", f"{one.flops:,.0f}",
-         f"{one.memory / 1e3:.0f}", *(f"{cost:.4g}" for cost in one.costs), f"{loss:.3f}")
+         f"{one.iterations}", f"{one.memory / 1e3:.0f}", *(f"{cost:.4g}" for cost in one.costs), f"{loss:.3f}")
         for one, loss in zip(found, losses(found), strict=True)
     ]  # fmt: skip
-    return aligned(rows, numbers=True) + f"\nthe smallest with a loss up to {ENOUGH:g}:\n{configuration(found)}"
+    period = f"iterations: in {SAMPLING_PERIOD_S:g} s on the configured PLC\n"
+    return (
+        aligned(rows, numbers=True) + period + f"\nthe smallest with a loss up to {ENOUGH:g}:\n{configuration(found)}"
+    )
 
 
 def configuration(found: Sequence[Judged]) -> str:

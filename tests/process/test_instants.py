@@ -34,7 +34,7 @@ def test_each_candidate_is_a_design_with_the_horizon_of_the_configured_one() -> 
 
 def test_the_smallest_set_that_loses_little_is_proposed() -> None:
     def one(label: str, variables: int, *costs: float) -> Judged:
-        return Judged(label, ControlDesign(), variables, 2 * variables, 1.0, 1.0, 1, costs)
+        return Judged(label, ControlDesign(), variables, 2 * variables, 1.0, 1.0, 1, 1, costs)
 
     sets = [one("configured", 49, 100.0, 400.0), one("small", 14, 102.0, 408.0), one("middle", 28, 100.5, 402.0),
             one("fullest", 168, 100.0, 400.0)]  # fmt: skip

@@ -1,13 +1,13 @@
 """Somebody else's solver, rule and estimator with another process; a solver that raises while the rig is up."""
 
 import tomllib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
 import pytest
 
 from coldloop.registers.control_plc import Mode
+from tests.harness.installed import installed
 from tests.harness.processes import Processes
 from tests.harness.waiting import eventually
 from tests.process.runs import run, started
@@ -25,20 +25,6 @@ class Raising:
         return guess, iterations
 """
 REASON: Final = "optimizer_plc: solver raising: ZeroDivisionError: no pivot"
-
-
-def installed(site: Path, sources: Mapping[str, str], points: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
-    """Write modules and entry points as they are in an installed package; return the variables that find it."""
-    about = site / "outside-1.0.dist-info"
-    about.mkdir(parents=True)
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: outside\nVersion: 1.0\n", encoding="utf-8")
-    lines = (
-        line for group, named in points.items() for line in (f"[{group}]", *(f"{a} = {b}" for a, b in named.items()))
-    )
-    (about / "entry_points.txt").write_text("\n".join(lines), encoding="utf-8")
-    for name, source in sources.items():
-        (site / name).write_text(source, encoding="utf-8")
-    return {"PYTHONPATH": str(site)}
 
 
 @pytest.fixture

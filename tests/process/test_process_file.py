@@ -1,5 +1,6 @@
 """A process file: what it is made into, against closed forms, and what it refuses, in one line each."""
 
+import json
 from dataclasses import replace
 from math import sqrt
 from pathlib import Path
@@ -15,6 +16,7 @@ from rig.process_file.declaration import LagSection
 from rig.process_file.judgement import described
 from rig.process_file.linearised import lag_model
 from rig.process_file.making import Made, made_from
+from tests.harness.installed import installed
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
@@ -87,20 +89,64 @@ def test_a_dead_time_has_the_phase_of_a_dead_time_well_below_its_reciprocal() ->
     assert c @ np.linalg.solve(-a, b) == pytest.approx(2.0)
 
 
+BY_MATRICES = ONE_BY_ONE.replace("noise = 0.1", "noise = 0.1\nat = 325.0").replace(
+    'python = "heater.py:Heater"', 'matrices = "GIVEN"'
+)
+LOAD = '[load]\nname = "sun"\nat = 0.0\nspan = [-20.0, 20.0]\n'
+
+
 def test_matrices_of_a_file_are_the_model(tmp_path: Path) -> None:
     A, B, C = np.array([[-0.1, 0.0], [0.05, -0.2]]), np.array([[1.0], [0.0]]), np.array([[0.0, 1.0]])
     np.savez(tmp_path / "matrices.npz", A=A, B=B, C=C)
-    text = ONE_BY_ONE.replace('python = "heater.py:Heater"', 'matrices = "matrices.npz"')
-    model = made(tmp_path, text.replace("noise = 0.1", "noise = 0.1\nat = 325.0")).model
-    assert np.array_equal(model.A, A)
-    assert np.array_equal(model.C, C)
-    assert not model.F.any()
+    (tmp_path / "matrices.json").write_text(
+        json.dumps({"A": A.tolist(), "B": B.tolist(), "C": C.tolist(), "note": "of ours"}), encoding="utf-8"
+    )
+    for given in ("matrices.npz", "matrices.json"):
+        model = made(tmp_path, BY_MATRICES.replace("GIVEN", given)).model
+        assert np.array_equal(model.A, A)
+        assert np.array_equal(model.C, C)
+        assert not model.F.any()
+
+
+def test_a_state_space_is_the_model_with_the_load_behind_the_inputs(tmp_path: Path) -> None:
+    space = "from scipy.signal import StateSpace\nplant = StateSpace([[-0.02]], BS, [[1.0]], DS)\n"
+    text = BY_MATRICES.replace("GIVEN", "space.py:plant")
+    (tmp_path / "space.py").write_text(
+        space.replace("BS", "[[0.01, 0.03]]").replace("DS", "[[0.0, 0.5]]"), encoding="utf-8"
+    )
+    model = made(tmp_path, text + LOAD).model
+    assert (model.A, model.B, model.F, model.C, model.D, model.G) == (-0.02, 0.01, 0.03, 1.0, 0.0, 0.5)
+    assert model.plant == "linear", "nothing of the file is executed by the services"
+    with pytest.raises(ColdloopError, match=r"space\.py:plant: has 2 inputs, not 1: 1 inputs, then load"):
+        made(tmp_path, text)
+    disturbed = LOAD.replace("[load]", "[[disturbances]]")
+    model = made(tmp_path, text + disturbed).model
+    assert model.A.tolist() == [[-0.02, 0.03], [0.0, 0.0]], "a disturbance is a state"
+    assert not model.F.any(), "there is no load"
+
+
+def test_a_plant_may_be_of_a_package_that_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    site = tmp_path / "site"
+    installed(site, {"heating.py": HEATER}, {"coldloop.plants": {"heater": "heating:Heater", "gone": "nowhere:Heater"}})
+    monkeypatch.syspath_prepend(site)
+    text = ONE_BY_ONE.replace("python =", "installed =").replace("heater.py:Heater", "heater")
+    there, here = made(tmp_path, text).model, made(tmp_path).model
+    assert np.array_equal(there.A, here.A)
+    assert there.plant_parameters["source"] == HEATER, "the services need no package"
+    for name, said in (("other", "no plant 'other' among the entry points coldloop.plants: gone, heater"),
+                       ("gone", "gone, nowhere:Heater, has no source: ImportError: no module nowhere")):  # fmt: skip
+        with pytest.raises(ColdloopError, match=said):
+            made(tmp_path, text.replace('"heater"\n[[', f'"{name}"\n[['))
 
 
 def test_what_is_wrong_with_a_process_is_said_in_words(tmp_path: Path) -> None:
     unstable = HEATER.replace("- 2.0 * (x[0] - 300.0)", "- 50.0 + 2.0 * (x[0] - 325.0)")
     assert "unstable: a mode grows" in described(made(tmp_path, plant=unstable))
     assert "band: temperature rests at" in described(made(tmp_path, ONE_BY_ONE.replace("320.0, 330.0", "340.0, 350.0")))
+    far = ONE_BY_ONE.replace("[200.0, 500.0]", "[200.0, 2e6]")
+    assert "single precision: temperature has steps of 0.12 K, too coarse for the noise of its sensor" in (
+        described(made(tmp_path, far))
+    )
     kink = HEATER.replace("(u[0] -", "(abs(u[0] - 50.0) + 50.0 -")
     assert "kink" in described(made(tmp_path, plant=kink)) or "controllability" in described(made(tmp_path, plant=kink))
 
@@ -190,9 +236,34 @@ def test_a_bad_plant_gets_one_line_that_says_why(case: str, tmp_path: Path) -> N
 def test_more_signals_than_a_request_carries_are_refused(tmp_path: Path) -> None:
     n = 60
     np.savez(tmp_path / "matrices.npz", A=-np.eye(n), B=np.ones((n, 1)), C=np.eye(1, n))
-    text = ONE_BY_ONE.replace('python = "heater.py:Heater"', 'matrices = "matrices.npz"')
     with pytest.raises(ColdloopError, match="60 states are too many: the rack's measurement is"):
-        made(tmp_path, text.replace("noise = 0.1", "noise = 0.1\nat = 325.0"))
+        made(tmp_path, BY_MATRICES.replace("GIVEN", "matrices.npz"))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("m.json", '{"A": [[-1.0]], "B": [[1.0]]}', "no C; it needs A, B and C"),
+        ("m.json", '{"A": [[-1.0], [1.0, 2.0]], "B": [[1.0]], "C": [[1.0]]}', "not a readable NPZ or JSON file"),
+        ("m.json", "[" * 100_000, "not a readable NPZ or JSON file"),
+        ("m.json", '{"A": [["x"]], "B": [[1.0]], "C": [[1.0]]}', "not a readable NPZ or JSON file"),
+        ("m.json", '{"A": [[-1.0]], "B": [[1.0, 2.0]], "C": [[1.0]]}', r"B has shape (1, 2), and not (1, 1)"),
+        ("m.json", '{"A": [[NaN]], "B": [[1.0]], "C": [[1.0]]}', "A of the linear model is not finite"),
+        ("m.json", "7", "not a readable NPZ or JSON file"),
+        ("m.npz", "PK nothing", "not a readable NPZ or JSON file"),
+        ("m.py:plant", "plant = 3", "no state space with A, B, C and D"),
+        ("m.py:plant", "plan = 3", "plant cannot be made: AttributeError"),
+        ("m.py:plant", "raise OSError('no\\nplant')", "plant cannot be made: OSError: no plant"),
+        ("m.py:plant", "class plant: A = B = C = D = [[1.0]]; dt = 0.1", "has a sampling time of 0.1 s"),
+        ("m.py:plant", "class plant: A = B = C = D = [[1.0]]; dt = True", "has a sampling time"),
+    ],
+)
+def test_matrices_that_are_none_get_one_line(name: str, content: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / name.partition(":")[0]).write_text(content, encoding="utf-8")
+    with pytest.raises(ColdloopError) as refused:
+        made(tmp_path, BY_MATRICES.replace("GIVEN", name))
+    assert "\n" not in str(refused.value)
+    assert said in str(refused.value)
 
 
 def test_the_command_prints_it_and_writes_nothing_that_is_half_made(tmp_path: Path, coldloop: "Coldloop") -> None:

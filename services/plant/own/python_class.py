@@ -35,17 +35,30 @@ class Equations(Protocol):
         """Return y."""
 
 
+def made_by(source: str, name: str, where: str) -> Any:  # noqa: ANN401 whatever the user has written
+    """Return what a Python source calls by a name; `where` names it in messages.
+
+    Raises:
+        ModelFileError: The source does not run, or has nothing of this name: one line.
+    """
+    module = ModuleType(f"coldloop_plant_{name}")
+    sys.modules[module.__name__] = module  # dataclasses look there
+    try:
+        exec(compile(source, where, "exec"), vars(module))  # noqa: S102 it is what the user has written
+        return getattr(module, name)
+    except Exception as error:
+        raise ModelFileError(f"{where}: {name} cannot be made: {_said(error)}") from error
+
+
 def equations_of(source: str, name: str, where: str) -> Equations:
     """Return an instance of a class of a Python source; `where` names it in messages.
 
     Raises:
         ModelFileError: The source does not run, or the class lacks something: one line.
     """
-    module = ModuleType(f"coldloop_plant_{name}")
-    sys.modules[module.__name__] = module  # dataclasses look there
+    kind = made_by(source, name, where)
     try:
-        exec(compile(source, where, "exec"), vars(module))  # noqa: S102 it is what the user has written
-        made: Any = getattr(module, name)()
+        made: Any = kind()
         made.steps_per_tick = int(getattr(made, "steps_per_tick", 1))
         states, guess = dict(made.states), np.array(made.guess, dtype=np.float64)
     except Exception as error:

@@ -1,0 +1,38 @@
+"""The figure of sets of instants: what each loses in the loop, and what a PLC does of its iterations."""
+
+from collections.abc import Sequence
+
+from matplotlib.figure import Figure
+
+from coldloop.process.signals import SAMPLING_PERIOD_S
+from rig.figures.plot import COLOURS, INK, legend_above
+from rig.studies.drawing import panels
+from rig.studies.instants import ENOUGH, Judged, losses, proposed
+
+
+def drawn(found: Sequence[Judged], names: Sequence[str]) -> Figure:
+    """Return loss and iterations over the number of variables; the configured and the proposed set are named.
+
+    Args:
+        found: The sets, the configured one first, the fullest last.
+        names: The loads.
+    """
+    sets = sorted(found[1:], key=lambda one: one.variables)
+    sizes = [one.variables for one in sets]
+    with panels(2, 1, (7.0, 6.0), sharex=True) as (figure, (loss, iterations)):
+        for name, colour, cost, fullest in zip(
+            names, COLOURS, zip(*(one.costs for one in sets), strict=True), found[-1].costs, strict=False
+        ):
+            loss.plot(sizes, [each / fullest for each in cost], color=colour, marker=".", label=f"load {name}")
+        loss.axhline(ENOUGH, color=INK, linewidth=0.8, linestyle=":", label=f"small enough, {ENOUGH:g}")
+        iterations.plot(sizes, [one.iterations for one in sets], color=COLOURS[0], marker=".")
+        lost = dict(zip([one.label for one in found], losses(found), strict=True))
+        for label, one, marker in (("configured", found[0], "s"), ("proposed", proposed(found), "o")):
+            for axes, value in ((loss, lost[one.label]), (iterations, one.iterations)):
+                axes.plot(one.variables, value, color=INK, marker=marker, markerfacecolor="none", markersize=9,
+                          linestyle="", label=label)  # fmt: skip
+        loss.set_ylabel("loss: J_BF over that of the fullest set (1)")
+        iterations.set_ylabel(f"iterations of the PLC in {SAMPLING_PERIOD_S:g} s (1)")
+        iterations.set_xlabel("variables (1)")
+        legend_above(loss)
+    return figure
