@@ -32,7 +32,7 @@ Entry = dict[str, str | int | float | dict[str, str] | None]
 def _entries(maps: Sequence[RegisterMap]) -> Iterator[Entry]:
     """Yield one entry a register, the first row of each block."""
     for register_map in maps:
-        for block in register_map.blocks:
+        for block in register_map.shown:
             for register in block.registers():
                 yield _entry(register_map.service, block, register)
 
@@ -91,7 +91,7 @@ def as_markdown(maps: Sequence[RegisterMap]) -> str:
             f"digest {register_map.digest:08x})\n"
         )
         parts.append(f"Addresses 0 to {register_map.end - 1}; those in no table read 0 and are not written.\n")
-        parts += [_block_markdown(register_map.service, block) for block in register_map.blocks]
+        parts += [_block_markdown(register_map.service, block) for block in register_map.shown]
     return "\n".join(parts)
 
 

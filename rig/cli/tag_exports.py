@@ -16,7 +16,6 @@ from typing import Any, Final, NamedTuple
 from coldloop.modbus.requests import MAX_READ_WORDS
 from coldloop.registers.control_plc import Operator
 from coldloop.registers.declaration import Block, Kind, Register, RegisterMap, fields_of
-from coldloop.registers.plant import UNUSED
 from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.service.event_text import alarm_word
 from rig.cli.commands.options import HostPort
@@ -39,8 +38,8 @@ class Tag(NamedTuple):
 
 def exported(register_map: RegisterMap) -> Iterator[Tag]:
     """Yield the tags of a service, in the order of their addresses."""
-    for block in register_map.blocks:
-        if block.record in UNUSED or (block.writer is not None and block.record is not Operator):
+    for block in register_map.shown:
+        if block.writer is not None and block.record is not Operator:
             continue
         if block.record is Alarm:
             for kind in AlarmKind:

@@ -9,7 +9,6 @@ from typing import Any, Final, NamedTuple
 
 from coldloop.registers.declaration import Block, Kind, RegisterMap, fields_of
 from coldloop.registers.maps import MAPS
-from coldloop.registers.plant import UNUSED
 from coldloop.registers.text import from_words
 from hmi.process_view import decimals_by_unit
 
@@ -44,7 +43,7 @@ def words_in(description: str) -> dict[int, str]:
 
 def shown_blocks(register_map: RegisterMap) -> list[Block]:
     """Return the blocks that the page shows value by value: those with one row that mean something."""
-    return [block for block in register_map.blocks if block.rows == 1 and block.record not in UNUSED]
+    return [block for block in register_map.shown if block.rows == 1]
 
 
 def _texts(block: Block) -> set[str]:

@@ -5,6 +5,7 @@ An interpreter is loaded with one process, so each of these runs is a process of
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -159,3 +160,11 @@ def test_the_list_of_plans_has_those_that_suit_the_process(processes: Processes)
     names = {line.split()[0] for line in listed.splitlines()}
     assert {"kill", "drop", "lossy"} <= names
     assert not {"sensor", "mixed", "day", "refrigerator"} & names
+
+
+def test_the_registers_that_are_listed_are_those_of_the_process(processes: Processes) -> None:
+    code, listed, complaints = started(processes, "--process", TANK, "registers", "--format", "json")
+    assert code == 0, complaints
+    names = [f"{one['block']} {one['name']} {one['unit']}" for one in json.loads(listed)]
+    assert "measurement y.h1 cm" in names
+    assert not [name for name in names if re.search(r"station|surroundings|model range|CV155|NCR22|\bT5\b|\bK\b", name)]

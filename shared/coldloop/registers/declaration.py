@@ -220,6 +220,8 @@ class RegisterMap:
     service: str
     version: int
     blocks: tuple[Block, ...]
+    unused: tuple[type[tuple[object, ...]], ...] = ()
+    """Records that mean nothing in this process: they keep their addresses, and nobody is shown them."""
 
     def __post_init__(self) -> None:
         end = 0
@@ -232,6 +234,11 @@ class RegisterMap:
     def end(self) -> int:
         """First address behind the last block."""
         return self.blocks[-1].end
+
+    @property
+    def shown(self) -> Iterator[Block]:
+        """The blocks that mean something in this process."""
+        return (block for block in self.blocks if block.record not in self.unused)
 
     def block_of(self, record: type[tuple[object, ...]]) -> Block:
         """Return the block that holds `record`."""

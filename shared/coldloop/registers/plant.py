@@ -383,12 +383,13 @@ class Surroundings(NamedTuple):
     blocked_nef6: Annotated[float, _blocking("NEF6")] = 0.0
 
 
-UNUSED: Final = () if PROCESS.has_station else (StationStatus, StationSample, Surroundings, ModelRangeStatus)
-"""Records that mean nothing in this process: of a refrigerator and its property tables."""
+OF_A_REFRIGERATOR: Final = (StationStatus, StationSample, Surroundings, ModelRangeStatus)
+"""Records of a compression station and of property tables."""
 
 PLANT_MAP: Final = RegisterMap(
     service="plant",
     version=4,
+    unused=() if PROCESS.has_station else OF_A_REFRIGERATOR,
     blocks=placed(
         (
             IDENTITY_BLOCK,

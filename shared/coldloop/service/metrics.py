@@ -14,7 +14,6 @@ from prometheus_client.registry import Collector
 from coldloop import __version__
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.declaration import Block, fields_of
-from coldloop.registers.plant import UNUSED
 
 _NOT_IN_NAMES: Final = re.compile(r"[^a-zA-Z0-9_]+")
 
@@ -48,8 +47,8 @@ def block_families(service: str, block: Block, record: tuple[Any, ...]) -> Itera
 def bank_families(bank: RegisterBank) -> Iterator[Metric]:
     """Yield all registers of a service that are not rows of a table and that no client writes."""
     yield build_family()
-    for block in bank.map.blocks:
-        if block.rows == 1 and block.writer is None and block.record not in UNUSED:
+    for block in bank.map.shown:
+        if block.rows == 1 and block.writer is None:
             yield from block_families(bank.map.service, block, bank.get(block.record))
 
 
