@@ -49,8 +49,9 @@ SHARED: Final = (
     "up",
     "client",
     "_engine",
+    "problems",
 )
-"""Fixtures that start processes for many tests: these tests run in one worker, which starts them once."""
+"""Fixtures that start processes, or compute for long, for many tests: these run in one worker, which does that once."""
 
 # Whoever started the tests may ignore these (a script in the background, nohup); what the tests start must not.
 for _number, _handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):

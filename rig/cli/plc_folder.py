@@ -1,6 +1,7 @@
 """What is exported for a PLC as a folder: sources, golden vectors, self-tests, READMEs for who loads it, manifests."""
 
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Mapping
@@ -34,7 +35,7 @@ from rig.plc_export.kernels.counted import (
 from rig.plc_export.kernels.golden_calls import golden_calls
 from rig.plc_export.kernels.guard_program import GuardKernels
 from rig.plc_export.kernels.recorded_problems import LOAD, TICKS, GoldenVector, GoldenVectors, paper_settings, record
-from rig.plc_export.kernels.recorded_updates import GoldenUpdate, UpdateRecorder
+from rig.plc_export.kernels.recorded_updates import GoldenUpdate, UpdateRecorder, refuse
 from rig.plc_export.problem_layout import problem_layout
 from rig.plc_export.structured_text.guard_files import GuardText
 from rig.plc_export.structured_text.optimizer_files import OptimizerText
@@ -86,6 +87,8 @@ def export_plc(
         UsageError: The folder is not empty or cannot be written to, or no input moves in so many ticks.
     """
     refuse_taken(folder)
+    if not PROCESS.forecasts:
+        refuse(settings.optimizer_plc.program)
     recorded = record(ticks or TICKS)
     vectors = telling(recorded, ticks)
     texts = c99(recorded, vectors, profile) if target == "c" else structured_text(recorded, vectors, profile, target)
@@ -257,7 +260,7 @@ def output_guard(target: str, settings: Settings) -> dict[str, str]:
 
 
 def refuse_taken(folder: Path) -> None:
-    """Refuse a folder that has something in it, and what is no folder.
+    """Refuse a folder that has something in it, what is no folder, and a place where none can be made.
 
     Raises:
         UsageError: It is so.
@@ -267,6 +270,9 @@ def refuse_taken(folder: Path) -> None:
     try:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise UsageError(f"{folder}: is not an empty folder; name a new one with --out")
+        nearest = next(parent for parent in folder.absolute().parents if parent.exists())
+        if not (nearest.is_dir() and os.access(nearest, os.W_OK)):
+            raise UsageError(f"{folder}: no folder can be made in {nearest}; choose another --out")
     except OSError as error:
         raise UsageError(f"{folder}: {error.strerror}; choose another --out") from None
 
