@@ -118,27 +118,16 @@ def proposed(found: Sequence[Judged]) -> Judged:
 
 def table(found: Sequence[Judged], names: Sequence[str]) -> str:
     """Return the comparison as text, and the lines of a configuration with the set that is proposed."""
-    rows = [
-        (
-            "decisions and constraints",
-            "variables",
-            "rows",
-            "condition",
-            "operations",
-            "iterations",
-            "kB",
-            *names,
-            "loss",
-        )
-    ]
+    columns = ("variables", "rows", "condition", "operations", "iterations", "kB")
+    rows: list[tuple[str, ...]] = [("decisions and constraints", *columns, *names, "loss")]
     rows += [
         (one.label, f"{one.variables}", f"{one.rows}", f"{one.condition:.2g}", f"{one.flops:,.0f}",
          f"{one.iterations}", f"{one.memory / 1e3:.0f}", *(f"{cost:.4g}" for cost in one.costs), f"{loss:.3f}")
         for one, loss in zip(found, losses(found), strict=True)
     ]  # fmt: skip
-    period = f"iterations: in {SAMPLING_PERIOD_S:g} s on the configured PLC\n"
     return (
-        aligned(rows, numbers=True) + period + f"\nthe smallest with a loss up to {ENOUGH:g}:\n{configuration(found)}"
+        f"{aligned(rows, numbers=True)}iterations: in {SAMPLING_PERIOD_S:g} s on the configured PLC\n\n"
+        f"the smallest with a loss up to {ENOUGH:g}:\n{configuration(found)}"
     )
 
 

@@ -9,6 +9,7 @@ from coldloop.errors import StudyError
 from optimizer_plc.qp.design import ControlDesign
 from rig.studies.adaptive_gain import over_best_fixed
 from rig.studies.instants import Judged, candidates, losses, proposed, spread
+from rig.studies.instants_figure import drawn
 
 
 @given(st.integers(1, 30), st.integers(1, 400))
@@ -32,15 +33,26 @@ def test_each_candidate_is_a_design_with_the_horizon_of_the_configured_one() -> 
     assert [len(design.decision_instants) for design in found.values()][-1] == 24
 
 
-def test_the_smallest_set_that_loses_little_is_proposed() -> None:
-    def one(label: str, variables: int, *costs: float) -> Judged:
-        return Judged(label, ControlDesign(), variables, 2 * variables, 1.0, 1.0, 1, 1, costs)
+def one(label: str, variables: int, *costs: float) -> Judged:
+    return Judged(label, ControlDesign(), variables, 2 * variables, 1.0, 1.0, 1, 1000 // variables, costs)
 
-    sets = [one("configured", 49, 100.0, 400.0), one("small", 14, 102.0, 408.0), one("middle", 28, 100.5, 402.0),
-            one("fullest", 168, 100.0, 400.0)]  # fmt: skip
-    assert losses(sets) == pytest.approx([1.0, 1.02, 1.005, 1.0])
-    assert proposed(sets).label == "middle"
-    assert proposed([sets[1], sets[3]]).label == "fullest"
+
+SETS = [one("configured", 49, 100.0, 400.0), one("small", 14, 102.0, 408.0), one("middle", 28, 100.5, 402.0),
+        one("fullest", 168, 100.0, 400.0)]  # fmt: skip
+
+
+def test_the_smallest_set_that_loses_little_is_proposed() -> None:
+    assert losses(SETS) == pytest.approx([1.0, 1.02, 1.005, 1.0])
+    assert proposed(SETS).label == "middle"
+    assert proposed([SETS[1], SETS[3]]).label == "fullest"
+
+
+def test_the_figure_has_loss_and_iterations_and_names_the_set_that_is_proposed() -> None:
+    loss, iterations = drawn(SETS, ["a", "b"]).axes
+    curves = {line.get_label(): np.array(line.get_xydata()).tolist() for line in loss.lines}
+    assert curves["load a"] == [[14.0, 1.02], [28.0, 1.005], [168.0, 1.0]]
+    assert curves["proposed"][0] == pytest.approx([28.0, 1.005])
+    assert np.array(iterations.lines[0].get_xydata()).tolist() == [[14.0, 71.0], [28.0, 35.0], [168.0, 5.0]]
 
 
 def test_loops_that_cost_nothing_are_not_compared() -> None:
