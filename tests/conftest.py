@@ -1,4 +1,4 @@
-"""What all tests share: which of them run, how Hypothesis searches, coroutines as tests, no configuration from outside,
+"""What all tests share: lanes and which of them run, how Hypothesis searches, coroutines as tests, no configuration from outside,
 processes and a free port, the command line, and Debian's mbpoll.
 """
 
@@ -8,17 +8,21 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 from collections.abc import Callable, Generator, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import pytest
+from _pytest.fixtures import FixtureDef
 from hypothesis import settings
 
 from coldloop.config import PREFIX
 from rig import cli
 from rig.cosim.ports import ReservedPorts
 from rig.figures.worker import FigureProcess
+from tests.harness.budget import BudgetPlugin
+from tests.harness.lanes import USES, Lane, Watch, judge, lane_of, table
 from tests.harness.processes import Processes
 
 QUICK: Final = settings(deadline=None, print_blob=True, max_examples=20, derandomize="CI" in os.environ)
@@ -26,23 +30,15 @@ settings.register_profile("quick", QUICK)
 settings.register_profile("all", QUICK, max_examples=100)
 settings.register_profile("thorough", QUICK, max_examples=5000)
 settings.load_profile("quick")
-"""Examples of each property: few by default, more with `--all`; `--hypothesis-profile=thorough` is for a night. A test
+"""Examples of each property: few by default, more in the night; `--hypothesis-profile=thorough` is for a night. A test
 that needs more or fewer names a multiple or a part of them. Each run looks elsewhere and begins with what failed
 before, but with `CI` set the examples are always the same. None has a deadline: the machine may be busy."""
-
-USES: Final = {
-    "process": {"processes", "shared_processes", "coldloop_rigs", "live_rig"},
-    "realtime": {"realtime"},
-    "browser": {"browser"},
-    "container": {"_engine"},
-}
-"""The mark of a test that requests, itself or through other fixtures, one of these."""
 
 SHARED: Final = (
     "site",
     "start_site",
     "served",
-    "rack",
+    "shared_rack",
     "three_processes",
     "live_rig",
     "page_rig",
@@ -51,7 +47,8 @@ SHARED: Final = (
     "_engine",
     "problems",
 )
-"""Fixtures that start processes, or compute for long, for many tests: these run in one worker, which does that once."""
+"""Fixtures that start processes, or compute for long, for many tests: the tests that have the same one run in one worker,
+which does that once. It ends with the last of them."""
 
 # Whoever started the tests may ignore these (a script in the background, nohup); what the tests start must not.
 for _number, _handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
@@ -59,13 +56,42 @@ for _number, _handler in ((signal.SIGINT, signal.default_int_handler), (signal.S
         signal.signal(_number, _handler)
 
 
+LANES: Final = pytest.StashKey[Lane]()
+SHARED_BY: Final = pytest.StashKey[FixtureDef[Any] | None]()
+WATCH: Final = Watch()
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--all", action="store_true", help="also tests marked exhaustive or container; more examples")
+    group = parser.getgroup("lanes")
+    for option, help_text in {
+        "--fast": "the fast lane, which is the default: no program, no compiler, no clock, no browser",
+        "--system": "the system lane: programs, rigs in real time, the page in a browser",
+        "--night": "the night lane: many configurations, long searches, the composed rig; 100 examples of each property",
+        "--all": "all lanes, with 100 examples of each property",
+    }.items():
+        group.addoption(option, action="store_true", help=help_text)
+    group.addoption("--lanes", action="store_true", help="run nothing: print the table of which tests are in which lane")
+    group.addoption("--over-budget", metavar="FILE", help="write the folders that are over their budget to a file")
+
+
+def asked_lanes(config: pytest.Config) -> set[Lane]:
+    """Return the lanes that the options ask for."""
+    if config.getoption("--all"):
+        return set(Lane)
+    return {lane for lane in Lane if config.getoption(f"--{lane}")} or {Lane.FAST}
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    if config.getoption("--all") and not config.getoption("--hypothesis-profile"):
+    if Lane.NIGHT in asked_lanes(config) and not config.getoption("--hypothesis-profile"):
         settings.load_profile("all")
+    config.pluginmanager.register(BudgetPlugin(lambda item: item.stash.get(LANES, Lane.FAST)), "budget")
+
+
+def shared_fixture(item: pytest.Item) -> FixtureDef[Any] | None:
+    """Return the shared fixture that a test requests, itself or through others; a fixture of one test is not shared."""
+    definitions = getattr(item, "_fixtureinfo").name2fixturedefs if hasattr(item, "_fixtureinfo") else {}  # noqa: B009
+    found = (definitions[name][-1] for name in SHARED if name in definitions)
+    return next((each for each in found if each.scope != "function"), None)
 
 
 def keep_together(item: pytest.Item, group: str) -> None:
@@ -77,22 +103,61 @@ def keep_together(item: pytest.Item, group: str) -> None:
         item._id = type(identity).parse(f"{item.nodeid}@{group}")  # type: ignore[attr-defined]  # noqa: SLF001
 
 
+def is_named(item: pytest.Item) -> bool:
+    """Return whether the command line names this test: it then runs whatever its lane."""
+    return any("::" in each and item.nodeid.startswith(each.split("[")[0]) for each in item.config.args)
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark each test by what it uses, and leave out what only `--all` runs."""
-    left_out: set[pytest.Item] = set()
+    """Mark each test by what it uses, and leave out what is in other lanes than those asked for."""
+    asked, chosen, left_out = asked_lanes(config), list[pytest.Item](), list[pytest.Item]()
     for item in items:
         fixtures = set(getattr(item, "fixturenames", ()))
         for mark in (mark for mark, names in USES.items() if names & fixtures):
             item.add_marker(mark)
-        group = next((name for name in SHARED if name in fixtures), None)
-        if group:
-            keep_together(item, group)
-        if item.get_closest_marker("exhaustive") or item.get_closest_marker("container"):
-            left_out.add(item)
-    if left_out and not config.getoption("--all"):
-        config.hook.pytest_deselected(items=list(left_out))
-        items[:] = [item for item in items if item not in left_out]
+        item.stash[LANES] = lane_of(mark.name for mark in item.iter_markers())
+        item.stash[SHARED_BY] = shared = shared_fixture(item)
+        (chosen if item.stash[LANES] in asked or is_named(item) else left_out).append(item)
+        if shared is not None:
+            keep_together(item, f"{shared.baseid}/{shared.argname}")
+    if config.getoption("--lanes"):
+        marked = ((item.nodeid, item.stash[LANES], {mark.name for mark in item.iter_markers()}) for item in items)
+        sys.stdout.write("\n".join(table(marked)) + "\n")
+        left_out = [*items]
+        chosen = []
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = chosen
+
+
+def pytest_report_collectionfinish(config: pytest.Config) -> str:
+    """Say which lanes run."""
+    return f"lanes: {', '.join(sorted(asked_lanes(config)))} (also: --fast, --system, --night, --all)"
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Begin to watch what the test does."""
+    WATCH.begin()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, Any, Any]:
+    """Fail a test that does what its lane may not do."""
+    result = yield
+    judge(item.stash[LANES], WATCH.notes)
+    return result
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> Generator[None, Any, Any]:
+    """End what tests share, with its programs, after the last test that uses it."""
+    result = yield
+    shared = item.stash[SHARED_BY]
+    if shared is not None and (nextitem is None or nextitem.stash[SHARED_BY] is not shared):
+        shared.finish(item._request)  # type: ignore[attr-defined]  # noqa: SLF001 no public way before the scope's end
+    return result
 
 
 LAST_LINES = 12
@@ -148,6 +213,16 @@ def shared_processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proce
     started = Processes(tmp_path_factory.mktemp("shared"))
     yield started
     started.end()
+
+
+@pytest.fixture(scope="session")
+def programs() -> None:
+    """Requested where a test starts programs without `processes`, as threads' pools and compilers do: it marks the test."""
+
+
+@pytest.fixture(scope="session")
+def compiles() -> None:
+    """Requested where kernels are compiled that set-up does not compile: it marks the test."""
 
 
 @pytest.fixture(scope="session")

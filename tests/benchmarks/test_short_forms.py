@@ -49,7 +49,7 @@ def test_an_ode_iteration_is_compared_with_cholesky_factorisations(printed_by: B
     assert is_time(ratio), text
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_a_run_is_compared_with_the_sum_of_its_kernels(printed_by: Benchmark) -> None:
     text = printed_by("limits.py", "--ticks", "2400", "--repeat", "1", "--calls", "300")
     ratios = numbers(r"([0-9.]+) times the sum", text)
@@ -58,7 +58,7 @@ def test_a_run_is_compared_with_the_sum_of_its_kernels(printed_by: Benchmark) ->
     assert all(map(is_time, numbers(r": ([0-9,]+) times real time", text))), text
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_all_solvers_take_part_in_the_comparison(printed_by: Benchmark) -> None:
     text = printed_by("qp_solvers.py", "--hours", "e", "--minutes", "5", "--iterations", "5")
     for name in ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "hybrid", "daqp"):
@@ -69,20 +69,20 @@ def test_all_solvers_take_part_in_the_comparison(printed_by: Benchmark) -> None:
         assert (f"without {name}" in text or f", {name}" in text) == (find_spec(module) is None)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_one_process_and_three_leave_one_trace_in_the_speed_benchmark(printed_by: Benchmark) -> None:
     text = printed_by("run_speed.py", "--load", "a", "--duration", "20s", "--repeat", "1")
     assert text.count("one trace: True") == 2, text
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_lock_step_is_compared_with_bare_exchanges(printed_by: Benchmark) -> None:
     text = printed_by("lockstep.py", "--ticks", "200")
     (ratio,) = numbers(r"ratio ([0-9.]+)", text)
     assert is_time(ratio), text
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_the_start_of_each_program_is_timed(printed_by: Benchmark) -> None:
     text = printed_by("start.py", "--repeat", "1")
     seconds = numbers(r"warm: ([0-9.]+) s", text)
@@ -90,7 +90,7 @@ def test_the_start_of_each_program_is_timed(printed_by: Benchmark) -> None:
     assert all(map(is_time, seconds)), text
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_the_problem_for_peers_costs_less_where_every_sample_is_free(printed_by: Benchmark) -> None:
     told = json.loads(printed_by("peer_problem.py"))
     assert len(told["problem"]["A"]) == 28

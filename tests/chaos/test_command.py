@@ -106,7 +106,7 @@ sys.exit(main())
 """The program `coldloop`, which writes ticks in small groups: the first ones are in the file after a minute."""
 
 
-@pytest.mark.exhaustive  # test_interruption.py has the same of a run
+@pytest.mark.night  # test_interruption.py has the same of a run
 def test_ctrl_c_in_the_middle_of_a_plan_leaves_what_was_recorded(tmp_path: Path, processes: Processes) -> None:
     out = tmp_path / "out"
     words = ("chaos", "undisturbed", "--duration", "10h", "--out", str(out))
@@ -139,7 +139,7 @@ faults = [
 """
 
 
-@pytest.mark.exhaustive  # test_testing.py kills each service of a rig that is up
+@pytest.mark.night  # test_testing.py kills each service of a rig that is up
 @pytest.mark.usefixtures("processes", "undrawn")
 def test_whatever_is_killed_the_plant_is_not_hurt_and_mpc_comes_back(coldloop: "Coldloop", tmp_path: Path) -> None:
     plan, out = tmp_path / "kills.toml", tmp_path / "out"

@@ -107,7 +107,7 @@ def test_processes_that_need_a_kernel_at_once_compile_it_once_and_one_of_them_sa
     assert sorted(worker.end() for worker in workers) == ["", "", LINE]
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_kernels_for_different_types_that_are_compiled_at_once_are_kept_apart(start: Start) -> None:
     numbers, workers = ("1.5", "1", "1j"), [start() for _ in range(3)]
     for worker, number in zip(workers, numbers, strict=True):
@@ -120,7 +120,7 @@ def test_kernels_for_different_types_that_are_compiled_at_once_are_kept_apart(st
     assert not later.end()
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_who_fails_to_compile_a_kernel_keeps_nobody_waiting(start: Start) -> None:
     first, second = start(), start()
     for worker in (first, second):
@@ -139,7 +139,7 @@ def test_the_kernel_of_a_process_that_is_killed_is_compiled_by_who_waits(start: 
     assert waiting.answer() == (["outer", "inner"], "is 5.0")
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_half_a_kernel_on_the_disk_is_compiled_anew(start: Start, tmp_path: Path) -> None:
     first = start()
     first.send("outer(1.5)")

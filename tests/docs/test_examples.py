@@ -302,7 +302,7 @@ def marks(lesson: Lesson) -> list[pytest.MarkDecorator]:
     by_the_clock = lesson.needs_a_rig or lesson.says(BY_THE_CLOCK)
     long = by_the_clock or lesson.says(STARTS_MUCH) or lesson.blocks[0].marker == TEST_SUITE
     found = [pytest.mark.realtime] if by_the_clock else []
-    return [*found, pytest.mark.exhaustive] if long and lesson.page.name not in READ_FIRST else found
+    return [*found, pytest.mark.night] if long and lesson.page.name not in READ_FIRST else found
 
 
 LESSONS = [

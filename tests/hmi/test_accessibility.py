@@ -32,8 +32,8 @@ WIDE, PHONE = (1280, 720), (390, 844)
     [
         pytest.param(WIDE, "light", id="wide-light"),
         pytest.param(PHONE, "dark", id="phone-dark"),
-        pytest.param(WIDE, "dark", id="wide-dark", marks=pytest.mark.exhaustive),
-        pytest.param(PHONE, "light", id="phone-light", marks=pytest.mark.exhaustive),
+        pytest.param(WIDE, "dark", id="wide-dark", marks=pytest.mark.night),
+        pytest.param(PHONE, "light", id="phone-light", marks=pytest.mark.night),
     ],
 )
 def test_no_view_has_a_serious_finding(browser: "Browser", site: Site, scheme: str, size: tuple[int, int]) -> None:

@@ -99,7 +99,7 @@ def rig(processes: Processes, realtime: None) -> Rig:  # noqa: ARG001 a mark
     return Rig(processes)
 
 
-@pytest.mark.exhaustive  # test_lying_rigs.py has each command alone
+@pytest.mark.night  # test_lying_rigs.py has each command alone
 async def test_who_only_looks_outlives_nonsense(rig: Rig, tmp_path: Path) -> None:
     async with AsyncExitStack() as stack:
         for link in rig.links:

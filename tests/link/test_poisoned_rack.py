@@ -111,7 +111,7 @@ async def test_an_age_that_goes_on_to_make_no_sense_is_alarmed(field: "FieldAt")
         await site.rack.until(quiet)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 async def test_every_field_of_a_measurement_may_be_nonsense_for_once(field: "FieldAt") -> None:
     async with field() as site:
         control, poisoner = await site.joined(), Poisoner()

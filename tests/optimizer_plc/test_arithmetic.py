@@ -34,7 +34,7 @@ ON_LINE = {"qp.instance.instance", "qp.profile.inputs_of", "decisions.take_updat
 """Kernels that the program calls; those that they call, solvers and rules among them, are part of their code."""
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_no_kernel_computes_with_a_double_in_single_precision(processes: Processes) -> None:
     """In an interpreter of its own, which has compiled nothing for other tests: all kernels are compiled there."""
     cases = list(product(SINGLE_PRECISION_SOLVERS, EstimatorKind))
@@ -109,7 +109,7 @@ def loss(qp: QuadraticProblem, guess: Array, iterations: int, best: float) -> tu
     return (ends[0] - best) / best, (ends[1] - best) / best
 
 
-@pytest.mark.parametrize("iterations", [19, *(pytest.param(n, marks=pytest.mark.exhaustive) for n in (4, 200))])
+@pytest.mark.parametrize("iterations", [19, *(pytest.param(n, marks=pytest.mark.night) for n in (4, 200))])
 def test_after_harsh_load_jumps_single_precision_loses_little(
     harsh_jumps: "list[Jump]", penalised_optimum: "PenalisedOptimum", iterations: int
 ) -> None:

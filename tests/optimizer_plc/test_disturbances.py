@@ -196,7 +196,7 @@ def live_rig() -> Iterator[LiveRig]:
         yield one
 
 
-@pytest.mark.exhaustive  # with a rig that is up
+@pytest.mark.night  # with a rig that is up
 def test_the_registers_say_what_the_plant_needs_more_than_its_model(live_rig: LiveRig) -> None:
     """Valves that pass 10 % less, at 43 % and 36 %: like 4.3 and 3.6 % less of the inputs."""
     live_rig.advance(600)

@@ -335,7 +335,7 @@ def test_without_momentum_a_step_never_raises_the_cost(harsh_jumps: "list[Jump]"
         assert first.cost <= first.guessed
 
 
-@pytest.mark.exhaustive  # compiles each solver for it; test_arithmetic.py has the default's
+@pytest.mark.night  # compiles each solver for it; test_arithmetic.py has the default's
 @pytest.mark.parametrize(
     "make",
     [

@@ -127,7 +127,7 @@ def test_targets_are_those_of_independent_solvers(inputs_off: PredictionModel, r
     compare(inputs_off, 300, real, tolerance)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_targets_are_those_of_independent_solvers_in_10_000_cases(inputs_off: PredictionModel) -> None:
     compare(inputs_off, 10_000, DOUBLE, 1e-3)
     compare(inputs_off, 10_000, SINGLE, 1e-2)

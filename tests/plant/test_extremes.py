@@ -289,7 +289,7 @@ FINER = 8
 
 
 @pytest.mark.parametrize(
-    "event", ["both compressors trip", *(pytest.param(name, marks=pytest.mark.exhaustive) for name in list(EVENTS)[1:])]
+    "event", ["both compressors trip", *(pytest.param(name, marks=pytest.mark.night) for name in list(EVENTS)[1:])]
 )
 def test_one_step_a_tick_is_stable_with_a_margin_and_exact_within_a_percent_of_each_move(event: str) -> None:
     load, happens, seconds = EVENTS[event]

@@ -17,7 +17,7 @@ def coolprop(name: str, first: str, x: float, second: str, y: float) -> float:
     return float(library.PropsSI(name, first, x, second, y, "Helium"))
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 @given(T=st.floats(4.0, 300.0))
 def test_the_16_bar_isobar_agrees(T: float) -> None:
     pytest.importorskip("CoolProp.CoolProp")

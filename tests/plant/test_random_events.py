@@ -167,7 +167,7 @@ def test_helium_and_energy_are_conserved_whatever_happens(course: Course) -> Non
     assert_held(course)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 @given(course=st.lists(pieces, min_size=24, max_size=24))
 @settings(max_examples=20)
 def test_helium_and_energy_are_conserved_over_hours_of_whatever_happens(course: Course) -> None:
@@ -221,7 +221,7 @@ def test_a_cold_box_has_gained_what_crossed_its_boundary(course: BoxCourse) -> N
     energy_over_random_events(course)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 @given(course=st.lists(box_pieces, min_size=24, max_size=24))
 @settings(max_examples=20)
 def test_a_cold_box_has_gained_what_crossed_its_boundary_in_hours_of_events(course: BoxCourse) -> None:

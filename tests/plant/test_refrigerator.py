@@ -112,7 +112,7 @@ def test_electrical_power_leaves_as_heat_but_for_what_warms_the_gas(rest: Point)
     assert s["E_NC"] - s["Q_NC"] == pytest.approx(warmed, rel=1e-6)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_the_shipped_file_is_that_of_the_reference_refrigerator(rest: Point) -> None:
     assert FILE.parameters_digest == refrigerator_digest(PLANT, HELIUM)
     model = build_model()

@@ -74,7 +74,7 @@ def in_double(recorded: GoldenVectors, most: int) -> GoldenVectors:
     return GoldenVectors(method, vectors)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_double_precision_has_the_same_bits_too(recorded: GoldenVectors, tmp_path: Path) -> None:
     double = in_double(recorded, 5)
     export_of(double).write(tmp_path, double.vectors)
@@ -111,7 +111,7 @@ def test_a_changed_bit_of_a_literal_a_matrix_or_a_golden_vector_is_found(
     assert_found(folder, tmp_path / "copy", name, 1)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 @pytest.mark.parametrize("name", ["kernels.c", "problem.c", "golden.c"])
 def test_many_changed_bits_are_found(folder: Path, tmp_path: Path, name: str) -> None:
     assert_found(folder, tmp_path / "copy", name, 30)

@@ -137,7 +137,7 @@ def all_active(recorded: GoldenVectors, vector: GoldenVector) -> GoldenVector:
     return answered(recorded.method, vector.problem._replace(gamma=gamma), vector.guess)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_the_longest_call_of_the_whole_optimiser_is_hardly_longer_than_the_mean() -> None:
     machine = Machine(*OptimizerText(recorder().optimizer, recorded_updates(100, "e")).files().values())
     test, calls = machine.instance("cl_self_test"), list[int]()

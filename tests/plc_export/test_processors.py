@@ -70,7 +70,7 @@ def built(target: Target, folder: Path, *sources: str) -> list[str]:
     return [*target.runner, program]
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 @pytest.mark.parametrize("name", TARGETS)
 def test_the_output_guard_passes_its_self_test(tmp_path: Path, name: str) -> None:
     limits = InputLimits(rate=(0.1, 7.7, 1 / 3))
@@ -80,7 +80,7 @@ def test_the_output_guard_passes_its_self_test(tmp_path: Path, name: str) -> Non
     assert (done.returncode, done.stdout[-13:]) == (0, ", 0 failures\n")
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 @pytest.mark.parametrize("name", TARGETS)
 def test_problems_of_six_loads_have_the_bits_of_the_kernels(problems: Path, tmp_path: Path, name: str) -> None:
     sources = [problems / "kernels.c", problems / "problem.c", DRIVER]

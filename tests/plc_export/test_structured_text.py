@@ -77,7 +77,7 @@ def test_an_iteration_a_call_gives_every_bit_of_the_kernels(
                          in zip(answer.points, answer.costs, answer.iterations, strict=True)]  # fmt: skip
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_every_problem_has_the_same_bits_one_after_the_other(files: dict[str, str], recorded: GoldenVectors) -> None:
     solver = Machine(*files.values()).instance("cl_solver")
     for vector in recorded.vectors:
@@ -120,7 +120,7 @@ def test_a_changed_bit_of_a_literal_is_found(files: dict[str, str]) -> None:
     assert_found(files, "configuration.st", 3, 4)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_a_changed_bit_of_any_literal_is_found(files: dict[str, str]) -> None:
     assert literals(files) == 13
     for place in range(13):

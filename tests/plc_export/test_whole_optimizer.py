@@ -47,7 +47,7 @@ def test_the_self_test_finds_plans_and_sequences_as_the_kernels_have_them(
     assert code == 0
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 @pytest.mark.parametrize("assignments", OPTIMISERS.values(), ids=OPTIMISERS)
 def test_two_hours_of_updates_have_the_same_bits_at_every_level_of_optimisation(
     tmp_path: Path, assignments: tuple[str, ...]

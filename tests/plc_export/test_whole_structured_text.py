@@ -49,13 +49,13 @@ def run(test: SimpleNamespace, most: int = 100_000) -> SimpleNamespace:
     return test
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_executed_as_text_the_self_test_passes(machine: Machine) -> None:
     test = run(machine.instance("cl_self_test"))
     assert (test.done, test.passed, test.what) == (True, True, 0)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_a_changed_bit_is_found_wherever_it_is(texts: dict[str, str]) -> None:
     for name, what in (("configuration.st", 4), ("golden.st", 5)):
         number = list(NUMBER.finditer(texts[name]))[-7]
@@ -172,7 +172,7 @@ def test_the_self_test_passes_in_native_code(tmp_path: Path, assignments: tuple[
 
 
 @NEEDS_MATIEC
-@pytest.mark.exhaustive
+@pytest.mark.night
 @pytest.mark.parametrize("assignments", OPTIMISERS.values(), ids=OPTIMISERS)
 def test_half_an_hour_of_updates_has_the_same_bits_in_native_code(tmp_path: Path, assignments: tuple[str, ...]) -> None:
     golden = recorded_updates(7200, "e", *assignments)

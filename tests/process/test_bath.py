@@ -210,7 +210,7 @@ def test_names_and_order_of_its_signals_do_not_matter_to_the_laws_of_a_bath(
     assert other["may stand"] == [[OTHER.names[name] for name in names] for names in own["may stand"]]
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_it_runs_with_the_targets_and_the_limit_of_its_feed(processes: Processes, tmp_path: Path) -> None:
     file, options = renamed(tmp_path), ["--load", "a", "--duration", "30min"]
     unlimited = run(processes, file, tmp_path / "unlimited", "--in-process", *options)

@@ -178,7 +178,7 @@ def printed(module: str, model: Path | None, *words: str) -> Any:  # noqa: ANN40
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in USUALLY else pytest.mark.exhaustive) for name in CASES]
+    "name", [pytest.param(name, marks=[] if name in USUALLY else pytest.mark.night) for name in CASES]
 )
 def test_compiled_loops_leave_what_the_programs_leave(name: str, processes: Processes, tmp_path: Path) -> None:
     case = CASES[name]

@@ -29,7 +29,7 @@ def exported(processes: Processes, file: Path, target: str, out: Path, ticks: in
     return out
 
 
-PROCESSES = ["quadruple_tank", *(pytest.param(name, marks=pytest.mark.exhaustive) for name in ("wood_berry", "pond"))]
+PROCESSES = ["quadruple_tank", *(pytest.param(name, marks=pytest.mark.night) for name in ("wood_berry", "pond"))]
 
 
 @pytest.mark.skipif(not COMPILERS, reason=NO_COMPILER)
@@ -52,7 +52,7 @@ def test_in_c_its_self_test_passes_and_on_the_bus_it_leaves_the_trace_and_the_up
     assert updates[0].num_rows > 10
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_in_structured_text_its_self_tests_pass(processes: Processes, tmp_path: Path) -> None:
     out = exported(processes, process_file("pond", tmp_path), "st", tmp_path / "out", 600)
     for folder in ("optimizer/", "output_guard/"):

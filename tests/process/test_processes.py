@@ -135,7 +135,7 @@ def test_a_run_is_repeated_with_its_process_as_it_was_then(processes: Processes,
         assert "has_pond is unknown; use the version of Coldloop that made this run" in complaints
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 @pytest.mark.parametrize("plan", ["kill", "drop"])
 @pytest.mark.parametrize(("file", "duration"), [(TANK, "30min"), (COLUMN, "2h")], ids=["tank", "column"])
 def test_a_process_survives_chaos_as_the_cold_box_does(

@@ -97,7 +97,7 @@ def test_a_load_with_which_a_better_turbine_gets_too_cold_is_said(tmp_path: Path
     assert "raise it" in str(alarm["cause"])
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_the_loads_that_can_be_held_are_those_of_the_steady_states_of_the_plant() -> None:
     """Proof over a grid of the valves, with the heater at the end that helps."""
     openings, turbine = (20.0, 23.0, 24.0, 25.0, 26.0, 50.0, 54.0, 56.0, 58.0, 60.0), (20.0, 22.0, 24.0, 50.0, 60.0)

@@ -145,7 +145,7 @@ def test_a_line_is_completed(line: str, offered: str, tmp_path: Path, python: Py
     assert offered in answer.read_text().split()
 
 
-DUMB = pytest.param({"NO_COLOR": "1", "COLUMNS": "20", "TERM": "dumb"}, marks=pytest.mark.exhaustive)
+DUMB = pytest.param({"NO_COLOR": "1", "COLUMNS": "20", "TERM": "dumb"}, marks=pytest.mark.night)
 
 
 @pytest.mark.parametrize("environment", [{}, DUMB])

@@ -148,7 +148,7 @@ USUALLY = {
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[] if name in USUALLY else pytest.mark.exhaustive)
+        pytest.param(name, marks=[] if name in USUALLY else pytest.mark.night)
         for name in (*COMPILED, *LEFT_TO_PROGRAMS, *UNUSUAL)
     ],
 )

@@ -40,9 +40,9 @@ def trace_of(coldloop: "Coldloop", out: Path, *words: object) -> str:
         (),
         pytest.param(
             ("--set", "plant.load=e", "--set", "plant.seed=3", "--set", "plant.sensors.level=0.2"),
-            marks=pytest.mark.exhaustive,
+            marks=pytest.mark.night,
         ),
-        pytest.param(("--set", "plant.kind=refrigerator", "--set", EVENTS), marks=pytest.mark.exhaustive),
+        pytest.param(("--set", "plant.kind=refrigerator", "--set", EVENTS), marks=pytest.mark.night),
     ],
 )
 def test_a_run_with_the_written_configuration_is_the_same_run(
@@ -125,7 +125,7 @@ def test_the_weight_of_broken_constraints_follows_a_penalty_beside_a_file_with_e
     assert {key: value for key, (value, _) in effective(file, change).items()} == plain(change)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_the_option_reaches_the_run(coldloop: "Coldloop", tmp_path: Path) -> None:
     file = written(coldloop, tmp_path)
     run = ("--load", "a", "--preset", "as-printed", "--duration", "2min")

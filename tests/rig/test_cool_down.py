@@ -71,7 +71,7 @@ def test_a_cool_down_begins_without_a_loss_of_helium_or_energy() -> None:
     assert [str(each) for each in events["subject"]] == ["hold", "turbine", "classical"]
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_mpc_takes_over_a_refrigerator_that_was_cooled_down_from_300_k_and_holds_it_under_its_load() -> None:
     run = cooled_down_for("22h")
     events = run.events.to_dict()

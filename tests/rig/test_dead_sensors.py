@@ -70,7 +70,7 @@ def outside(load_a: LoadProfile, monkeypatch: pytest.MonkeyPatch) -> Outside:
     return run
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_the_estimate_does_without_a_dead_sensor_whose_last_value_would_mislead_it(outside: Outside) -> None:
     """With the preset `paper` all that a stale pressure shows is taken for state and load; `tuned` adds a constant."""
     assert outside(["P1"], HALF_HOUR, Preset.PAPER, stale=True)[:, 0].any()
@@ -82,7 +82,7 @@ def test_the_bands_are_kept_without_some_sensors_and_when_they_are_back(outside:
     assert not outside(dead, TEN_MINUTES).any()
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 @pytest.mark.parametrize("dead", OTHERS)
 def test_the_bands_are_kept_for_half_an_hour_without_any_one_sensor(outside: Outside, dead: str) -> None:
     assert not outside([dead], HALF_HOUR).any()

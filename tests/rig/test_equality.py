@@ -127,7 +127,7 @@ def test_the_command_starts_three_services_and_gets_the_trace_of_one_process(
     }  # fmt: skip
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 @pytest.mark.usefixtures("undrawn", "processes")
 def test_tls_on_every_connection_changes_nothing_about_the_trace(coldloop: "Coldloop", tmp_path: Path) -> None:
     assert coldloop("certificates", "--out", tmp_path / "site").code == 0

@@ -79,7 +79,7 @@ def test_a_run_with_it_has_the_trace_and_the_updates_of_ours(
     assert_same(coldloop, export, tmp_path, "--load", "e", "--duration", "150s", "--updating-period", period)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 @pytest.mark.usefixtures("undrawn", "processes")
 @pytest.mark.parametrize("period", ["adaptive", "2.5"])
 def test_so_have_two_hours(coldloop: Coldloop, export: Path, tmp_path: Path, period: str) -> None:

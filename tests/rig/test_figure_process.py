@@ -36,7 +36,7 @@ def run(recorded: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(recorded, tmp_path / "run"))
 
 
-@pytest.mark.parametrize("early", [True, pytest.param(False, marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize("early", [True, pytest.param(False, marks=pytest.mark.night)])
 def test_it_draws_in_the_formats_asked_for_whether_it_was_started_early_or_not(run: Path, *, early: bool) -> None:
     with FigureProcess(["png", "pdf"]) as figure:
         if early:

@@ -288,7 +288,7 @@ def test_a_model_of_other_signals_is_refused(
     refused(coldloop("identify", recorded, "--model", tmp_path / "fewer.json"), "2 inputs", "--model")
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 @pytest.mark.usefixtures("undrawn")
 def test_valves_that_pass_less_are_found_in_an_hour_of_control(
     model: LtiModel, coldloop: "Coldloop", tmp_path: Path

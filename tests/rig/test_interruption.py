@@ -60,10 +60,10 @@ sys.exit(main())
 
 INTERRUPTED = [
     pytest.param(("--in-process",), signal.SIGTERM, id="in process, SIGTERM"),
-    pytest.param((), signal.SIGINT, id="networked, SIGINT", marks=pytest.mark.exhaustive),
-    pytest.param((), signal.SIGTERM, id="networked, SIGTERM", marks=pytest.mark.exhaustive),
-    pytest.param(("--in-process",), signal.SIGINT, id="in process, SIGINT", marks=pytest.mark.exhaustive),
-    pytest.param(("--in-process",), signal.SIGHUP, id="in process, terminal closed", marks=pytest.mark.exhaustive),
+    pytest.param((), signal.SIGINT, id="networked, SIGINT", marks=pytest.mark.night),
+    pytest.param((), signal.SIGTERM, id="networked, SIGTERM", marks=pytest.mark.night),
+    pytest.param(("--in-process",), signal.SIGINT, id="in process, SIGINT", marks=pytest.mark.night),
+    pytest.param(("--in-process",), signal.SIGHUP, id="in process, terminal closed", marks=pytest.mark.night),
 ]
 
 

@@ -128,7 +128,7 @@ def test_a_load_written_during_a_session_takes_effect_from_the_tick_it_names(tmp
     asyncio.run(check())
 
 
-@pytest.mark.exhaustive  # test_load_schedule.py has the rack's part
+@pytest.mark.night  # test_load_schedule.py has the rack's part
 def test_steps_written_ahead_are_held_one_after_the_other(tmp_path: Path) -> None:
     async def check() -> None:
         async with running(tmp_path) as rig:
@@ -167,7 +167,7 @@ def test_a_rig_that_is_paused_stands_and_goes_on_without_alarm(tmp_path: Path) -
     asyncio.run(check())
 
 
-@pytest.mark.exhaustive  # test_rig_that_stays_up.py has the command
+@pytest.mark.night  # test_rig_that_stays_up.py has the command
 def test_the_factor_changes_in_the_middle_of_a_session(tmp_path: Path) -> None:
     async def check() -> None:
         async with running(tmp_path) as rig:
@@ -183,7 +183,7 @@ def test_the_factor_changes_in_the_middle_of_a_session(tmp_path: Path) -> None:
     asyncio.run(check())
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_a_pace_that_is_not_for_the_session_is_refused(tmp_path: Path) -> None:
     async def check() -> None:
         async with running(tmp_path) as rig:

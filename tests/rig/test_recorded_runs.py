@@ -185,7 +185,7 @@ def test_a_repetition_does_not_replace_what_it_repeats(coldloop: "Coldloop", mpc
     assert {file: file.read_bytes() for file in mpc.rglob("*") if file.is_file()} == before
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_two_runs_at_once_do_not_share_a_folder(processes: Processes, tmp_path: Path) -> None:
     words = ("run", "--load", "a", "--duration", "100h", "--out", tmp_path / "run")
     first = processes.coldloop(*words)

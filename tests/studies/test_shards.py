@@ -66,7 +66,7 @@ def test_seven_shards_merged_are_the_study_byte_for_byte(whole: Path, parts: lis
     assert theirs == {path.name: path.read_bytes() for path in (whole / RUNS).iterdir()}
 
 
-@pytest.mark.exhaustive
+@pytest.mark.night
 def test_shards_may_share_a_folder_and_be_done_at_once(whole: Path, client: "Client", tmp_path: Path) -> None:
     """Two of the three are the same one: both do its runs, or find them done."""
     workers = Workers(1, scheduler=client.scheduler.address)
@@ -89,7 +89,7 @@ def test_shards_may_share_a_folder_and_be_done_at_once(whole: Path, client: "Cli
     assert results(tmp_path) == results(whole)
 
 
-@pytest.mark.exhaustive  # what a dead worker costs is shown for single runs in test_execution.py
+@pytest.mark.night  # what a dead worker costs is shown for single runs in test_execution.py
 def test_a_third_of_the_workers_killed_changes_no_byte(whole: Path, tmp_path: Path) -> None:
     with Workers(3).connected() as client:
         victim = next(iter(client.run(os.getpid).values()))
