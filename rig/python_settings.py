@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
-from coldloop.config import Configuration, load_configuration
+from coldloop.config import Configuration, flattened, load_configuration
 from rig.settings import Settings
 
 Period = float | Literal["adaptive"]
@@ -37,15 +37,5 @@ def configured(
         "session.factor": (factor, "factor"),
     }  # fmt: skip
     given = {key: (value, name) for key, (value, name) in arguments.items() if value is not None}
-    options = given | _flattened(sections)
+    options = given | {key: (value, key) for key, value in flattened(sections).items() if value != {}}
     return load_configuration(Settings, file=None if config is None else Path(config), environment={}, options=options)
-
-
-def _flattened(sections: Mapping[str, object], prefix: str = "") -> dict[str, tuple[object, str]]:
-    flat: dict[str, tuple[object, str]] = {}
-    for key, value in sections.items():
-        if isinstance(value, Mapping):
-            flat |= _flattened(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = (value, f"{prefix}{key}")
-    return flat

@@ -7,8 +7,9 @@ from typing import Annotated, Any, Final, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from coldloop.config import Configuration, parsed_toml
+from coldloop.config import Configuration
 from coldloop.errors import LoadFileError, UsageError
+from coldloop.parsing import parsed_toml
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import SAMPLING_PERIOD_S, TICK_S

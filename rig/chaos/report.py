@@ -1,11 +1,11 @@
 """The files of a run under chaos, and its table."""
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from coldloop.parsing import parsed_json
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES
 from coldloop.registers.control_plc import Mode
@@ -46,7 +46,7 @@ def document(
 ) -> dict[str, Any]:
     """Return what chaos.json holds."""
     return {
-        "plan": json.loads(plan.model_dump_json()),
+        "plan": parsed_json(plan.model_dump_json()),
         "failure": failure,
         "faults": [
             {**row._asdict(), "alarms": [alarm._asdict() for alarm in row.alarms], "back_s": row.back_s}

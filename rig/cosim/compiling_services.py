@@ -1,12 +1,12 @@
 """Shows on standard error that services compile kernels before they serve: they write to log files."""
 
 import asyncio
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from coldloop.kernels.first_use import Kernels, write_line
+from coldloop.parsing import parsed_json
 from coldloop.service.start import COMPILING, SERVING
 
 LOOK_S: Final = 0.25
@@ -37,7 +37,7 @@ def _events(log: Path) -> dict[str, dict[str, Any]]:
 def _lines(log: Path) -> Iterator[dict[str, Any]]:
     for text in log.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
-            line = json.loads(text)
+            line = parsed_json(text)
         except ValueError:  # the last words of a service, or half a line
             continue
         if isinstance(line, dict) and "event" in line:

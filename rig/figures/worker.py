@@ -13,6 +13,7 @@ from types import TracebackType
 from typing import Final, Self
 
 from coldloop.errors import ColdloopError, ResultsError, UsageError
+from coldloop.parsing import parsed_json
 from rig.interpreter import PYTHON
 
 COMMAND: Final = (*PYTHON, "-m", "rig.figures.worker")
@@ -76,7 +77,7 @@ def main() -> None:
     request = sys.stdin.buffer.read()
     if not request:
         return
-    folder, formats = json.loads(request)
+    folder, formats = parsed_json(request)
     try:
         plot_run(Path(folder), formats)
     except (OSError, ColdloopError) as error:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final, NamedTuple, Self
 
 from coldloop.errors import ColdloopError, UsageError
+from coldloop.parsing import parsed_json
 from rig.chaos.faults import Freeze, Link
 from rig.chaos.proxied_services import LinkProxies
 from rig.cosim.kept_up import say
@@ -43,9 +44,9 @@ class Cut(NamedTuple):
             ValueError: It asks for none.
         """
         try:
-            link, seconds = json.loads(text)
+            link, seconds = parsed_json(text)
             cut = cls(Link(link), float(seconds))
-        except (ValueError, TypeError, OverflowError, RecursionError):
+        except (ValueError, TypeError, OverflowError):
             raise ValueError("not what `coldloop fault cut` writes") from None
         if not 0 < cut.seconds <= LONGEST_S:
             raise ValueError(f"not a number of seconds up to {LONGEST_S:g}")

@@ -15,6 +15,7 @@ from typing import Any, Final, NamedTuple, Self
 
 from coldloop.errors import ColdloopError, UsageError
 from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
+from coldloop.parsing import parsed_json
 from rig.cosim.endpoints import REQUIRED, RigEndpoints
 from rig.interpreter import PYTHON
 from rig.interruption import INTERRUPTION
@@ -89,7 +90,7 @@ class RunningRig(NamedTuple):
             ValueError: It was not written by `coldloop up`, or by another version.
         """
         try:
-            content: dict[str, Any] = json.loads(text)
+            content: dict[str, Any] = parsed_json(text)
             own = ServiceProcess.parsed([content["pid"], content["identity"]])
             services = {
                 service: ServiceProcess.parsed(content["services"][service])
@@ -97,7 +98,7 @@ class RunningRig(NamedTuple):
                 if service in REQUIRED or service in content["services"]
             }
             rig = cls(*own, tuple(content["ports"]), content["tls"], services, content["cuttable"] is True)
-        except (ValueError, KeyError, TypeError, RecursionError):
+        except (ValueError, KeyError, TypeError):
             raise ValueError("not what `coldloop up` of this version writes") from None
         ports_fit = len(rig.ports) == len(DEFAULT_PORTS) and all(
             type(port) is int and 0 < port < 0x10000 for port in rig.ports

@@ -1,12 +1,12 @@
 """What an export for a PLC costs there, from its manifest: operations of its calls, bytes, times."""
 
-import json
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from coldloop.errors import UsageError
+from coldloop.parsing import parsed_json
 from coldloop.process.signals import TICK_S
 from optimizer_plc.budget import MAX_PERIOD_TICKS
 from rig.plc_sizing.profile import PlcProfile
@@ -89,7 +89,7 @@ def read_cost(folder: Path) -> ExportCost:
         UsageError: It is no export.
     """
     try:
-        return ExportCost.model_validate(json.loads((folder / MANIFEST).read_text(encoding="ascii")))
+        return ExportCost.model_validate(parsed_json((folder / MANIFEST).read_text(encoding="ascii")))
     except (OSError, ValueError, ValidationError):
         raise UsageError(f"{folder}: has no manifest of an export (coldloop export plc --out FOLDER)") from None
 

@@ -1,6 +1,5 @@
 """A plant given as matrices: a file of them, or a state space that a Python file makes."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -9,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
+from coldloop.parsing import parsed_json
 from plant.own.maker import LINEAR
 from plant.own.python_class import made_by
 from rig.process_file.declaration import ProcessFile
@@ -57,12 +57,12 @@ def from_matrices(file: ProcessFile, folder: Path, given: str) -> Linearised:
 def _of_file(path: Path) -> dict[str, Array]:
     try:
         if path.suffix == ".json":
-            stored: Mapping[str, Any] = dict(json.loads(path.read_text(encoding="utf-8")))
+            stored: Mapping[str, Any] = dict(parsed_json(path.read_text(encoding="utf-8")))
         else:
             with np.load(path, allow_pickle=False) as archive:
                 stored = dict(archive)
         return {name: np.array(stored[name], dtype=np.float64) for name in NAMES if name in stored}
-    except (OSError, ValueError, TypeError, EOFError, RecursionError) as error:
+    except (OSError, ValueError, TypeError, EOFError, RecursionError, MemoryError) as error:
         raise UsageError(f"{path}: not a readable NPZ or JSON file of matrices ({error}); {REMEDY}") from error
 
 

@@ -2,12 +2,12 @@
 
 import platform
 import time
-import tomllib
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
 from coldloop import __version__
+from coldloop.parsing import parsed_toml
 from coldloop.whole_file import whole_text
 from rig.report.document import as_page, deviations, findings, revisions, scorecard_table, verdict_counts
 from rig.report.scorecard import COUNTED, TOLERANCES, Judged, as_json, counted, counts, judge, withdrawn
@@ -87,7 +87,7 @@ def report(options: StudyOptions, results: Mapping[str, StudyResult], judged: Se
     """Return the report as Markdown."""
     scale = " --quick" if options.quick else f" --draws {options.seeds}" if options.seeds else ""
     commands = {name: f"coldloop study {name}{scale}" for name in STUDIES}
-    explanations = tomllib.loads(EXPLANATIONS.read_text(encoding="utf-8"))
+    explanations = parsed_toml(EXPLANATIONS.read_text(encoding="utf-8"))
     parts = [
         f"# {TITLE}",
         circumstances(options, effort),

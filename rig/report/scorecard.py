@@ -1,7 +1,6 @@
 """Claims, what is asked of them, and the verdicts."""
 
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from datetime import date
 from enum import StrEnum
@@ -12,6 +11,7 @@ from typing import Annotated, Any, Final, NamedTuple, Self
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, model_validator
 
+from coldloop.parsing import parsed_toml
 from rig.plc_sizing.operations import dense_cholesky
 from rig.plc_sizing.reference_plc import cholesky_times
 from rig.studies import published as paper
@@ -123,7 +123,7 @@ def withdrawn() -> tuple[Revision, ...]:
 
 
 def _document() -> dict[str, Any]:
-    return tomllib.loads(TOLERANCES.read_text(encoding="utf-8"))
+    return parsed_toml(TOLERANCES.read_text(encoding="utf-8"))
 
 
 def judge(values: Mapping[str, Sequence[float]]) -> list[Judged]:

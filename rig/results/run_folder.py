@@ -1,6 +1,5 @@
 """A folder that a run has left behind, and how it is read."""
 
-import json
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coldloop.errors import UsageError
+from coldloop.parsing import parsed_json
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
 from coldloop.process.loaded import PROCESS
@@ -84,8 +84,8 @@ class RunFolder:
 
     def _document(self, name: str) -> dict[str, Any]:
         try:
-            document: dict[str, Any] = json.loads((self.path / name).read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
+            document: dict[str, Any] = parsed_json((self.path / name).read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise UsageError(f"{self.path / name}: {reason}; name the folder of a run that has ended") from None
         if not isinstance(document, dict):

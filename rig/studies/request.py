@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
+from coldloop.parsing import parsed_json
 from coldloop.process.cold_box import COLD_BOX, L1, T5
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
@@ -151,7 +152,7 @@ class Outcome:
             ValueError: It is not one.
         """
         try:
-            content = json.loads(text)
+            content = parsed_json(text)
             events = [Happening(*event) for event in content["events"]]
             return cls(**{**content, "indicators": Indicators(**content["indicators"]), "events": events})
         except (TypeError, KeyError) as error:

@@ -14,6 +14,7 @@ from typing import Any, Final, Self
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coldloop.errors import StudyError, UsageError
+from coldloop.parsing import parsed_json
 from rig.results.folders import prepare_folder, write_json, writing
 from rig.studies.execution import Workers, checked_requests, perform_all
 from rig.studies.request import RunRequest, programs_digest
@@ -72,7 +73,7 @@ class ShardRecord(BaseModel):
         """Return the record of a shard that is about to be done."""
         digests = [request.digest for request in unique(study.requests(options))]
         runs = hashlib.sha256("\n".join(digests).encode()).hexdigest()[:20]
-        plain = json.loads(json.dumps(asdict(options)))
+        plain = parsed_json(json.dumps(asdict(options)))
         return cls(
             study=study.name, shard=shard.number, of=shard.of, options=plain, programs=programs_digest(), runs=runs
         )

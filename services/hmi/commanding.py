@@ -6,6 +6,7 @@ from aiohttp import web
 
 from coldloop.errors import LinkError, UsageError
 from coldloop.operating.commands import read_command
+from coldloop.parsing import parsed_json
 from hmi.access import LoginSession
 from hmi.audit import Audit
 from hmi.documents import encoded
@@ -154,8 +155,8 @@ async def _document(request: web.Request) -> dict[str, Any]:
         HTTPBadRequest: It has none.
     """
     try:
-        document = await request.json()
-    except (ValueError, LookupError, RecursionError):  # no JSON, no such character set, too deep
+        document = await request.json(loads=parsed_json)
+    except (ValueError, LookupError):  # no JSON, or no such character set
         document = None
     if not isinstance(document, dict):
         raise web.HTTPBadRequest(reason="the request is not a JSON object")

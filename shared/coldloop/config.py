@@ -10,7 +10,6 @@ the file have of them.
 
 import json
 import os
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -21,13 +20,12 @@ from typing import Any, Final, Generic, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from coldloop.errors import ConfigurationError
+from coldloop.parsing import MOST_LEVELS, TOO_DEEP, parsed_toml
 
 PREFIX = "COLDLOOP__"
 DEFAULT = "default"
 DERIVED = "follows from other settings"
 LISTING: Final = "`coldloop config` lists the keys"
-MOST_LEVELS: Final = 32
-"""Tables and arrays within one another that a TOML text may have."""
 MOST_BYTES: Final = 1_000_000
 """Size of a configuration file, at most."""
 WHOLE: Final = "configuration"
@@ -66,6 +64,8 @@ class _Layers:
     def put(self, layer: int, key: str, value: object, source: str) -> None:
         """Set the value of a dotted key; a layer of a higher number overrides."""
         *sections, last = key.split(".")
+        if len(sections) > MOST_LEVELS:
+            raise ConfigurationError(f"{source[:MOST_SHOWN]}...: {TOO_DEEP}; {LISTING}")
         place = self.values
         for section in sections:
             place = place.setdefault(section, {})
@@ -215,34 +215,6 @@ def as_toml(value: object) -> str:
     return text.replace("\x7f", "\\u007f")  # the one control character that JSON lets pass and TOML does not
 
 
-def parsed_toml(text: str) -> dict[str, Any]:
-    """Return what a TOML text holds.
-
-    Raises:
-        ValueError: It is not TOML, or beyond what can be read: a number of thousands of digits, thousands of levels.
-    """
-    try:
-        tree = tomllib.loads(text)
-    except tomllib.TOMLDecodeError:
-        raise
-    except ValueError:
-        raise ValueError("a number has too many digits") from None
-    except RecursionError:
-        raise ValueError("nested too deeply") from None
-    level: list[object] = [tree]
-    for _ in range(MOST_LEVELS):
-        level = [part for one in level for part in _parts(one)]
-        if not level:
-            return tree
-    raise ValueError("nested too deeply")
-
-
-def _parts(value: object) -> Iterable[object]:
-    if isinstance(value, Mapping):
-        return value.values()
-    return value if isinstance(value, list) else ()
-
-
 def _read_toml(file: Path, option: str) -> dict[str, Any]:
     try:
         with file.open("rb") as content:  # a pipe will do, a device without an end will not
@@ -266,7 +238,13 @@ def _parsed(value: str) -> object:
 
 
 def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the values of nested sections by dotted key."""
+    """Return the values of nested sections by dotted key.
+
+    Raises:
+        ConfigurationError: Too many levels, in a mapping that was not read from a text.
+    """
+    if prefix.count(".") > MOST_LEVELS:
+        raise ConfigurationError(f"{prefix[:MOST_SHOWN]}...: {TOO_DEEP}; {LISTING}")
     flat: dict[str, Any] = {}
     for key, value in tree.items():
         if isinstance(value, Mapping) and value:

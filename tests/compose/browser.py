@@ -29,8 +29,9 @@ class Browser:
             with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:  # noqa: S310
                 self._cookie = (answer.headers["Set-Cookie"] or self._cookie).partition(";")[0]
                 return answer.status, json.loads(answer.read())
-        except urllib.error.HTTPError as error:
-            return error.code, json.loads(error.read())
+        except urllib.error.HTTPError as refusal:
+            with refusal:
+                return refusal.code, json.loads(refusal.read())
 
     def values(self) -> dict[str, Any]:
         """Return what the page shows now, by name."""

@@ -115,8 +115,9 @@ class Site:
         try:
             with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:  # noqa: S310
                 return _answer(answer.status, answer.read(), answer.headers)
-        except urllib.error.HTTPError as error:
-            return _answer(error.code, error.read(), error.headers)
+        except urllib.error.HTTPError as refusal:
+            with refusal:
+                return _answer(refusal.code, refusal.read(), refusal.headers)
 
     def log_in(self, user: tuple[str, str] = OPERATOR) -> str:
         """Log in; return the cookie."""

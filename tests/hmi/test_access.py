@@ -1,6 +1,7 @@
 """Who may look, who may operate, and what becomes of those who may not: refused, and audited."""
 
 import asyncio
+import contextlib
 import json
 from http import HTTPStatus
 from http.client import HTTPConnection
@@ -139,6 +140,7 @@ def test_a_confirmation_counts_once_and_only_from_who_asked(site: Site) -> None:
         ({"Host": "\xff"}, "{}", 421),
         ({"Content-Type": "application/json; charset=none"}, "{}", 400),
         ({}, "[" * 4_000, 400),
+        ({}, '{"user":' + "[" * 2_000 + "]" * 2_000 + "}", 400),
         ({}, "[" * 50_000, 413),
         ({"Content-Encoding": "gzip"}, "no gzip", 400),
         ({"Content-Encoding": "br"}, "{}", 400),
@@ -150,12 +152,11 @@ def test_a_confirmation_counts_once_and_only_from_who_asked(site: Site) -> None:
 def test_requests_that_no_browser_sends_are_refused_like_others(
     site: Site, headers: dict[str, str], body: str, status: int
 ) -> None:
-    connection = HTTPConnection("127.0.0.1", site.ports["hmi"], timeout=60)
-    connection.request("POST", "/api/login", body, {"Origin": site.address, **headers})
-    answer = connection.getresponse()
-    assert answer.status == status
-    assert "error" in json.loads(answer.read())
-    connection.close()
+    with contextlib.closing(HTTPConnection("127.0.0.1", site.ports["hmi"], timeout=60)) as connection:
+        connection.request("POST", "/api/login", body, {"Origin": site.address, **headers})
+        with connection.getresponse() as answer:
+            assert answer.status == status
+            assert "error" in json.loads(answer.read())
     site.log_in()
     assert site.audited()[-1]["outcome"] == "done", "the audit can still be written and read"
 

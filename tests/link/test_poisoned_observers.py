@@ -79,8 +79,9 @@ def _asked(url: str) -> tuple[int, Any]:
     try:
         with urllib.request.urlopen(url, timeout=PATIENCE_S) as answer:  # noqa: S310 our own page
             return answer.status, answer.read()
-    except urllib.error.HTTPError as error:
-        return error.code, error.read()
+    except urllib.error.HTTPError as refusal:
+        with refusal:
+            return refusal.code, refusal.read()
     except OSError:
         return 0, b""
 

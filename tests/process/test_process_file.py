@@ -246,6 +246,7 @@ def test_more_signals_than_a_request_carries_are_refused(tmp_path: Path) -> None
         ("m.json", '{"A": [[-1.0]], "B": [[1.0]]}', "no C; it needs A, B and C"),
         ("m.json", '{"A": [[-1.0], [1.0, 2.0]], "B": [[1.0]], "C": [[1.0]]}', "not a readable NPZ or JSON file"),
         ("m.json", "[" * 100_000, "not a readable NPZ or JSON file"),
+        ("m.json", '{"A":' + "[" * 5000 + "]" * 5000 + "}", "nested too deeply"),
         ("m.json", '{"A": [["x"]], "B": [[1.0]], "C": [[1.0]]}', "not a readable NPZ or JSON file"),
         ("m.json", '{"A": [[-1.0]], "B": [[1.0, 2.0]], "C": [[1.0]]}', r"B has shape (1, 2), and not (1, 1)"),
         ("m.json", '{"A": [[NaN]], "B": [[1.0]], "C": [[1.0]]}', "A of the linear model is not finite"),

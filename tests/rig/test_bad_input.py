@@ -229,11 +229,12 @@ def test_a_model_that_is_not_of_this_plant_is_refused(
         (b"junk", "not a readable model file"),
         (b"\xff\xfe\x00", "not a readable model file"),
         (b"[" * 100_000, "not a readable model file"),
+        (b'{"format":' * 5000 + b"1" + b"}" * 5000, "nested too deeply"),
         (b"{}", "format"),
         (DEFAULT_MODEL_FILE.read_bytes()[:5000], "not a readable model file"),
         (DEFAULT_MODEL_FILE.read_bytes().replace(b'"w0": ', b'"w0": 1'), "digest mismatch"),
     ],
-    ids=["empty", "junk", "binary", "deep", "no model", "half", "changed"],
+    ids=["empty", "junk", "binary", "deep", "deep and whole", "no model", "half", "changed"],
 )
 def test_a_damaged_model_file_is_refused(
     content: bytes, part: str, coldloop: "Coldloop", results: Path, tmp_path: Path

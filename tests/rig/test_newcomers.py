@@ -57,7 +57,8 @@ def test_rerun_names_what_it_cannot_repeat(coldloop: "Coldloop", tmp_path: Path)
     assert_refused(coldloop("rerun", tmp_path / "absent" / "manifest.json"), str(tmp_path / "absent"))
     (tmp_path / "summary.json").write_text("{}")
     assert_refused(coldloop("rerun", tmp_path / "summary.json"), "not the manifest.json of a run")
-    for text in ("[]", "5", "null", "{", "[" * 5000, "9" * 5000, "{}"):
+    deep = '{"format":' * 5000 + "1" + "}" * 5000
+    for text in ("[]", "5", "null", "{", "[" * 5000, deep, "9" * 5000, "{}"):
         (tmp_path / "manifest.json").write_text(text)
         assert_refused(coldloop("rerun", tmp_path), str(tmp_path))
 

@@ -214,7 +214,8 @@ def _refuse_two_places(options: argparse.Namespace) -> None:
 
 def _tls_site(folder: Path) -> dict[str, tuple[object, str]]:
     """Return the settings of a folder of `coldloop certificates`, and where they come from."""
-    from coldloop.config import flattened, parsed_toml
+    from coldloop.config import flattened
+    from coldloop.parsing import parsed_toml
 
     file = folder / "tls.toml"
     try:

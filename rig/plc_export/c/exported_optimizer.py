@@ -11,6 +11,7 @@ from typing import Any, Final
 from coldloop import __version__
 from coldloop.config import selected
 from coldloop.errors import UsageError
+from coldloop.parsing import parsed_json
 from coldloop.process.lti_model import load as load_model
 from coldloop.registers.control_plc import CONTROL_MAP
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
@@ -42,7 +43,7 @@ def _identity(settings: Settings) -> dict[str, Any]:
     return {
         "model_digest": load_model(settings.model.file).digest,
         "register_maps": [CONTROL_MAP.digest, OPTIMIZER_MAP.digest],
-        "settings": json.loads(json.dumps({key: value for key, value in shown.items() if key not in OF_SESSION})),
+        "settings": parsed_json(json.dumps({key: value for key, value in shown.items() if key not in OF_SESSION})),
     }
 
 
@@ -67,7 +68,7 @@ def exported_optimizer(given: str, settings: Settings) -> tuple[str, ...]:
 
 def _check(given: str, folder: Path, settings: Settings) -> None:
     try:
-        found = json.loads((folder / FOLDER / MANIFEST).read_text(encoding="ascii"))
+        found = parsed_json((folder / FOLDER / MANIFEST).read_text(encoding="ascii"))
     except (OSError, ValueError):
         solver = (folder / "kernels.c").exists() or (folder / "kernels.st").exists()
         what = "has the solver alone, without the optimiser: export it again" if solver else "is no export"

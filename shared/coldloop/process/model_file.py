@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from coldloop.errors import ModelFileError
+from coldloop.parsing import parsed_json
 from coldloop.whole_file import whole_text
 
 FORMAT = 1
@@ -103,10 +104,10 @@ def read_document(path: Path, remedy: str = REMEDY) -> dict[str, Any]:
         ModelFileError: the file is missing, unreadable, not JSON, not finite, of another version or damaged.
     """
     try:
-        document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
+        document = parsed_json(path.read_text(encoding="utf-8"), parse_constant=_refuse)
     except FileNotFoundError as error:
         raise ModelFileError(f"{path}: no such model file; {remedy}") from error
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise ModelFileError(f"{path}: not a readable model file ({error}); {remedy}") from error
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise ModelFileError(f"{path}: not a model file of format {FORMAT}; {remedy}")

@@ -9,6 +9,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Final, NamedTuple
 
+from coldloop.parsing import parsed_json
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.declaration import Block, text, u16
 from coldloop.registers.text import from_words, to_words
@@ -63,9 +64,7 @@ def configuration_of(digest: ConfigurationDigest, lines: Sequence[ConfigurationL
     if _digest(document) != from_words(digest.sha256):
         raise ValueError("the text is not the one of its digest")
     try:
-        return {**json.loads(document)}
-    except RecursionError:
-        raise ValueError("the text is nested too deeply") from None
+        return {**parsed_json(document)}
     except TypeError:
         raise ValueError("the text is not an object") from None
 

@@ -19,6 +19,7 @@ from typing import Any, Final
 from pydantic import BaseModel, ConfigDict
 
 from coldloop.errors import ColdloopError
+from coldloop.parsing import parsed_json
 
 MAGIC = "coldloop-retained"
 MOST_BYTES: Final = 2**26
@@ -56,8 +57,8 @@ def decoded(data: bytes, owner: str, digest: int) -> dict[str, Any]:
     if line + b"\n" != _description(content, owner, digest):
         raise RetainedStateError(f"{_complaint(line, owner, digest)}; it is not used")
     try:
-        state = json.loads(content)
-    except (ValueError, RecursionError):
+        state = parsed_json(content)
+    except ValueError:
         raise RetainedStateError("it holds no valid state; it is not used") from None
     if not isinstance(state, dict):
         raise RetainedStateError("it holds no valid state; it is not used")
