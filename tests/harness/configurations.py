@@ -1,6 +1,5 @@
 """Configurations of runs of the cold box in one process: what the compiled loop and the programs are compared with."""
 
-from collections.abc import Mapping
 from typing import Final
 
 from coldloop.process.load_profile import LoadProfile
@@ -19,7 +18,7 @@ TRIP: Final = (
     '{at_s=65, target="turbine", value=0}, {at_s=75, target="turbine", value=1}, {at_s=80, target="cv155", value=1}, '
     '{at_s=85, target="blocked_nef2", value=5.0}, {at_s=150.25, target="leak", value=2.0}]'
 )
-COMPILED: Final[Mapping[str, tuple[str, ...]]] = {
+COMPILED: Final[dict[str, tuple[str, ...]]] = {
     "adaptive": (),
     "fixed": (f"{PROGRAM}updating_period_s=2.5",),
     "contraction": (f'{PROGRAM}adaptive.rule="contraction"',),
@@ -69,7 +68,7 @@ COMPILED: Final[Mapping[str, tuple[str, ...]]] = {
     ),
 }
 """Whose updates are compiled too."""
-LEFT_TO_PROGRAMS: Final[Mapping[str, tuple[str, ...]]] = {
+LEFT_TO_PROGRAMS: Final[dict[str, tuple[str, ...]]] = {
     "osqp": (f'{PROGRAM}solver="osqp"', f"{PROGRAM}updating_period_s=5"),
     "daqp": (f'{PROGRAM}solver="daqp"', *NOISE),
     "qpoases": (f'{PROGRAM}solver="qpoases"',),
@@ -77,7 +76,7 @@ LEFT_TO_PROGRAMS: Final[Mapping[str, tuple[str, ...]]] = {
     "qpoases and a refrigerator": (f'{PROGRAM}solver="qpoases"', REFRIGERATOR),
 }
 """Whose ticks alone are compiled, where that is worth while."""
-UNUSUAL: Final[Mapping[str, tuple[str, ...]]] = {
+UNUSUAL: Final[dict[str, tuple[str, ...]]] = {
     "narrow alarm bands": ("control_plc.alarms.level_band=[59.9,60.1]", "control_plc.alarms.t5_band=[12,13]"),
     "sensors out of range": ("control_plc.sensors.level=[59.9,60.1]",),
     "sensors that freeze soon": ("control_plc.sensors.frozen_s=0.5",),
