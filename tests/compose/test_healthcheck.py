@@ -22,9 +22,9 @@ from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
 from coldloop.registers.plant import PLANT_MAP, PlantSession
 from rig.cli.certificates import Authority
+from tests.harness.process_files import made
 from tests.harness.processes import END_S, Processes
 from tests.process.runs import started
-from tests.process.test_processes import made
 
 PROGRAM = Path(__file__).parents[2] / "docker" / "healthcheck.py"
 MAPS = {"plant": PLANT_MAP, "control_plc": CONTROL_MAP, "optimizer_plc": OPTIMIZER_MAP}

@@ -21,6 +21,7 @@ from rig.cosim.compiled.stretches import CompiledStretches, Stretch
 from rig.cosim.scenario import Scenario
 from rig.results.recording import MemorySink
 from rig.settings import Settings
+from tests.harness.process_configurations import load_of_shares
 from tests.rig.test_precompile import FirstTick, compiled_kernels
 
 
@@ -69,8 +70,7 @@ def main(ticks: str, steps: str, assignments: Sequence[str]) -> None:
     own = (f'model.file="{FILE}"', 'plant.kind="of-process"')
     settings = load_configuration(Settings, environment={}, assignments=(*own, *assignments)).settings
     w0, end = read_header(settings.model.file).w0, LOAD_SPAN[1]
-    pairs = [step.split(":") for step in steps.split(",")]
-    load = LoadProfile(tuple(int(tick) for tick, _ in pairs), tuple(w0 + float(part) * (end - w0) for _, part in pairs))
+    load = load_of_shares(steps, w0, end)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(one_process, "SHORT", 0)
         patch.setattr(stretches, "CompiledStretches", Counted)

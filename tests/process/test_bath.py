@@ -21,9 +21,10 @@ from coldloop.process.lti_model import load
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from rig.process_file.judgement import described
 from rig.process_file.making import made_from
+from tests.harness.process_files import TANK
 from tests.harness.processes import Processes
 from tests.process.runs import run, started
-from tests.process.test_processes import ROOT, TANK
+from tests.process.test_processes import ROOT
 
 INPUTS: Final = [one.name for one in COLD_BOX.inputs]
 OUTPUTS: Final = [one.name for one in COLD_BOX.outputs]

@@ -18,13 +18,13 @@ from plant.own.fmu import FmuSimulation, Wiring
 from plant.own.fmu_file import Fmu
 from rig.process_file.judgement import described
 from rig.process_file.making import Made, made_from
+from tests.harness.process_files import EXAMPLES, fmu
 from tests.harness.processes import PROGRAM_S, Processes
 from tests.process.runs import run
 
 fmpy = pytest.importorskip("fmpy")
 
 HERE: Final = Path(__file__).parent
-EXAMPLES: Final = HERE.parents[1] / "examples" / "processes"
 TANKS: Final = """
 name = "tanks"
 [plant]
@@ -108,15 +108,6 @@ def foreign(folder: Path) -> None:
     shutil.copy(str(oscillator.locate()), folder)
 
 
-def built(folder: Path, *options: str) -> Path:
-    """Build the example's FMU; return its process file."""
-    for name in ("quadruple_tank.py", "quadruple_tank_fmu.py", "quadruple_tank_fmu.toml"):
-        shutil.copy(EXAMPLES / name, folder)
-    command = [sys.executable, "-m", "pythonfmu", "build", "-f", "quadruple_tank_fmu.py", *options, "quadruple_tank.py"]
-    subprocess.run(command, check=True, cwd=folder, capture_output=True)
-    return folder / "quadruple_tank_fmu.toml"
-
-
 @pytest.fixture(autouse=True)
 def unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let FMUs of this test be unpacked where those of no other are."""
@@ -176,7 +167,7 @@ def test_an_fmu_without_them_is_differentiated_by_its_start_values(compiled: Pat
 
 
 def test_an_fmu_that_hides_its_states_is_identified_and_has_the_gains_of_its_equations(tmp_path: Path) -> None:
-    hidden = made_from(built(tmp_path)).model
+    hidden = made_from(fmu(tmp_path)).model
     known = made_from(EXAMPLES / "quadruple_tank.toml").model
     assert hidden.y0 == pytest.approx(known.y0, abs=1e-3)
     gains = [model.C @ model.discretised(300.0).B for model in (hidden, known)]
@@ -344,7 +335,7 @@ def test_an_fmu_of_another_platform_or_none_at_all_gets_one_line(compiled: Path,
 
 def test_an_fmu_that_does_not_start_says_why_in_its_own_words(tmp_path: Path, processes: Processes) -> None:
     """Its Python needs a module that is not there."""
-    file = built(tmp_path)
+    file = fmu(tmp_path)
     with zipfile.ZipFile(tmp_path / "QuadrupleTankFmu.fmu") as packed:
         content = {name: packed.read(name) for name in packed.namelist() if not name.endswith("/quadruple_tank.py")}
     with zipfile.ZipFile(tmp_path / "QuadrupleTankFmu.fmu", "w") as packed:

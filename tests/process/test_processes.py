@@ -11,37 +11,15 @@ import sys
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 import pytest
 
 from coldloop.process.model_file import read_document, write_document
 from coldloop.registers.control_plc import Mode
+from tests.harness.process_files import COLUMN, TANK, made
 from tests.harness.processes import Processes
 from tests.process.runs import run, started
 
 ROOT: Final = Path(__file__).parents[2]
-EXAMPLES: Final = ROOT / "examples" / "processes"
-TANK, COLUMN = EXAMPLES / "quadruple_tank.toml", EXAMPLES / "wood_berry.toml"
-
-
-def made(folder: Path, *, inputs: int, outputs: int, tick_s: float, load: bool, states: int = 6) -> Path:
-    """Write a process of random stable matrices with so many signals; each output of an even place has a band."""
-    random = np.random.default_rng(inputs + 10 * outputs)
-    time_s = 40.0 * tick_s * (1.0 + np.arange(states))
-    A = -np.diag(1.0 / time_s)
-    B = random.uniform(0.5, 1.5, (states, inputs)) / time_s[:, None]
-    C = random.uniform(0.2, 1.0, (outputs, states))
-    np.savez(folder / "matrices.npz", A=A, B=B, C=C, F=(1.0 / time_s) * load)
-    lines = [f'name = "made-{inputs}-{outputs}"', f"tick_s = {tick_s}", "[plant]", 'matrices = "matrices.npz"']
-    for i in range(inputs):
-        lines += ["[[inputs]]", f'name = "u{i}"', "at = 1.0", "low = 0.0", "high = 2.0", "rate = 0.1"]
-    for i in range(outputs):
-        lines += ["[[outputs]]", f'name = "y{i}"', "at = 5.0", "range = [-50.0, 50.0]", "noise = 0.01", "weight = 0.1"]
-        lines += ["band = [4.5, 5.5]"] * (i % 2 == 0)
-    if load:
-        lines += ["[load]", 'name = "d"', "at = 0.0", "span = [-1.0, 1.0]"]
-    (folder / "process.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return folder / "process.toml"
 
 
 @pytest.mark.parametrize("period", ["adaptive", "2.5"])

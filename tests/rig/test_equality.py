@@ -12,10 +12,10 @@ from coldloop.registers.codec import WordOrder
 from control_plc.settings import ControlSection, ControlStrategy
 from optimizer_plc.computing_settings import PlausibilitySettings
 from optimizer_plc.settings import AdaptiveSettings, OptimizerSection, ProgramSettings, RuleName
-from plant.load import find_load
 from plant.settings import PlantSection, SensorSettings
 from rig.cosim.scenario import Scenario
 from rig.settings import Settings
+from tests.harness import configurations
 
 if TYPE_CHECKING:
     from rig.results.recording import Recording
@@ -27,9 +27,7 @@ NOISY = PlantSection(sensors=SensorSettings(level=0.02, speed=0.5, temperature=0
 
 @pytest.fixture
 def lively(mean_load: float) -> LoadProfile:
-    """A load that moves from the first minute on."""
-    e = find_load("e", mean_load)
-    return LoadProfile((0, *(time - e.times[1] + 60 for time in e.times[1:])), e.watts)
+    return configurations.lively(mean_load)
 
 
 def three_minutes(load: LoadProfile, period_s: float = 0.0, seed: int = 1) -> Scenario:

@@ -1,0 +1,89 @@
+"""What a configuration left behind, and in which of it two differ, by name."""
+
+from collections.abc import Collection, Iterator, Sequence
+from typing import Final, NotRequired, TypedDict
+
+from tests.harness.traces.checks import Table, difference, sizes_of
+
+SHOWN: Final = 4
+"""Columns of a difference that are named."""
+
+
+class Names(TypedDict):
+    """What columns are called, by place: of messages, never compared."""
+
+    trace: list[str]
+    updates: list[str]
+    indicators: list[str]
+
+
+class Left(TypedDict):
+    """What a run leaves behind, as it is in the file."""
+
+    process: str
+    processor: NotRequired[str]
+    """Kind of processor that the last bits depend on, by OpenBLAS's name; without it they are the same on all."""
+    trace: Table
+    updates: Table
+    events: list[str]
+    """Each as the numbers of service, kind, tick, subject, cause."""
+    indicators: list[str]
+    """Each to its last digit."""
+
+
+def differences(recorded: Left, found: Left, names: Names) -> Iterator[str]:
+    """Yield what differs, each in a line that names tick and column, update and field, event, or indicator."""
+    yield from _of_table("tick", "column", recorded["trace"], found["trace"], names["trace"])
+    yield from _of_table("update", "field", recorded["updates"], found["updates"], names["updates"])
+    yield from _of_list("event", recorded["events"], found["events"], [])
+    yield from _of_list("indicator", recorded["indicators"], found["indicators"], names["indicators"])
+
+
+def _of_table(row: str, column: str, recorded: Table, found: Table, names: Sequence[str]) -> Iterator[str]:
+    before, now = sizes_of(recorded), sizes_of(found)
+    if before != now:
+        yield f"{column}s: {' + '.join(map(str, before))} on record, now {' + '.join(map(str, now))}"
+        return
+    if recorded["rows"] != found["rows"]:
+        yield f"{row}s: {recorded['rows']} on record, now {found['rows']}"
+    seen = difference(recorded, found)
+    if seen is None:
+        return
+    place = f"{row} {seen.first}" if seen.first == seen.last else f"{row}s {seen.first} to {seen.last}"
+    named = [f"{number} {names[number]}" for number in seen.columns]
+    later = f"; {len(seen.others)} other {column}s elsewhere" if seen.others else ""
+    yield f"{place}: {column} {shortened(named)}{later}"
+
+
+def shortened(names: Sequence[str]) -> str:
+    """Return the first of some names, and how many more there are."""
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(names[:SHOWN]) + more
+
+
+def _of_list(kind: str, recorded: Sequence[str], found: Sequence[str], names: Sequence[str]) -> Iterator[str]:
+    """Yield the first that differs of what follows each other, or each that differs of what has names."""
+    if len(recorded) != len(found):
+        yield f"{kind}s: {len(recorded)} on record, now {len(found)}"
+    pairs = enumerate(zip(recorded, found, strict=False))
+    lines = (
+        f"{kind} {number}{f' {names[number]}' if names else ''}: {one} on record, now {other}"
+        for number, (one, other) in pairs
+        if one != other
+    )
+    if names:
+        yield from lines
+    else:
+        yield from [line for _, line in zip(range(1), lines, strict=False)]
+
+
+def unmatched(recorded: Collection[str], wanted: Sequence[str], known: Collection[str]) -> Iterator[str]:
+    """Yield a line for each configuration that is not on record, and for each on record that there is not.
+
+    Args:
+        recorded: What is on record, by configuration.
+        wanted: Configurations that are checked.
+        known: All that there are.
+    """
+    yield from (f"{name}: is not on record" for name in wanted if name not in recorded)
+    yield from (f"{name}: is on record, and no such configuration exists" for name in recorded if name not in known)

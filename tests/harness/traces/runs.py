@@ -1,0 +1,132 @@
+"""Runs configurations of one process in this interpreter, and prints what each leaves behind, as JSON.
+
+python -m tests.harness.traces.runs NAME...    COLDLOOP_PROCESS: model file of their process, none for the cold box
+python -m tests.harness.traces.runs --models FOLDER PROCESS...    only makes model files of processes
+"""
+
+import ctypes
+import json
+import platform
+import sys
+from pathlib import Path
+from typing import Any, Final
+
+import numba
+import numpy as np
+import scipy
+
+from coldloop.config import load_configuration
+from coldloop.process.load_profile import LOAD_SPAN, LoadProfile
+from coldloop.process.loaded import FILE
+from coldloop.process.lti_model import load as load_model
+from coldloop.process.model_file import read_header
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, STATION_SIGNAL_NAMES
+from coldloop.registers.optimizer_plc import Optimization
+from plant.load import find_load
+from rig.cosim.one_process import OneProcessRig
+from rig.cosim.scenario import Scenario
+from rig.process_file.making import made_from
+from rig.results.driving import CONTROL, PLANT
+from rig.results.indicators import Indicators, RunEvaluation
+from rig.results.recording import MemorySink, Recorder
+from rig.settings import Settings
+from tests.harness.configurations import lively
+from tests.harness.process_configurations import load_of_shares
+from tests.harness.process_files import PROCESSES
+from tests.harness.traces.checks import Group, Table, checked
+from tests.harness.traces.configurations import COLD_BOX, CONFIGURATIONS, LIVELY, Configuration
+from tests.harness.traces.judge import Left, Names
+from tests.harness.traces.record import Found, Platform
+
+SEED: Final = 3
+SERVICES: Final = (CONTROL, PLANT)
+WHOLE: Final = Optimization._fields.index("j_effective")
+"""Fields of an update before this one are whole numbers."""
+
+
+def left_by(configuration: Configuration) -> Left:
+    """Run a configuration."""
+    own = (f'model.file="{FILE}"', 'plant.kind="of-process"') if FILE else ()
+    settings = load_configuration(Settings, environment={}, assignments=(*own, *configuration.assignments)).settings
+    program, model = settings.optimizer_plc.program, load_model(settings.model.file)
+    evaluation, memory = RunEvaluation(model, program.design), MemorySink()
+    recorder = Recorder(configuration.ticks, [evaluation, memory])
+    load = load_of(configuration, read_header(settings.model.file).w0)
+    OneProcessRig(settings).run(Scenario(configuration.ticks, load, program.updating_period_s, SEED), recorder)
+    recorder.close()
+    block = memory.recording(recorder.link).block
+    station = [block.station] if block.station.size else []
+    left = Left(
+        process=configuration.process,
+        trace=checked([np.column_stack([block.load, block.u]), block.y, block.x, *station]),
+        updates=of_updates(memory.recording(recorder.link).updates),
+        events=[
+            f"{SERVICES.index(service)} {event.kind:d} {event.tick} {event.subject} {event.cause}"
+            for service, event in memory.events
+        ],
+        indicators=[repr(float(value)) for value in evaluation.indicators],
+    )
+    if configuration.process != COLD_BOX:  # whose model is a file; those of others were just computed, by LAPACK
+        left["processor"] = processor()
+    return left
+
+
+def load_of(configuration: Configuration, mean: float) -> LoadProfile:
+    """Return the load of a configuration."""
+    if ":" in configuration.load:
+        return load_of_shares(configuration.load, mean, LOAD_SPAN[1])
+    return lively(mean) if configuration.load == LIVELY else find_load(configuration.load, mean)
+
+
+def of_updates(updates: list[Optimization]) -> Table:
+    """Return the checks of updates: what was decided, and costs and rates."""
+    rows: Group = np.array(updates, dtype=float).reshape(len(updates), len(Optimization._fields))
+    return checked([rows[:, :WHOLE], rows[:, WHOLE:]])
+
+
+def processor() -> str:
+    """Return the kind of processor that numpy's OpenBLAS computes for."""
+    libraries = Path(np.__file__).parents[1] / "numpy.libs"
+    for library in libraries.glob("*openblas*"):
+        try:
+            name: Any = ctypes.CDLL(str(library)).scipy_openblas_get_corename64_
+        except (OSError, AttributeError):
+            continue
+        name.restype = ctypes.c_char_p
+        return str(name().decode())
+    return "unknown"
+
+
+def names() -> Names:
+    """Return what columns are called, by place."""
+    station = (*STATION_SIGNAL_NAMES, "mode", "alarms")
+    return Names(
+        trace=["load", *INPUT_NAMES, *OUTPUT_NAMES, *STATE_NAMES, *(station if FILE is None else ())],
+        updates=[*Optimization._fields],
+        indicators=[*Indicators._fields],
+    )
+
+
+def main(words: list[str]) -> None:
+    """Print what was found."""
+    if words[0] == "--models":
+        for process in words[2:]:
+            folder = Path(words[1]) / process
+            folder.mkdir()
+            made_from(PROCESSES[process](folder)).model.save(folder / "model.json")
+        return
+    made_with = Platform(
+        python=platform.python_version(), numpy=np.__version__, scipy=scipy.__version__, numba=numba.__version__,
+        processor=processor(),
+    )  # fmt: skip
+    found = Found(
+        made_with=made_with,
+        services=[*SERVICES],
+        names={CONFIGURATIONS[words[0]].process: names()},
+        configurations={name: left_by(CONFIGURATIONS[name]) for name in words},
+    )
+    sys.stdout.write(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
