@@ -23,14 +23,22 @@ DIGEST = "from rig.studies.request import programs_digest; print(programs_digest
 SHORT = RunRequest("", (0, 30), (400.0, 300.0), 60, 0.5)
 
 
-def codes(code: CodeType) -> Iterator[CodeType]:
-    yield code
+Place = tuple[str, str, int]
+"""File, name and line: numba changes the flags, and so the hash, of the code of kernels that are profiled."""
+
+
+def place(code: CodeType) -> Place:
+    return code.co_filename, code.co_qualname, code.co_firstlineno
+
+
+def places(code: CodeType) -> Iterator[Place]:
+    yield place(code)
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
-            yield from codes(constant)
+            yield from places(constant)
 
 
-def executed(action: Callable[[], Any]) -> set[CodeType]:
+def executed(action: Callable[[], Any]) -> set[Place]:
     """Return the code of ours that is executed, without that of modules being imported."""
     found: dict[int, tuple[CodeType, str]] = {}
 
@@ -46,19 +54,19 @@ def executed(action: Callable[[], Any]) -> set[CodeType]:
     ours = {
         code for code, module in found.values() if is_decisive_module(module) and module.partition(".")[0] != "tests"
     }
-    return {code for code in ours if code.co_name != "<module>"}
+    return {place(code) for code in ours if code.co_name != "<module>"}
 
 
 @pytest.mark.parametrize("procedure", Procedure)
 def test_all_code_of_ours_that_a_run_executes_counts(procedure: Procedure) -> None:
     request = replace(SHORT, procedure=procedure)
     counted = {
-        code for holder in reached(programs()) if isinstance(holder, FunctionType) for code in codes(holder.__code__)
+        each for holder in reached(programs()) if isinstance(holder, FunctionType) for each in places(holder.__code__)
     }
     perform(SHORT)  # it imports
     done = executed(partial(perform, request))
-    assert len(done) > 100
-    assert not {f"{code.co_filename}: {code.co_qualname}" for code in done - counted}
+    assert len(done) > 50
+    assert not done - counted
 
 
 def test_the_compiled_step_of_a_plant_counts() -> None:

@@ -48,6 +48,8 @@ OF_FIELD: Final = ("annotation", "default", "default_factory", "alias", "validat
 IMPORT: Final = dis.opmap["IMPORT_NAME"]
 HAS_DOCSTRING: Final = 0x4000000
 """Flag of code whose first constant is its docstring, from Python 3.13 on."""
+OF_FUNCTION: Final = 0x3
+"""Flags of the code of each function, which numba takes away from kernels that are profiled."""
 PLAIN: Final = (bool, int, float, complex, str, bytes, type(None), type(Ellipsis), type(NotImplemented), range, slice)
 
 Plain = Any
@@ -175,7 +177,7 @@ class Describer:
             tuple(self._code(one, names) if isinstance(one, CodeType) else self.value(one) for one in constants),
             code.co_names, code.co_varnames[:arguments], code.co_freevars, code.co_cellvars,
             code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_nlocals,
-            code.co_flags & ~HAS_DOCSTRING, code.co_exceptiontable,
+            (code.co_flags | OF_FUNCTION) & ~HAS_DOCSTRING, code.co_exceptiontable,
         )  # fmt: skip
 
     def _cell(self, cell: Any) -> Plain:  # noqa: ANN401
@@ -280,9 +282,21 @@ def is_decisive_module(name: str) -> bool:
 
 def overloads_of(function: FunctionType) -> list[tuple[Any, Any]]:
     """Return what takes a function's place in compiled code, and how it is compiled, as far as modules are imported."""
+    _read_overloads()
+    return _overloads.by_function.get(function, [])
+
+
+def registrations() -> int:
+    """Return how many overloads and implementations there are."""
+    _read_overloads()
+    overloads, tables = _overloads.by_function.values(), Implementations.tables
+    return sum(map(len, overloads)) + sum(map(len, tables))
+
+
+def _read_overloads() -> None:
     templates = sys.modules.get("numba.core.typing.templates")
     if templates is None:
-        return []
+        return
     registered = templates.builtin_registry.globals
     for held, kind in registered[_overloads.seen :]:
         if isinstance(held, FunctionType) and is_own(held.__module__):
@@ -292,7 +306,6 @@ def overloads_of(function: FunctionType) -> list[tuple[Any, Any]]:
                 for each in found
             )
     _overloads.seen = len(registered)
-    return _overloads.by_function.get(function, [])
 
 
 class _Overloads:

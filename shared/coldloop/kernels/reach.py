@@ -12,7 +12,7 @@ import threading
 from collections.abc import Iterator
 from typing import Any, Final
 
-from coldloop.kernels.description import Describer, Plain, Reference
+from coldloop.kernels.description import Describer, Plain, Reference, registrations
 
 Key = tuple[int, bool]
 
@@ -32,7 +32,21 @@ class _Node:
         self.digest: bytes | None = None
 
 
+class _State:
+    """Of the nodes that there are.
+
+    Attributes:
+        finished: None of them refers to a module that is being imported.
+        registered: So many implementations were there when they were described.
+    """
+
+    def __init__(self) -> None:
+        self.finished = True
+        self.registered = 0
+
+
 _nodes: Final[dict[Key, _Node]] = {}
+_state: Final = _State()
 _lock: Final = threading.RLock()
 
 
@@ -43,26 +57,39 @@ def digest(*roots: Any, compiled: bool = False) -> str:  # noqa: ANN401 function
         roots: What the digest is of.
         compiled: They are used by compiled code, for which a class is the layout of its data.
     """
-    describer = Describer(compiled=compiled)
-    description = describer.value(roots)
     with _lock:
-        parts = [_settle(each).digest for each in describer.references]
-        _forget_unfinished()
-    return _hash((description, parts)).hex()[:24]
+        description, nodes = _described(roots, compiled=compiled)
+        return _hash((description, [node.digest for node in nodes])).hex()[:24]
 
 
 def reached(*roots: Any) -> list[Any]:  # noqa: ANN401
     """Return the functions, classes and instances that the digest of `roots` is of."""
-    describer, found = Describer(compiled=False), dict[Key, _Node]()
-    describer.value(roots)
-    waiting = list(describer.references)
     with _lock:
+        _, waiting = _described(roots, compiled=False)
+        found: dict[int, _Node] = {}
         while waiting:
-            each = waiting.pop()
-            if _key(each) not in found:
-                found[_key(each)] = _settle(each)
-                waiting += found[_key(each)].references
+            node = waiting.pop()
+            if node.number not in found:
+                found[node.number] = node
+                waiting += map(_settle, node.references)
     return [node.holder for node in found.values()]
+
+
+def _described(roots: Any, *, compiled: bool) -> tuple[Plain, list[_Node]]:  # noqa: ANN401
+    """Return the description of roots and the nodes that it refers to.
+
+    To describe some functions is to import what they import, which may register implementations of others that have
+    been described: these are then described again.
+    """
+    while True:
+        if _state.registered != registrations() or not _state.finished:
+            _nodes.clear()
+            _state.finished, _state.registered = True, registrations()
+        describer = Describer(compiled=compiled)
+        description = describer.value(roots)
+        nodes = [_settle(each) for each in describer.references]
+        if _state.registered == registrations():
+            return description, nodes
 
 
 def _key(reference: Reference) -> Key:
@@ -104,6 +131,7 @@ def _settle(root: Reference) -> _Node:
 
 def _added(reference: Reference) -> _Node:
     node = _nodes[_key(reference)] = _Node(reference, len(_nodes))
+    _state.finished = _state.finished and node.finished
     return node
 
 
@@ -121,9 +149,3 @@ def _parts(node: _Node, contents: dict[int, bytes]) -> Iterator[bytes]:
     for reference in node.references:
         other = _nodes[_key(reference)]
         yield other.digest or contents[id(other)]
-
-
-def _forget_unfinished() -> None:
-    """Describe anew, next time, what refers to a module that is being imported."""
-    if not all(node.finished for node in _nodes.values()):
-        _nodes.clear()
