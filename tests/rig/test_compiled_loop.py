@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import rig.cosim.compiled.portable  # noqa: F401 lets numba compile what is plain Python
-from coldloop.kernels.compiled import kernel
 from coldloop.config import load_configuration
+from coldloop.kernels.compiled import kernel
 from coldloop.kernels.single_precision import neighbour, single
 from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.load_profile import LoadProfile

@@ -8,6 +8,7 @@ import dataclasses
 import dis
 import functools
 import hashlib
+import io
 import sys
 import sysconfig
 import typing
@@ -26,10 +27,10 @@ F = TypeVar("F")
 PROJECT: Final = frozenset({"coldloop", "plant", "control_plc", "optimizer_plc", "hmi", "rig", "tests"})
 """Packages that are ours wherever they are installed; what is not part of an installed distribution is ours, too."""
 NOT_DECISIVE: Final = frozenset({
-    f"coldloop.kernels.{module}"
-    for module in ("cache_folder", "compiled", "description", "first_use", "lean_numba", "reach")
+    "coldloop.kernels.cache_folder", "coldloop.kernels.compiled", "coldloop.kernels.description",
+    "coldloop.kernels.first_use", "coldloop.kernels.lean_numba", "coldloop.kernels.reach", "coldloop.service.logs",
 })  # fmt: skip
-"""Modules that decide where results are kept, and not what they are."""
+"""Modules that decide where results are kept and what is logged, and not what results are."""
 OF_MODULE: Final = frozenset({
     "__builtins__", "__cached__", "__doc__", "__file__", "__loader__", "__name__", "__package__", "__path__", "__spec__"
 })  # fmt: skip
@@ -497,6 +498,12 @@ def _(value: np.generic, _: Describer) -> Plain:
 @_described.register
 def _(value: np.dtype, _: Describer) -> Plain:
     return ("dtype", repr(value), value.itemsize)
+
+
+@_described.register
+def _(_: io.TextIOBase, __: Describer) -> Plain:
+    """Describe a stream, which another one may have taken the place of."""
+    return ("stream",)
 
 
 @_described.register
