@@ -3,12 +3,13 @@
 import asyncio
 import hashlib
 import json
+import sys
 import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from functools import cached_property, lru_cache
-from importlib.util import find_spec
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,16 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
+from coldloop.kernels.reach import digest
 from coldloop.parsing import parsed_json
 from coldloop.process.cold_box import COLD_BOX, L1, T5
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.signals import STATION_SIGNAL_NAMES, TICK_S
+from coldloop.service.start import main as start_service
 from optimizer_plc.solvers import make_solver
 from rig.cosim.linear_plant import LinearRig
 from rig.cosim.local_services import run_on_localhost
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
+from rig.cosim.wiring import SERVICES
 from rig.results.folders import installed_version
 from rig.results.indicators import Indicators, StageCost, evaluate
 from rig.results.recording import Recorder, Recording
@@ -36,28 +40,8 @@ from rig.studies.settings import settings_of
 
 Series = NDArray[np.float64]
 
-PROGRAM_PACKAGES = ("coldloop", "plant", "control_plc", "optimizer_plc")
-RIG_MODULES = (
-    "rig.cosim.compiled.control",
-    "rig.cosim.compiled.loops",
-    "rig.cosim.compiled.plants",
-    "rig.cosim.compiled.portable",
-    "rig.cosim.compiled.records",
-    "rig.cosim.compiled.stretches",
-    "rig.results.indicators",
-    "rig.cosim.session_client",
-    "rig.cosim.session_reader",
-    "rig.cosim.one_process",
-    "rig.results.recorded",
-    "rig.results.recording",
-    "rig.cosim.linear_plant",
-    "rig.studies.paired_run",
-    "rig.studies.played_profiles",
-    "rig.studies.problem_sequence",
-    "rig.studies.request",
-    "rig.studies.settings",
-)
-SUFFIXES = (".py", ".json", ".npz", ".csv")
+PACKAGES_WITH_DATA = ("coldloop", "plant", "control_plc", "optimizer_plc")
+DATA_SUFFIXES = (".json", ".npz", ".csv")
 T9 = [one.name for one in COLD_BOX.outputs].index("T9")
 DECISIVE = {"limits", "model", "session", "plant", "control_plc", "optimizer_plc"}
 """Sections of the configuration that a run reads."""
@@ -188,19 +172,19 @@ def _file_digest(path: Path) -> str:
         return str(path)  # the run will say what is wrong with it
 
 
+def programs() -> tuple[Any, ...]:
+    """Return what does a run: `perform`, and the services that it may start, which it knows by name."""
+    services = (import_module(f"{service}.runtime").serve for service in SERVICES)
+    return (perform, start_service, *services)
+
+
 @lru_cache(maxsize=1)
 def programs_digest() -> str:
-    """Return a digest of all that decides what a run gives: sources, data files, versions of libraries."""
-    files = [Path(spec.origin) for spec in map(find_spec, RIG_MODULES) if spec and spec.origin]
-    for spec in map(find_spec, PROGRAM_PACKAGES):
-        for folder in (spec.submodule_search_locations or ()) if spec else ():
-            files += sorted(file for file in Path(folder).rglob("*") if file.suffix in SUFFIXES)
-    digest = hashlib.sha256()
-    for file in files:
-        digest.update(file.read_bytes())
-    for library in LIBRARIES:
-        digest.update(f"{library} {installed_version(library)}".encode())
-    return digest.hexdigest()[:16]
+    """Return a digest of all that decides what a run gives: code, data files, versions of Python and of libraries."""
+    folders = (Path(folder) for name in PACKAGES_WITH_DATA for folder in import_module(name).__path__)
+    files = [file for folder in folders for file in sorted(folder.rglob("*")) if file.suffix in DATA_SUFFIXES]
+    versions = [(library, installed_version(library)) for library in LIBRARIES]
+    return digest(programs(), files, versions, sys.implementation.cache_tag)[:16]
 
 
 SHORTEST_TICKS = 60

@@ -1,5 +1,6 @@
 """What the optimiser believes of the plant's state at an updating instant."""
 
+from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -263,35 +264,37 @@ def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -
     """Return what the Kalman filter corrects with after every updating period; what is forecast it leaves alone."""
     nx = prediction.n_estimated
     C = np.ascontiguousarray(np.hstack([prediction.C[:, :nx], prediction.G]))
-    sensors, drift = np.array(settings.sensors), walks_of(prediction, settings)
-
-    def computed() -> Array:
-        P = np.diag(100.0 * drift**2)
-        found = []
-        for ticks, step in prediction.transitions.items():
-            A = np.eye(nx + 1)
-            A[:nx, :nx], A[:nx, nx] = step.A[:nx, :nx], step.F[:nx, 0]
-            process = drift**2 * (ticks * TICK_S / SAMPLING_PERIOD_S)
-            measured = sensors**2 * (SAMPLING_PERIOD_S / (ticks * TICK_S) if of_time else 1.0)
-            gain = stationary_gain(A, C, process, measured, P, settings.longest_riccati)
-            found.append(np.hstack([gain.T, inverse_covariance(A, C, process, measured, P)]))
-        return np.array(found)
-
-    tick = prediction.transitions[1]
+    steps = {ticks: (step.A[:nx, :nx], step.F[:nx, 0]) for ticks, step in prediction.transitions.items()}
     of_time = settings.noise_reference is NoiseReference.TIME
-    decided_by = (
-        tick.A[:nx, :nx],
-        tick.F[:nx],
-        C,
-        drift,
-        sensors,
-        np.array(settings.longest_riccati),
-        np.ones(int(of_time)),
-    )
-    found = kept("kalman", b"".join(part.tobytes() for part in decided_by), computed)
+    drift, sensors = walks_of(prediction, settings), np.array(settings.sensors)
+    found = kept("kalman", gains_after, steps, C, drift, sensors, of_time, settings.longest_riccati)
     gains, inverses = np.split(found, [nx + 1], axis=2)
     gains = np.insert(gains, [nx] * len(prediction.ahead), 0.0, axis=2)
     return StationaryGains(np.ascontiguousarray(gains), np.ascontiguousarray(inverses))
+
+
+def gains_after(
+    steps: Mapping[int, tuple[Array, Array]], C: Array, drift: Array, sensors: Array, of_time: bool, periods: int  # noqa: FBT001
+) -> Array:  # fmt: skip
+    """Return the stationary gains, transposed, beside the inverse covariances, shape (steps, n_y, n + 1 + n_y).
+
+    Args:
+        steps: A (n, n) and F (n,) over so many ticks.
+        C: Outputs by states and load mismatch, shape (n_y, n + 1).
+        drift: Standard deviations of the process noise in a sampling period, shape (n + 1,).
+        sensors: Standard deviations of the measurements, shape (n_y,).
+        of_time: The latter are those of a mean over a sampling period.
+        periods: Steps of the Riccati recursion at most.
+    """
+    P, n, found = np.diag(100.0 * drift**2), len(drift) - 1, []
+    for ticks, (step, load) in steps.items():
+        A = np.eye(n + 1)
+        A[:n, :n], A[:n, n] = step, load
+        process = drift**2 * (ticks * TICK_S / SAMPLING_PERIOD_S)
+        measured = sensors**2 * (SAMPLING_PERIOD_S / (ticks * TICK_S) if of_time else 1.0)
+        gain = stationary_gain(A, C, process, measured, P, periods)
+        found.append(np.hstack([gain.T, inverse_covariance(A, C, process, measured, P)]))
+    return np.array(found)
 
 
 def inverse_covariance(A: Array, C: Array, process: Array, sensors: Array, P: Array) -> Array:

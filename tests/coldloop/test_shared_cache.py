@@ -11,6 +11,7 @@ import pytest
 
 PROGRAM = """
 import sys
+from numba import types
 from numba.core import event
 from coldloop.kernels.compiled import kernel
 from coldloop.kernels.first_use import kernels_of
@@ -132,7 +133,7 @@ def test_who_fails_to_compile_a_kernel_keeps_nobody_waiting(start: Start) -> Non
 
 def test_the_kernel_of_a_process_that_is_killed_is_compiled_by_who_waits(start: Start) -> None:
     killed, waiting = start(), start()
-    killed.send("outer._cache._lock()")
+    killed.send("outer._cache.load_overload((types.float64,), outer.targetctx)")  # which locks it
     assert killed.answer() == ([], "is None")
     waiting.send("outer(1.5)")
     killed.process.kill()
@@ -144,8 +145,8 @@ def test_half_a_kernel_on_the_disk_is_compiled_anew(start: Start, tmp_path: Path
     first = start()
     first.send("outer(1.5)")
     first.answer()
-    (kept,) = (tmp_path / "cache").rglob("some_kernels.outer*.nbc")
-    kept.unlink()
+    (kept,) = (tmp_path / "cache").rglob("__main__.outer-*.nbc")
+    kept.write_bytes(kept.read_bytes()[:1000])
     second, third = start(), start()
     second.send("outer(1.5)")
     assert second.answer() == (["outer"], "is 5.0")
@@ -160,3 +161,22 @@ def test_without_a_folder_to_write_to_kernels_are_compiled_all_the_same(start: S
     worker.send("outer(1.5)")
     assert worker.answer() == (["outer", "inner"], "is 5.0")
     assert list(tmp_path.glob("coldloop-kernels-*"))
+
+
+def test_an_edit_compiles_what_reaches_it_and_no_more(start: Start, tmp_path: Path) -> None:
+    def compiled() -> list[str]:
+        worker = start()
+        worker.send("outer(1.5)")
+        return worker.answer()[0]
+
+    program = tmp_path / "some_kernels.py"
+    assert compiled() == ["outer", "inner"]
+    program.write_text("# a comment\n" + PROGRAM)
+    os.utime(program, (1e9, 1e9))
+    assert not compiled()
+    program.write_text(PROGRAM.replace("2 * inner(x)", "3 * inner(x)"))
+    assert compiled() == ["outer"]
+    program.write_text(PROGRAM.replace("x + 1", "x + 2"))
+    assert compiled() == ["outer", "inner"]
+    program.write_text(PROGRAM)
+    assert not compiled(), "what was compiled first one is still there"

@@ -2,9 +2,9 @@
 
 from typing import Final
 
-import numba
 import numpy as np
 
+from coldloop.kernels.compiled import kernel
 from coldloop.process.signals import OUTPUT_NAMES
 from plant.components.passes import MASS
 from plant.components.phase_separator import start_account
@@ -32,7 +32,7 @@ LP, TO_BOX, COMPRESSED = (SIGNAL_NAMES.index(name) for name in ("P11", "M12", "M
 V1 = OUTPUT_NAMES.index("V1")
 
 
-@numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def accounted_tick(
     x: RealArray,
     y: RealArray,
@@ -72,7 +72,7 @@ def accounted_tick(
     return x
 
 
-@numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def accounted_program_tick(
     x: RealArray,
     y: RealArray,

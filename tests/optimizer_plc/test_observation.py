@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 import optimizer_plc.program
+from coldloop.kernels.compiled import kernel
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import TICK_S
@@ -85,7 +85,7 @@ class NotingRule(NamedTuple):
 
 
 @decides_by(NotingRule)
-@numba.njit
+@kernel
 def decide(rule: NotingRule, memory: Array, o: Observation, a: Assessment) -> int:  # noqa: ARG001 a kernel
     note = rule.notes[rule.count[0]]
     note[0], note[1], note[2], note[3] = o.q, o.iterations, o.period_s, o.effective_before

@@ -1,11 +1,11 @@
 """Helium and energy over random events: stuck valves and heaters, trips, leaks, lost nitrogen, blocked exchangers."""
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from coldloop.kernels.compiled import kernel
 from coldloop.process.model_range import model_range
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.process.signals import OUTPUT_NAMES
@@ -59,7 +59,7 @@ pieces = st.tuples(st.integers(40, 1200), inputs, st.tuples(percent, percent, pe
 Course = list[tuple[int, tuple[float, ...], tuple[float, ...], tuple[float, ...]]]
 
 
-@numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def held(
     x: RealArray,
     equipment: RealArray,
@@ -185,7 +185,7 @@ BoxCourse = list[tuple[int, tuple[float, ...], float]]
 BOX = plain_tuples(REFERENCE)
 
 
-@numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def box_held(
     x: RealArray, u: RealArray, w: float, ticks: int, plain: object, tables: object
 ) -> tuple[RealArray, RealArray]:

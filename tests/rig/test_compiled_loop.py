@@ -3,7 +3,6 @@
 import math
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,6 +10,7 @@ from hypothesis import strategies as st
 
 import rig.cosim.compiled.portable  # noqa: F401 lets numba compile what is plain Python
 from coldloop.config import load_configuration
+from coldloop.kernels.compiled import kernel
 from coldloop.kernels.single_precision import neighbour, single
 from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.load_profile import LoadProfile
@@ -114,17 +114,17 @@ def test_nothing_is_compiled_while_the_classical_loops_drive(
 # -- arithmetic that is plain Python in the control PLC ----------------------------------------------------------------
 
 
-@numba.njit
+@kernel
 def compiled_single(value: float) -> float:
     return single(value)
 
 
-@numba.njit
+@kernel
 def compiled_neighbour(value: float, target: float) -> float:
     return neighbour(value, target)
 
 
-@numba.njit
+@kernel
 def compiled_admit(guard: Any, limits: Any, tick: int, wanted: Any, update: bool) -> None:  # noqa: ANN401, FBT001 a kernel
     admit(guard[0], limits, tick, wanted, update)
 

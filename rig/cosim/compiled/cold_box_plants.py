@@ -1,9 +1,8 @@
 """The cold box alone and the whole refrigerator in the compiled loop."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba.extending import overload
 
 from coldloop.kernels.compiled import kernel
 from coldloop.process.signals import TICK_S
@@ -16,7 +15,7 @@ from plant.refrigerator.physics import BOX_STATES, SIGNALS, Refrigerator
 from plant.refrigerator.program import RefrigeratorProgram
 from plant.refrigerator.station_law import StationLaw
 from plant.refrigerator.tick import ALARMS, MODE, RefrigeratorMemory, advance_tick
-from rig.cosim.compiled.plants import CompiledPlant, advance_plant
+from rig.cosim.compiled.plants import CompiledPlant, advances
 from rig.cosim.compiled.records import Array
 
 
@@ -68,15 +67,9 @@ class RefrigeratorState(NamedTuple):
     """Disturbances at each tick of the trace and at the one behind it, without load, shape (N + 1, 16)."""
 
 
-@overload(advance_plant, jit_options={"error_model": "numpy"}, strict=False)
-def _advance_plant(c: Any, plant: Any, u: Any, load: Any, row: Any) -> Any:  # noqa: ANN401, ARG001 types of numba
-    if c.instance_class is RefrigeratorConstants:
-        return lambda c, plant, u, load, row: advance_whole(c, plant, u, load, row)  # noqa: PLW0108 no dispatcher
-    return lambda c, plant, u, load, row: advance_box(c, plant, u, load)  # noqa: ARG005 the signature is given
-
-
+@advances(BoxConstants)
 @kernel
-def advance_box(c: BoxConstants, plant: BoxState, u: Array, load: float) -> None:
+def advance_box(c: BoxConstants, plant: BoxState, u: Array, load: float, row: int) -> None:  # noqa: ARG001 of others
     """Go one tick forward with a cold box alone; its slope is known where inputs and load stand."""
     held = plant.held[3] == load
     for i in range(3):
@@ -90,6 +83,7 @@ def advance_box(c: BoxConstants, plant: BoxState, u: Array, load: float) -> None
     evaluate(plant.x, inputs, load, c.box, c.helium, plant.slope, plant.y)
 
 
+@advances(RefrigeratorConstants)
 @kernel
 def advance_whole(c: RefrigeratorConstants, plant: RefrigeratorState, u: Array, load: float, row: int) -> None:
     """Go one tick forward with a refrigerator."""

@@ -3,13 +3,12 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba.extending import overload
 
 from coldloop.kernels.compiled import kernel
-from plant.own.linear import LinearPlant, advance_linear
+from plant.own.linear import LinearPlant, Matrices, advance_linear
 from plant.own.transfer_functions import LagTable, TransferFunctionPlant, advance_lags
 from plant.program import PlantProgram
-from rig.cosim.compiled.plants import CompiledPlant, advance_plant
+from rig.cosim.compiled.plants import CompiledPlant, advances
 from rig.cosim.compiled.records import Array
 
 
@@ -28,13 +27,14 @@ class OwnState(NamedTuple):
     """Tick of the trace's first row."""
 
 
-@overload(advance_plant, jit_options={"error_model": "numpy"}, strict=False)
-def _advance_plant(c: Any, plant: Any, u: Any, load: Any, row: Any) -> Any:  # noqa: ANN401, ARG001 types of numba
-    if c.instance_class is LagTable:
-        return lambda c, plant, u, load, row: advance_delayed(c, plant, u, load, row)  # noqa: PLW0108 no dispatcher
-    return lambda c, plant, u, load, row: advance_linear(c, plant.x, u, load, plant.met[row + 1], plant.y)
+@advances(Matrices)
+@kernel
+def advance_undelayed(c: Matrices, plant: OwnState, u: Array, load: float, row: int) -> None:
+    """Go one tick forward with a linear plant."""
+    advance_linear(c, plant.x, u, load, plant.met[row + 1], plant.y)
 
 
+@advances(LagTable)
 @kernel
 def advance_delayed(c: LagTable, plant: OwnState, u: Array, load: float, row: int) -> None:
     """Go one tick forward with lags, and with disturbances as the last states and outputs."""

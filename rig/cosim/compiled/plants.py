@@ -3,8 +3,12 @@
 Each plant has its own types of constants and state, and numba makes a loop for each.
 """
 
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any, Final, Protocol, TypeVar
 
+from numba.extending import overload
+
+from coldloop.kernels.description import Implementations
 from coldloop.process.loaded import PROCESS
 from plant.program import PlantProgram
 from rig.cosim.compiled.records import Array, PlantState
@@ -35,6 +39,29 @@ def compiled_plant(program: PlantProgram) -> CompiledPlant | None:
     return of_process(program)
 
 
+Advance = Callable[[Any, PlantState, Array, float, int], None]
+A = TypeVar("A", bound=Advance)
+
+TICKS: Final[Implementations[Advance]] = Implementations("advance_plant")
+"""The kernel of each plant, by the type of its constants."""
+
+
+def advances(constants: type) -> Callable[[A], A]:
+    """Register a kernel as the tick of the plant whose constants are of this type."""
+
+    def register(kernel: A) -> A:
+        TICKS[constants] = kernel
+        return kernel
+
+    return register
+
+
 def advance_plant(c: Any, plant: PlantState, u: Array, load: float, row: int) -> None:  # noqa: ANN401 of each kind
     """Go one tick forward from the one whose row in the trace is `row`, with u (3,) held and without noise on y."""
     raise NotImplementedError("kernels alone call it")
+
+
+@overload(advance_plant, jit_options={"error_model": "numpy"}, strict=False)
+def _advance_plant(c: Any, plant: Any, u: Any, load: Any, row: Any) -> Any:  # noqa: ANN401, ARG001 types of numba
+    advance = TICKS[c.instance_class]
+    return lambda c, plant, u, load, row: advance(c, plant, u, load, row)  # noqa: PLW0108 no dispatcher

@@ -12,6 +12,7 @@ import numpy as np
 from numba.extending import overload
 from numpy.typing import NDArray
 
+from coldloop.kernels.description import Implementations
 from coldloop.registers.optimizer_plc import UpdatingRuleStatus
 from optimizer_plc.rules.assessment import Assessment, Observation
 
@@ -41,7 +42,7 @@ class UpdatingRule(Protocol):
 Decision = Callable[[Any, Array, Observation, Assessment], int]
 D = TypeVar("D", bound=Decision)
 
-DECISIONS: Final[dict[type, Decision]] = {}
+DECISIONS: Final[Implementations[Decision]] = Implementations("decide_by")
 """The kernel of each rule."""
 
 

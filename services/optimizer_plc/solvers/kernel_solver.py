@@ -12,6 +12,7 @@ import numpy as np
 from numba.extending import overload
 from numpy.typing import NDArray
 
+from coldloop.kernels.description import Implementations
 from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.interface import Answer, Costs
 
@@ -19,7 +20,7 @@ Array = NDArray[np.float64]
 Kernel = Callable[[Any, QuadraticProblem, Array, NDArray[np.int64], Costs], Answer]
 K = TypeVar("K", bound=Callable[..., Answer])
 
-KERNELS: Final[dict[type, Kernel]] = {}
+KERNELS: Final[Implementations[Kernel]] = Implementations("solve_by")
 """The kernel of each method."""
 
 

@@ -1,0 +1,173 @@
+"""The folder of compiled kernels and of what takes long to compute, shared by processes and versions of Coldloop.
+
+It is `kernels` in `COLDLOOP_CACHE_DIR`, or in the user's cache directory. The name of a file has a digest of all that
+its content depends on, so nothing in the folder is ever out of date. What nobody has used for `KEPT_DAYS` is deleted by
+a process that adds something, once a day; so are the folders of versions that had one for each state of the sources.
+"""
+
+import contextlib
+import os
+import shutil
+import stat
+import sys
+import tempfile
+import time
+import zlib
+from pathlib import Path
+from typing import Final
+
+from coldloop.errors import ConfigurationError
+
+try:
+    import fcntl
+except ImportError:  # Windows: processes may compile the same kernel twice
+    fcntl = None  # type: ignore[assignment]
+
+NAME: Final = "kernels"
+LOCKS: Final = "locks"
+TIDIED: Final = "tidied"
+OF_OLDER_VERSIONS: Final = "kernels-" + 16 * "[0-9a-f]"
+CHECKSUM_BYTES: Final = 4
+KEPT_DAYS: Final = 60
+DAY_S: Final = 86_400.0
+
+
+class CacheFolder:
+    """A folder whose files appear whole or not at all.
+
+    Args:
+        path: Where it is.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._locks = _file_of_locks(path)
+
+    def read(self, name: str) -> bytes | None:
+        """Return the content of a file, and note that it is used; None where there is none, or a damaged one."""
+        path = self.path / name
+        try:
+            checksum, content = _split(path.read_bytes())
+        except OSError:
+            return None
+        with contextlib.suppress(OSError):  # another user's
+            if time.time() - path.stat().st_mtime > DAY_S:
+                path.touch()
+        return content if zlib.crc32(content) == checksum else None
+
+    def write(self, name: str, content: bytes) -> None:
+        """Write a file that every user reads, as images are made by root; nothing is written where that fails."""
+        with contextlib.suppress(OSError):
+            handle, draft = tempfile.mkstemp(dir=self.path, prefix="draft-")
+            try:
+                with os.fdopen(handle, "wb") as file:
+                    file.write(zlib.crc32(content).to_bytes(CHECKSUM_BYTES, "big") + content)
+                Path(draft).chmod(0o644)
+                Path(draft).replace(self.path / name)
+            finally:
+                Path(draft).unlink(missing_ok=True)
+            self._tidy()
+
+    def lock(self, name: str) -> None:
+        """Wait until no other process has locked a name; a process that ends lets go of its locks."""
+        if self._locks is not None:
+            with contextlib.suppress(OSError):  # a file system without locks: a kernel may be compiled twice
+                fcntl.lockf(self._locks, fcntl.LOCK_EX, 1, zlib.crc32(name.encode()))
+
+    def unlock(self, name: str) -> None:
+        """Let other processes lock a name."""
+        if self._locks is not None:
+            with contextlib.suppress(OSError):
+                fcntl.lockf(self._locks, fcntl.LOCK_UN, 1, zlib.crc32(name.encode()))
+
+    def _tidy(self) -> None:
+        """Delete what has not been used for long, once a day."""
+        tidied, now = self.path / TIDIED, time.time()
+        if tidied.exists() and now - tidied.stat().st_mtime < DAY_S:
+            return
+        tidied.touch()
+        for path in (*self.path.iterdir(), *self.path.parent.glob(OF_OLDER_VERSIONS)):
+            with contextlib.suppress(OSError):
+                if path.name == LOCKS or now - path.stat().st_mtime < KEPT_DAYS * DAY_S:
+                    continue
+                if path.is_dir():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink()
+
+
+def _split(content: bytes) -> tuple[int, bytes]:
+    return int.from_bytes(content[:CHECKSUM_BYTES], "big"), content[CHECKSUM_BYTES:]
+
+
+def find_cache_folder() -> Path:
+    """Return a folder for the cache that only this user can write to: its files are loaded as code.
+
+    Raises:
+        ConfigurationError: Others can write to the one that the environment names.
+    """
+    chosen = os.environ.get("COLDLOOP_CACHE_DIR")
+    for root in [Path(chosen)] if chosen else _usual_roots():
+        folder = root / NAME
+        try:
+            root.mkdir(mode=0o755, parents=True, exist_ok=True)
+            folder.mkdir(mode=0o755, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+            closed = _is_closed(root, sticky=True) and _is_closed(folder)
+            if closed and _lets_others_write():
+                folder.chmod(0o700)
+        except OSError as error:
+            if chosen:
+                sys.stderr.write(
+                    f"COLDLOOP_CACHE_DIR={chosen}: {error.strerror}; kernels are compiled for this process alone\n"
+                )
+            continue
+        if closed:
+            return folder
+        if chosen:
+            raise ConfigurationError(
+                f"COLDLOOP_CACHE_DIR={chosen}: others can write to {folder}, and kernels are loaded as code: name a "
+                "folder of your own, or take the permission away (chmod -R go-w)"
+            )
+    return Path(tempfile.mkdtemp(prefix="coldloop-kernels-"))
+
+
+def _usual_roots() -> list[Path]:
+    roots = [Path(tempfile.gettempdir()) / f"coldloop-cache-{_user()}"]
+    with contextlib.suppress(RuntimeError):  # a user without a home
+        roots.insert(0, Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "coldloop")
+    return roots
+
+
+def _lets_others_write() -> bool:
+    """Return whether everyone can write to new files of this process."""
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return not mask & stat.S_IWOTH
+
+
+def _user() -> int:
+    return os.getuid() if hasattr(os, "getuid") else 0
+
+
+def _is_closed(folder: Path, *, sticky: bool = False) -> bool:
+    """Return whether only this user and an administrator can write to a folder; the user's own group is left alone.
+
+    Args:
+        folder: Which one.
+        sticky: Others may write to it if they cannot replace what this user has in it, as in /tmp.
+    """
+    if not hasattr(os, "getuid"):  # Windows has no such modes
+        return True
+    status = folder.stat()
+    by_others = status.st_mode & stat.S_IWOTH or (status.st_mode & stat.S_IWGRP and status.st_gid != os.getgid())
+    return status.st_uid in (0, os.getuid()) and not (by_others and not (sticky and status.st_mode & stat.S_ISVTX))
+
+
+def _file_of_locks(folder: Path) -> int | None:
+    if fcntl is None:
+        return None
+    try:
+        return os.open(folder / LOCKS, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+    except OSError:  # another user's, who shares the folder
+        return None
