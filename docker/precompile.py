@@ -113,13 +113,18 @@ def _make_optimizer(settings: "ProgramSettings", kind: "type[OptimizerProgram] |
     (kind or OptimizerProgram)(load(DEFAULT_MODEL_FILE), settings, InputLimits())
 
 
-def in_one_process(**changes: Any) -> Callable[[], None]:  # noqa: ANN401 as of `simulate`
+def in_one_process(**changes: Any) -> Callable[[], None]:  # noqa: ANN401 sections of the configuration
     """Return what lets a minute pass in one process: the compiled loop, and the programs for what is unusual."""
 
     def minute() -> None:
-        from rig import simulate  # noqa: PLC0415 not in the images
+        from rig.cosim.one_process import OneProcessRig  # noqa: PLC0415 not in the images
+        from rig.results.recording import Recorder  # noqa: PLC0415
+        from rig.runs.running import make_scenario  # noqa: PLC0415
+        from rig.settings import Settings  # noqa: PLC0415
 
-        simulate(load="a", duration_s=60, **changes)
+        settings = Settings.model_validate(changes)
+        scenario = make_scenario(settings, 240)
+        OneProcessRig(settings, compiled=True).run(scenario, Recorder(scenario.ticks))
 
     return minute
 
@@ -171,11 +176,11 @@ PARTS: Final[dict[str, tuple[Callable[[], None], int]]] = {
     "default-solver": (default_solver, 13),
     "default-optimizer": (default_optimizer, 10),
     "cold-box-in-one-process": (in_one_process(), 55),
-    "refrigerator-in-one-process": (in_one_process(plant={"kind": "refrigerator"}), 27),
+    "refrigerator-in-one-process": (in_one_process(plant={"kind": "refrigerator", "load": "a"}), 27),
     "single-precision-in-one-process": (in_one_process(optimizer_plc={"program": {"arithmetic": "float32"}}), 25),
-    "interior-point-in-one-process": (in_one_process(solver="interior-point"), 25),
-    "hybrid-in-one-process": (in_one_process(solver="hybrid"), 25),
-    "fast-gradient-in-one-process": (in_one_process(solver="fast-gradient"), 25),
+    "interior-point-in-one-process": (in_one_process(optimizer_plc={"program": {"solver": "interior-point"}}), 25),
+    "hybrid-in-one-process": (in_one_process(optimizer_plc={"program": {"solver": "hybrid"}}), 25),
+    "fast-gradient-in-one-process": (in_one_process(optimizer_plc={"program": {"solver": "fast-gradient"}}), 25),
     "linear-models": (linear_models, 20),
     "run-modules": (run_modules, 4),
     "all-modules": (all_modules, 13),

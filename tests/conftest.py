@@ -1,4 +1,4 @@
-"""What all tests share: lanes and which of them run, how Hypothesis searches, coroutines as tests, no configuration from outside,
+"""What all tests share: their lanes, how Hypothesis searches, coroutines as tests, no configuration from outside,
 processes and a free port, the command line, and Debian's mbpoll.
 """
 
@@ -47,7 +47,7 @@ SHARED: Final = (
     "_engine",
     "problems",
 )
-"""Fixtures that start processes, or compute for long, for many tests: the tests that have the same one run in one worker,
+"""Fixtures that start processes, or compute for long, for many tests: those that have the same one run in one worker,
 which does that once. It ends with the last of them."""
 
 # Whoever started the tests may ignore these (a script in the background, nohup); what the tests start must not.
@@ -66,11 +66,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     for option, help_text in {
         "--fast": "the fast lane, which is the default: no program, no compiler, no clock, no browser",
         "--system": "the system lane: programs, rigs in real time, the page in a browser",
-        "--night": "the night lane: many configurations, long searches, the composed rig; 100 examples of each property",
+        "--night": "the night lane: many configurations, long searches, the composed rig; 100 examples a property",
         "--all": "all lanes, with 100 examples of each property",
     }.items():
         group.addoption(option, action="store_true", help=help_text)
-    group.addoption("--lanes", action="store_true", help="run nothing: print the table of which tests are in which lane")
+    group.addoption(
+        "--lanes", action="store_true", help="run nothing: print the table of which tests are in which lane"
+    )
     group.addoption("--over-budget", metavar="FILE", help="write the folders that are over their budget to a file")
 
 
@@ -217,7 +219,7 @@ def shared_processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proce
 
 @pytest.fixture(scope="session")
 def programs() -> None:
-    """Requested where a test starts programs without `processes`, as threads' pools and compilers do: it marks the test."""
+    """Requested where a test starts programs without `processes`: it marks the test."""
 
 
 @pytest.fixture(scope="session")

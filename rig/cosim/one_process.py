@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from rig.cosim.compiled.stretches import CompiledStretches
 
 SHORT: Final = 10_000
-"""Ticks of another process than the cold box below which the programs are done before a loop would be compiled."""
+"""Ticks below which the programs are done before a loop would be compiled."""
 
 
 class Listener(Protocol):
@@ -99,10 +99,11 @@ class OneProcessRig:
 
     Args:
         settings: Configuration.
-        compiled: Ordinary ticks are done in compiled loops, with the same bits.
+        compiled: Whether ordinary ticks are done in compiled loops, with the same bits; by default where these have
+            been compiled already, and where the run is not `SHORT`.
     """
 
-    def __init__(self, settings: Settings, *, compiled: bool = True) -> None:
+    def __init__(self, settings: Settings, *, compiled: bool | None = None) -> None:
         header = own_header(settings.model.file)
         self._settings = settings
         self._header = header
@@ -128,13 +129,16 @@ class OneProcessRig:
 
     def _stretches(self, plant: PlantProgram, load: LoadProfile, ticks: int) -> "CompiledStretches | None":
         """Return what runs ahead in compiled loops, where there are any."""
-        if not self._compiled or (self._header.process and ticks < SHORT):
+        if self._compiled is False:
             return None
         from rig.cosim.compiled.plants import compiled_plant  # noqa: PLC0415 only where something is compiled
         from rig.cosim.compiled.stretches import CompiledStretches  # noqa: PLC0415
 
         compiled = compiled_plant(plant)
-        return CompiledStretches(plant, compiled, self.control, self.optimizer, load) if compiled else None
+        if compiled is None:
+            return None
+        may_compile = self._compiled is True or ticks >= SHORT
+        return CompiledStretches(plant, compiled, self.control, self.optimizer, load, may_compile=may_compile)
 
     def _run(self, scenario: Scenario, recorder: Recorder) -> None:
         load = load_table(scenario.load)

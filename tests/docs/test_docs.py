@@ -57,11 +57,12 @@ def test_every_mbpoll_line_in_the_readme_reads_declared_floats() -> None:
         assert any(r.address == int(address) and r.kind.label == "float32" for r in registers), (port, address)
 
 
-def test_the_hosted_workflow_calls_scripts_that_exist_with_pinned_actions_on_each_python() -> None:
-    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text("utf-8"))
-    steps = [step for job in workflow["jobs"].values() for step in job["steps"]]
+def test_the_hosted_workflows_call_scripts_that_exist_with_pinned_actions_on_each_python() -> None:
+    folder = ROOT / ".github" / "workflows"
+    workflow, night = (yaml.safe_load((folder / name).read_text("utf-8")) for name in ("ci.yml", "night.yml"))
+    steps = [step for one in (workflow, night) for job in one["jobs"].values() for step in job["steps"]]
     scripts = [step["run"].split()[0] for step in steps if step.get("run", "").startswith("scripts/")]
-    assert {"scripts/check", "scripts/test"} <= set(scripts)
+    assert {"scripts/check", "scripts/test", "scripts/traces"} <= set(scripts)
     assert all((ROOT / script).is_file() for script in scripts)
     assert all(re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40}", step["uses"]) for step in steps if "uses" in step)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]

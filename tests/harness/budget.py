@@ -1,7 +1,8 @@
 """The budget of the tests: processor time by folder and lane, in multiples of a calibration loop timed in the same run.
 
 The loop takes 13 ms of the machine that the budget was written on: 75 multiples are a second there. A slow or busy
-machine slows the loop and the tests alike. What a test's own process and the programs that it has waited for have used counts for its folder.
+machine slows the loop and the tests alike. What a test's own process, and the programs that it has waited for, have
+used counts for its folder.
 """
 
 import resource

@@ -25,7 +25,7 @@ USES: Final = {
 """The mark of a test that requests, itself or through other fixtures, one of these."""
 
 WAITED_S: Final = 1.0
-"""Seconds that a test of the fast lane may wait for the clock in all: time limits of servers are tested by short ones."""
+"""Seconds that a test of the fast lane may wait for the clock in all; time limits are tested by short ones."""
 
 
 class Lane(StrEnum):
@@ -128,7 +128,7 @@ def table(tests: Iterable[tuple[str, Lane, set[str]]]) -> list[str]:
         files.setdefault(test.partition("::")[0], {}).setdefault(lane, []).append(marks & {*USES, "night"})
     rows = ["| file | fast | system | night | why |", "|---|---|---|---|---|"]
     for file, lanes in sorted(files.items()):
-        why = sorted({mark for lane, marks in lanes.items() if lane is not Lane.FAST for each in marks for mark in each})
+        why = sorted({mark for found in lanes.values() for each in found for mark in each})
         counts = " | ".join(str(len(lanes.get(lane, []))) for lane in Lane)
         rows.append(f"| {file} | {counts} | {', '.join(why)} |")
     totals = (sum(len(lanes.get(lane, [])) for lanes in files.values()) for lane in Lane)

@@ -72,7 +72,6 @@ def main(ticks: str, steps: str, assignments: Sequence[str]) -> None:
     w0, end = read_header(settings.model.file).w0, LOAD_SPAN[1]
     load = load_of_shares(steps, w0, end)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(one_process, "SHORT", 0)
         patch.setattr(stretches, "CompiledStretches", Counted)
         programs, loops = (left_by(settings, load, int(ticks), compiled=compiled) for compiled in (False, True))
     raised = {(EventKind(kind).name, subject, cause) for _, _, kind, subject, cause in programs.events}

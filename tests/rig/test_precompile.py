@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from numba.core.dispatcher import Dispatcher
 
+from coldloop.kernels.compiled import forms_of
 from rig.cosim.one_process import OneProcessRig
 from rig.results.recording import Recorder
 from rig.runs.running import make_scenario
@@ -18,7 +19,7 @@ OURS = ("coldloop", "plant", "optimizer_plc", "control_plc", "rig")
 
 
 def compiled_kernels() -> int:
-    """Return how many kernels this process has, for all types."""
+    """Return how many kernels this process has, for all types, and for calls from Python and from kernels."""
     found = {
         id(value): value
         for name, module in tuple(sys.modules.items())
@@ -26,7 +27,7 @@ def compiled_kernels() -> int:
         for value in vars(module).values()
         if isinstance(value, Dispatcher)
     }
-    return sum(len(kernel.overloads) for kernel in found.values())
+    return sum(len(form.overloads) for kernel in found.values() for form in forms_of(kernel))
 
 
 class FirstTick(Recorder):

@@ -8,23 +8,28 @@ from typing import Any
 
 from numba.core.dispatcher import Dispatcher
 
-from coldloop.kernels.compiled import _parts, cache_folder
+from coldloop.kernels.compiled import _parts, cache_folder, forms_of
 from coldloop.kernels.description import label
 from coldloop.kernels.reach import reached
-from rig import simulate
+from rig.cosim.one_process import OneProcessRig
+from rig.results.recording import Recorder
+from rig.runs.running import make_scenario
+from rig.settings import Settings
 from tests.rig.test_precompile import OURS
 
 MANGLED = re.compile(rb"_ZN(?:08NumbaEnv)?((?:\d+[A-Za-z_]\w*)+)")
 
 
 def kernels() -> Iterator[Dispatcher]:
-    """Return the kernels of all modules that have been compiled, or loaded."""
+    """Return the kernels of all modules that have been compiled, or loaded, in each of their forms."""
     found = {
-        id(value): value
+        id(form): form
         for name, module in tuple(sys.modules.items())
         if name.partition(".")[0] in OURS
         for value in vars(module).values()
-        if isinstance(value, Dispatcher) and value.overloads
+        if isinstance(value, Dispatcher)
+        for form in forms_of(value)
+        if form.overloads
     }
     yield from found.values()
 
@@ -49,7 +54,9 @@ def linked(kernel: Any, signature: tuple[Any, ...]) -> set[str]:  # noqa: ANN401
 
 
 def test_all_functions_that_are_linked_to_a_kernel_count_for_it() -> None:
-    simulate(load="a", duration_s=60)
+    settings = Settings()
+    scenario = make_scenario(settings, 240)
+    OneProcessRig(settings, compiled=True).run(scenario, Recorder(scenario.ticks))
     seen: set[str] = set()
     for kernel in kernels():
         for signature in kernel.overloads:

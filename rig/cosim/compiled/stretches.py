@@ -1,9 +1,11 @@
 """Does stretches of ordinary ticks in compiled loops, on behalf of the three programs."""
 
-from typing import Final, NamedTuple
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from coldloop.kernels.compiled import is_compiled
 from coldloop.process.load_profile import LOAD_SPAN, LoadProfile
 from coldloop.process.loaded import PROCESS
 from coldloop.registers.control_plc import Verdict
@@ -38,6 +40,7 @@ class CompiledStretches:
         control: The control PLC.
         optimizer: The optimiser, in its session.
         load: What the plant's load follows.
+        may_compile: Loops that have not been compiled yet are; else the programs do without.
     """
 
     def __init__(
@@ -47,9 +50,12 @@ class CompiledStretches:
         control_plc: ControlProgram,
         optimizer_plc: OptimizerProgram,
         load: LoadProfile,
+        *,
+        may_compile: bool,
     ) -> None:
         self._plant, self._compiled, self._control, self._optimizer = plant, compiled, control_plc, optimizer_plc
         self._is_compiled = _is_compiled(optimizer_plc)
+        self._may_compile = may_compile
         self._trace, self._reports = empty_trace(STATION_COLUMNS if plant.station else 0), empty_reports()
         self._pause_until = 0
         sensors = control_plc.sensors
@@ -87,8 +93,9 @@ class CompiledStretches:
         if sequence is None or program.player.next_update_tick - program.tick < SHORTEST:
             return None
         scans, guards = control.scan_record(program), control.guard_records(program.guard.state)
-        rows = control.sequence_rows(sequence)
-        loops.play(self._world, control.alarms_of(program), scans, guards, rows[0], plant, self._trace, until)
+        rows, alarms = control.sequence_rows(sequence), control.alarms_of(program)
+        if not self._run(loops.play, self._world, alarms, scans, guards, rows[0], plant, self._trace, until):
+            return None
         s = scans[0]
         if s["tick"] == s["first"]:
             return None
@@ -102,10 +109,11 @@ class CompiledStretches:
         rows = control.sequence_rows(playing)
         o = optimizer_plc
         parts = Optimizer(o.constants, o.method, o.rule, o.state)
-        loops.run_block(
-            self._world, control.alarms_of(program), parts, scans, guards, rows, plant, self._trace, self._reports,
-            until,
-        )  # fmt: skip
+        alarms = control.alarms_of(program)
+        if not self._run(
+            loops.run_block, self._world, alarms, parts, scans, guards, rows, plant, self._trace, self._reports, until
+        ):
+            return None
         s = scans[0]
         if s["tick"] == s["first"]:
             return None
@@ -117,6 +125,15 @@ class CompiledStretches:
             now = o.state.numbers[0]
             program.shortage, program.suspects = float(np.float32(now["shortage"])), int(now["suspects"])
         return Stretch(block, _optimizations(self._reports, solved))
+
+    def _run(self, loop: Callable[..., int], *arguments: Any) -> bool:  # noqa: ANN401 of each loop
+        """Run a loop; return whether it is there, for it may have to be compiled."""
+        if not self._may_compile:
+            if not is_compiled(loop, *arguments):
+                return False
+            self._may_compile = True
+        loop(*arguments)
+        return True
 
     def _give_back(self, plant: PlantState, s: np.void, guard: np.void) -> SampleBlock:
         """Hand the state of the loop back to plant and control PLC; return the ticks it has run."""

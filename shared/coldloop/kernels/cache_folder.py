@@ -55,6 +55,10 @@ class CacheFolder:
                 path.touch()
         return content if zlib.crc32(content) == checksum else None
 
+    def has(self, name: str) -> bool:
+        """Return whether there is a file, damaged or not."""
+        return (self.path / name).is_file()
+
     def write(self, name: str, content: bytes) -> None:
         """Write a file that every user reads, as images are made by root; nothing is written where that fails."""
         with contextlib.suppress(OSError):
