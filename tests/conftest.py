@@ -139,9 +139,9 @@ def pytest_report_collectionfinish(config: pytest.Config) -> str:
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup() -> None:
+def pytest_runtest_setup(item: pytest.Item) -> None:
     """Begin to watch what the test does."""
-    WATCH.begin()
+    WATCH.begin(item.stash[LANES])
 
 
 @pytest.hookimpl(wrapper=True)

@@ -1,7 +1,7 @@
 """The lanes of the tests, fast, system and night: which one a test is in, and what a test of the fast lane may not do.
 
-A test is in the lane that the fixtures it requests say. A test of the fast lane that starts a program, compiles a
-kernel, drives a browser (a program) or waits for the clock fails with what it did.
+A test is in the lane that the fixtures it requests say. A test of the fast lane that starts a program, drives a browser
+(a program) or waits for the clock fails with what it did; one that is to compile a kernel fails before that is done.
 """
 
 import multiprocessing.util
@@ -49,9 +49,10 @@ class Watch:
 
     def __init__(self) -> None:
         self.waited_s = 0.0
+        self.lane = Lane.FAST
         self._notes: list[str] = []
         sys.addaudithook(self._audit)
-        event.register("numba:compile", _Compilations(self._notes.append))  # type: ignore[no-untyped-call]
+        event.register("numba:compile", _Compilations(self._compile))  # type: ignore[no-untyped-call]
         _before(multiprocessing.util, "spawnv_passfds", lambda path, *_: self._notes.append(f"it starts {path!r}"))
         _before(time, "sleep", self._sleep)
         original = selectors.DefaultSelector.select
@@ -64,9 +65,10 @@ class Watch:
 
         selectors.DefaultSelector.select = select  # type: ignore[method-assign]
 
-    def begin(self) -> None:
-        """Begin to watch a test."""
+    def begin(self, lane: Lane) -> None:
+        """Begin to watch a test of a lane."""
         self.waited_s = 0.0
+        self.lane = lane
         self._notes.clear()
 
     @property
@@ -74,6 +76,10 @@ class Watch:
         """What the test has done so far."""
         waited = [f"it waits {self.waited_s:.1f} s for the clock"] if self.waited_s > WAITED_S else []
         return [*dict.fromkeys(self._notes), *waited]
+
+    def _compile(self, kernel: str) -> None:
+        self._notes.append(f"it compiles {kernel}")
+        judge(self.lane, self._notes)
 
     def _audit(self, name: str, arguments: tuple[Any, ...]) -> None:
         if name in {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.system"}:
@@ -84,14 +90,14 @@ class Watch:
 
 
 class _Compilations(event.Listener):
-    """Notes each kernel that is compiled."""
+    """Notes each kernel that is to be compiled."""
 
     def __init__(self, note: Callable[[str], None]) -> None:
         self._note = note
 
     def on_start(self, happening: Any) -> None:  # noqa: ANN401 of numba
         """Note a kernel."""
-        self._note(f"it compiles {happening.data['dispatcher'].py_func.__qualname__}")
+        self._note(happening.data["dispatcher"].py_func.__qualname__)
 
     def on_end(self, happening: Any) -> None:  # noqa: ANN401 of numba
         """Nothing: it has been noted."""
