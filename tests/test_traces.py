@@ -38,6 +38,7 @@ def left(trace: list[Any] | None = None, made: list[Any] | None = None, processo
     found = Left(
         process="cold box",
         trace=checked(trace or groups()),
+        end=["1.5 2.5", "0.1"],
         updates=checked(made or updates()),
         events=["0 2 40 7 1", "0 3 90 7 1"],
         indicators=["0.1", "nan"],
@@ -132,6 +133,14 @@ def test_a_trace_that_is_shorter_says_so_and_is_compared_as_far_as_it_goes() -> 
 def test_a_column_more_is_said_without_a_comparison() -> None:
     wider = [groups()[0], np.hstack([groups()[1], groups()[1][:, :1]])]
     assert told(left(), left(wider)) == ["columns: 3 + 3 on record, now 3 + 4"]
+
+
+def test_the_last_bit_of_a_state_after_the_last_tick_is_named() -> None:
+    found = left()
+    found["end"] = ["1.5 2.5", "0.10000000000000002"]
+    assert told(left(), found) == ["after tick 99: column 5 y2: 0.1, now 0.10000000000000002"]
+    found["end"] = ["1.5 2.6", "0.10000000000000002"]
+    assert told(left(), found) == ["after tick 99: column 4 y1: 2.5, now 2.6; 1 other columns too"]
 
 
 def test_an_update_is_named_by_number_and_field() -> None:

@@ -24,6 +24,9 @@ class Left(TypedDict):
     processor: NotRequired[str]
     """Kind of processor that the last bits depend on, by OpenBLAS's name; without it they are the same on all."""
     trace: Table
+    end: list[str]
+    """Outputs, then states of the plant after the last tick, all digits of double precision, separated by spaces: the
+    trace has single precision, which rounds away what moves the last bits of a plant only."""
     updates: Table
     events: list[str]
     """Each as the numbers of service, kind, tick, subject, cause."""
@@ -34,6 +37,7 @@ class Left(TypedDict):
 def differences(recorded: Left, found: Left, names: Names) -> Iterator[str]:
     """Yield what differs, each in a line that names tick and column, update and field, event, or indicator."""
     yield from _of_table("tick", "column", recorded["trace"], found["trace"], names["trace"])
+    yield from _of_end(recorded, found, names["trace"])
     yield from _of_table("update", "field", recorded["updates"], found["updates"], names["updates"])
     yield from _of_list("event", recorded["events"], found["events"], [])
     yield from _of_list("indicator", recorded["indicators"], found["indicators"], names["indicators"])
@@ -53,6 +57,18 @@ def _of_table(row: str, column: str, recorded: Table, found: Table, names: Seque
     named = [f"{number} {names[number]}" for number in seen.columns]
     later = f"; {len(seen.others)} other {column}s elsewhere" if seen.others else ""
     yield f"{place}: {column} {shortened(named)}{later}"
+
+
+def _of_end(recorded: Left, found: Left, names: Sequence[str]) -> Iterator[str]:
+    """Yield the line of what differs after the last tick; these columns are behind those of load and inputs."""
+    first = sizes_of(recorded["trace"])[0]
+    before, now = ([value for group in left["end"] for value in group.split()] for left in (recorded, found))
+    pairs = enumerate(zip(before, now, strict=False), first)
+    differing = [(column, one, other) for column, (one, other) in pairs if one != other]
+    if differing:
+        column, one, other = differing[0]
+        more = f"; {len(differing) - 1} other columns too" if len(differing) > 1 else ""
+        yield f"after tick {found['trace']['rows'] - 1}: column {column} {names[column]}: {one}, now {other}{more}"
 
 
 def shortened(names: Sequence[str]) -> str:
