@@ -66,13 +66,15 @@ def left_by(configuration: Configuration) -> Left:
     rig = ObservedRig(settings)
     rig.run(Scenario(configuration.ticks, load, program.updating_period_s, SEED), recorder)
     recorder.close()
-    block = memory.recording(recorder.link).block
+    recording = memory.recording(recorder.link)
+    block = recording.block
     station = [block.station] if block.station.size else []
     left = Left(
         process=configuration.process,
         trace=checked([np.column_stack([block.load, block.u]), block.y, block.x, *station]),
         end=[" ".join(map(repr, values)) for values in (rig.plant.measure(), rig.plant.state)],
-        updates=of_updates(memory.recording(recorder.link).updates),
+        updates=of_updates(recording.updates),
+        instants=" ".join(str(update.tick) for update in recording.updates),
         events=[
             f"{SERVICES.index(service)} {event.kind:d} {event.tick} {event.subject} {event.cause}"
             for service, event in memory.events
