@@ -38,7 +38,9 @@ def left(trace: list[Any] | None = None, made: list[Any] | None = None, processo
     found = Left(
         process="cold box",
         trace=checked(trace or groups()),
+        end=["1.5 2.5", "0.1"],
         updates=checked(made or updates()),
+        instants=" ".join(str(10 * number) for number in range(10)),
         events=["0 2 40 7 1", "0 3 90 7 1"],
         indicators=["0.1", "nan"],
     )
@@ -134,10 +136,18 @@ def test_a_column_more_is_said_without_a_comparison() -> None:
     assert told(left(), left(wider)) == ["columns: 3 + 3 on record, now 3 + 4"]
 
 
+def test_the_last_bit_of_a_state_after_the_last_tick_is_named() -> None:
+    found = left()
+    found["end"] = ["1.5 2.5", "0.10000000000000002"]
+    assert told(left(), found) == ["after tick 99: column 5 y2: 0.1, now 0.10000000000000002"]
+    found["end"] = ["1.5 2.6", "0.10000000000000002"]
+    assert told(left(), found) == ["after tick 99: column 4 y1: 2.5, now 2.6; 1 other columns too"]
+
+
 def test_an_update_is_named_by_number_and_field() -> None:
     made = updates()
     made[1][7, 0] += 1e-12
-    assert told(left(), left(made=made)) == ["update 7: field 2 j_dev"]
+    assert told(left(), left(made=made)) == ["update 7 at tick 70: field 2 j_dev"]
 
 
 def test_no_updates_are_a_table_too() -> None:

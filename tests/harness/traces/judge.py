@@ -24,7 +24,12 @@ class Left(TypedDict):
     processor: NotRequired[str]
     """Kind of processor that the last bits depend on, by OpenBLAS's name; without it they are the same on all."""
     trace: Table
+    end: list[str]
+    """Outputs, then states of the plant after the last tick, all digits of double precision, separated by spaces: the
+    trace has single precision, which rounds away what moves the last bits of a plant only."""
     updates: Table
+    instants: str
+    """Tick of each update, separated by spaces: of messages, never compared."""
     events: list[str]
     """Each as the numbers of service, kind, tick, subject, cause."""
     indicators: list[str]
@@ -33,13 +38,19 @@ class Left(TypedDict):
 
 def differences(recorded: Left, found: Left, names: Names) -> Iterator[str]:
     """Yield what differs, each in a line that names tick and column, update and field, event, or indicator."""
-    yield from _of_table("tick", "column", recorded["trace"], found["trace"], names["trace"])
-    yield from _of_table("update", "field", recorded["updates"], found["updates"], names["updates"])
+    yield from _of_table(("tick", "column"), recorded["trace"], found["trace"], names["trace"])
+    yield from _of_end(recorded, found, names["trace"])
+    instants = found["instants"].split()
+    yield from _of_table(("update", "field"), recorded["updates"], found["updates"], names["updates"], instants)
     yield from _of_list("event", recorded["events"], found["events"], [])
     yield from _of_list("indicator", recorded["indicators"], found["indicators"], names["indicators"])
 
 
-def _of_table(row: str, column: str, recorded: Table, found: Table, names: Sequence[str]) -> Iterator[str]:
+def _of_table(
+    kinds: tuple[str, str], recorded: Table, found: Table, names: Sequence[str], instants: Sequence[str] = ()
+) -> Iterator[str]:
+    """Yield where two tables begin to differ; `kinds` are the words for a row and a column."""
+    row, column = kinds
     before, now = sizes_of(recorded), sizes_of(found)
     if before != now:
         yield f"{column}s: {' + '.join(map(str, before))} on record, now {' + '.join(map(str, now))}"
@@ -50,9 +61,22 @@ def _of_table(row: str, column: str, recorded: Table, found: Table, names: Seque
     if seen is None:
         return
     place = f"{row} {seen.first}" if seen.first == seen.last else f"{row}s {seen.first} to {seen.last}"
+    place += f" at tick {instants[seen.first]}" if instants else ""
     named = [f"{number} {names[number]}" for number in seen.columns]
     later = f"; {len(seen.others)} other {column}s elsewhere" if seen.others else ""
     yield f"{place}: {column} {shortened(named)}{later}"
+
+
+def _of_end(recorded: Left, found: Left, names: Sequence[str]) -> Iterator[str]:
+    """Yield the line of what differs after the last tick; these columns are behind those of load and inputs."""
+    first = sizes_of(recorded["trace"])[0]
+    before, now = ([value for group in left["end"] for value in group.split()] for left in (recorded, found))
+    pairs = enumerate(zip(before, now, strict=False), first)
+    differing = [(column, one, other) for column, (one, other) in pairs if one != other]
+    if differing:
+        column, one, other = differing[0]
+        more = f"; {len(differing) - 1} other columns too" if len(differing) > 1 else ""
+        yield f"after tick {found['trace']['rows'] - 1}: column {column} {names[column]}: {one}, now {other}{more}"
 
 
 def shortened(names: Sequence[str]) -> str:

@@ -23,6 +23,7 @@ from coldloop.process.model_file import read_header
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, STATION_SIGNAL_NAMES
 from coldloop.registers.optimizer_plc import Optimization
 from plant.load import find_load
+from plant.program import PlantProgram
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
 from rig.process_file.making import made_from
@@ -44,6 +45,16 @@ WHOLE: Final = Optimization._fields.index("j_effective")
 """Fields of an update before this one are whole numbers."""
 
 
+class ObservedRig(OneProcessRig):
+    """Lets its plant be read after the run."""
+
+    plant: PlantProgram
+
+    def _plant(self, load: LoadProfile, seed: int) -> PlantProgram:
+        self.plant = super()._plant(load, seed)
+        return self.plant
+
+
 def left_by(configuration: Configuration) -> Left:
     """Run a configuration."""
     own = (f'model.file="{FILE}"', 'plant.kind="of-process"') if FILE else ()
@@ -52,14 +63,18 @@ def left_by(configuration: Configuration) -> Left:
     evaluation, memory = RunEvaluation(model, program.design), MemorySink()
     recorder = Recorder(configuration.ticks, [evaluation, memory])
     load = load_of(configuration, read_header(settings.model.file).w0)
-    OneProcessRig(settings).run(Scenario(configuration.ticks, load, program.updating_period_s, SEED), recorder)
+    rig = ObservedRig(settings)
+    rig.run(Scenario(configuration.ticks, load, program.updating_period_s, SEED), recorder)
     recorder.close()
-    block = memory.recording(recorder.link).block
+    recording = memory.recording(recorder.link)
+    block = recording.block
     station = [block.station] if block.station.size else []
     left = Left(
         process=configuration.process,
         trace=checked([np.column_stack([block.load, block.u]), block.y, block.x, *station]),
-        updates=of_updates(memory.recording(recorder.link).updates),
+        end=[" ".join(map(repr, values)) for values in (rig.plant.measure(), rig.plant.state)],
+        updates=of_updates(recording.updates),
+        instants=" ".join(str(update.tick) for update in recording.updates),
         events=[
             f"{SERVICES.index(service)} {event.kind:d} {event.tick} {event.subject} {event.cause}"
             for service, event in memory.events

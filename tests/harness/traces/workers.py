@@ -18,7 +18,7 @@ from tests.harness.traces.record import Found, RecordError
 MODELS: Final = "models"
 """No process: the interpreter that makes the model files."""
 ROOT: Final = Path(__file__).parents[3]
-ONE_PROCESSOR: Final = {"OPENBLAS_CORETYPE": "Prescott", "OPENBLAS_NUM_THREADS": "1"}
+ONE_PROCESSOR: Final = {"OPENBLAS_CORETYPE": "Nehalem", "OPENBLAS_NUM_THREADS": "1"}
 """Lets OpenBLAS compute as on any x86-64: models of process files are made with LAPACK, whose last bits depend on the
 kind of processor. The cold box needs none of it."""
 
