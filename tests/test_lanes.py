@@ -57,7 +57,7 @@ def test_a_kernel_that_a_test_is_to_compile_is_noted_and_not_compiled() -> None:
     def successor(x: int) -> int:
         return x + 1
 
-    with pytest.raises(pytest.fail.Exception, match="it compiles .*successor"):
+    with pytest.raises(pytest.fail.Exception, match=r"it compiles .*successor"):
         numba.njit(successor)(1)
     assert len(found := noted()) == 1
     assert "it compiles" in found[0]

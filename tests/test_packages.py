@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.usefixtures("programs")
+
 PACKAGES = Path(__file__).parents[1] / "scripts" / "packages"
 
 APT_GET = """#!/bin/sh

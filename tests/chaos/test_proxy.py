@@ -107,6 +107,7 @@ async def test_what_is_sent_into_a_frozen_link_arrives_when_it_thaws() -> None:
         writer.close()
 
 
+@pytest.mark.usefixtures("realtime")
 async def test_a_lost_answer_is_a_time_out_and_a_lost_request_is_never_served() -> None:
     async with line(timeout_s=1.0) as it:
         for direction, served in ((Direction.REQUESTS, set[int]()), (Direction.ANSWERS, {5})):

@@ -98,6 +98,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
         worker.process.communicate()
 
 
+@pytest.mark.usefixtures("programs")
 def test_processes_that_need_a_kernel_at_once_compile_it_once_and_one_of_them_says_so(start: Start) -> None:
     workers = [start() for _ in range(3)]
     for worker in workers:
@@ -131,6 +132,7 @@ def test_who_fails_to_compile_a_kernel_keeps_nobody_waiting(start: Start) -> Non
     assert first.answer()[1] == "is 5.0"
 
 
+@pytest.mark.usefixtures("programs")
 def test_the_kernel_of_a_process_that_is_killed_is_compiled_by_who_waits(start: Start) -> None:
     killed, waiting = start(), start()
     killed.send("outer._cache.load_overload((types.float64,), outer.targetctx)")  # which locks it
@@ -154,6 +156,7 @@ def test_half_a_kernel_on_the_disk_is_compiled_anew(start: Start, tmp_path: Path
     assert third.answer() == ([], "is 5.0")
 
 
+@pytest.mark.usefixtures("programs")
 def test_without_a_folder_to_write_to_kernels_are_compiled_all_the_same(start: Start, tmp_path: Path) -> None:
     occupied = tmp_path / "a file"
     occupied.touch()
@@ -163,6 +166,7 @@ def test_without_a_folder_to_write_to_kernels_are_compiled_all_the_same(start: S
     assert list(tmp_path.glob("coldloop-kernels-*"))
 
 
+@pytest.mark.usefixtures("programs")
 def test_an_edit_compiles_what_reaches_it_and_no_more(start: Start, tmp_path: Path) -> None:
     def compiled() -> list[str]:
         worker = start()

@@ -134,6 +134,7 @@ async def test_an_alarm_with_a_delay_is_raised_also_while_no_scans_are_made() ->
         await until(lambda: alarm(plc, AlarmKind.PLANT_LOST) is AlarmState.UNACKNOWLEDGED)
 
 
+@pytest.mark.usefixtures("realtime")
 async def test_scans_that_are_not_made_are_alarmed_from_outside_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
     ended = asyncio.Event()
     async with running(SmallRack(1)) as plc:
@@ -202,6 +203,7 @@ async def test_autostart_leaves_a_session_to_the_operator_who_is_about_to_ask_fo
         assert plc.sessions.running
 
 
+@pytest.mark.usefixtures("realtime")
 async def test_no_number_of_a_start_or_of_an_event_is_given_out_twice(tmp_path: Path) -> None:
     """Whether scans are made or not: here there is no rack."""
     given: list[tuple[int, int]] = []

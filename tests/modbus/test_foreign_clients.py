@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from coldloop.registers.declaration import Register
     from tests.modbus.conftest import Running, Serve
 
+pytestmark = pytest.mark.usefixtures("programs")
+
 
 KELVIN = 20.25
 MEASURED = Measurement(

@@ -56,6 +56,7 @@ async def test_the_last_sequence_number_is_followed_by_those_of_a_session_begun_
     assert control.headers[-1].number < LAST_NUMBER
 
 
+@pytest.mark.usefixtures("realtime")
 async def test_every_field_of_an_update_may_be_nonsense(
     connect: "Connect", control: "PlayedControlPlc", until: "Until"
 ) -> None:

@@ -168,6 +168,7 @@ async def test_a_control_plc_that_answers_at_once_without_an_update_is_not_asked
 # -- somebody else ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("realtime")
 async def test_it_lets_another_optimiser_be_and_goes_on_when_the_lease_is_free(
     connect: "Connect", control: "PlayedControlPlc", caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -228,6 +229,7 @@ async def test_one_flipped_bit_in_the_model_that_is_read_ends_nothing(
         assert link.status.damaged == 1
 
 
+@pytest.mark.usefixtures("realtime")
 async def test_a_control_plc_that_comes_back_with_another_model_is_waited_for_without_taking_its_lease(
     connect: "Connect", control: "PlayedControlPlc", model: LtiModel
 ) -> None:

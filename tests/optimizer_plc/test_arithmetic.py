@@ -56,12 +56,14 @@ def halved_twice(x: NDArray[Any]) -> float:
     return halved(x) + halved(x)
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("kernel", [halved, halved_twice])
 def test_the_check_finds_a_constant_in_double(kernel: Any) -> None:  # noqa: ANN401 - numba has no types
     kernel(np.ones(1, np.float32))
     assert has_double(code(kernel, kernel.signatures[0]))
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_check_finds_nothing_in_single_precision() -> None:
     def halved_in_single(x: NDArray[Any]) -> Any:  # noqa: ANN401
         return x[0] * np.float32(0.3)

@@ -53,6 +53,7 @@ def test_it_belongs_to_the_default_and_not_to_the_paper() -> None:
     assert ProgramSettings(preset=Preset.PAPER).design == ControlDesign()
 
 
+@pytest.mark.usefixtures("compiles")
 def test_an_output_that_rests_at_its_limit_rests_within_the_band() -> None:
     """A better turbine: T5 rests at 9 K."""
     outside = [

@@ -176,6 +176,7 @@ def test_the_problem_keeps_the_reading_of_t5_within_its_band(
     assert np.all(shift[56:] == 0.0)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_level_stays_within_its_band_on_a_plant_whose_valves_pass_less() -> None:
     off = {"mismatch": {"jt_valve": 0.9, "turbine_valve": 0.9}}
     outside = [

@@ -248,6 +248,7 @@ def test_a_program_with_both_restarts_as_if_it_were_new(model: LtiModel) -> None
     assert program.plan(at_rest(model)).next_update_tick == 4, "a fixed period is fixed"
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_conformance_suite_finds_what_an_estimator_does_not_keep() -> None:
     failures = {one.text: one.failures for one in estimator_requirements(Believing, Settings())}
     assert [text for text, count in failures.items() if count] == ["converges on a plant that is its model"]

@@ -220,6 +220,7 @@ def test_l1_rests_at_its_operating_point_whatever_is_constant(
     assert low < model.y0[T5] + y[T5] < high
 
 
+@pytest.mark.usefixtures("compiles")
 def test_l1_comes_to_rest_nearer_to_its_operating_point_with_valves_that_pass_less() -> None:
     off = []
     for target in (Target.OPERATING_POINT, Target.MISMATCH):

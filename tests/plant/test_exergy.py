@@ -47,17 +47,20 @@ def balances(reference: Rest, efficient: Rest) -> list[ExergyBalance]:
     return [exergy_balance(rest, plant, HELIUM) for rest, plant in zip((reference, efficient), plants, strict=True)]
 
 
+@pytest.mark.usefixtures("compiles")
 def test_what_is_destroyed_is_what_is_put_in_less_what_is_useful(balances: list[ExergyBalance]) -> None:
     for balance in balances:
         assert sum(balance.destroyed.values()) == pytest.approx(balance.put_in - balance.useful, abs=1e-3)
         assert min(balance.destroyed.values()) > -1e-3
 
 
+@pytest.mark.usefixtures("compiles")
 def test_heat_at_the_temperature_of_the_bath_loses_nothing_there(balances: list[ExergyBalance]) -> None:
     for balance in balances:
         assert balance.destroyed["bath"] == pytest.approx(0.0, abs=0.5)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_bypass_loses_the_isothermal_work_of_its_flow(reference: Rest, balances: list[ExergyBalance]) -> None:
     """By hand: m R T0 ln(16/1.05) = 0.01337 kg/s x 623.2 kJ/kg x 2.724 = 22.7 kW."""
     flow = 1e-3 * reference.signals[STATION_SIGNAL_NAMES.index("M_CV956")]
@@ -65,6 +68,7 @@ def test_the_bypass_loses_the_isothermal_work_of_its_flow(reference: Rest, balan
     assert balances[0].destroyed["bypass"] == pytest.approx(22.7e3, rel=0.01)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_throttle_loses_the_entropy_that_coolprop_has_before_and_behind_it(
     reference: Rest, balances: list[ExergyBalance]
 ) -> None:
@@ -76,6 +80,7 @@ def test_the_throttle_loses_the_entropy_that_coolprop_has_before_and_behind_it(
     assert balances[0].destroyed["CV155"] == pytest.approx(300.0 * flow * (behind - before), rel=1e-4)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_reference_takes_too_much_power_and_the_efficient_one_what_such_machines_take(
     efficient: Rest, balances: list[ExergyBalance]
 ) -> None:

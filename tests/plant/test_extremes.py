@@ -69,6 +69,7 @@ def test_a_bath_that_runs_dry_holds_the_same_on_both_sides(P: float) -> None:
     assert dry.energy == pytest.approx(wet.energy, abs=1e-6)
 
 
+@pytest.mark.usefixtures("compiles")
 @given(
     P=bath_pressures, V_l=liquid_volumes, inflow=st.floats(0.0, 0.1), out=st.floats(0.0, 0.2), heat=st.floats(0.0, 1e4)
 )
@@ -82,6 +83,7 @@ def test_a_bath_stores_what_enters_whatever_it_holds(
     assert c.U_P * dP + c.U_V * dV == pytest.approx(inflow * 7600.0 - out * top.h + heat, abs=1e-7)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_what_a_hot_dry_bath_holds_is_found_to_the_rounding_of_its_walls_energy() -> None:
     """A vessel whose wall is at 273 K: its 7.6 MJ are not known to 1e-8 J, and were once sought to that."""
     mass, energy = 0.010486257221242683, 7625657.129908127
@@ -92,6 +94,7 @@ def test_what_a_hot_dry_bath_holds_is_found_to_the_rounding_of_its_walls_energy(
     assert there.energy == pytest.approx(energy, rel=1e-13)
 
 
+@pytest.mark.usefixtures("compiles")
 @given(P=bath_pressures, superheat=st.floats(0.1, 250.0))
 def test_the_vapour_in_a_dry_bath_is_that_of_coolprop(P: float, superheat: float) -> None:
     library = pytest.importorskip("CoolProp.CoolProp")
@@ -103,6 +106,7 @@ def test_the_vapour_in_a_dry_bath_is_that_of_coolprop(P: float, superheat: float
     assert top.rho == pytest.approx(rho, rel=3e-3)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_a_full_bath_sends_liquid_along_and_no_more_than_it_has() -> None:
     sat = saturation(1.2e5, HELIUM)
     tops = [outflow(BATH, 1.2e5, share * BATH.volume, sat, HELIUM) for share in (0.9, 0.97, 0.985, 1.0, 1.01)]
@@ -113,6 +117,7 @@ def test_a_full_bath_sends_liquid_along_and_no_more_than_it_has() -> None:
         assert (top.h, top.rho) == pytest.approx((sat.h_l, sat.rho_l))
 
 
+@pytest.mark.usefixtures("compiles")
 @given(P=bath_pressures, over=st.floats(100.0, 2e4))
 def test_liquid_that_leaves_a_full_bath_flows_as_a_liquid(P: float, over: float) -> None:
     line, sat = ReturnLine(REFERENCE.return_line.cold_resistance, 0.0), saturation(P, HELIUM)
@@ -133,6 +138,7 @@ def test_the_wall_of_a_dry_bath_goes_on_to_take_up_heat_above_300_k(P: float, V_
     assert (colder.energy - hotter.energy) / (2.0 * dV) == pytest.approx(c.U_V, rel=1e-6)
 
 
+@pytest.mark.usefixtures("compiles")
 @given(P=bath_pressures, superheat=st.floats(1.0, 250.0), over=st.floats(0.0, 2e4), exhaust=st.floats(0.0, 0.08))
 def test_the_pressure_of_a_dry_bath_settles_slowly_enough_for_a_tick(
     P: float, superheat: float, over: float, exhaust: float
@@ -288,6 +294,7 @@ FINER = 8
 """Steps in the place of one; what controls the station goes on once a tick."""
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize(
     "event", ["both compressors trip", *(pytest.param(name, marks=pytest.mark.night) for name in list(EVENTS)[1:])]
 )
@@ -319,6 +326,7 @@ def test_one_step_a_tick_is_stable_with_a_margin_and_exact_within_a_percent_of_e
     assert np.all(errors < 0.01 * moves + 1e-6 * rate_scales(PLANT))
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_alarm_for_the_end_of_the_tables_knows_what_has_left_them() -> None:
     x = np.array(HEADER.x0)
     assert model_range(x, 16.0, 1.05) == 0

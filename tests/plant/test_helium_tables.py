@@ -43,6 +43,7 @@ def test_saturation_agrees(P: float) -> None:
     assert sat.s_v == pytest.approx(coolprop("S", "P", P, "Q", 1.0), abs=1e-3)
 
 
+@pytest.mark.usefixtures("compiles")
 @given(P=st.floats(0.91e5, 1.89e5))
 def test_saturation_slopes_are_the_derivatives_of_saturation(P: float) -> None:
     above, below = helium_at.saturation(P + 10.0, HELIUM), helium_at.saturation(P - 10.0, HELIUM)
@@ -62,6 +63,7 @@ def test_vapour_agrees(P: float, superheat: float) -> None:
     assert helium_at.vapour_temperature(P, h, sat, HELIUM) == pytest.approx(T, abs=2e-5)
 
 
+@pytest.mark.usefixtures("compiles")
 @given(P=bath_pressures, superheat=superheats)
 def test_the_end_of_an_isentropic_expansion_agrees(P: float, superheat: float) -> None:
     T = helium_at.saturation(P, HELIUM).T + superheat
@@ -75,6 +77,7 @@ def test_entropy_at_the_turbine_inlet_agrees(P: float, h: float) -> None:
     assert helium_at.entropy_before_expansion(P, h, HELIUM) == pytest.approx(s, abs=5e-3)
 
 
+@pytest.mark.usefixtures("compiles")
 @given(P=bath_pressures, share=st.floats(0.2, 0.999))
 def test_an_expansion_into_wet_vapour_follows_the_lever_rule(P: float, share: float) -> None:
     s = share * coolprop("S", "P", P, "Q", 1.0) + (1.0 - share) * coolprop("S", "P", P, "Q", 0.0)
@@ -84,6 +87,7 @@ def test_an_expansion_into_wet_vapour_follows_the_lever_rule(P: float, share: fl
     assert helium_at.vapour_temperature(P, h, sat, HELIUM) == sat.T
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize(("P", "edge"), [(0.2e5, 0.3e5), (2.26e5, 2.25e5)])
 def test_the_saturation_line_goes_on_straight_outside_its_table(P: float, edge: float) -> None:
     at_edge, slopes = helium_at.saturation(edge, HELIUM), helium_at.saturation_slopes(P, HELIUM)
@@ -109,6 +113,7 @@ def test_the_isobar_agrees_down_to_its_coldest_end(T: float) -> None:
     assert rho_cp == pytest.approx(density * cp, rel=1e-6)
 
 
+@pytest.mark.usefixtures("compiles")
 @given(P=outer_pressures, superheat=superheats)
 def test_bath_and_return_agree_from_a_vacuum_to_the_critical_point(P: float, superheat: float) -> None:
     sat = helium_at.saturation(P, HELIUM)
@@ -123,6 +128,7 @@ def test_bath_and_return_agree_from_a_vacuum_to_the_critical_point(P: float, sup
     assert helium_at.enthalpy_after_isentropic_expansion(P, s, HELIUM) == pytest.approx(h, abs=0.03 * cp)
 
 
+@pytest.mark.usefixtures("compiles")
 @given(P=st.floats(0.4e5, 2.2e5), T=st.floats(115.0, 295.0))
 def test_an_expansion_of_warm_gas_and_its_density_agree(P: float, T: float) -> None:
     h, s, rho = (coolprop(name, "P", P, "T", T) for name in ("H", "S", "D"))

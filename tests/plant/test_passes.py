@@ -42,6 +42,8 @@ from plant.refrigerator.physics import (
     rates,
 )
 
+pytestmark = pytest.mark.usefixtures("compiles")
+
 HELIUM = load_helium()
 PLANT = REFERENCE_REFRIGERATOR
 FILE = read_refrigerator_file(SHIPPED)

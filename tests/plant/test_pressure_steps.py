@@ -7,6 +7,8 @@ from plant.refrigerator.file import SHIPPED, read_refrigerator_file
 from plant.refrigerator.pressure_steps import LOAD, Response, pressures_after, response_of, table
 from plant.refrigerator.station_settings import StationControlKind
 
+pytestmark = pytest.mark.usefixtures("compiles")
+
 FILE = read_refrigerator_file(SHIPPED)
 
 

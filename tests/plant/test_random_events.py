@@ -34,6 +34,8 @@ from plant.refrigerator.station_control import station_law
 from plant.refrigerator.station_settings import StationSettings
 from tests.harness.energy_account import AHEAD, CROSSED, SIZE, TO_BATH, WEIGHTS, WORST, accounted_tick
 
+pytestmark = pytest.mark.usefixtures("compiles")
+
 HELIUM = load_helium()
 PLANT = REFERENCE_REFRIGERATOR
 BATH = REFERENCE.separator

@@ -129,6 +129,7 @@ def test_another_refrigerator_has_another_digest() -> None:
     assert refrigerator_digest(bigger, HELIUM) != FILE.parameters_digest
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize(
     ("u", "v", "w"),
     [((2.0, 0.0, 0.0), 0.0, 0.0), ((0.0, 20.0, 0.0), 0.0, 0.0), ((0.0, 0.0, -3.0), 0.0, 60.0)],
@@ -141,6 +142,7 @@ def test_helium_is_neither_made_nor_lost(rest: Point, u: tuple[float, ...], v: f
     assert total == pytest.approx(inventory(rest.x, PLANT, HELIUM), rel=1e-9)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_what_leaks_is_what_is_missing(rest: Point) -> None:
     leaking = rest._replace(d=rest.d + np.array([0, 0, 2e-3, 0, 0, 0]))
     after = simulate(leaking, 300.0)
@@ -171,6 +173,7 @@ def moved_by(rest: Point, name: str) -> Point:
     return rest._replace(**{what: vector})
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("name", MOVES)
 def test_the_linear_model_follows_the_refrigerator_for_100_s(rest: Point, name: str) -> None:
     moved = moved_by(rest, name)

@@ -25,6 +25,7 @@ def test_it_says_for_which_plant_it_was_made() -> None:
     assert ModelSettings.model_validate({"file": "refrigerator"}).file == SHIPPED_MODELS["refrigerator"]
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_shipped_model_is_that_of_the_shipped_refrigerator() -> None:
     rebuilt = prediction_model(FILE)
     assert pytest.approx(MODEL.A, rel=1e-6, abs=1e-9) == rebuilt.A

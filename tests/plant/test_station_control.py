@@ -172,6 +172,7 @@ def test_a_leak_is_made_up_from_the_buffer() -> None:
     assert signals[-1, LOST] == pytest.approx(0.89, abs=0.01)
 
 
+@pytest.mark.usefixtures("compiles")
 @BOTH
 @pytest.mark.parametrize("hp", [0.0, 4.0, 30.0])
 @pytest.mark.parametrize("lp", [0.0, 0.5, 3.0])
@@ -183,6 +184,7 @@ def test_openings_stay_between_shut_and_open_whatever_is_measured(control: str, 
         assert all(0.0 <= opening <= 100.0 for opening in commands)
 
 
+@pytest.mark.usefixtures("compiles")
 @BOTH
 def test_integrals_do_not_wind_up_while_a_valve_is_at_its_end(control: str) -> None:
     """After ten minutes of a pressure that no valve could mend, one that is 5 mbar too low opens the bypass soon."""
@@ -196,6 +198,7 @@ def test_integrals_do_not_wind_up_while_a_valve_is_at_its_end(control: str) -> N
     assert commands.cv956 > 0.0
 
 
+@pytest.mark.usefixtures("compiles")
 def test_charging_stops_when_the_low_pressure_is_too_high() -> None:
     controller = StationControl(StationSettings(), FILE.reference, REFERENCE_REFRIGERATOR.station)
     for _ in range(40):

@@ -43,6 +43,7 @@ def test_a_volume_holds_the_mass_that_its_pressure_tells(P: float, T: float) -> 
     assert gas_pressure(STATION.buffer, gas_mass(STATION.buffer, P, T), T) == pytest.approx(P, rel=1e-12)
 
 
+@pytest.mark.usefixtures("compiles")
 @given(P=pressures)
 def test_the_gas_of_a_volume_is_as_dense_as_helium(P: float) -> None:
     density = pytest.importorskip("CoolProp.CoolProp").PropsSI("D", "P", P, "T", 300.0, "Helium")
@@ -119,15 +120,18 @@ def test_gas_does_not_flow_against_the_pressure(opening: float, P: float) -> Non
     assert gas_valve_flow(STATION.charge, opening, P, 1.5 * P, 300.0) == 0.0
 
 
+@pytest.mark.usefixtures("compiles")
 @given(P=st.floats(0.5e5, 18e5))
 def test_a_relief_valve_is_tight_up_to_its_set_pressure(P: float) -> None:
     assert relief_flow(STATION.hp_relief, P, 300.0) == 0.0
 
 
+@pytest.mark.usefixtures("compiles")
 def test_a_relief_valve_blows_off_what_both_compressors_deliver() -> None:
     assert relief_flow(STATION.hp_relief, 19e5, 300.0) > 2.0 * compress(NC, 1.0, 1.05e5, 16e5, 300.0).mass_flow
 
 
+@pytest.mark.usefixtures("compiles")
 @given(opening=openings, command=st.floats(-50.0, 150.0))
 def test_an_opening_moves_towards_its_command_no_faster_than_its_drive(opening: float, command: float) -> None:
     actuator = Actuator(lag=1.0, fastest=20.0)
@@ -169,6 +173,7 @@ def test_a_full_bath_takes_what_boils_off_and_no_more() -> None:
 # -- the warm exchanger ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("compiles")
 @given(UA=st.floats(10.0, 1e5), C=st.floats(50.0, 600.0), ratio=st.floats(0.2, 5.0))
 def test_the_heat_of_an_exchanger_is_that_of_its_textbook_effectiveness(UA: float, C: float, ratio: float) -> None:
     C_high, C_low = C, C * ratio
@@ -182,6 +187,7 @@ def test_the_heat_of_an_exchanger_is_that_of_its_textbook_effectiveness(UA: floa
     assert exchanged_heat(UA, C_high, C_low, 10.0) == pytest.approx(10.0 * small * effectiveness, rel=2e-3)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_heat_is_smooth_where_both_streams_are_alike() -> None:
     flows = np.linspace(499.0, 501.0, 401)
     heat = np.array([exchanged_heat(21500.0, 500.0, C, 10.0) for C in flows])
@@ -189,6 +195,7 @@ def test_the_heat_is_smooth_where_both_streams_are_alike() -> None:
     assert np.max(np.abs(np.diff(heat, 2))) < 1e-3
 
 
+@pytest.mark.usefixtures("compiles")
 @given(m_high=st.floats(0.01, 0.12), m_low=st.floats(0.01, 0.12), T_low=st.floats(70.0, 90.0))
 def test_what_the_warm_exchanger_takes_from_one_stream_it_gives_to_the_other(
     m_high: float, m_low: float, T_low: float

@@ -16,6 +16,8 @@ from plant.refrigerator.program import RefrigeratorProgram
 from plant.refrigerator.warm_start import warm_state
 from plant.settings import PlantSettings
 
+pytestmark = pytest.mark.usefixtures("compiles")
+
 HEADER = own_header(DEFAULT_MODEL_FILE)
 REST = read_refrigerator_file(SHIPPED).x0
 HELIUM = load_helium()

@@ -49,6 +49,7 @@ def folder(recorded: GoldenVectors, tmp_path_factory: pytest.TempPathFactory) ->
     return made
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("level", ["-O0", "-O2", "-O3"])
 @pytest.mark.parametrize("compiler", COMPILERS)
 def test_the_self_test_finds_every_bit_as_the_kernels_have_it(
@@ -104,6 +105,7 @@ def assert_found(folder: Path, copy: Path, name: str, most: int) -> None:
         assert "is not what was written" in result.stdout
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("name", ["kernels.c", "problem.c", "golden.c"])
 def test_a_changed_bit_of_a_literal_a_matrix_or_a_golden_vector_is_found(
     folder: Path, tmp_path: Path, name: str

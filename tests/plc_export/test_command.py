@@ -92,6 +92,7 @@ FILES = {
 }
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("target", FILES)
 def test_the_sources_and_a_readme_are_written(coldloop: "Coldloop", tmp_path: Path, target: str) -> None:
     out = tmp_path / "new" / target
@@ -107,6 +108,7 @@ def test_the_sources_and_a_readme_are_written(coldloop: "Coldloop", tmp_path: Pa
     assert [path.name for path in out.parent.iterdir()] == [target]
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_written_structured_text_passes_its_self_test_and_no_call_does_more_than_the_readme_says(
     coldloop: "Coldloop", tmp_path: Path
 ) -> None:
@@ -127,6 +129,7 @@ def test_the_written_structured_text_passes_its_self_test_and_no_call_does_more_
     assert work < most <= work + piece
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.skipif(not shutil.which("gcc"), reason="no C compiler: gcc is not installed")
 def test_the_written_c_passes_its_self_tests(coldloop: "Coldloop", tmp_path: Path) -> None:
     out = tmp_path / "c"
@@ -149,6 +152,7 @@ def test_it_is_the_solver_of_the_process_that_is_named(processes: Processes, tmp
     assert program.test.passed
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [

@@ -37,6 +37,7 @@ def counter(recorded: GoldenVectors) -> Counter:
     return Counter(recorded.method, recorded.vectors[0].problem)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_what_is_counted_has_the_bits_of_the_kernels(recorded: GoldenVectors) -> None:
     vector = recorded.vectors[0]
     program = OdeProgram(recorded.method, vector.problem, np.arange(1, ITERATIONS + 1))
@@ -69,6 +70,7 @@ def test_without_zeros_it_is_what_the_formulas_say_with_masks_and_products_of_co
     assert counter.worst() == operations.ode(sizes, m).flops + beside + again
 
 
+@pytest.mark.usefixtures("compiles")
 @settings(deadline=None, max_examples=20)
 @given(data=st.data())
 def test_no_iteration_takes_more_than_the_worst(recorded: GoldenVectors, counter: Counter, data: st.DataObject) -> None:
@@ -83,6 +85,7 @@ def test_no_iteration_takes_more_than_the_worst(recorded: GoldenVectors, counter
     assert max(found) <= counter.worst()
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_count_of_the_budget_is_that_of_the_export(recorded: GoldenVectors) -> None:
     configured = load_configuration(Settings, environment={}, assignments=SINGLE).settings
     budget = counter_of(problem_of(configured)[0], configured.optimizer_plc.program)
@@ -101,6 +104,7 @@ def test_updates_are_counted() -> None:
 # -- manifest, budget, profile -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize(
     ("target", "call", "remedy"),
     [("st", "call", "give a call less work"), ("c", "call (iteration)", "set that higher")],
@@ -123,6 +127,7 @@ def test_an_export_says_what_does_not_fit_a_plc_and_the_budget_says_the_same(
     assert f"{found['worst']:,.0f}" in coldloop("budget").out
 
 
+@pytest.mark.usefixtures("compiles")
 def test_what_fits_is_said(recorded: GoldenVectors, tmp_path: Path) -> None:
     count = counted_iterations(recorded.method, recorded.vectors[:1]).recorded._asdict()
     (tmp_path / "manifest.json").write_text(

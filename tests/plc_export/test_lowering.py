@@ -136,6 +136,7 @@ VECTORS = st.lists(
 ).map(lambda values: np.array(values, np.float32))  # fmt: skip
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("compiled", [largest, leading, chosen], ids=["largest", "leading", "chosen"])
 def test_a_value_is_that_of_the_kernel(compiled: Dispatcher) -> None:
     exported = Exported(compiled, ZEROS)

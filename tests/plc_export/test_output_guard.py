@@ -97,6 +97,7 @@ def answered(guard: OutputGuard, call: GoldenCall) -> tuple[tuple[float, ...], J
 # -- C99 ---------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("programs")
 @needs_a_compiler
 @pytest.mark.parametrize("compiler", COMPILERS)
 @each_limits
@@ -106,6 +107,7 @@ def test_the_self_test_in_c_passes(tmp_path: Path, compiler: str, limits: InputL
     assert output(compiled(tmp_path, compiler, *SANITIZED)) == (0, said)
 
 
+@pytest.mark.usefixtures("programs")
 @needs_a_compiler
 @pytest.mark.parametrize("name", ["kernels.c", "limits.c", "golden.c"])
 @pytest.mark.parametrize("share", [0.0, 0.4, 0.999])
@@ -143,6 +145,7 @@ CHANGES = {
 }  # fmt: skip
 
 
+@pytest.mark.usefixtures("programs")
 @needs_a_compiler
 @pytest.mark.parametrize(("kernel", "old", "new"), CHANGES.values(), ids=CHANGES)
 def test_a_guard_in_c_that_does_something_else_is_found(tmp_path: Path, kernel: str, old: str, new: str) -> None:
@@ -185,6 +188,7 @@ steps = st.one_of(
 )
 
 
+@pytest.mark.usefixtures("programs")
 @needs_a_compiler
 @given(name=st.sampled_from(list(LIMITS)), course=st.lists(steps, max_size=25))
 def test_whatever_is_asked_the_guard_in_c_has_the_bits_of_ours(
@@ -220,6 +224,7 @@ def floats(*values: float) -> "ctypes.Array[ctypes.c_float]":
     return (ctypes.c_float * len(values))(*values)
 
 
+@pytest.mark.usefixtures("programs")
 @needs_a_compiler
 def test_what_cannot_be_is_refused_in_c(loaded: Callable[[str], ctypes.CDLL]) -> None:
     guard, row, rows = loaded("default"), floats(*MIDDLE), floats(*MIDDLE * 240)
@@ -254,6 +259,7 @@ def test_the_self_test_in_structured_text_passes(limits: InputLimits) -> None:
     assert self_test(in_text(limits)) == (True, 0)
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("place", [0, 1, 2, 3, 8, 12, 13, 14, 40, 900, -1])
 def test_a_changed_bit_in_structured_text_is_found(place: int) -> None:
     texts = in_text(InputLimits())

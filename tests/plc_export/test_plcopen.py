@@ -17,6 +17,8 @@ from rig.plc_export.structured_text.solver_files import StructuredTextExport
 from tests.plc_export.st_interpreter import Machine
 from tests.plc_export.st_parser import parsed
 
+pytestmark = pytest.mark.usefixtures("compiles")
+
 SCHEMA = os.environ.get("COLDLOOP_TC6_SCHEMA")
 P = f"{{{XHTML}}}p"
 KEYWORDS: Final = {tag: keyword for keyword, tag in SECTIONS.items()}

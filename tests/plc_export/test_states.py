@@ -221,6 +221,7 @@ finite = st.floats(-50.0, 50.0, width=32)
 STEPS = st.lists(st.tuples(st.lists(finite, min_size=N, max_size=N), st.integers(0, 2)), min_size=1, max_size=4)
 
 
+@pytest.mark.usefixtures("compiles", "programs")
 @needs_compiler
 @settings(deadline=None)
 @given(steps=STEPS)
@@ -279,6 +280,7 @@ class InText:
         return [float(each) for each in getattr(self.machine.globals, f"cl_state_{name}").values()]
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("largest_list", [64 * 1024, 4 * N * 2], ids=["whole", "in pieces"])
 def test_a_state_goes_the_same_way_in_structured_text(monkeypatch: pytest.MonkeyPatch, largest_list: int) -> None:
     monkeypatch.setattr(constants, "LARGEST_LIST", largest_list)

@@ -37,6 +37,7 @@ def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     return made
 
 
+@pytest.mark.usefixtures("programs")
 @pytest.mark.parametrize("options", [("-O0",), ("-O2",), ("-O3",), SANITIZED], ids=" ".join)
 @pytest.mark.parametrize("compiler", COMPILERS)
 def test_the_self_test_finds_plans_and_sequences_as_the_kernels_have_them(
@@ -67,6 +68,7 @@ def last_bit(number: re.Match[str]) -> str:
     return f"{np.nextafter(np.float32(number[0].rstrip('f')), np.float32(np.inf)):.9e}f"
 
 
+@pytest.mark.usefixtures("programs")
 @pytest.mark.parametrize("name", ["kernels.c", "constants.c", "golden.c"])
 def test_a_changed_bit_of_a_literal_a_matrix_or_a_golden_update_is_found(
     folder: Path, tmp_path: Path, name: str
@@ -82,6 +84,7 @@ def test_a_changed_bit_of_a_literal_a_matrix_or_a_golden_update_is_found(
         assert "is not what was written" in said
 
 
+@pytest.mark.usefixtures("programs")
 def test_a_changed_setting_is_found(folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     text = (folder / "constants.c").read_text()
@@ -160,6 +163,7 @@ def sent(optimizer: OptimizerProgram) -> tuple[Any, ...]:
     return (header.number, header.update, header.first_tick, header.length, header.tau_u), [tuple(row) for row in rows]
 
 
+@pytest.mark.usefixtures("programs")
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("fixed_ticks", [0, 10])
 def test_whatever_arrives_is_answered_as_in_python(folder: Path, library: Path, seed: int, fixed_ticks: int) -> None:

@@ -19,6 +19,8 @@ from tests.plc_export.st_interpreter import Machine
 from tests.plc_export.st_parser import parsed
 from tests.plc_export.test_plcopen import ET, SCHEMA, text_of
 
+pytestmark = pytest.mark.usefixtures("compiles")
+
 FEW = 100
 """Ticks: the interpreter takes a second for an update or two."""
 NUMBER = re.compile(r"REAL#-?\d\.\d{9}E[+-]\d\d")

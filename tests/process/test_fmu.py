@@ -140,6 +140,7 @@ def test_an_oscillator_of_other_people_has_the_poles_of_its_equation(tmp_path: P
     assert "identified with 2 states" in described(found)
 
 
+@pytest.mark.usefixtures("programs")
 def test_derivatives_of_an_fmu_are_taken_where_it_has_them(compiled: Path, tmp_path: Path) -> None:
     """At rest x1 = 5 u = 5, x2 = (0.05 x1 + w) / 0.2 = 1.75."""
     tanks(tmp_path, compiled)
@@ -166,6 +167,7 @@ def test_an_fmu_without_them_is_differentiated_by_its_start_values(compiled: Pat
     assert "differences of start values" in described(found)
 
 
+@pytest.mark.usefixtures("programs")
 def test_an_fmu_that_hides_its_states_is_identified_and_has_the_gains_of_its_equations(tmp_path: Path) -> None:
     hidden = made_from(fmu(tmp_path)).model
     known = made_from(EXAMPLES / "quadruple_tank.toml").model
@@ -176,6 +178,7 @@ def test_an_fmu_that_hides_its_states_is_identified_and_has_the_gains_of_its_equ
     assert loads[0] == pytest.approx(loads[1], rel=0.02, abs=0.01)
 
 
+@pytest.mark.usefixtures("programs")
 def test_an_fmu_of_fmi_3(tmp_path: Path) -> None:
     """dx/dt = (u - x) / 20: by Euler's method with 0.25 s a pole of 0.9875 a step, a gain of 1."""
     (tmp_path / "lag.py").write_text(LAG, encoding="utf-8")

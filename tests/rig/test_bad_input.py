@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from tests.conftest import Coldloop, Outcome
     from tests.rig.conftest import Bus
 
+pytestmark = pytest.mark.usefixtures("programs")
+
 USAGE, FAILURE = 2, 1
 
 RUN = ("run", "--in-process", "--duration", "2s")

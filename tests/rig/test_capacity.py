@@ -14,6 +14,8 @@ from plant.cold_box.physics import REFERENCE, derivative
 from plant.helium.properties import load_helium
 from rig import Simulation, simulate
 
+pytestmark = pytest.mark.usefixtures("compiles")
+
 STEP_S = 60.0
 LIMITS = InputLimits()
 LEAST, LARGEST = ProgramSettings().holdable_load_w

@@ -23,6 +23,8 @@ from rig.settings import Settings
 if TYPE_CHECKING:
     from tests.rig.conftest import Simulate
 
+pytestmark = pytest.mark.usefixtures("compiles")
+
 BANDS = ControlDesign()
 HALF_HOUR, TEN_MINUTES, FIVE_MINUTES = 7200, 2400, 1200
 

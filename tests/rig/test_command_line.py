@@ -189,6 +189,7 @@ def test_an_option_without_effect_is_refused(words: list[str], part: str, coldlo
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("programs")
 @pytest.mark.parametrize("device", ["/dev/null", "/dev/full"])
 @pytest.mark.parametrize("command", ["run --in-process --duration 2s", "certificates", "model", "chaos kill"])
 def test_a_device_as_the_place_for_results_is_refused_and_stays(

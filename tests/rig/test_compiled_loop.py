@@ -25,6 +25,8 @@ from rig.settings import Settings
 from tests.harness import configurations
 from tests.harness.configurations import COMPILED, LEFT_TO_PROGRAMS, REFRIGERATOR, TRIP, UNUSUAL
 
+pytestmark = pytest.mark.usefixtures("compiles")
+
 
 class Left(NamedTuple):
     """What a run leaves behind."""

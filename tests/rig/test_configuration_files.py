@@ -34,6 +34,7 @@ def trace_of(coldloop: "Coldloop", out: Path, *words: object) -> str:
     return next(str(line) for line in outcome.out.splitlines() if line.startswith("trace"))
 
 
+@pytest.mark.usefixtures("programs")
 @pytest.mark.parametrize(
     "words",
     [
@@ -62,6 +63,7 @@ def test_python_runs_what_the_file_has(coldloop: "Coldloop", tmp_path: Path) -> 
     assert simulate(config=tmp_path / "rig.toml", load="a", duration_s=5).configuration["plant.load"] == "a"
 
 
+@pytest.mark.usefixtures("programs")
 def test_a_factor_that_lock_step_does_not_have_is_still_refused(coldloop: "Coldloop", tmp_path: Path) -> None:
     file = written(coldloop, tmp_path, "--set", "session.factor=5")
     outcome = coldloop("run", "--in-process", "--config", file)
@@ -146,6 +148,7 @@ def deep(levels: int) -> str:
     return "[" * levels + "]" * levels
 
 
+@pytest.mark.usefixtures("programs")
 @pytest.mark.parametrize(
     "text",
     [

@@ -64,6 +64,7 @@ def assert_balanced(run: Simulation) -> None:
     assert energy(x) - energy(before.x) == pytest.approx(sums[CROSSED], abs=1e-6 * sums[SIZE])
 
 
+@pytest.mark.usefixtures("compiles")
 def test_a_cool_down_begins_without_a_loss_of_helium_or_energy() -> None:
     run = cooled_down_for("20min")
     assert_balanced(run)

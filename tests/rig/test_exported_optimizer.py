@@ -190,12 +190,14 @@ def refusal(folder: Path, *assignments: str) -> str:
     return str(refused.value)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_an_export_for_other_settings_is_refused(folder: Path) -> None:
     why = "it has optimizer_plc.program.adaptive.q_first = 9, the run 5: set it, or export the optimiser again"
     assert why in refusal(folder, "optimizer_plc.program.adaptive.q_first=5")
     assert "limits.high" in refusal(folder, "limits.high=[60, 140, 60]")
 
 
+@pytest.mark.usefixtures("compiles")
 def test_an_updating_period_is_the_sessions(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exported_optimizer, "_compiled", lambda *_: Path("program"))
     fixed = settings("optimizer_plc.program.updating_period_s=2.5")
@@ -207,6 +209,7 @@ def changed_manifest(copy: Path, **fields: object) -> None:
     file.write_text(json.dumps({**json.loads(file.read_text()), **fields}))
 
 
+@pytest.mark.usefixtures("compiles")
 def test_an_export_of_another_model_or_for_other_registers_is_refused(copy: Path) -> None:
     changed_manifest(copy, model_digest="ab" * 32)
     assert "it has the model abababab, the run " in refusal(copy)
@@ -214,6 +217,7 @@ def test_an_export_of_another_model_or_for_other_registers_is_refused(copy: Path
     assert "whose registers are others than those of" in refusal(copy)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_what_is_no_export_or_of_the_solver_alone_is_refused(copy: Path, tmp_path: Path) -> None:
     assert "is no export (coldloop export plc --target c" in refusal(tmp_path)
     shutil.rmtree(copy / "optimizer")
@@ -222,17 +226,20 @@ def test_what_is_no_export_or_of_the_solver_alone_is_refused(copy: Path, tmp_pat
         exported_optimizer.exported_optimizer(str(copy), settings())
 
 
+@pytest.mark.usefixtures("compiles")
 def test_structured_text_is_refused(copy: Path) -> None:
     changed_manifest(copy, files={"kernels.st": "ab" * 32})
     assert "it is not in C: export it with --target c" in refusal(copy)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_a_source_that_was_changed_is_refused(copy: Path) -> None:
     with (copy / "optimizer" / "kernels.c").open("a") as file:
         file.write("\n")
     assert "optimizer/kernels.c is not as it was exported: export it again" in refusal(copy)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_without_a_compiler_or_libmodbus_one_line_says_what_to_install(
     copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -243,6 +250,7 @@ def test_without_a_compiler_or_libmodbus_one_line_says_what_to_install(
     assert "there is no C compiler (cc) to compile it: on Debian, install gcc" in refusal(copy)
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler: cc is not installed")
 def test_a_compiler_that_gives_other_bits_is_refused(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exported_optimizer, "FLAGS", ("-std=c99", "-O3", "-ffast-math"))

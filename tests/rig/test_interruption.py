@@ -119,6 +119,7 @@ def fail_after(ticks: int, error: Exception, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(Recorder, "stretch", stretch)
 
 
+@pytest.mark.usefixtures("programs")
 def test_a_failure_in_the_middle_leaves_what_was_recorded(
     coldloop: "Coldloop", results: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -131,6 +132,7 @@ def test_a_failure_in_the_middle_leaves_what_was_recorded(
     assert assert_incomplete_but_readable(results, "the plant is gone") == BLOCK_TICKS
 
 
+@pytest.mark.usefixtures("programs")
 def test_a_failure_before_the_first_tick_leaves_no_folder(
     coldloop: "Coldloop", results: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -159,6 +161,7 @@ class SmallDisk:
         monkeypatch.setattr(rig.results.disk_reserve.ReservedFile, "write", limited)
 
 
+@pytest.mark.usefixtures("compiles", "programs")
 def test_a_disk_that_fills_up_leaves_what_was_recorded(
     coldloop: "Coldloop", results: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -15,6 +15,8 @@ from rig.results.recording import Recorder, Recording
 from rig.settings import Settings
 from rig.studies.settings import settings_of
 
+pytestmark = pytest.mark.usefixtures("compiles")
+
 MODEL = load_model(Settings().model.file)
 STEP = LoadProfile((0, 40), (MODEL.w0, MODEL.w0 + 80.0))
 

@@ -63,6 +63,7 @@ def test_rerun_names_what_it_cannot_repeat(coldloop: "Coldloop", tmp_path: Path)
         assert_refused(coldloop("rerun", tmp_path), str(tmp_path))
 
 
+@pytest.mark.usefixtures("programs")
 @pytest.mark.parametrize("key", ["plant.load", "model.file", "plant.retain.file", "plant.refrigerator.file"])
 def test_an_empty_setting_is_named(key: str, coldloop: "Coldloop") -> None:
     name = "COLDLOOP__" + key.upper().replace(".", "__")

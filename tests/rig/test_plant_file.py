@@ -47,6 +47,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     return Made(file, model, run_in_process(load="a", duration_s="10min", model={"file": str(file)}))
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_example_rests_and_stays_within_its_bands(made: Made) -> None:
     assert made.model.y0[L1] == pytest.approx(60.0)
     assert T5_BAND[0] < made.model.y0[T5] < T5_BAND[1]
@@ -59,6 +60,7 @@ def test_a_refrigerator_refuses_the_model_of_another_cold_box(made: Made) -> Non
         run_in_process(load="a", duration_s=60, model={"file": str(made.file)}, plant={"kind": "refrigerator"})
 
 
+@pytest.mark.usefixtures("compiles")
 def test_it_is_another_plant_whose_model_predicts_it_better(made: Made) -> None:
     columns = {name: np.array(values) for name, values in made.run.trace.to_dict().items()}
     shipped = load(DEFAULT_MODEL_FILE)
@@ -88,6 +90,7 @@ async def test_over_the_bus_it_is_the_same_plant(made: Made, on_the_bus: "OnTheB
     assert networked.trace_sha256 == simulate(scenario, model=model).trace_sha256
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_command_prints_the_model_and_writes_it(made: Made, coldloop: "Coldloop", tmp_path: Path) -> None:
     file = tmp_path / "box.json"
     outcome = coldloop("model", "--plant", EXAMPLE, "--out", file)

@@ -14,6 +14,8 @@ from rig.results.recording import Recorder
 from rig.runs.running import make_scenario
 from rig.settings import Settings
 
+pytestmark = pytest.mark.usefixtures("programs")
+
 ROOT = Path(__file__).parents[2]
 OURS = ("coldloop", "plant", "optimizer_plc", "control_plc", "rig")
 

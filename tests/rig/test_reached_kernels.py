@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from types import FunctionType
 from typing import Any
 
+import pytest
 from numba.core.dispatcher import Dispatcher
 
 from coldloop.kernels.compiled import _parts, cache_folder, forms_of
@@ -16,6 +17,8 @@ from rig.results.recording import Recorder
 from rig.runs.running import make_scenario
 from rig.settings import Settings
 from tests.rig.test_precompile import OURS
+
+pytestmark = pytest.mark.usefixtures("compiles")
 
 MANGLED = re.compile(rb"_ZN(?:08NumbaEnv)?((?:\d+[A-Za-z_]\w*)+)")
 

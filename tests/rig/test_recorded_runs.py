@@ -236,6 +236,7 @@ def test_a_trace_that_is_damaged_is_one_line(command: str, damage: str, coldloop
     assert "damaged" in outcome.complaints[0]
 
 
+@pytest.mark.usefixtures("programs")
 def test_a_repetition_can_be_kept(coldloop: "Coldloop", mpc: Path, results: Path) -> None:
     assert coldloop("rerun", mpc, "--out", results).code == 0
     assert RunFolder(results).summary["trace_sha256"] == RunFolder(mpc).summary["trace_sha256"]

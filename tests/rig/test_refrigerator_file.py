@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from tests.conftest import Coldloop
     from tests.rig.conftest import OnTheBus, Simulate
 
+pytestmark = pytest.mark.usefixtures("compiles")
+
 EXAMPLE = Path(__file__).parents[2] / "examples" / "efficient_refrigerator.toml"
 USAGE = 2
 

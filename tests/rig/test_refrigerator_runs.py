@@ -14,6 +14,8 @@ from rig import simulate
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
 
+pytestmark = pytest.mark.usefixtures("compiles")
+
 TRIP = """
 [plant]
 kind = "refrigerator"

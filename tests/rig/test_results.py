@@ -69,6 +69,7 @@ def read(path: Path) -> dict[str, Any]:
     return document
 
 
+@pytest.mark.usefixtures("programs")
 def test_a_run_leaves_these_files_and_no_others(folder: Path) -> None:
     names = {"manifest.json", "summary.json", "schema.json", "run.png", "inputs", *FILES}
     assert {path.name for path in folder.iterdir()} == names
@@ -184,6 +185,7 @@ def test_the_manifest_holds_what_is_needed_to_repeat_the_run(
     assert read(tmp_path / "again" / "summary.json")["trace_sha256"] == minute.trace_sha256
 
 
+@pytest.mark.usefixtures("programs")
 def test_a_run_shorter_than_its_first_update_has_results_too(coldloop: "Coldloop", results: Path) -> None:
     assert coldloop("run", "--in-process", "--duration", "0.25s", "--out", results).code == 0
     summary = read(results / "summary.json")
@@ -257,6 +259,7 @@ def test_a_recording_keeps_the_updates_whose_sequence_was_played() -> None:
     assert len(recorder.recording().load) == 100
 
 
+@pytest.mark.usefixtures("programs")
 def test_a_run_without_updates_leaves_all_files_too(coldloop: "Coldloop", results: Path) -> None:
     outcome = coldloop(
         "run", "--in-process", "--load", "e", "--duration", "60s", "--set", "control_plc.driver=classical",

@@ -51,6 +51,7 @@ def test_a_refrigerator_has_its_pressures_between_inputs_and_updating_period() -
     assert labels[6:9] == ["P12 (bar)", "P11 (bar)", "tau_u (s)"]
 
 
+@pytest.mark.usefixtures("compiles", "programs")
 def test_the_run_of_a_refrigerator_is_drawn_with_what_its_station_recorded(tmp_path: Path, coldloop: Coldloop) -> None:
     folder = tmp_path / "run"
     outcome = coldloop(

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.usefixtures("programs")
+
 ROOT = Path(__file__).parents[2]
 GOOD, UNUSABLE, SLOW, ABSENT = 0, 1, 3, 127
 """What the question of the script to an interpreter ends with; the last one is a shim's with nothing behind it."""

@@ -77,6 +77,7 @@ def state_of(process: Process, first_port: int = FIRST, **changes: object) -> di
 # -- the process -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("programs")
 def test_down_ends_the_process_of_the_rig(coldloop: "Coldloop", other: Process) -> None:
     keep(FIRST, state_of(other))
     outcome = coldloop("down")
@@ -84,6 +85,7 @@ def test_down_ends_the_process_of_the_rig(coldloop: "Coldloop", other: Process) 
     assert str(other.pid) in outcome.out
 
 
+@pytest.mark.usefixtures("programs")
 def test_down_never_ends_another_program_that_has_the_number(coldloop: "Coldloop", other: Process) -> None:
     keep(FIRST, state_of(other, identity="of a process before it"))
     for words in ((), ("--port-base", str(FIRST))):
@@ -93,6 +95,7 @@ def test_down_never_ends_another_program_that_has_the_number(coldloop: "Coldloop
     assert other.poll() is None
 
 
+@pytest.mark.usefixtures("programs")
 def test_a_process_that_has_ended_and_was_not_waited_for_is_none(other: Process) -> None:
     keep(FIRST, state_of(other))
     assert [rig.pid for rig in rigs_up()] == [other.pid]
@@ -111,6 +114,7 @@ ODD: list[Any] = [
 ]  # fmt: skip
 
 
+@pytest.mark.usefixtures("programs")
 @pytest.mark.parametrize("odd", ODD, ids=lambda odd: str(odd)[:20].encode("unicode_escape").decode())
 def test_odd_content_is_one_line_and_ends_nothing(odd: Any, coldloop: "Coldloop", other: Process) -> None:  # noqa: ANN401
     file = keep(FIRST, odd if isinstance(odd, str) else state_of(other, **odd))
@@ -123,6 +127,7 @@ def test_odd_content_is_one_line_and_ends_nothing(odd: Any, coldloop: "Coldloop"
     assert other.poll() is None
 
 
+@pytest.mark.usefixtures("programs")
 def test_a_damaged_file_does_not_hide_a_rig_that_is_up(other: Process) -> None:
     keep(FIRST, "{")
     keep(SECOND, state_of(other, SECOND))
@@ -132,6 +137,7 @@ def test_a_damaged_file_does_not_hide_a_rig_that_is_up(other: Process) -> None:
 # -- faults of its services --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("programs")
 def test_a_service_is_killed(coldloop: "Coldloop", other: Process) -> None:
     keep(FIRST, state_of(other))
     outcome = coldloop("fault", "kill", "control_plc")
@@ -140,6 +146,7 @@ def test_a_service_is_killed(coldloop: "Coldloop", other: Process) -> None:
     assert (again.code, len(again.complaints)) == (2, 1)
 
 
+@pytest.mark.usefixtures("programs")
 def test_no_fault_is_put_into_another_program_that_has_the_number(coldloop: "Coldloop", other: Process) -> None:
     services = dict.fromkeys(RigEndpoints._fields, ServiceProcess(other.pid, "of a process before it"))
     keep(FIRST, state_of(other, services=services))
@@ -150,6 +157,7 @@ def test_no_fault_is_put_into_another_program_that_has_the_number(coldloop: "Col
     assert other.poll() is None
 
 
+@pytest.mark.usefixtures("programs")
 async def test_a_service_that_was_frozen_runs_again_when_the_command_is_ended(other: Process) -> None:
     def until(what: int) -> None:
         deadline = time.monotonic() + 60
@@ -182,6 +190,7 @@ def test_a_fault_that_cannot_be_is_one_line(words: tuple[str, ...], part: str, c
 # -- which rig ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("programs")
 def test_several_rigs_are_listed(coldloop: "Coldloop", other: Process) -> None:
     for first_port in (FIRST, SECOND):
         keep(first_port, state_of(other, first_port))
@@ -203,6 +212,7 @@ def test_without_a_rig_every_command_says_so(coldloop: "Coldloop", processes: "P
         assert "coldloop up" in outcome.complaints[0]
 
 
+@pytest.mark.usefixtures("programs")
 def test_every_command_takes_the_same_options(coldloop: "Coldloop", other: Process) -> None:
     keep(FIRST, state_of(other))
     for command in COMMANDS:
@@ -233,6 +243,7 @@ def test_without_a_runtime_folder_of_ones_own_it_is_among_the_temporary_files(
         assert base_folder().name == f"coldloop-{os.getuid()}"
 
 
+@pytest.mark.usefixtures("programs")
 @pytest.mark.parametrize("which", ["coldloop", f"coldloop/{FIRST}"])
 @pytest.mark.parametrize("what", ["link", "open", "file", "fifo"])
 def test_a_folder_that_is_not_ours_alone_is_not_used(

@@ -101,6 +101,7 @@ async def test_without_a_broker_in_the_configuration_nothing_is_sampled() -> Non
     await Telemetry(TelemetrySettings(), "plant", snapshot).run()
 
 
+@pytest.mark.usefixtures("realtime")
 async def test_a_service_can_be_stopped_while_its_broker_is_frozen(
     frozen_broker: "ServeFrozen", free_port: int
 ) -> None:
@@ -159,6 +160,7 @@ async def test_what_is_published_is_json_whatever_the_numbers(broker: "Serve", f
         await until(lambda: known.retained("coldloop/plant/telemetry"), lambda now: now is not None)
 
 
+@pytest.mark.usefixtures("realtime")
 async def test_the_password_is_read_at_each_connection_and_is_not_in_the_configuration(
     frozen_broker: "ServeFrozen", free_port: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from tests.studies.conftest import Requests
 
 
+@pytest.mark.usefixtures("programs", "realtime")
 def test_workers_give_what_the_run_gives(requests: "Requests", store: Store, running: Workers) -> None:
     asked = requests(4)
     outcomes = perform_all(asked, store, running, "test")
@@ -40,6 +41,7 @@ def test_a_damaged_file_is_done_again(requests: "Requests", store: Store, runnin
     assert perform_all([request], store, running, "test") == first
 
 
+@pytest.mark.usefixtures("programs", "realtime")
 def test_a_worker_that_dies_costs_only_its_own_runs(requests: "Requests", store: Store) -> None:
     asked = [replace(request, ticks=1200) for request in requests(6)]
     with Workers(2).connected() as client:
@@ -79,6 +81,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(
         perform_all(requests(1), store, Workers(1, scheduler="tcp://127.0.0.1:1"), "test")
 
 
+@pytest.mark.usefixtures("realtime")
 def test_a_run_that_the_scheduler_gives_up_is_one_line(requests: "Requests", store: Store, client: "Client") -> None:
     asked = [replace(request, ticks=2400) for request in requests(12)]  # the last is not under way for long
     last = Future(f"run-{asked[-1].digest}", client=client)  # type: ignore[no-untyped-call]

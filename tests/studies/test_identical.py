@@ -69,6 +69,7 @@ def test_the_same_run_in_other_words_has_the_same_name(load: Load) -> None:
     assert load.request(5.0, "optimizer_plc.program.solver=osqp").digest != asked.digest
 
 
+@pytest.mark.usefixtures("realtime")
 def test_identical_runs_are_done_once(
     load: Load, client: "Client", store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:

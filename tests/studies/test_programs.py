@@ -57,6 +57,7 @@ def executed(action: Callable[[], Any]) -> set[Place]:
     return {place(code) for code in ours if code.co_name != "<module>"}
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("procedure", Procedure)
 def test_all_code_of_ours_that_a_run_executes_counts(procedure: Procedure) -> None:
     request = replace(SHORT, procedure=procedure)
@@ -92,11 +93,13 @@ def digest_in(folder: Path, first: str = "", **environment: str) -> str:
     return done.stdout.split()[-1]
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_digest_is_the_same_elsewhere_and_whatever_was_imported_or_done_before(copy: Path) -> None:
     before = "import rig.cosim.compiled.own_plants, rig.cli.commands.run, rig; rig.simulate(load='a', duration_s=15)"
     assert digest_in(copy, before, PYTHONHASHSEED="1") == programs_digest()
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize(
     ("file", "old", "new"),
     [
@@ -115,6 +118,7 @@ def test_an_edit_of_what_a_run_uses_is_another_digest(copy: Path, file: str, old
         (copy / file).write_text(text)
 
 
+@pytest.mark.usefixtures("programs")
 def test_the_edit_of_a_docstring_a_comment_or_the_page_is_not(copy: Path) -> None:
     for file, old, new in (
         ("services/optimizer_plc/settings.py", '"""Configuration', '"""The configuration'),

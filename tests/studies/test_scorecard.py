@@ -143,6 +143,7 @@ def git(*arguments: str) -> str:
     return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True).stdout
 
 
+@pytest.mark.usefixtures("programs")
 @pytest.mark.skipif(not (ROOT / ".git").exists(), reason="an unpacked source distribution has no history")
 def test_each_change_in_the_history_of_the_file_was_dated_when_it_was_made() -> None:
     """From the version before the first report on; a clone without its whole history shows what it has."""

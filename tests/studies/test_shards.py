@@ -58,6 +58,7 @@ def parts(tmp_path_factory: pytest.TempPathFactory, running: Workers) -> list[Pa
     return folders
 
 
+@pytest.mark.usefixtures("realtime")
 def test_seven_shards_merged_are_the_study_byte_for_byte(whole: Path, parts: list[Path], tmp_path: Path) -> None:
     merge(STUDY, OPTIONS, parts, tmp_path)
     conduct(STUDY, OPTIONS, Workers(1, scheduler="tcp://127.0.0.1:1"), tmp_path)
@@ -164,6 +165,7 @@ def test_what_cannot_be_merged_is_one_line(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.usefixtures("realtime")
 def test_the_command_does_shards_and_merges_them(
     whole: Path, coldloop: "Coldloop", running: Workers, tmp_path: Path
 ) -> None:
@@ -215,6 +217,7 @@ def test_a_folder_that_the_workers_do_not_have_is_one_line(
         perform_all(requests(1), Store(tmp_path / "not there"), running, "test")
 
 
+@pytest.mark.usefixtures("realtime")
 def test_a_file_that_a_worker_wrote_elsewhere_is_one_line(
     requests: "Requests", running: Workers, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
