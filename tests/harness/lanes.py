@@ -24,7 +24,7 @@ USES: Final = {
 }
 """The mark of a test that requests, itself or through other fixtures, one of these."""
 
-WAITED_S: Final = 1.0
+WAITED_S: Final = 2.0
 """Seconds that a test of the fast lane may wait for the clock in all; time limits are tested by short ones."""
 
 

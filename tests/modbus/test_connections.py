@@ -113,7 +113,7 @@ async def test_half_a_request_does_not_keep_a_connection(serve: "Serve") -> None
 
 
 async def test_a_client_that_does_not_read_costs_bounded_memory_and_is_dropped(serve: "Serve") -> None:
-    async with serve(idle_timeout_s=10.0) as running:
+    async with serve(idle_timeout_s=2.0) as running:
         greedy, other = await running.connect(), await running.connect()
         requests = framed(READ_MUCH) * 100_000  # 26 MB of answers
         tracemalloc.start()

@@ -22,11 +22,12 @@ from tests.plc_export.recorded_optimizers import recorded_updates, recorder
 from tests.plc_export.st_interpreter import Machine
 from tests.plc_export.test_structured_text import bits, solved
 
-pytestmark = pytest.mark.usefixtures("compiles")
-
 Array = NDArray[np.float32]
 
-pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy's of overflow: the kernels have none
+pytestmark = [
+    pytest.mark.usefixtures("compiles"),
+    pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # numpy's of overflow: the kernels have none
+]
 
 
 class Paused:
@@ -85,7 +86,7 @@ def paused(request: pytest.FixtureRequest) -> Paused:
     return Paused(compiled, *arguments)
 
 
-@settings(deadline=None, max_examples=settings().max_examples // 8)
+@settings(deadline=None, max_examples=settings.default.max_examples // 8)
 @given(data=st.data(), most=st.sampled_from([1, 2, 300, 10_000, 10**9]))
 def test_whatever_calls_are_given_bits_are_those_of_the_kernel(paused: Paused, most: int, data: st.DataObject) -> None:
     rng = np.random.default_rng(data.draw(st.integers(0, 2**32)))

@@ -18,12 +18,13 @@ from rig.plc_export.structured_text.solver_files import WORK, StructuredTextExpo
 from rig.plc_export.tree.subset import UnfitKernelError
 from tests.plc_export.st_interpreter import Machine
 
-pytestmark = pytest.mark.usefixtures("compiles")
-
 NUMBER = re.compile(r"REAL#-?\d\.\d{9}E[+-]\d\d")
 INF = np.float32(np.inf)
 
-pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy's of overflow: the kernels have none
+pytestmark = [
+    pytest.mark.usefixtures("compiles"),
+    pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # numpy's of overflow: the kernels have none
+]
 
 
 @pytest.fixture(scope="module")

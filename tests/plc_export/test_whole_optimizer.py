@@ -192,6 +192,7 @@ def is_tuned(folder: Path) -> bool:
     return ".load_step = 1.0" in (folder / "constants.c").read_text()
 
 
+@pytest.mark.usefixtures("programs")
 def test_numbers_beyond_32_bits_and_periods_that_there_are_not_are_refused(library: Path, tmp_path: Path) -> None:
     c = Exported(Path(shutil.copy(library, tmp_path)))  # one that has not begun
     update = recorded_updates(SHORT, "e")[0].update

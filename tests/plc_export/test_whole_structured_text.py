@@ -19,13 +19,14 @@ from tests.plc_export.st_interpreter import Machine
 from tests.plc_export.st_parser import parsed
 from tests.plc_export.test_plcopen import ET, SCHEMA, text_of
 
-pytestmark = pytest.mark.usefixtures("compiles")
-
 FEW = 100
 """Ticks: the interpreter takes a second for an update or two."""
 NUMBER = re.compile(r"REAL#-?\d\.\d{9}E[+-]\d\d")
 
-pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy's of overflow: the kernels have none
+pytestmark = [
+    pytest.mark.usefixtures("compiles"),
+    pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # numpy's of overflow: the kernels have none
+]
 
 
 def export(ticks: int, *assignments: str) -> OptimizerText:

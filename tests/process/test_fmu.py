@@ -157,6 +157,7 @@ def test_derivatives_of_an_fmu_are_taken_where_it_has_them(compiled: Path, tmp_p
     assert "directional derivatives" in described(found)
 
 
+@pytest.mark.usefixtures("programs")
 def test_an_fmu_without_them_is_differentiated_by_its_start_values(compiled: Path, tmp_path: Path) -> None:
     text = (HERE / "two_tanks.xml").read_text(encoding="utf-8")
     tanks(tmp_path, compiled, text.replace('providesDirectionalDerivative="true"', ""))
@@ -312,6 +313,7 @@ def changed(change: str) -> str:
     return text.replace("canGetAndSet", f"{change} canGetAndSet") if change else text
 
 
+@pytest.mark.usefixtures("programs")
 @pytest.mark.parametrize("case", BAD)
 def test_what_cannot_be_used_gets_one_line(case: str, compiled: Path, tmp_path: Path) -> None:
     text, change, why = BAD[case]

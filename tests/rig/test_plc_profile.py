@@ -77,6 +77,7 @@ def test_a_plc_that_does_not_fit_is_said_so_with_what_it_lacks(
     assert says in coldloop("budget", "--plc", written(tmp_path, WHOLE.replace(*change))).out.splitlines()[0]
 
 
+@pytest.mark.usefixtures("compiles")
 def test_whether_an_adaptive_period_pays_is_the_ratio_of_the_runs(coldloop: "Coldloop", tmp_path: Path) -> None:
     names = []
     for number, watts in enumerate((430, 480)):

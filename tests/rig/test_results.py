@@ -77,6 +77,7 @@ def test_a_run_leaves_these_files_and_no_others(folder: Path) -> None:
     assert (folder / "run.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.usefixtures("programs")
 def test_the_summary_has_all_indicators_and_null_for_what_does_not_exist(folder: Path, minute: Recording) -> None:
     summary = read(folder / "summary.json")
     assert set(summary) >= SUMMARY

@@ -36,7 +36,7 @@ def store(tmp_path: Path) -> Store:
 
 
 @pytest.fixture(scope="session")
-def client() -> Iterator[Client]:
+def client(programs: None) -> Iterator[Client]:  # noqa: ARG001 a mark
     """Two workers, in processes of their own; they are the same ones for all tests.
 
     Dask silences the handlers of its loggers as long as they are there: pytest's are among them, and of all loggers.

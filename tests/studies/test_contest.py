@@ -53,6 +53,7 @@ def test_the_reference_is_among_the_ways() -> None:
     assert REFERENCE[1] in {way.label for way in WAYS}
 
 
+@pytest.mark.usefixtures("programs")
 def test_the_study_is_conducted(conducted: "Conducted", tmp_path: Path) -> None:
     result = conducted(STUDY, StudyOptions(ticks=240, loads=("e",), seeds=1))
     assert len(result.rows) == len(SOLVERS) * len(WAYS)

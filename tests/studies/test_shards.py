@@ -130,6 +130,7 @@ def changed(**fields: object) -> Callable[[Path], None]:
     return change
 
 
+@pytest.mark.usefixtures("programs")
 @pytest.mark.parametrize(
     ("damage", "error", "part"),
     [
@@ -210,6 +211,7 @@ def test_a_full_disk_is_one_line(requests: "Requests", store: Store, monkeypatch
     assert list(store.folder.iterdir()) == []
 
 
+@pytest.mark.usefixtures("realtime")
 def test_a_folder_that_the_workers_do_not_have_is_one_line(
     requests: "Requests", running: Workers, tmp_path: Path
 ) -> None:
