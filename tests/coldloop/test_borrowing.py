@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
 
+pytestmark = pytest.mark.usefixtures("compiles")
+
 Array = NDArray[np.float64]
 
 

@@ -111,6 +111,7 @@ def loss(qp: QuadraticProblem, guess: Array, iterations: int, best: float) -> tu
     return (ends[0] - best) / best, (ends[1] - best) / best
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("iterations", [19, *(pytest.param(n, marks=pytest.mark.night) for n in (4, 200))])
 def test_after_harsh_load_jumps_single_precision_loses_little(
     harsh_jumps: "list[Jump]", penalised_optimum: "PenalisedOptimum", iterations: int
@@ -126,6 +127,7 @@ def test_after_harsh_load_jumps_single_precision_loses_little(
     assert single.mean() < 1.2 * double.mean() + 0.03
 
 
+@pytest.mark.usefixtures("compiles")
 def test_in_single_precision_the_cost_never_rises_however_long_one_iterates(harsh_jumps: "list[Jump]") -> None:
     for qp, guess in harsh_jumps[:10]:
         single = rounded(qp)

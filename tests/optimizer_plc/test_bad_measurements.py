@@ -195,6 +195,7 @@ def test_single_precision_loses_little_of_it(prediction: PredictionModel, chosen
         assert np.abs((found - expected) / np.abs(exact.stationary.gains[TICKS - 1]).max(axis=0)).max() < 1e-3
 
 
+@pytest.mark.usefixtures("compiles")
 def test_state_feedback_does_not_look_at_outputs(model: LtiModel, prediction: PredictionModel) -> None:
     c = estimator_of(prediction, EstimatorSettings(kind=EstimatorKind.STATE_FEEDBACK))
     x = np.random.default_rng(6).normal(size=28)

@@ -53,6 +53,7 @@ def made(name: SolverName) -> Solver:
     return make_solver(ProgramSettings(preset=Preset.PAPER, solver=name))
 
 
+@pytest.mark.usefixtures("compiles")
 def test_a_problem_is_chosen_for_by_the_costs_of_the_one_before(
     choices: list[tuple[float, Costs]], harsh_jumps: "list[Jump]"
 ) -> None:
@@ -109,6 +110,7 @@ def passed(iterations: list[int], slots: list[int], tau_1_ps: int = INTERIOR) ->
     return in_slots(answer, np.array(slots), allowed, SLOT, tau_1_ps).iterations.tolist()
 
 
+@pytest.mark.usefixtures("compiles")
 def test_slots_pass_as_long_as_there_is_something_to_do() -> None:
     assert passed([5, 13], [4, 9]) == [4, 9], "all that fit were done"
     assert passed([5, 6], [4, 9]) == [4, 5], "six iterations take 1.02 s: the fifth slot has begun"
@@ -116,12 +118,14 @@ def test_slots_pass_as_long_as_there_is_something_to_do() -> None:
     assert passed([0, 0], [4, 9]) == [0, 0]
 
 
+@pytest.mark.usefixtures("compiles")
 def test_what_is_left_of_a_slot_counts_for_the_next_one() -> None:
     allowed = allowed_in(np.arange(5), SLOT, INTERIOR)
     assert np.diff(allowed).tolist() == [1, 1, 2, 1]
     assert passed([99] * 5, [0, 1, 2, 3, 4]) == [0, 1, 2, 3, 4]
 
 
+@pytest.mark.usefixtures("compiles")
 def test_on_harsh_problems_it_is_the_interior_point_in_the_time_of_its_slots(
     problem: PredictiveProblem, situations: "Situations", harsh_jumps: "list[Jump]"
 ) -> None:

@@ -28,6 +28,7 @@ def matrix(rng: np.random.Generator, rows: int, columns: int, precision: Precisi
     return np.asarray(rng.normal(size=(rows, columns)) * (rng.random((rows, columns)) < 0.8), dtype=precision)
 
 
+@pytest.mark.usefixtures("compiles")
 @each_precision
 @given(n=sizes, k=sizes, m=sizes, seed=seeds)
 def test_a_product_is_numpys(precision: Precision, tolerance: float, n: int, k: int, m: int, seed: int) -> None:

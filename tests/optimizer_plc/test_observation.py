@@ -29,6 +29,8 @@ from optimizer_plc.rules import Assessment, Observation
 from optimizer_plc.rules.interface import decides_by
 from optimizer_plc.settings import ProgramSettings
 
+pytestmark = pytest.mark.usefixtures("compiles")
+
 Array = NDArray[np.float64]
 
 ALPHA = 50.0

@@ -156,6 +156,7 @@ def test_a_solution_that_was_handed_out_does_not_change_any_more(
     assert (answer.points[0] != answer.points[1]).any()
 
 
+@pytest.mark.usefixtures("compiles")
 def test_after_harsh_load_jumps_few_iterations_come_near_the_optimum(
     harsh_jumps: "list[Jump]", penalised_optimum: "PenalisedOptimum"
 ) -> None:

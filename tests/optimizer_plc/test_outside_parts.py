@@ -229,6 +229,7 @@ def test_an_estimate_that_is_none_leaves_the_prediction_and_what_raises_is_said_
         corrected("Failing", 60.0)
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.usefixtures("named")
 def test_a_program_with_both_restarts_as_if_it_were_new(model: LtiModel) -> None:
     settings = ProgramSettings(outside=OutsideSettings(rule="Shorter", estimator="Believing"))

@@ -147,6 +147,7 @@ def test_before_the_first_iteration_the_answer_is_the_guess_inside_the_box(
     assert (guess == -1e3).all(), "the caller's guess is not touched"
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("name", EVERY)
 def test_truncated_answers_stay_inside_the_box(name: str, harsh_jumps: "list[Jump]") -> None:
     solver = solver_named(name)
@@ -156,6 +157,7 @@ def test_truncated_answers_stay_inside_the_box(name: str, harsh_jumps: "list[Jum
             assert ((qp.low <= z) & (z <= qp.high)).all()
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("name", EVERY)
 def test_iterations_add_up(name: str, harsh_jumps: "list[Jump]") -> None:
     at_once, in_parts = solver_named(name), solver_named(name)
@@ -165,6 +167,7 @@ def test_iterations_add_up(name: str, harsh_jumps: "list[Jump]") -> None:
         assert parts.z == pytest.approx(answer(at_once, qp, guess, 8), rel=1e-9, abs=1e-9)
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("name", EVERY)
 def test_reset_forgets(name: str, harsh_jumps: "list[Jump]") -> None:
     def sequence(solver: Solver) -> list[bytes]:
@@ -207,6 +210,7 @@ def test_rounding_in_the_data_hardly_changes_the_cost_of_answers(
 # -- qpOASES ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("compiles")
 def test_an_iteration_of_qpoases_changes_the_working_set_at_most_once(
     harsh_jumps: "list[Jump]", monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -226,6 +230,7 @@ def test_an_iteration_of_qpoases_changes_the_working_set_at_most_once(
     assert changes == sorted(changes, reverse=True), "once it has arrived it stays"
 
 
+@pytest.mark.usefixtures("compiles")
 def test_ten_recalculations_at_once_come_to_the_same_point(harsh_jumps: "list[Jump]") -> None:
     casadi = qpoases.load_casadi()
     ours = QpoasesSolver(QpoasesSettings())
@@ -250,6 +255,7 @@ def test_ten_recalculations_at_once_come_to_the_same_point(harsh_jumps: "list[Ju
     assert z == pytest.approx(np.clip(expected, second.low, second.high), abs=1e-9)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_qpoases_goes_on_from_where_it_stopped(harsh_jumps: "list[Jump]", optimum: "Optimum") -> None:
     solver = QpoasesSolver(QpoasesSettings())
     solver.solve(*harsh_jumps[0], (0,))
@@ -328,6 +334,7 @@ def test_the_step_is_bounded_by_the_largest_curvature(problem: PredictiveProblem
     assert 0.9 < largest <= 1.0
 
 
+@pytest.mark.usefixtures("compiles")
 def test_without_momentum_a_step_never_raises_the_cost(harsh_jumps: "list[Jump]") -> None:
     solver = fast_gradient_solver(FastGradientSettings())
     for qp, guess in harsh_jumps:
@@ -355,6 +362,7 @@ def test_single_precision_stays_single(make: Callable[[], Solver]) -> None:
 # -- the interior-point method ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_answer_of_the_interior_point_method_never_gets_worse(harsh_jumps: "list[Jump]") -> None:
     solver = interior_point_solver(InteriorPointSettings())
     for qp, guess in harsh_jumps:
@@ -363,6 +371,7 @@ def test_the_answer_of_the_interior_point_method_never_gets_worse(harsh_jumps: "
         assert path.costs.tolist() == sorted(path.costs, reverse=True)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_after_eight_iterations_it_is_at_the_optimum_of_most_harsh_problems(
     harsh_jumps: "list[Jump]", penalised_optimum: "PenalisedOptimum"
 ) -> None:
@@ -389,6 +398,7 @@ def test_its_structure_changes_nothing_but_the_work(problem: PredictiveProblem, 
 # -- the loop ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("name", EVERY)
 @pytest.mark.parametrize("updating_period_s", [0.0, 5.0])
 def test_every_solver_closes_the_loop(name: str, updating_period_s: float, model: LtiModel) -> None:

@@ -191,6 +191,7 @@ def test_the_response_increment_is_the_derivative_of_the_response_time(observati
     assert a.response_increment == pytest.approx(numerical, rel=1e-3, abs=1e-3 * scale + 1e-6)
 
 
+@pytest.mark.usefixtures("compiles")
 @given(observation=observations, q=st.integers(1, 19))
 def test_a_fixed_period_is_fixed_but_tells_the_quantities_all_the_same(observation: Observation, q: int) -> None:
     rule = FixedPeriod(q)
@@ -246,6 +247,7 @@ def test_after_a_load_step_nothing_contracts_at_first() -> None:
     assert rule.next(delivered(5.0))[0] == 2
 
 
+@pytest.mark.usefixtures("compiles")
 @given(rule=rules, observation=observations)
 def test_compiled_and_plain_a_rule_is_assessed_the_same(rule: Algorithm1, observation: Observation) -> None:
     """To the bit, and in single precision to its rounding."""
@@ -256,6 +258,7 @@ def test_compiled_and_plain_a_rule_is_assessed_the_same(rule: Algorithm1, observ
     assert rule.q_min <= decide_by(rule, np.zeros(MEMORY, np.float32), single, rough) <= rule.q_max
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("kind", [kind for kind in UpdatingRuleKind if kind != UpdatingRuleKind.OUTSIDE])
 @given(observation=observations)
 def test_each_kind_is_decided_by_its_rule(kind: UpdatingRuleKind, observation: Observation) -> None:

@@ -36,6 +36,7 @@ def coolprop(name: str, *point: object) -> float:
     return float(pytest.importorskip("CoolProp.CoolProp").PropsSI(name, *point, "Helium"))
 
 
+@pytest.mark.usefixtures("compiles")
 def test_a_vessel_blows_down_through_a_choked_valve_as_the_closed_form_says() -> None:
     """With dM/dt = -k P and P V = M (R T + B P), k R T t / V = [ln(P/(1 + bP)) + 1/(1 + bP)], b = B/(R T)."""
     vessel, valve, T, dt = GasVolume(20.0), Valve(4.0e-5), 300.0, 1.0

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 Rest: TypeAlias = tuple[RealArray, RealArray, float]
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_operating_point_is_at_rest(plant: Plant, rest: Rest) -> None:
     assert np.max(np.abs(plant.rates(*rest) / state_scales(REFERENCE))) < 1e-9
 
@@ -117,10 +118,12 @@ def settled_response(plant: Plant) -> tuple[RealArray, RealArray]:
     return model.C @ x + model.D, 100.0 * volume_rate / plant.box.separator.volume
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_linearisation_is_exact(plant: Plant, rest: Rest) -> None:
     assert linearisation_error(*rest, plant.box, plant.helium) < 1e-6
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("moved", [(np.array([2.0, 0.0, 0.0]), 0.0), (np.zeros(3), 100.0)], ids=["CV155", "load"])
 def test_the_linear_model_follows_the_plant_for_100_s(plant: Plant, rest: Rest, moved: tuple[RealArray, float]) -> None:
     x, u, w = rest
@@ -141,16 +144,19 @@ def integration_error(plant: Plant, rest: Rest, du: list[float], dt: float) -> f
     return float(np.max(np.abs(plant.simulate(x, moved, w, 20.0, dt)[2:] - exact[2:])))
 
 
+@pytest.mark.usefixtures("compiles")
 def test_halving_the_step_divides_the_error_by_about_16(plant: Plant, rest: Rest) -> None:
     tick, half = (integration_error(plant, rest, [-3.0, 10.0, 2.0], dt) for dt in (0.25, 0.125))
     assert tick < 1e-8
     assert 12.0 < tick / half < 24.0
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_error_stays_small_where_the_second_law_limits_a_cell(plant: Plant, rest: Rest) -> None:
     assert integration_error(plant, rest, [5.0, 20.0, -5.0], 0.25) < 5e-5
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("u", [(20.0, 0.0, 20.0), (60.0, 150.0, 60.0), (60.0, 0.0, 20.0), (20.0, 150.0, 60.0)])
 @pytest.mark.parametrize("extra", [-200.0, 300.0])
 def test_the_plant_stays_finite_at_the_corners_of_its_range(
@@ -165,6 +171,7 @@ def test_the_plant_stays_finite_at_the_corners_of_its_range(
     assert all(4.0 <= y[f"T{k}"] <= (300.0 if f"T{k}" in warmed else 80.0) for k in range(1, 11))
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_shipped_model_is_that_of_the_reference_plant(plant: Plant) -> None:
     assert plant.model.parameters_digest == parameters_digest(REFERENCE, plant.helium)
     rebuilt = build_model(REFERENCE)
@@ -177,6 +184,7 @@ def test_changed_parameters_have_another_digest(plant: Plant) -> None:
     assert parameters_digest(warmer, plant.helium) != plant.model.parameters_digest
 
 
+@pytest.mark.usefixtures("compiles")
 def test_without_supply_there_is_no_equilibrium(plant: Plant) -> None:
     with pytest.raises(NoEquilibriumError, match="no equilibrium"):
         find_equilibrium(np.zeros(3), 60.0, REFERENCE, plant.helium)

@@ -87,6 +87,7 @@ def test_the_pressure_drops_of_the_return_line_add_up(P_bath: float, exhaust: fl
         assert P_mix >= P_bath or P_mix == pytest.approx(P_bath)
 
 
+@pytest.mark.usefixtures("compiles")
 @given(m_high=flows, m_low=flows, T_high=st.floats(15.0, 80.0), T_low=st.floats(4.6, 14.0))
 def test_what_an_exchanger_takes_from_one_stream_it_gives_to_the_other(
     m_high: float, m_low: float, T_high: float, T_low: float

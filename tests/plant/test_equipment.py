@@ -161,6 +161,7 @@ def test_an_exchanger_blocks_up_as_fast_as_it_is_given_and_no_further() -> None:
     assert program.memory.equipment[BLOCKED + 2] == MOST_BLOCKED
 
 
+@pytest.mark.usefixtures("compiles")
 def test_half_blocked_an_exchanger_adds_three_clean_pressure_drops() -> None:
     """1/0.5^2 - 1 = 3; CV155 alone, of 14.77 bar at 43 %, then is as one of 43/sqrt(1 + 3 0.05/14.77) = 42.78 %."""
     assert further_drop(0.5) == 3.0

@@ -94,6 +94,7 @@ def test_every_parameter_but_the_numbers_of_cells_has_a_key_and_every_key_a_para
     assert {usual[place] for place in range(len(usual)) if place not in reached} == {8, 6, 12}
 
 
+@pytest.mark.usefixtures("compiles")
 def test_a_plant_like_the_reference_leaves_the_same_model_and_no_parameters(tmp_path: Path) -> None:
     helium = load_helium()
     model = model_at(operating_point(PlantFile(), helium), REFERENCE, helium, PlantFile().parameters)
@@ -159,6 +160,7 @@ def test_a_refrigerator_of_other_parameters_than_its_model_is_refused(tmp_path: 
         own_header(file)
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("size", [0.05, 10.0])
 def test_a_box_in_proportion_rests_in_proportion(size: float) -> None:
     intensive = ("_pct", "_bar", "efficiency", "_k", "per_kg")

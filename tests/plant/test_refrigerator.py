@@ -73,6 +73,7 @@ def simulate(point: Point, seconds: float, dt: float = 0.25) -> Point:
     return point._replace(x=x)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_operating_point_is_at_rest(rest: Point) -> None:
     assert np.max(np.abs(rates(*rest, PLANT, HELIUM) / rate_scales(PLANT))) < 1e-9
 
@@ -213,6 +214,7 @@ def reference_integration(point: Point, seconds: float) -> RealArray:
     return end
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("name", ["CV155", "CV956", "load", "leak"])
 def test_a_step_of_a_tick_is_as_good_as_a_reference_integration(rest: Point, name: str) -> None:
     moved = moved_by(rest, name)
@@ -220,12 +222,14 @@ def test_a_step_of_a_tick_is_as_good_as_a_reference_integration(rest: Point, nam
     assert np.max(error) < 1e-4, STATE_NAMES[int(np.argmax(error))]
 
 
+@pytest.mark.usefixtures("compiles")
 def test_a_trip_is_integrated_well_too(rest: Point) -> None:
     tripped = rest._replace(d=rest.d - np.array([0, 0, 0, 0, 1, 0]))
     error = np.abs(simulate(tripped, 30.0).x - reference_integration(tripped, 30.0)) / rate_scales(PLANT)
     assert np.max(error) < 0.05, STATE_NAMES[int(np.argmax(error))]
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("ambient", [275.0, 320.0])
 @pytest.mark.parametrize("run", [(0.0, 1.0), (1.0, 1.0)])
 @pytest.mark.parametrize("nitrogen", [0.0, 1.0])
@@ -240,6 +244,7 @@ def test_the_refrigerator_stays_finite_far_from_rest(
     assert 1.0 < s["P12"] < 19.0
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_cold_box_in_it_is_the_cold_box(rest: Point) -> None:
     """At 16 bar, 1.05 bar and 80 K the same equations are solved."""
     box = PLANT.box

@@ -38,6 +38,7 @@ openings = st.floats(0.0, 100.0)
 # -- gas volumes -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("compiles")
 @given(P=pressures, T=st.floats(270.0, 320.0))
 def test_a_volume_holds_the_mass_that_its_pressure_tells(P: float, T: float) -> None:
     assert gas_pressure(STATION.buffer, gas_mass(STATION.buffer, P, T), T) == pytest.approx(P, rel=1e-12)

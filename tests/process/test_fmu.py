@@ -212,6 +212,7 @@ class Lag(Fmi3Slave):
 # -- the simulated plant ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("programs")
 def test_instances_do_not_know_of_one_another_and_return_to_their_states(compiled: Path, tmp_path: Path) -> None:
     fmu = Fmu(tanks(tmp_path, compiled))
     wiring = Wiring(["u"], ["y"], "w", [], ["tank.x[1]", "tank.x[2]"], {"tank.x[1]": 2.0}, 1)
@@ -229,6 +230,7 @@ def test_instances_do_not_know_of_one_another_and_return_to_their_states(compile
     assert fmu.keeps_state
 
 
+@pytest.mark.usefixtures("programs")
 def test_no_unpacked_folder_is_left_behind(compiled: Path, tmp_path: Path) -> None:
     fmu = Fmu(tanks(tmp_path, compiled))
     instance = fmu.instance({})

@@ -157,6 +157,7 @@ def test_the_configuration_shown_is_a_configuration_file_that_gives_the_same_aga
     assert tomllib.loads(again.out) == tomllib.loads(shown)
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.usefixtures("undrawn")
 def test_a_model_written_is_the_model_in_use_and_can_be_run(coldloop: "Coldloop", tmp_path: Path) -> None:
     file = tmp_path / "model.json"
@@ -175,6 +176,7 @@ def test_a_model_written_is_the_model_in_use_and_can_be_run(coldloop: "Coldloop"
     assert json.loads((results / "manifest.json").read_text())["hashes"]["model_sha256"] == made.digest
 
 
+@pytest.mark.usefixtures("compiles")
 def test_a_model_that_cannot_be_written_is_told(coldloop: "Coldloop", tmp_path: Path) -> None:
     outcome = coldloop("model", "--out", tmp_path / "absent" / "model.json")
     assert outcome.code == 2

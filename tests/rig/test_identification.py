@@ -206,6 +206,7 @@ def run_of(recorded: Path, tmp_path: Path) -> RunOf:
     return make
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_command_writes_a_model_to_be_looked_at(
     model: LtiModel, run_of: RunOf, coldloop: "Coldloop", tmp_path: Path
 ) -> None:

@@ -72,6 +72,7 @@ def test_an_empty_setting_is_named(key: str, coldloop: "Coldloop") -> None:
     assert_refused(coldloop("run", "--in-process", "--duration", "5s", "--set", f"{key}="), f"--set {key}")
 
 
+@pytest.mark.usefixtures("compiles")
 def test_a_model_that_is_not_there_ends_with_an_error(coldloop: "Coldloop", tmp_path: Path) -> None:
     outcome = coldloop("model", "--set", f"model.file={tmp_path / 'absent.json'}")
     assert_refused(outcome, "absent.json: no such model file", code=1)

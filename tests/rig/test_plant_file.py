@@ -55,6 +55,7 @@ def test_the_example_rests_and_stays_within_its_bands(made: Made) -> None:
     assert made.run.summary["L1_outside_band_pct"] == made.run.summary["T5_outside_band_pct"] == 0.0
 
 
+@pytest.mark.usefixtures("compiles")
 def test_a_refrigerator_refuses_the_model_of_another_cold_box(made: Made) -> None:
     with pytest.raises(ModelFileError, match=r"model\.file: of another cold box .* set plant\.kind to cold-box"):
         run_in_process(load="a", duration_s=60, model={"file": str(made.file)}, plant={"kind": "refrigerator"})
@@ -82,6 +83,7 @@ def predicted(model: LtiModel, at: LtiModel, u: RealArray, w: RealArray) -> Real
     return np.array(rows)
 
 
+@pytest.mark.usefixtures("compiles")
 async def test_over_the_bus_it_is_the_same_plant(made: Made, on_the_bus: "OnTheBus", simulate: "Simulate") -> None:
     model = ModelSettings(file=made.file)
     scenario = Scenario(ticks=80, load=find_load("a", made.model.w0), updating_period_s=0.0, seed=1)
@@ -104,6 +106,7 @@ def test_the_command_prints_the_model_and_writes_it(made: Made, coldloop: "Coldl
     assert (again.code, len(again.complaints)) == (USAGE, 1)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_an_output_that_rests_outside_its_band_and_a_kink_are_said() -> None:
     changes = {
         "turbine": {"efficiency": 0.78},
@@ -161,6 +164,7 @@ SEARCHED = [
 ]
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize(("text", "part"), WITHOUT_SEARCH + SEARCHED)
 def test_an_absurd_plant_is_refused_in_one_line_that_names_the_place(
     text: str, part: str, coldloop: "Coldloop", tmp_path: Path

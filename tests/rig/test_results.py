@@ -93,6 +93,7 @@ def test_the_summary_has_all_indicators_and_null_for_what_does_not_exist(folder:
     assert summary["realtime_factor"] == as_rounded
 
 
+@pytest.mark.usefixtures("programs")
 def test_a_streamed_run_and_a_recording_in_memory_have_the_same_indicators(folder: Path, minute: Recording) -> None:
     settings = Settings()
     indicators = evaluate(minute, load(settings.model.file), settings.optimizer_plc.program.design)
@@ -110,6 +111,7 @@ def test_the_trace_has_a_row_a_tick_and_the_values_of_the_run(folder: Path, minu
     assert table["x_T_nef34_12"].to_pylist() == minute.x[:, -1].tolist()
 
 
+@pytest.mark.usefixtures("programs")
 @pytest.mark.parametrize("name", FILES)
 def test_each_column_has_its_unit_and_description_in_the_file_and_in_the_schema(name: str, folder: Path) -> None:
     described = {column["name"]: column for column in read(folder / "schema.json")["files"][name]["columns"]}

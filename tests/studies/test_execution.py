@@ -40,6 +40,7 @@ def test_a_damaged_file_is_done_again(requests: "Requests", store: Store, runnin
     assert perform_all([request], store, running, "test") == first
 
 
+@pytest.mark.usefixtures("programs", "realtime")
 def test_a_worker_that_dies_costs_only_its_own_runs(requests: "Requests", store: Store) -> None:
     asked = [replace(request, ticks=1200) for request in requests(6)]
     with Workers(2).connected() as client:

@@ -22,6 +22,7 @@ def load() -> Load:
     return draw_of("e", 1, StudyOptions(ticks=1000))
 
 
+@pytest.mark.usefixtures("compiles")
 def test_a_solver_that_ends_by_itself_does_the_same_run_with_more_power(load: Load) -> None:
     """The claim that everything here rests on, for the solver that the study of powers runs from P = 7 on again."""
     at_7, at_25 = throttled(load, "qpoases", 7.0), throttled(load, "qpoases", 25.0)
@@ -32,6 +33,7 @@ def test_a_solver_that_ends_by_itself_does_the_same_run_with_more_power(load: Lo
     assert perform(at_7) == perform(at_25)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_a_solver_that_is_cut_off_does_another_run(load: Load) -> None:
     at_1, at_25 = throttled(load, "qpoases", 1.0), throttled(load, "qpoases", 25.0)
     more = Outcome.from_json(perform(at_25))
@@ -39,6 +41,7 @@ def test_a_solver_that_is_cut_off_does_another_run(load: Load) -> None:
     assert perform(at_1) != perform(at_25)
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize(
     ("iterations", "limit", "expected"),
     [([3.0, 9.0, 4.0], 10, "ended"), ([3.0, 10.0], 10, "cut off"), ([10.0], 11, "ended"), ([], 10, "cut off")],

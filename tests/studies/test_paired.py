@@ -157,6 +157,7 @@ def test_no_profile_that_can_be_played_costs_less(problem: PredictiveProblem, pr
             assert profiles.cost(qp, other, where).total >= lowest * (1 - 1e-12)
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("name", [name.value for name in SolverName])
 @pytest.mark.parametrize("power", [0.2, 1.0, 10.0])
 def test_no_solver_at_any_power_gets_below_the_lowest_cost(name: str, power: float, sequence: ProblemSequence) -> None:
@@ -173,6 +174,7 @@ def test_no_solver_at_any_power_gets_below_the_lowest_cost(name: str, power: flo
 # -- what a solver is given, and what is kept of it --------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("compiles")
 def test_a_solver_starts_each_problem_from_its_own_last_profile(sequence: ProblemSequence) -> None:
     """Replayed here, solver, shifts and costs by hand."""
     program = ProgramSettings(
@@ -202,6 +204,7 @@ def test_equal_plc_times_hold_these_iterations() -> None:
     assert QpoasesSettings().tau_1_s == 0.475
 
 
+@pytest.mark.usefixtures("compiles")
 def test_on_harsh_problems_all_begin_at_the_same_guess(sequence: ProblemSequence) -> None:
     found = {name: harsh_run(sequence, with_solver(name)) for name in ("ode", "qpoases", "daqp")}
     assert len(found["ode"]["guess"]) >= 2, "the first load steps"
@@ -229,6 +232,7 @@ def test_indicators_of_problems_are_sums_and_means() -> None:
     assert np.isnan(found.J_BF)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_a_request_gives_the_problems_and_no_trace() -> None:
     load = draw_of("e", 1, StudyOptions(seeds=1, ticks=400))
     outcome = Outcome.from_json(perform(paired_request(load, "ode", 1.0)))
@@ -305,6 +309,7 @@ def test_harsh_problems_of_all_loads_are_counted_together(short: StudyOptions, m
     }
 
 
+@pytest.mark.usefixtures("compiles")
 def test_a_short_study_from_requests_to_report() -> None:
     study, options = STUDIES["solver-comparison"], StudyOptions(loads=("e",), ticks=600, quick=True)
     outcomes = {request: Outcome.from_json(perform(request)) for request in study.requests(options)}
@@ -316,6 +321,7 @@ def test_a_short_study_from_requests_to_report() -> None:
     assert [remark.splitlines()[0][:9] for remark in result.remarks] == ["**Paired,", "**Harsh p"]
 
 
+@pytest.mark.usefixtures("compiles")
 def test_under_a_load_that_never_steps_nothing_is_compared_and_nothing_fails(tmp_path: "Path") -> None:
     (tmp_path / "quiet.csv").write_text("time_s,load_w\n0,384.74\n")
     study, options = STUDIES["solver-comparison"], StudyOptions(loads=(f"{tmp_path}/quiet.csv",), ticks=240, quick=True)

@@ -98,6 +98,7 @@ def test_hours_that_rules_were_tuned_on_are_not_fresh() -> None:
     }
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_whole_study_of_half_a_minute_has_a_row_for_each_run(
     conducted: "Conducted", tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

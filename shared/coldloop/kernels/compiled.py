@@ -60,11 +60,15 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
     return cast("Callable[P, R]", _cached(function, forceinline=True))
 
 
-def _cached(function: Callable[..., Any], **options: bool) -> Any:  # noqa: ANN401 numba has no types
-    """Return a kernel in two forms: for calls from Python, and for calls from kernels, which need no wrapper.
+LARGE: Final = 100
+"""Parts of arguments from which on their wrapper takes longer to compile than a second form of the kernel."""
 
-    A wrapper takes apart the arguments, tables of hundreds of parts: without those that nobody calls, all kernels of a
-    run compile in four fifths of the time.
+
+def _cached(function: Callable[..., Any], **options: bool) -> Any:  # noqa: ANN401 numba has no types
+    """Return a kernel, with a second form for calls from kernels by arguments of many parts.
+
+    The first form has a wrapper for calls from Python, which takes the arguments apart. Where these are tables of
+    hundreds of parts it takes long to compile, and nobody calls most of them.
     """
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         return function
@@ -73,9 +77,27 @@ def _cached(function: Callable[..., Any], **options: bool) -> Any:  # noqa: ANN4
         _in_turn(njit(error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=bare, **options)(function))
         for bare in (False, True)
     )
-    from_python.get_call_template, from_python.get_overload = from_kernels.get_call_template, from_kernels.get_overload
+    usual_template, usual_overload = from_python.get_call_template, from_python.get_overload
+
+    def get_call_template(arguments: Any, named: Any) -> Any:  # noqa: ANN401
+        large = _count((*arguments, *named.values())) > LARGE
+        return (from_kernels.get_call_template if large else usual_template)(arguments, named)
+
+    def get_overload(signature: Any) -> Any:  # noqa: ANN401
+        arguments, _ = sigutils.normalize_signature(signature)  # type: ignore[no-untyped-call]
+        return (from_kernels.get_overload if _count(arguments) > LARGE else usual_overload)(signature)
+
+    from_python.get_call_template, from_python.get_overload = get_call_template, get_overload
     from_python.for_kernels = from_kernels
     return from_python
+
+
+def _count(kinds: Iterable[Any]) -> int:
+    """Return of how many parts arguments of these types are."""
+    count = 0
+    for kind in kinds:
+        count += _count(kind.types) if isinstance(kind, types.BaseTuple) else 1  # type: ignore[attr-defined]
+    return count
 
 
 def forms_of(kernel: Any) -> tuple[Any, Any]:  # noqa: ANN401
