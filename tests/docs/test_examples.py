@@ -43,7 +43,7 @@ SHORTENED = {
 }
 """What is executed instead of what the pages say, so that it takes seconds; the tutorial's own load is run whole."""
 IN_ONE_PROCESS = {r"^coldloop run(?!.*--(in-process|attach|mode|config))": "coldloop run --in-process"}
-"""And but for `--all`, where no way to run is named: three processes leave the same, and take longer to start."""
+"""And but for the night, where no way to run is named: three processes leave the same, and take longer to start."""
 
 IN_ORDER = {"tutorial.md"}
 """Pages whose blocks need what the blocks before them have left."""
@@ -51,7 +51,6 @@ IN_ORDER = {"tutorial.md"}
 NEEDS_A_RIG = re.compile(r"127\.0\.0\.1:502|coldloop (status|set|events|fault|record)|mbpoll")
 STARTS_A_RIG = re.compile(r"^(coldloop |scripts/)up\b", re.MULTILINE)
 READ_FIRST = {"README.md", "tutorial.md"}
-STARTS_MUCH = re.compile(r"^(scripts/|coldloop chaos)|refrigerator", re.MULTILINE)
 BY_THE_CLOCK = re.compile(r"realtime|(coldloop |scripts/)up\b")
 
 FOLLOWS = "--follow"
@@ -291,18 +290,17 @@ def reader(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("MPLBACKEND", "agg")
-    whole = bool(request.config.getoption("--all"))
+    whole = bool(request.config.getoption("--all") or request.config.getoption("--night"))
     if not whole:
         draw_nothing(monkeypatch)
     return Reader(tmp_path, coldloop, processes, whole=whole)
 
 
 def marks(lesson: Lesson) -> list[pytest.MarkDecorator]:
-    """Return the marks of a lesson; of pages that are read later, only short ones are executed without `--all`."""
+    """Return the marks of a lesson; pages that are read later are executed in the night."""
     by_the_clock = lesson.needs_a_rig or lesson.says(BY_THE_CLOCK)
-    long = by_the_clock or lesson.says(STARTS_MUCH) or lesson.blocks[0].marker == TEST_SUITE
     found = [pytest.mark.realtime] if by_the_clock else []
-    return [*found, pytest.mark.night] if long and lesson.page.name not in READ_FIRST else found
+    return found if lesson.page.name in READ_FIRST else [*found, pytest.mark.night]
 
 
 LESSONS = [
