@@ -15,7 +15,7 @@ from tests.harness.processes import Processes
 from tests.process.runs import started
 
 ROOT: Final = Path(__file__).parents[2]
-USUALLY: Final = {"column, noise, alarms", "small, noise", "matrices", "foreseen"}
+USUALLY: Final = {"matrices", "foreseen"}
 
 
 def model_of(process: str, folder: Path, processes: Processes) -> Path:

@@ -163,7 +163,14 @@ def test_a_course_is_held_from_step_to_step() -> None:
     assert weather.shown(4).tolist() == [2.0]
 
 
-@pytest.mark.parametrize("plant", ["python", "matrices", "transfer functions"])
+@pytest.mark.parametrize(
+    "plant",
+    [
+        "matrices",
+        pytest.param("python", marks=pytest.mark.night),
+        pytest.param("transfer functions", marks=pytest.mark.night),
+    ],
+)
 def test_the_setpoint_is_kept_over_the_link_as_in_one_process(plant: str, processes: Processes, tmp_path: Path) -> None:
     """Rain, which is measured, and what is drawn, which is estimated, leave no offset."""
     text = FILE
@@ -193,7 +200,9 @@ def test_the_setpoint_is_kept_over_the_link_as_in_one_process(plant: str, proces
         assert before.rain.to_numpy() == pytest.approx(rain, abs=1e-6)
 
 
-@pytest.mark.parametrize("known", ["rain", "draw", "leak"])
+@pytest.mark.parametrize(
+    "known", ["rain", pytest.param("draw", marks=pytest.mark.night), pytest.param("leak", marks=pytest.mark.night)]
+)
 def test_a_step_that_is_forecast_costs_less_than_one_that_is_not(
     known: str, processes: Processes, tmp_path: Path
 ) -> None:

@@ -239,7 +239,7 @@ def test_no_unpacked_folder_is_left_behind(compiled: Path, tmp_path: Path) -> No
     assert not left_behind()
 
 
-@pytest.mark.parametrize("disturbance", ["[load]", "[[disturbances]]"])
+@pytest.mark.parametrize("disturbance", ["[load]", pytest.param("[[disturbances]]", marks=pytest.mark.night)])
 def test_an_fmu_is_driven_through_the_rig_over_the_link_as_in_one_process(
     disturbance: str, compiled: Path, tmp_path: Path, processes: Processes
 ) -> None:
@@ -259,7 +259,7 @@ def test_an_fmu_is_driven_through_the_rig_over_the_link_as_in_one_process(
     assert not left_behind()
 
 
-@pytest.mark.parametrize("disturbance", ["[load]", "[[disturbances]]"])
+@pytest.mark.parametrize("disturbance", ["[load]", pytest.param("[[disturbances]]", marks=pytest.mark.night)])
 def test_what_an_fmu_meets_may_be_forecast(
     disturbance: str, compiled: Path, tmp_path: Path, processes: Processes
 ) -> None:

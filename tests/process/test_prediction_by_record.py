@@ -105,7 +105,7 @@ def test_columns_that_are_exchanged_are_told_by_what_the_plant_explains(
     assert all((f"of {name} the plant itself explains" in text) == told for name in ("h1", "h2"))
 
 
-@pytest.mark.parametrize("load", ["a", "c"])
+@pytest.mark.parametrize("load", ["a", pytest.param("c", marks=pytest.mark.night)])
 def test_a_model_from_a_step_test_costs_hardly_more_than_the_true_one(
     load: str, processes: Processes, tmp_path: Path
 ) -> None:
@@ -129,6 +129,7 @@ def test_such_a_plant_is_the_same_over_the_link_and_hides_its_states(processes: 
     assert not found.x0.any()
 
 
+@pytest.mark.night
 def test_a_forecast_is_worth_what_it_is_with_the_true_model(processes: Processes, tmp_path: Path) -> None:
     """A leak from one tick on, and pumps that are slow, 0.02 V in 5 s."""
     (tmp_path / "leak.csv").write_text("time_s,leak,load\n0,0,0\n240,2,2\n", encoding="utf-8")

@@ -22,7 +22,7 @@ from tests.process.runs import run, started
 ROOT: Final = Path(__file__).parents[2]
 
 
-@pytest.mark.parametrize("period", ["adaptive", "2.5"])
+@pytest.mark.parametrize("period", ["adaptive", pytest.param("2.5", marks=pytest.mark.night)])
 def test_the_quadruple_tank_is_the_same_over_the_link_and_in_one_process(
     period: str, processes: Processes, tmp_path: Path
 ) -> None:

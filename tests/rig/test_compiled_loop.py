@@ -54,7 +54,7 @@ def left_by(assignments: tuple[str, ...], load: LoadProfile, ticks: int, *, comp
 
 
 USUALLY = {
-    "adaptive", "noise", "interior point, cut off", "hybrid", "fast gradient", "load steps that interrupt",
+    "adaptive", "noise", "hybrid", "load steps that interrupt",
     "refrigerator", "as printed", "single precision", "osqp", "sequences that are refused", "an impatient watchdog",
     "the classical loops", "loads that cannot be held", "suspects",
 }  # fmt: skip
