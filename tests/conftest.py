@@ -145,6 +145,16 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 @pytest.hookimpl(wrapper=True)
+def pytest_fixture_setup() -> Generator[None, Any, Any]:
+    """Fail a fixture that does what the lane may not do: so each test that requests it fails, not the first one."""
+    noted = len(WATCH.notes)
+    result = yield
+    if len(WATCH.notes) > noted:
+        judge(WATCH.lane, WATCH.notes)
+    return result
+
+
+@pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, Any, Any]:
     """Fail a test that does what its lane may not do."""
     result = yield

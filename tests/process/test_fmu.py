@@ -82,7 +82,7 @@ def made(folder: Path, text: str) -> Made:
 
 
 @pytest.fixture(scope="module")
-def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def compiled(tmp_path_factory: pytest.TempPathFactory, programs: None) -> Path:  # noqa: ARG001 a mark
     """Compile the FMU in C, once."""
     if shutil.which("gcc") is None:
         pytest.skip("needs gcc")
@@ -140,7 +140,6 @@ def test_an_oscillator_of_other_people_has_the_poles_of_its_equation(tmp_path: P
     assert "identified with 2 states" in described(found)
 
 
-@pytest.mark.usefixtures("programs")
 def test_derivatives_of_an_fmu_are_taken_where_it_has_them(compiled: Path, tmp_path: Path) -> None:
     """At rest x1 = 5 u = 5, x2 = (0.05 x1 + w) / 0.2 = 1.75."""
     tanks(tmp_path, compiled)
@@ -157,7 +156,6 @@ def test_derivatives_of_an_fmu_are_taken_where_it_has_them(compiled: Path, tmp_p
     assert "directional derivatives" in described(found)
 
 
-@pytest.mark.usefixtures("programs")
 def test_an_fmu_without_them_is_differentiated_by_its_start_values(compiled: Path, tmp_path: Path) -> None:
     text = (HERE / "two_tanks.xml").read_text(encoding="utf-8")
     tanks(tmp_path, compiled, text.replace('providesDirectionalDerivative="true"', ""))
@@ -212,7 +210,6 @@ class Lag(Fmi3Slave):
 # -- the simulated plant ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("programs")
 def test_instances_do_not_know_of_one_another_and_return_to_their_states(compiled: Path, tmp_path: Path) -> None:
     fmu = Fmu(tanks(tmp_path, compiled))
     wiring = Wiring(["u"], ["y"], "w", [], ["tank.x[1]", "tank.x[2]"], {"tank.x[1]": 2.0}, 1)
@@ -230,7 +227,6 @@ def test_instances_do_not_know_of_one_another_and_return_to_their_states(compile
     assert fmu.keeps_state
 
 
-@pytest.mark.usefixtures("programs")
 def test_no_unpacked_folder_is_left_behind(compiled: Path, tmp_path: Path) -> None:
     fmu = Fmu(tanks(tmp_path, compiled))
     instance = fmu.instance({})
@@ -315,7 +311,6 @@ def changed(change: str) -> str:
     return text.replace("canGetAndSet", f"{change} canGetAndSet") if change else text
 
 
-@pytest.mark.usefixtures("programs")
 @pytest.mark.parametrize("case", BAD)
 def test_what_cannot_be_used_gets_one_line(case: str, compiled: Path, tmp_path: Path) -> None:
     text, change, why = BAD[case]

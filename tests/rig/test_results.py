@@ -52,7 +52,7 @@ PREDICTED = ("J_dev", "J_cst", "J_open_mean", "c1", "c2", "tau_u_mean", "tau_u_m
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory, programs: None) -> Path:  # noqa: ARG001 a mark
     """The results of a minute of load e."""
     folder = tmp_path_factory.mktemp("run") / "deep" / "results"
     assert cli.main(["run", "--in-process", "--load", "e", "--duration", "60s", "--out", str(folder)]) == 0
@@ -69,7 +69,6 @@ def read(path: Path) -> dict[str, Any]:
     return document
 
 
-@pytest.mark.usefixtures("programs")
 def test_a_run_leaves_these_files_and_no_others(folder: Path) -> None:
     names = {"manifest.json", "summary.json", "schema.json", "run.png", "inputs", *FILES}
     assert {path.name for path in folder.iterdir()} == names
@@ -77,7 +76,6 @@ def test_a_run_leaves_these_files_and_no_others(folder: Path) -> None:
     assert (folder / "run.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.usefixtures("programs")
 def test_the_summary_has_all_indicators_and_null_for_what_does_not_exist(folder: Path, minute: Recording) -> None:
     summary = read(folder / "summary.json")
     assert set(summary) >= SUMMARY
@@ -93,7 +91,6 @@ def test_the_summary_has_all_indicators_and_null_for_what_does_not_exist(folder:
     assert summary["realtime_factor"] == as_rounded
 
 
-@pytest.mark.usefixtures("programs")
 def test_a_streamed_run_and_a_recording_in_memory_have_the_same_indicators(folder: Path, minute: Recording) -> None:
     settings = Settings()
     indicators = evaluate(minute, load(settings.model.file), settings.optimizer_plc.program.design)
@@ -111,7 +108,6 @@ def test_the_trace_has_a_row_a_tick_and_the_values_of_the_run(folder: Path, minu
     assert table["x_T_nef34_12"].to_pylist() == minute.x[:, -1].tolist()
 
 
-@pytest.mark.usefixtures("programs")
 @pytest.mark.parametrize("name", FILES)
 def test_each_column_has_its_unit_and_description_in_the_file_and_in_the_schema(name: str, folder: Path) -> None:
     described = {column["name"]: column for column in read(folder / "schema.json")["files"][name]["columns"]}
