@@ -8,10 +8,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from coldloop.process.cold_box import L1
+from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Update
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, NoiseReference
 from optimizer_plc.estimator import begin_at_rest, begin_prediction, correct, estimator_of, no_belief, predict
+from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.qp.linear_algebra import respond
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.rest import rest_map
@@ -252,6 +254,21 @@ def test_a_filter_without_a_past_begins_where_the_plant_rests_with_its_inputs_an
     y = respond(prediction.C, prediction.D, prediction.G, x, applied, acting)
     assert y[L1] == pytest.approx(level, abs=1e-5)
     assert mismatch == pytest.approx(acting if load is None else 0.0, abs=1e-5)
+
+
+def test_an_optimiser_that_begins_within_a_session_believes_that_the_plant_rests(
+    model: LtiModel, prediction: PredictionModel
+) -> None:
+    """Its first update has what sensors say at rest with inputs that others have set: nothing is to be corrected."""
+    moved, rest = np.array([2.0, -3.0, 40.0]), no_belief(prediction.n_states)
+    begin_at_rest(rest_map(prediction), rest, moved, 0.0, load_known=True, level=1.0)
+    y = respond(prediction.C, prediction.D, prediction.G, rest.predicted, moved, 0.0)
+    program = OptimizerProgram(model, ProgramSettings(), InputLimits())
+    program.restart(0.0)
+    u, outputs = tuple((model.u0 + moved).tolist()), tuple((model.y0 + y).tolist())
+    program.plan(Update(1, 0, 1000, 77, load=model.w0, u_before=u, u=u, y=outputs, x=tuple(model.x0.tolist())))
+    believed = respond(prediction.C, prediction.D, prediction.G, program.state.belief.x[: len(rest.x)], moved, 0.0)
+    assert np.allclose(believed, y, rtol=1e-3, atol=1e-3 * np.abs(y).max())
 
 
 def test_at_the_operating_point_that_is_the_operating_point(prediction: PredictionModel) -> None:

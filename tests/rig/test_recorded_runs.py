@@ -1,7 +1,9 @@
 """What is done with a recorded run: exported, compared, drawn, reported, repeated."""
 
 import csv
+import fcntl
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -16,7 +18,9 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.io import loadmat
 
+from coldloop.errors import UsageError
 from rig import cli
+from rig.results.folders import claim_folder
 from rig.results.run_folder import RunFolder
 from tests.conftest import draw_nothing
 from tests.harness.processes import Processes
@@ -183,6 +187,15 @@ def test_a_repetition_does_not_replace_what_it_repeats(coldloop: "Coldloop", mpc
         assert (outcome.code, len(outcome.complaints)) == (2, 1)
         assert "the run replaces what is in" in outcome.complaints[0]
     assert {file: file.read_bytes() for file in mpc.rglob("*") if file.is_file()} == before
+
+
+def test_a_folder_that_another_process_has_claimed_is_not_taken(tmp_path: Path) -> None:
+    other = os.open(tmp_path, os.O_RDONLY)  # locks are of open files: as good as another process
+    fcntl.flock(other, fcntl.LOCK_EX)
+    with pytest.raises(UsageError, match="another run is being written there"):
+        claim_folder(tmp_path, force=True)
+    os.close(other)
+    claim_folder(tmp_path, force=True)
 
 
 @pytest.mark.night
