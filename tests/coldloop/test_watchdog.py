@@ -36,3 +36,12 @@ def test_setting_it_starts_it_anew_and_it_remembers_how_close_it_was() -> None:
     assert not watchdog.check(28)
     assert watchdog.check(29)
     assert watchdog.registers(29) == (20, WatchdogState.EXPIRED, 0, 0, 1)
+
+
+def test_where_the_time_is_set_back_it_has_its_whole_time_from_there_and_no_more() -> None:
+    watchdog = Watchdog(10)
+    watchdog.trigger(100)
+    watchdog.set_back(40)
+    assert not watchdog.check(49)
+    assert watchdog.check(50)
+

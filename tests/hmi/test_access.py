@@ -263,6 +263,8 @@ def test_requests_of_one_address_are_limited_and_others_not() -> None:
     assert limit.allows("elsewhere")
     clock.time = 2.0
     assert [limit.allows("here") for _ in range(3)] == [True, True, False]
+    clock.time = 3600.0
+    assert [limit.allows("here") for _ in range(4)] == [True, True, True, False], "no more than its capacity"
 
 
 def test_own_origin_and_host() -> None:
