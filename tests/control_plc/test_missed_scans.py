@@ -67,17 +67,6 @@ def test_the_classical_loops_execute_once_a_period_whatever_scans_are_missed(ben
     assert heater[-1] - heater[0] == pytest.approx(-100 * (bench.program.tick - began) * 0.25 / 300 * 0.5, abs=1.7)
 
 
-def test_an_exchange_that_fails_at_the_first_tick_of_a_sequence_is_no_miss(bench: "Bench", at: "At") -> None:
-    bench.play([at(0.3)] * 20, ticks=10)
-    assert bench.program.tick == 10
-    fail_exchange(bench, U0)
-    applied, update = bench.scan()
-    assert applied == as_transmitted(at(0.3)), "the whole step is still there"
-    assert update is not None
-    assert (bench.program.player.deadline_misses, bench.program.player.late) == (0, False)
-    assert bench.program.mode is Mode.MPC
-
-
 def test_an_exchange_that_fails_again_and_again_counts_a_miss_once(bench: "Bench") -> None:
     assert bench.plan(10)
     bench.scans(9)
@@ -100,12 +89,6 @@ def test_a_sequence_that_begins_long_after_its_tick_is_the_rest_of_one(bench: "B
     assert applied == as_transmitted(at(0.3))
     assert bench.program.mode is Mode.REST
     assert update is not None, "the optimiser is asked anew at once"
-
-
-def test_no_sequence_is_taken_while_the_rack_is_lost(bench: "Bench", at: "At") -> None:
-    assert bench.plan(10)
-    bench.program.alarms.now = bench.program.tick + 5
-    assert bench.offer(bench.sequence([at(0.3)] * 20)).verdict == Verdict.PLANT_LOST
 
 
 def test_an_optimiser_that_gave_signs_while_the_rack_was_away_is_not_lost(bench: "Bench", at: "At") -> None:

@@ -173,18 +173,3 @@ def test_settings_beyond_what_can_be_read_are_one_short_line(text: str, coldloop
             outcome = coldloop(*command, *words, environment=environment)
             assert (outcome.code, len(outcome.complaints)) == (2, 1)
             assert len(outcome.complaints[0]) < 1000
-
-
-@pytest.mark.parametrize("length", ["9" * 400, "9" * 5000 + "h", "2000000000h"])
-def test_a_duration_that_no_session_has_is_one_line(length: str, coldloop: "Coldloop") -> None:
-    outcome = coldloop("run", "--in-process", "--duration", length)
-    assert (outcome.code, len(outcome.complaints)) == (2, 1)
-
-
-@pytest.mark.parametrize("text", ["seed = " + "9" * 5000, "a = " + deep(5000)])
-def test_a_plan_of_faults_beyond_what_can_be_read_is_one_line(text: str, coldloop: "Coldloop", tmp_path: Path) -> None:
-    plan = tmp_path / "plan.toml"
-    plan.write_text(text)
-    outcome = coldloop("chaos", plan)
-    assert (outcome.code, len(outcome.complaints)) == (2, 1)
-    assert "not TOML" in outcome.complaints[0]
