@@ -72,11 +72,8 @@ def assert_same(coldloop: Coldloop, export: Path, tmp_path: Path, *scenario: str
 
 
 @pytest.mark.usefixtures("undrawn", "processes")
-@pytest.mark.parametrize("period", ["adaptive", "2.5"])
-def test_a_run_with_it_has_the_trace_and_the_updates_of_ours(
-    coldloop: Coldloop, export: Path, tmp_path: Path, period: str
-) -> None:
-    assert_same(coldloop, export, tmp_path, "--load", "e", "--duration", "150s", "--updating-period", period)
+def test_a_run_with_it_has_the_trace_and_the_updates_of_ours(coldloop: Coldloop, export: Path, tmp_path: Path) -> None:
+    assert_same(coldloop, export, tmp_path, "--load", "e", "--duration", "150s")
 
 
 @pytest.mark.night

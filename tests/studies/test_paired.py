@@ -159,7 +159,7 @@ def test_no_profile_that_can_be_played_costs_less(problem: PredictiveProblem, pr
 
 @pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("name", [name.value for name in SolverName])
-@pytest.mark.parametrize("power", [0.2, 1.0, 10.0])
+@pytest.mark.parametrize("power", [0.2, 10.0])
 def test_no_solver_at_any_power_gets_below_the_lowest_cost(name: str, power: float, sequence: ProblemSequence) -> None:
     program = with_solver(name)
     budget = program.budget.model_copy(update={"power": power, "preparation_slots": 0})
