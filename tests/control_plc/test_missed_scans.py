@@ -133,15 +133,6 @@ def test_the_guard_never_takes_over_what_is_no_number() -> None:
     assert guard.admit(7, SequenceRow(math.nan, 80.0, -math.inf), update=True) == SequenceRow(43.0, 80.0, 36.0)
 
 
-def test_no_input_moves_by_more_than_its_rate_within_the_slew_time_however_many_sequences_begin() -> None:
-    guard = OutputGuard(InputLimits(slew_s=1.0), U0)
-    applied = [guard.admit(tick, U0._replace(ncr22=150.0), update=True).ncr22 for tick in range(12)]
-    for tick in range(12):
-        for later in range(tick + 1, min(12, tick + 4)):
-            assert applied[later] - applied[tick] <= 10.0
-    assert applied[-1] == pytest.approx(75.0 + 10.0 * 3)
-
-
 def test_a_sequence_is_judged_as_it_would_be_played(bench: "Bench", at: "At") -> None:
     """Two steps of the full rate in neighbouring ticks are within no rate, whatever the windows say."""
     assert bench.plan(10)

@@ -16,11 +16,6 @@ LAST, BEYOND = f"{PLANT_MAP.end - 1:04x}", f"{PLANT_MAP.end:04x}"
 SESSION = PlantSession(session=1, realtime=0, factor=1.0, seed=2, load_steps=3)
 
 
-@pytest.fixture
-def serve(serve_either: "Serve") -> "Serve":
-    return serve_either
-
-
 def floats(*values: float) -> str:
     return struct.pack(f">{len(values)}f", *values).hex()
 

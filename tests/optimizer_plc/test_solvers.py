@@ -1,7 +1,6 @@
 """What holds for each of the solvers, and what the borrowed ones need to be told."""
 
 import importlib
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 from coldloop.errors import ConfigurationError
 from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Verdict
-from optimizer_plc.budget import PlcBudget
 from optimizer_plc.computing_settings import FastGradientSettings, InteriorPointSettings, QpoasesSettings
 from optimizer_plc.qp.penalties import Preset
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
@@ -318,11 +316,6 @@ def test_casadi_is_not_imported_unless_it_is_needed(processes: "Processes") -> N
     assert processes.run_python(program)[0].strip() == "False"
 
 
-def test_qpoases_gets_ten_iterations_from_five_seconds_on_the_reference_plc() -> None:
-    budget = PlcBudget(ProgramSettings().budget, QpoasesSettings().tau_1_s)
-    assert budget.iterations(20) == 10
-
-
 # -- the fast gradient method -----------------------------------------------------------------------------------------
 
 
@@ -340,23 +333,6 @@ def test_without_momentum_a_step_never_raises_the_cost(harsh_jumps: "list[Jump]"
     for qp, guess in harsh_jumps:
         first = solver.solve(qp, guess, (1,))
         assert first.cost <= first.guessed
-
-
-@pytest.mark.night  # compiles each solver for it; test_arithmetic.py has the default's
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: fast_gradient_solver(FastGradientSettings(alpha=30.0)),
-        lambda: interior_point_solver(InteriorPointSettings(alpha=30.0)),
-    ],
-)
-def test_single_precision_stays_single(make: Callable[[], Solver]) -> None:
-    rng = np.random.default_rng(26)
-    qp = convex_problem(rng, 5, 7)
-    single = QuadraticProblem(*(np.asarray(v, np.float32) for v in qp[:-1]), constant=0.0)
-    z = answer(make(), single, np.zeros(5, np.float32), 500)
-    assert z.dtype == np.float32
-    assert z == pytest.approx(answer(make(), qp, np.zeros(5), 500), abs=1e-4)
 
 
 # -- the interior-point method ----------------------------------------------------------------------------------------

@@ -32,7 +32,6 @@ from plant.refrigerator.physics import (
     SIGNAL_NAMES,
     STATE_NAMES,
     advance_refrigerator,
-    inventory,
     rates,
     read,
 )
@@ -125,34 +124,6 @@ def test_the_shipped_file_is_that_of_the_reference_refrigerator(rest: Point) -> 
     assert gains == pytest.approx(np.array(FILE.gains), rel=1e-6)
 
 
-def test_another_refrigerator_has_another_digest() -> None:
-    bigger = PLANT._replace(station=PLANT.station._replace(cooler_approach=6.0))
-    assert refrigerator_digest(bigger, HELIUM) != FILE.parameters_digest
-
-
-@pytest.mark.usefixtures("compiles")
-@pytest.mark.parametrize(
-    ("u", "v", "w"),
-    [((2.0, 0.0, 0.0), 0.0, 0.0), ((0.0, 20.0, 0.0), 0.0, 0.0), ((0.0, 0.0, -3.0), 0.0, 60.0)],
-    ids=["CV155", "NCR22", "CV156 and load"],
-)
-def test_helium_is_neither_made_nor_lost(rest: Point, u: tuple[float, ...], v: float, w: float) -> None:
-    moved = rest._replace(u=rest.u + np.array(u), v=rest.v + v, d=rest.d + np.array([w, 0, 0, 0, 0, 0]))
-    after = simulate(moved, 600.0)
-    total = inventory(after.x, PLANT, HELIUM) + after.x[STATE_NAMES.index("M_lost")]
-    assert total == pytest.approx(inventory(rest.x, PLANT, HELIUM), rel=1e-9)
-
-
-@pytest.mark.usefixtures("compiles")
-def test_what_leaks_is_what_is_missing(rest: Point) -> None:
-    leaking = rest._replace(d=rest.d + np.array([0, 0, 2e-3, 0, 0, 0]))
-    after = simulate(leaking, 300.0)
-    lost = after.x[STATE_NAMES.index("M_lost")]
-    assert 0.5 < lost < 0.61
-    total = inventory(after.x, PLANT, HELIUM) + lost
-    assert total == pytest.approx(inventory(rest.x, PLANT, HELIUM), rel=1e-9)
-
-
 MOVES = {
     "CV155": ("u", 0, 1.0),
     "NCR22": ("u", 1, 20.0),
@@ -230,9 +201,7 @@ def test_a_trip_is_integrated_well_too(rest: Point) -> None:
 
 
 @pytest.mark.usefixtures("compiles")
-@pytest.mark.parametrize("ambient", [275.0, 320.0])
-@pytest.mark.parametrize("run", [(0.0, 1.0), (1.0, 1.0)])
-@pytest.mark.parametrize("nitrogen", [0.0, 1.0])
+@pytest.mark.parametrize(("ambient", "run", "nitrogen"), [(275.0, (0.0, 1.0), 1.0), (320.0, (1.0, 1.0), 0.0)])
 def test_the_refrigerator_stays_finite_far_from_rest(
     rest: Point, ambient: float, run: tuple[float, float], nitrogen: float
 ) -> None:

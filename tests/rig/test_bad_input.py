@@ -166,25 +166,12 @@ def other_parameters(document: dict[str, Any]) -> None:
     document["parameters_digest"] = "0" * 64
 
 
-def missing_row(document: dict[str, Any]) -> None:
-    document["A"] = document["A"][:-1]
-
-
-def missing_matrix(document: dict[str, Any]) -> None:
-    del document["B"]
-
-
-def newer_format(document: dict[str, Any]) -> None:
-    document["format"] = 99
-
-
 Change = Callable[[dict[str, Any]], None]
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        missing_row, missing_matrix, newer_format,
         other_names, fewer_states, fewer_outputs, other_parameters,
     ],
 )  # fmt: skip
@@ -202,16 +189,11 @@ def test_a_model_that_is_not_of_this_plant_is_refused(
 @pytest.mark.parametrize(
     ("content", "part"),
     [
-        (b"", "not a readable model file"),
-        (b"junk", "not a readable model file"),
-        (b"\xff\xfe\x00", "not a readable model file"),
         (b"[" * 100_000, "not a readable model file"),
         (b'{"format":' * 5000 + b"1" + b"}" * 5000, "nested too deeply"),
-        (b"{}", "format"),
-        (DEFAULT_MODEL_FILE.read_bytes()[:5000], "not a readable model file"),
         (DEFAULT_MODEL_FILE.read_bytes().replace(b'"w0": ', b'"w0": 1'), "digest mismatch"),
     ],
-    ids=["empty", "junk", "binary", "deep", "deep and whole", "no model", "half", "changed"],
+    ids=["deep", "deep and whole", "changed"],
 )
 def test_a_damaged_model_file_is_refused(
     content: bytes, part: str, coldloop: "Coldloop", results: Path, tmp_path: Path

@@ -101,13 +101,3 @@ async def test_a_service_that_is_told_to_stop_ends_in_good_order(number: signal.
     client.close()
     assert await asyncio.to_thread(process.interrupt, number) == 0
     assert "Traceback" not in process.said
-
-
-def test_tls_files_that_cannot_be_used_end_a_service_with_one_line(start: "Start", tmp_path: Path) -> None:
-    files = ("certificate", "key", "ca")
-    missing = [f'="{tmp_path / name}.pem"' for name in files]
-    server = [f"plant.server.tls.{name}{file}" for name, file in zip(files, missing, strict=True)]
-    client = [f"control_plc.plant.tls.{name}{file}" for name, file in zip(files, missing, strict=True)]
-    expected = (f"{tmp_path}/certificate.pem", "No such file", "coldloop certificates")
-    assert_ended(start("plant", *server), USAGE, "plant.server.tls", *expected)
-    assert_ended(start("control_plc", *client), USAGE, "client of plant", *expected)
