@@ -194,15 +194,6 @@ async def test_an_unknown_unit_id_is_met_with_silence_where_so_configured(serve:
         assert await wire.answer() == (2, 17, bytes.fromhex("030442f6e979"))
 
 
-async def test_errors_are_counted_by_kind(serve: "Serve") -> None:
-    async with serve() as running:
-        wire = await running.connect()
-        for pdu in ("41", f"03 {BEYOND} 0001", f"04 {BEYOND} 0001", "03 0000 0000"):
-            await wire.ask(bytes.fromhex(pdu))
-        counters = running.server.counters
-        assert (counters.illegal_function, counters.illegal_address, counters.illegal_value) == (1, 2, 1)
-
-
 async def test_refusals_are_logged_in_one_line_and_not_over_and_over(
     serve: "Serve", caplog: pytest.LogCaptureFixture
 ) -> None:

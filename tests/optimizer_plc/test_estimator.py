@@ -252,10 +252,3 @@ def test_a_filter_without_a_past_begins_where_the_plant_rests_with_its_inputs_an
     y = respond(prediction.C, prediction.D, prediction.G, x, applied, acting)
     assert y[L1] == pytest.approx(level, abs=1e-5)
     assert mismatch == pytest.approx(acting if load is None else 0.0, abs=1e-5)
-
-
-def test_at_the_operating_point_that_is_the_operating_point(prediction: PredictionModel) -> None:
-    belief = no_belief(prediction.n_states)
-    begin_at_rest(rest_map(prediction), belief, np.zeros(3), 0.0, load_known=True, level=0.0)
-    assert not belief.x.any()
-    assert belief.numbers[0].tolist() == (0.0, 0.0, 1)

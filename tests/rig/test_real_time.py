@@ -1,9 +1,8 @@
 """Real time: everyone paces on the clock, what is late is counted, and the plant is held meanwhile."""
 
-import asyncio
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -24,6 +23,7 @@ from rig.cosim.scenario import Scenario
 from rig.cosim.session_reader import SampleReader
 from rig.settings import Settings
 from tests.harness import processes as harness
+from tests.harness.waiting import until
 
 if TYPE_CHECKING:
     from rig.results.recording import Recording
@@ -48,15 +48,6 @@ async def client(register_map: RegisterMap, port: int) -> AsyncIterator[Register
         yield one
     finally:
         one.close()
-
-
-async def until(read: Callable[[], Awaitable[T]], wanted: Callable[[T], bool], within_s: float = PATIENCE_S) -> T:
-    """Return the first value read that is as wanted."""
-    deadline = time.monotonic() + within_s
-    while not wanted(value := await read()):
-        assert time.monotonic() < deadline, f"still {value} after {within_s} s"
-        await asyncio.sleep(0.005)
-    return value
 
 
 def in_bounds(u: tuple[float, ...]) -> bool:

@@ -174,16 +174,6 @@ def test_the_manifest_holds_what_is_needed_to_repeat_the_run(folder: Path, minut
     assert manifest["configuration"]["plant.load"] == "e"
 
 
-@pytest.mark.usefixtures("programs")
-def test_a_run_shorter_than_its_first_update_has_results_too(coldloop: "Coldloop", results: Path) -> None:
-    assert coldloop("run", "--in-process", "--duration", "0.25s", "--out", results).code == 0
-    summary = read(results / "summary.json")
-    assert summary["updates"] == 0
-    assert pq.read_table(results / "trace.parquet").num_rows == 1
-    assert pq.read_table(results / "trace.parquet")["update"].to_pylist() == [None]
-    assert pq.read_table(results / "updates.parquet").num_rows == 0
-
-
 @pytest.mark.usefixtures("undrawn")
 def test_an_existing_run_is_replaced_only_when_forced(coldloop: "Coldloop", results: Path) -> None:
     run = ("run", "--in-process", "--duration", "2s", "--figures", "png", "--out", results)

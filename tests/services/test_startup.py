@@ -3,7 +3,6 @@
 import asyncio
 import signal
 import socket
-from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +13,7 @@ from coldloop.process.model_file import read_document, write_document
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.control_plc import CONTROL_MAP, PlantLinkState, PlantLinkStatus
 from coldloop.registers.safety import Alarm, AlarmKind
+from tests.harness.waiting import until
 
 if TYPE_CHECKING:
     from tests.harness.processes import Process
@@ -63,13 +63,6 @@ async def test_a_control_plc_waits_for_a_rack_that_is_absent_at_power_up(
     start("plant", *alone, port=free_port)
     await until(lambda: is_in_step(client))
     client.close()
-
-
-async def until(holds: Callable[[], Awaitable[bool]]) -> None:
-    """Wait until something holds."""
-    async with asyncio.timeout(PATIENCE_S):
-        while not await holds():  # noqa: ASYNC110 it is another process that changes it
-            await asyncio.sleep(0.02)
 
 
 async def is_lost(client: RegisterClient) -> bool:

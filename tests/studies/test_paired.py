@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 import daqp
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from coldloop.errors import StudyError
 from coldloop.process.limits import InputLimits
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
 
     from tests.studies.conftest import MakeOutcome
 
-Array = NDArray[np.float64]
 
 UNBOUNDED = 1e30
 
