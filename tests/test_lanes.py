@@ -12,7 +12,7 @@ import pytest
 
 from tests.conftest import WATCH
 from tests.harness import lanes
-from tests.harness.budget import Account, Use, folder_of, read_budget
+from tests.harness.budget import Account, Use, read_budget
 from tests.harness.lanes import Lane, judge, lane_of, table
 
 
@@ -20,11 +20,8 @@ from tests.harness.lanes import Lane, judge, lane_of, table
     ("marks", "lane"),
     [
         ((), Lane.FAST),
-        (("parametrize", "usefixtures"), Lane.FAST),
         (("process",), Lane.SYSTEM),
         (("realtime", "browser"), Lane.SYSTEM),
-        (("compiles",), Lane.SYSTEM),
-        (("night",), Lane.NIGHT),
         (("process", "night"), Lane.NIGHT),
         (("container",), Lane.NIGHT),
     ],
@@ -124,13 +121,6 @@ def test_a_folder_is_over_its_budget_when_it_uses_more_than_half_as_much_again()
     assert [line.split()[-1].rpartition("::")[2] for line in lines[lines.index("dearest tests:") + 1 :]][:2] == [
         "test_1", "test_3",
     ]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("test", "folder"), [("tests/rig/test_a.py::test_b[x/y]", "rig"), ("tests/test_a.py::test_b", ".")]
-)
-def test_a_test_counts_for_its_folder(test: str, folder: str) -> None:
-    assert folder_of(test) == folder
 
 
 def test_the_budget_names_folders_that_exist() -> None:

@@ -135,11 +135,6 @@ class AlarmSettings(BaseModel):
         """What each output with a band is to be within."""
         return (self.level_band, self.t5_band, *DECLARED_BANDS[2:])[: len(DECLARED_BANDS)]
 
-    @property
-    def band_ticks(self) -> int:
-        """The on-delay of the band alarms, in ticks."""
-        return _ticks(self.band_delay_s)
-
     def rule(self, kind: AlarmKind) -> AlarmRule:
         """Return how an alarm is treated."""
         default = DEFAULT_RULES[kind]

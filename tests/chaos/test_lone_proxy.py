@@ -182,14 +182,6 @@ def test_a_client_meets_the_exception_of_the_plan_and_then_the_server(
     assert last.registers
 
 
-@pytest.mark.parametrize("fault", ['kind = "drop"\nshare = 1.0', 'kind = "freeze"', 'kind = "wrong_unit"'])
-def test_a_client_whose_answers_do_not_come_gives_up(
-    fault: str, processes: Processes, tmp_path: Path, server: int
-) -> None:
-    _, port = proxy(processes, tmp_path, f"[[faults]]\n{fault}\n", server)
-    assert isinstance(read(port, 0.3), Exception)
-
-
 def test_a_proxy_says_that_nobody_listens_behind_it_and_ends_at_ctrl_c(
     processes: Processes, tmp_path: Path, free_port: int
 ) -> None:

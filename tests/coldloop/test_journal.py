@@ -129,10 +129,6 @@ def test_an_answer_has_a_bounded_number_of_events_and_looks_at_a_bounded_number(
     assert all(page.found == len(found) <= QUERY_ROWS for page, found in pages(filled(50), ALL))
 
 
-def test_a_journal_that_has_only_a_retained_count_has_nothing_more_to_find() -> None:
-    assert Journal(count=500).select(ALL) == (JournalPage(0, 500, 0, 0), [])
-
-
 def test_events_that_were_dropped_between_two_pages_are_seen_from_the_oldest_number() -> None:
     journal = filled(KEPT)
     page, _ = journal.select(ALL)

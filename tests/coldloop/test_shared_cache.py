@@ -142,20 +142,6 @@ def test_the_kernel_of_a_process_that_is_killed_is_compiled_by_who_waits(start: 
     assert waiting.answer() == (["outer", "inner"], "is 5.0")
 
 
-@pytest.mark.night
-def test_half_a_kernel_on_the_disk_is_compiled_anew(start: Start, tmp_path: Path) -> None:
-    first = start()
-    first.send("outer(1.5)")
-    first.answer()
-    (kept,) = (tmp_path / "cache").rglob("__main__.outer-*.nbc")
-    kept.write_bytes(kept.read_bytes()[:1000])
-    second, third = start(), start()
-    second.send("outer(1.5)")
-    assert second.answer() == (["outer"], "is 5.0")
-    third.send("outer(1.5)")
-    assert third.answer() == ([], "is 5.0")
-
-
 @pytest.mark.usefixtures("programs")
 def test_without_a_folder_to_write_to_kernels_are_compiled_all_the_same(start: Start, tmp_path: Path) -> None:
     occupied = tmp_path / "a file"

@@ -44,4 +44,3 @@ def test_where_the_time_is_set_back_it_has_its_whole_time_from_there_and_no_more
     watchdog.set_back(40)
     assert not watchdog.check(49)
     assert watchdog.check(50)
-

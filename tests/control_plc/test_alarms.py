@@ -120,25 +120,6 @@ def test_all_alarms_are_acknowledged_at_once_and_unknown_ones_are_nobodys(panel:
     assert {row.state for row in panel.rows} == {AlarmState.ACKNOWLEDGED}
 
 
-def test_each_change_is_an_event_with_its_tick_and_cause(panel: AlarmPanel) -> None:
-    journal = Journal()
-    panel = AlarmPanel(journal)
-    panel.now = 3
-    panel.raised(KIND, 7)
-    panel.now = 8
-    panel.returned(KIND)
-    do(panel, "acknowledge", "shelve", "unshelve")
-    assert [(event.number, event.tick, EventKind(event.kind)) for event in journal.since(0)] == [
-        (1, 3, EventKind.ALARM_RAISED),
-        (2, 8, EventKind.ALARM_RETURNED),
-        (3, 8, EventKind.ALARM_ACKNOWLEDGED),
-        (4, 8, EventKind.ALARM_SHELVED),
-        (5, 8, EventKind.ALARM_UNSHELVED),
-    ]
-    assert journal.since(0)[0].cause == 7
-    assert journal.since(5) == []
-
-
 ACTIONS = ("raise", "return", "acknowledge", "shelve", "unshelve", "out_of_service", "in_service")
 
 

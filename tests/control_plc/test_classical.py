@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.errors import ConfigurationError
 from coldloop.process.cold_box import L1, T5
 from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.lti_model import load as load_model
@@ -132,20 +131,6 @@ def test_at_the_operating_point_nothing_moves() -> None:
     assert all(loops().wanted(tick, outputs(), REST) == REST for tick in range(60))
 
 
-@pytest.mark.parametrize("move", [0.2, -0.2])
-def test_a_full_bath_is_heated_and_an_empty_one_less(move: float) -> None:
-    wanted = loops().wanted(0, outputs(level=move), REST)
-    assert (wanted.ncr22 - REST.ncr22) * move > 0
-    assert (wanted.cv155, wanted.cv156) == (REST.cv155, REST.cv156)
-
-
-@pytest.mark.parametrize("move", [0.2, -0.2])
-def test_a_warm_turbine_gets_more_gas_and_a_cold_one_less(move: float) -> None:
-    wanted = loops().wanted(0, outputs(temperature=move), REST)
-    assert (wanted.cv156 - REST.cv156) * move > 0
-    assert (wanted.cv155, wanted.ncr22) == (REST.cv155, REST.ncr22)
-
-
 def test_setpoints_may_be_moved_from_the_operating_point() -> None:
     tuning = ClassicalSettings(level=LevelLoop(setpoint_offset=0.5))
     assert loops(tuning).wanted(0, outputs(level=0.5), REST) == REST
@@ -216,11 +201,6 @@ def test_a_new_session_begins_as_the_first_did() -> None:
             program.end_scan(measured(tick, outputs(level=0.01 * tick, temperature=-0.02 * tick)))
         sessions.append(applied)
     assert sessions[0] == sessions[1]
-
-
-def test_a_setting_that_is_no_driver_is_refused() -> None:
-    with pytest.raises((ConfigurationError, ValueError), match="driver"):
-        ControlSection.model_validate({"driver": "nobody"})
 
 
 @given(

@@ -153,12 +153,6 @@ def test_a_move_at_the_end_of_what_is_played_limits_what_follows() -> None:
     assert guard.judge([at(44.0)], 16, meanwhile) is Verdict.RATE_EXCEEDED
 
 
-def test_what_is_inside_the_limits_passes_unchanged() -> None:
-    guard = OutputGuard(InputLimits(), INITIAL)
-    wanted = SequenceRow(43.5, 65.0, 35.90625)
-    assert guard.admit(0, wanted, update=True) == wanted
-
-
 @pytest.mark.parametrize("fault", [math.nan, math.inf, -math.inf])
 def test_a_value_that_is_no_number_holds_what_was_applied_before_the_window(fault: float) -> None:
     guard = OutputGuard(InputLimits(), INITIAL)
@@ -186,12 +180,6 @@ def test_breaks_that_follow_one_another_do_not_give_a_full_rate_each() -> None:
         guard.begin_at(tick, guard.admit(tick, wanted, update=False))
     assert guard.applied.cv155 == pytest.approx(43.5)
     assert guard.applied.ncr22 == pytest.approx(85.0)
-
-
-def test_what_is_applied_outside_an_open_window_begins_a_new_one() -> None:
-    guard = OutputGuard(InputLimits(), SequenceRow(43.0, 75.0, 36.0))
-    guard.begin_at(5, SequenceRow(50.0, 75.0, 36.0))
-    assert guard.admit(6, SequenceRow(43.0, 75.0, 36.0), update=False).cv155 == pytest.approx(49.5)
 
 
 @settings(max_examples=2 * settings.default.max_examples)

@@ -348,15 +348,6 @@ def test_after_a_leap_of_time_the_sequence_goes_on_where_it_would_be(rig: "Bench
 # -- corners -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_rack_that_comes_back_one_tick_behind_is_followed(rig: "Bench", at: At) -> None:
-    rig.play([at(0.2)] * 40, ticks=2)
-    rig.scans(5)
-    tick = rig.program.tick
-    rig.program.rejoin(tick - 1, rig.program.applied)
-    rig.scan()
-    assert rig.program.tick == tick
-
-
 def test_a_commit_that_arrives_twice_does_not_let_the_loops_move_before_it_begins(rig: "Bench", at: At) -> None:
     rig.play([at()] * 2, ticks=2)
     rig.level = 1.0

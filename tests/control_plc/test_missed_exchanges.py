@@ -35,15 +35,6 @@ def test_an_exchange_that_fails_at_the_first_tick_of_a_sequence_is_neither_a_mis
     assert program.alarms.rows[AlarmKind.SEQUENCE_LATE].times == 0
 
 
-def test_a_sequence_that_is_overtaken_by_time_is_the_rest_of_one_and_not_a_new_one(bench: "Bench", at: "At") -> None:
-    assert bench.plan(8)
-    assert bench.offer(bench.sequence([at(cv155=0.2)] * 240)).verdict == Verdict.ACCEPTED
-    program = bench.program
-    program.rejoin(program.player.next_update_tick + 113, program.applied)
-    bench.scan()
-    assert (program.mode, program.ladder.cause) == (Mode.REST, Cause.SEQUENCE_LATE)
-
-
 def test_a_rack_that_has_been_away_for_a_while_takes_no_new_sequence(bench: "Bench", at: "At") -> None:
     assert bench.plan(8)
     bench.program.alarms.now = bench.program.tick + 5

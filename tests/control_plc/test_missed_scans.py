@@ -10,7 +10,7 @@ import pytest
 from coldloop.process.cold_box import L1, T5
 from coldloop.process.limits import InputLimits
 from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import Mode, Operator, OperatorMode, SequenceRow, Verdict
+from coldloop.registers.control_plc import Mode, Operator, OperatorMode, SequenceRow
 from coldloop.session.time_base import TimeBase
 from control_plc.guard import OutputGuard
 from control_plc.retained_state import ControlStateStore, RetainedControlState
@@ -67,17 +67,6 @@ def test_the_classical_loops_execute_once_a_period_whatever_scans_are_missed(ben
     assert heater[-1] - heater[0] == pytest.approx(-100 * (bench.program.tick - began) * 0.25 / 300 * 0.5, abs=1.7)
 
 
-def test_an_exchange_that_fails_at_the_first_tick_of_a_sequence_is_no_miss(bench: "Bench", at: "At") -> None:
-    bench.play([at(0.3)] * 20, ticks=10)
-    assert bench.program.tick == 10
-    fail_exchange(bench, U0)
-    applied, update = bench.scan()
-    assert applied == as_transmitted(at(0.3)), "the whole step is still there"
-    assert update is not None
-    assert (bench.program.player.deadline_misses, bench.program.player.late) == (0, False)
-    assert bench.program.mode is Mode.MPC
-
-
 def test_an_exchange_that_fails_again_and_again_counts_a_miss_once(bench: "Bench") -> None:
     assert bench.plan(10)
     bench.scans(9)
@@ -100,12 +89,6 @@ def test_a_sequence_that_begins_long_after_its_tick_is_the_rest_of_one(bench: "B
     assert applied == as_transmitted(at(0.3))
     assert bench.program.mode is Mode.REST
     assert update is not None, "the optimiser is asked anew at once"
-
-
-def test_no_sequence_is_taken_while_the_rack_is_lost(bench: "Bench", at: "At") -> None:
-    assert bench.plan(10)
-    bench.program.alarms.now = bench.program.tick + 5
-    assert bench.offer(bench.sequence([at(0.3)] * 20)).verdict == Verdict.PLANT_LOST
 
 
 def test_an_optimiser_that_gave_signs_while_the_rack_was_away_is_not_lost(bench: "Bench", at: "At") -> None:
@@ -148,23 +131,6 @@ def test_the_guard_never_takes_over_what_is_no_number() -> None:
     guard.begin_at(7, SequenceRow(math.nan, math.inf, 36.0))
     assert guard.applied == U0
     assert guard.admit(7, SequenceRow(math.nan, 80.0, -math.inf), update=True) == SequenceRow(43.0, 80.0, 36.0)
-
-
-def test_no_input_moves_by_more_than_its_rate_within_the_slew_time_however_many_sequences_begin() -> None:
-    guard = OutputGuard(InputLimits(slew_s=1.0), U0)
-    applied = [guard.admit(tick, U0._replace(ncr22=150.0), update=True).ncr22 for tick in range(12)]
-    for tick in range(12):
-        for later in range(tick + 1, min(12, tick + 4)):
-            assert applied[later] - applied[tick] <= 10.0
-    assert applied[-1] == pytest.approx(75.0 + 10.0 * 3)
-
-
-def test_a_sequence_is_judged_as_it_would_be_played(bench: "Bench", at: "At") -> None:
-    """Two steps of the full rate in neighbouring ticks are within no rate, whatever the windows say."""
-    assert bench.plan(10)
-    zigzag = [at(0.5), at(0.0), at(-0.5)] * 6
-    assert bench.offer(bench.sequence(zigzag)).verdict == Verdict.RATE_EXCEEDED
-    assert bench.offer(bench.sequence([at(0.5)] * 18)).verdict == Verdict.ACCEPTED
 
 
 def test_a_sensor_that_shows_nothing_new_for_a_while_without_scans_is_frozen_by_plant_time(bench: "Bench") -> None:

@@ -30,7 +30,6 @@ COMPILED: Final[dict[str, tuple[str, ...]]] = {
     "interior point": (f'{PROGRAM}solver="interior-point"', f"{PROGRAM}updating_period_s=5"),
     "interior point, cut off": (f'{PROGRAM}solver="interior-point"', f'{PROGRAM}adaptive.rule="contraction"'),
     "hybrid": (f'{PROGRAM}solver="hybrid"', f"{PROGRAM}updating_period_s=1.5"),
-    "hybrid on a fast PLC": (f'{PROGRAM}solver="hybrid"', f"{PROGRAM}budget.power=10"),
     "fast gradient": (f'{PROGRAM}solver="fast-gradient"',),
     "loads that cannot be held": (
         f"{PROGRAM}holdable_load_w=[330,345]",
@@ -53,7 +52,6 @@ COMPILED: Final[dict[str, tuple[str, ...]]] = {
     ),
     "as printed": (f'{PROGRAM}preset="as-printed"',),
     "as printed, interior point": (f'{PROGRAM}preset="as-printed"', f'{PROGRAM}solver="interior-point"'),
-    "as printed, elapsed time": (f'{PROGRAM}preset="as-printed"', 'limits.rate_reference="elapsed"'),
     "soft rows": (f"{PROGRAM}penalties.output_rows=1", f"{PROGRAM}penalties.rate_rows=[1, 2, 3]"),
     "a box penalty alone": (f"{PROGRAM}penalties.box=2",),
     "first knot as rows": (f"{PROGRAM}penalties.first_knot_in_box=false",),
@@ -61,18 +59,12 @@ COMPILED: Final[dict[str, tuple[str, ...]]] = {
     "not held at bounds": (f"{PROGRAM}ode.hold_at_bounds=false",),
     "single precision": (SINGLE,),
     "single precision, fixed": (SINGLE, f"{PROGRAM}updating_period_s=2.5", *NOISE),
-    "single precision, load steps that interrupt a rule": (
-        SINGLE,
-        f'{PROGRAM}adaptive.rule="contraction"',
-        f"{PROGRAM}interrupting_load_step_w=10",
-    ),
 }
 """Whose updates are compiled too."""
 LEFT_TO_PROGRAMS: Final[dict[str, tuple[str, ...]]] = {
     "osqp": (f'{PROGRAM}solver="osqp"', f"{PROGRAM}updating_period_s=5"),
     "daqp": (f'{PROGRAM}solver="daqp"', *NOISE),
     "qpoases": (f'{PROGRAM}solver="qpoases"',),
-    "osqp and load steps that interrupt": (f'{PROGRAM}solver="osqp"', f"{PROGRAM}interrupting_load_step_w=10"),
     "qpoases and a refrigerator": (f'{PROGRAM}solver="qpoases"', REFRIGERATOR),
 }
 """Whose ticks alone are compiled, where that is worth while."""

@@ -1,7 +1,8 @@
 """Waiting for what other processes do: patiently, for the machine may be busy with something else."""
 
+import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Final, TypeVar
 
 T = TypeVar("T")
@@ -20,3 +21,12 @@ def eventually(condition: Callable[[], T], what: str) -> T:
         assert waited < PATIENCE_S, f"{what}: not within {PATIENCE_S:g} s"
         time.sleep(POLL_S)
     return found
+
+
+async def until(read: Callable[[], Awaitable[T]], wanted: Callable[[T], bool] = bool) -> T:
+    """Return the first value read that is as wanted."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not wanted(value := await read()):
+        assert time.monotonic() < deadline, f"still {value} after {PATIENCE_S:g} s"
+        await asyncio.sleep(POLL_S / 4)
+    return value

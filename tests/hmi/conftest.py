@@ -35,6 +35,16 @@ RECORDED_S = 120
 """Length of the run that is replayed."""
 
 
+class Clock:
+    """A clock that is set by hand."""
+
+    def __init__(self, time: float = 0.0) -> None:
+        self.time = time
+
+    def __call__(self) -> float:
+        return self.time
+
+
 class Answer(NamedTuple):
     """What the page's server answered."""
 

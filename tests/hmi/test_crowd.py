@@ -19,7 +19,7 @@ from hmi.reading import MOST_NAMES, ROWS_AT_ONCE
 from hmi.settings import HmiSection
 from hmi.trends import NAMES
 from tests.harness.waiting import eventually
-from tests.hmi.conftest import OPERATOR, Site
+from tests.hmi.conftest import OPERATOR, Clock, Site
 
 BROWSERS = 4
 CONNECTIONS = 24
@@ -123,16 +123,6 @@ def test_junk_neither_fills_the_audit_nor_keeps_an_operator_from_work(small_site
 
 
 # -- the parts, by themselves ------------------------------------------------------------------------------------------
-
-
-class Clock:
-    """A clock that is set by hand."""
-
-    def __init__(self) -> None:
-        self.time = 0.0
-
-    def __call__(self) -> float:
-        return self.time
 
 
 def test_refusals_that_are_alike_are_one_entry_and_a_count() -> None:

@@ -26,18 +26,9 @@ from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
 from hmi.operator_desk import CONFIRM_WITHIN_S, CommandResult, OperatorDesk
 from hmi.process_image import Model
+from tests.hmi.conftest import Clock
 
 R = TypeVar("R", bound=tuple[Any, ...])
-
-
-class Clock:
-    """A clock that is set by hand."""
-
-    def __init__(self) -> None:
-        self.time = 100.0
-
-    def __call__(self) -> float:
-        return self.time
 
 
 class Peer:
@@ -84,7 +75,7 @@ class Desk:
     """A desk, the services that it writes to, and somebody at it."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.clock = Clock()
+        self.clock = Clock(100.0)
         self.model = Model(self.clock, 300)
         pace = SessionPace(1, 1, 1.0, 0)
         self.model.put("plant", pace)

@@ -27,21 +27,12 @@ from hmi.process_image import STALE_S, JournalEntry, Model
 from hmi.reading import safe_cell
 from hmi.signals import signals_of, words_in
 from hmi.trends import MOST_ROWS, TrendStore, thin
-
-
-class Clock:
-    """A clock that is set by hand."""
-
-    def __init__(self) -> None:
-        self.time = 100.0
-
-    def __call__(self) -> float:
-        return self.time
+from tests.hmi.conftest import Clock
 
 
 @pytest.fixture
 def clock() -> Clock:
-    return Clock()
+    return Clock(100.0)
 
 
 @pytest.fixture

@@ -17,27 +17,15 @@ from hmi.process_image import Model
 from hmi.reading import STATIC
 from hmi.signals import signals_of
 from tests.harness.waiting import eventually
-from tests.hmi.conftest import Served, Site, opened, read_registers, record, write_registers
+from tests.hmi.conftest import Served, Site, opened, record, write_registers
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
     from tests.harness.processes import Processes
 
-STATION, STATION_WORDS, SURROUNDINGS = 700, 50, 760
+SURROUNDINGS = 760
 SHOWN = [f"signals.{name}" for name in STATION_SIGNAL_NAMES] + [f"commands.{name}" for name in STATION_VALVE_NAMES]
-COMPARED = 20
-"""Ticks."""
-COLLECT = """() => {
-  window.seen = {};
-  const tick = document.querySelector("#detail [data-signal='plant.station.tick']");
-  new MutationObserver(() => {
-    const values = {};
-    for (const one of document.querySelectorAll("#mimic .tag[data-signal^='plant.station']"))
-      values[one.dataset.signal.slice("plant.station.".length)] = one.querySelector(".reading").textContent;
-    window.seen[tick.textContent] = values;
-  }).observe(tick, { childList: true, characterData: true, subtree: true });
-}"""
 
 
 @pytest.fixture(scope="module")
@@ -51,35 +39,8 @@ def page(browser: "Browser", refrigerator: Site) -> "Iterator[Page]":
         yield one
 
 
-def station_now(site: Site) -> tuple[int, dict[str, float]]:
-    """Read tick, signals and commands with nothing but a socket."""
-    tick, _, _, *values = struct.unpack(">IHH23f", read_registers(site.ports["plant"], STATION, STATION_WORDS))
-    return tick, dict(zip(SHOWN, values, strict=True))
-
-
 def give(site: Site, *, nc1: int) -> None:
     write_registers(site.ports["plant"], SURROUNDINGS, struct.pack(">HHHff", nc1, 1, 1, 0.0, 300.0))
-
-
-def test_every_value_of_the_station_is_that_of_an_independent_reading_of_the_same_tick(
-    page: "Page", refrigerator: Site
-) -> None:
-    page.evaluate(COLLECT)
-    read: dict[int, dict[str, float]] = {}
-
-    def compared() -> dict[int, dict[str, str]]:
-        """Return what was shown of the ticks that were read, when there are enough."""
-        tick, values = station_now(refrigerator)
-        read[tick] = values
-        both = {int(tick): values for tick, values in page.evaluate("window.seen").items() if int(tick) in read}
-        return both if len(both) >= COMPARED else {}
-
-    shown = eventually(compared, f"{COMPARED} ticks")
-    for tick in shown:
-        for name, text in shown[tick].items():
-            number = text.partition(" ")[0]
-            step = 10.0 ** -len(number.partition(".")[2])
-            assert abs(float(number) - read[tick][name]) <= 0.501 * step + 1e-6 * abs(read[tick][name]), (tick, name)
 
 
 def test_a_tripped_compressor_is_seen_on_the_drawing_and_in_the_alarm_line(page: "Page", refrigerator: Site) -> None:
@@ -97,17 +58,6 @@ def test_a_tripped_compressor_is_seen_on_the_drawing_and_in_the_alarm_line(page:
     finally:
         give(refrigerator, nc1=1)
     eventually(lambda: page.locator(".compressor.tripped").count() == 0, "it runs again")
-
-
-def test_values_of_the_station_are_crossed_out_with_the_plant(page: "Page", refrigerator: Site) -> None:
-    tags = "#mimic .tag[data-signal^='plant.station']"
-    eventually(lambda: page.locator(f"{tags}.stale").count() == 0, "they are current")
-    refrigerator.freeze("plant")
-    try:
-        eventually(lambda: page.locator(f"{tags}.stale").count() == page.locator(tags).count(), "all are crossed out")
-    finally:
-        refrigerator.thaw("plant")
-    eventually(lambda: page.locator(f"{tags}.stale").count() == 0, "they come back")
 
 
 def test_both_pressures_are_drawn_over_time(page: "Page", refrigerator: Site) -> None:

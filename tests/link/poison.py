@@ -63,11 +63,6 @@ def _setting(place: int, field: Field, value: float) -> Change:
     return change
 
 
-def sealed_blocks(register_map: RegisterMap) -> list[Block]:
-    """Return the blocks of a map that are sealed and read."""
-    return [block for block in register_map.blocks if block.sealed and block.writer is None]
-
-
 class PoisonedReads:
     """Changes, in a share of a server's answers, one field of one record that is in them; seals are made to fit.
 

@@ -51,8 +51,13 @@ async def assert_goes_on(site: "Field", control: "Control") -> None:
 
 
 @pytest.mark.parametrize(
-    "field_bytes", [(2, 6), (8, 12), (12, 14), (16, 20), (20, 24)], ids=["map", "state", "model", "session", "tick"]
-)
+    "field_bytes",
+    [
+        *(pytest.param(each, marks=pytest.mark.night) for each in ((2, 6), (8, 12), (20, 24))),
+        (12, 14), (16, 20),
+    ],
+    ids=["map", "state", "tick", "model", "session"],
+)  # fmt: skip
 async def test_a_reset_and_a_flipped_bit_in_the_first_answer_cost_the_session_nothing(
     field_bytes: tuple[int, int], field: "FieldAt"
 ) -> None:

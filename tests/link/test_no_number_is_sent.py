@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import math
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -20,16 +20,14 @@ from coldloop.registers.declaration import Block
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import AlarmKind
 from coldloop.registers.seal import sealed
+from tests.harness.waiting import until
 
 if TYPE_CHECKING:
     from tests.harness.processes import Processes
     from tests.link.conftest import Control
 
 HEADER = read_header(DEFAULT_MODEL_FILE)
-HOST = "127.0.0.1"
 START_S = 90.0
-PATIENCE_S = 100.0
-POLL_S = 0.01
 
 
 class FakeRack:
@@ -83,12 +81,6 @@ async def faked(
         processes.end()
         control.client.close()
         await rack.server.close()
-
-
-async def until(condition: Callable[[], Awaitable[bool]]) -> None:
-    async with asyncio.timeout(PATIENCE_S):
-        while not await condition():  # noqa: ASYNC110 - another process is waited for
-            await asyncio.sleep(POLL_S)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])

@@ -21,8 +21,6 @@ ACCESS = {"control": [], "optimizer": [OPTIMIZER], "operator": [OPERATOR], "read
 READ_MAGIC = bytes.fromhex("03 0000 0002")
 MAGIC = bytes.fromhex("03 04 42f6e979")
 
-PLAN = CONTROL_MAP.block_of(Plan)
-GRANT = CONTROL_MAP.block_of(Grant)
 WRITE_GRANT = bytes.fromhex("10 01cc 0002 04 00000009")
 
 
@@ -56,13 +54,6 @@ async def test_each_role_writes_its_own_blocks_and_no_others(serve: "Serve") -> 
         assert running.written == ["plan", "grant"]
         assert running.server.counters.access_refused == 2
         assert running.server.counters.illegal_function == running.server.counters.illegal_address == 0
-
-
-async def test_who_has_several_roles_may_do_what_each_may(serve: "Serve") -> None:
-    both = {**ACCESS, "operator": ["127.0.0.2/31"]}
-    async with serve(CONTROL_MAP, access=both) as running:
-        wire = await running.connect(OPTIMIZER)
-        assert [(await wire.ask(pdu))[0] for pdu in (write_of(a_plan(3)), WRITE_GRANT)] == [16, 16]
 
 
 @pytest.mark.parametrize(

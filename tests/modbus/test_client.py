@@ -162,7 +162,6 @@ IMPOSTORS = {
     ),
     "too few registers": (bytes.fromhex("0000 0005 01 03 02 0000"), "with something invalid"),
     "another function": (bytes.fromhex("0000 0005 01 04 02 0000"), "with something invalid"),
-    "an unknown function": (bytes.fromhex("0000 0003 01 55 02"), "with something invalid"),
 }
 
 

@@ -54,29 +54,6 @@ def test_random_bytes(serve: "Serve", conversations: list[list[bytes]]) -> None:
 
 
 @bounded
-@given(pdus=st.lists(plausible_pdus, max_size=100))
-def test_random_requests_in_sound_frames_each_get_one_answer_of_their_function(
-    serve: "Serve", pdus: list[bytes]
-) -> None:
-    async def story() -> None:
-        async with asyncio.timeout(PATIENCE_S), serve() as running:
-            wire = await running.connect()
-            for transaction, pdu in enumerate(pdus):
-                wire.send(struct.pack(">HHHB", transaction, 0, len(pdu) + 1, 1) + pdu)
-            for transaction, pdu in enumerate(pdus):
-                answered, _, answer = await wire.answer()
-                assert answered == transaction
-                assert answer[0] & 0x7F == pdu[0] & 0x7F
-                assert len(answer) <= 253
-                if answer[0] & 0x80:
-                    assert len(answer) == 2
-                    assert answer[1] in (1, 2, 3)
-            assert await still_serves(running)
-
-    asyncio.run(story())
-
-
-@bounded
 @given(pdu=plausible_pdus, cut=st.integers(0, 20))
 def test_a_client_may_go_away_at_any_byte(serve: "Serve", pdu: bytes, cut: int) -> None:
     async def story() -> None:

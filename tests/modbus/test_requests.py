@@ -16,11 +16,6 @@ LAST, BEYOND = f"{PLANT_MAP.end - 1:04x}", f"{PLANT_MAP.end:04x}"
 SESSION = PlantSession(session=1, realtime=0, factor=1.0, seed=2, load_steps=3)
 
 
-@pytest.fixture
-def serve(serve_either: "Serve") -> "Serve":
-    return serve_either
-
-
 def floats(*values: float) -> str:
     return struct.pack(f">{len(values)}f", *values).hex()
 
@@ -197,15 +192,6 @@ async def test_an_unknown_unit_id_is_met_with_silence_where_so_configured(serve:
         wire = await running.connect()
         wire.send(bytes.fromhex("0001 0000 0006 01 03 0000 0002 0002 0000 0006 11 03 0000 0002"))
         assert await wire.answer() == (2, 17, bytes.fromhex("030442f6e979"))
-
-
-async def test_errors_are_counted_by_kind(serve: "Serve") -> None:
-    async with serve() as running:
-        wire = await running.connect()
-        for pdu in ("41", f"03 {BEYOND} 0001", f"04 {BEYOND} 0001", "03 0000 0000"):
-            await wire.ask(bytes.fromhex(pdu))
-        counters = running.server.counters
-        assert (counters.illegal_function, counters.illegal_address, counters.illegal_value) == (1, 2, 1)
 
 
 async def test_refusals_are_logged_in_one_line_and_not_over_and_over(

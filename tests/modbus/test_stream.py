@@ -5,8 +5,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.registers.common import Identity
-
 if TYPE_CHECKING:
     from tests.modbus.conftest import Serve
 
@@ -36,36 +34,6 @@ async def test_a_refused_request_in_a_pipeline_does_not_disturb_its_neighbours(s
         wire = await running.connect()
         wire.send(numbered(1) + bytes.fromhex("0002 0000 0002 01 41") + numbered(3))
         assert [(await wire.answer())[::2] for _ in range(3)] == [(1, MAGIC_PDU), (2, b"\xc1\x01"), (3, MAGIC_PDU)]
-
-
-async def test_back_to_back_segments_get_their_own_transaction_ids(serve: "Serve") -> None:
-    async with serve() as running:
-        wire = await running.connect()
-        for transaction in range(0xFFF0, 0x10000):
-            wire.send(numbered(transaction))
-            await wire.writer.drain()
-        assert [(await wire.answer())[0] for _ in range(16)] == list(range(0xFFF0, 0x10000))
-
-
-async def test_a_request_and_half_of_the_next_are_both_answered_once_whole(serve: "Serve") -> None:
-    async with serve() as running:
-        wire = await running.connect()
-        both = numbered(1) + numbered(2)
-        wire.send(both[:18])
-        assert await wire.answer() == (1, 1, MAGIC_PDU)
-        wire.send(both[18:])
-        assert await wire.answer() == (2, 1, MAGIC_PDU)
-
-
-@pytest.mark.parametrize("cut", range(1, 12))
-async def test_a_fragmented_request_is_answered_once_whole(serve: "Serve", cut: int) -> None:
-    async with serve() as running:
-        first, other = await running.connect(), await running.connect()
-        first.send(numbered(7)[:cut])
-        await other.ask(b"\x03\x00\x00\x00\x02")  # by now the first fragment has been taken in
-        first.send(numbered(7)[cut:])
-        assert await first.answer() == (7, 1, MAGIC_PDU)
-        assert await first.ask(b"\x03\x00\x00\x00\x02", 8) == MAGIC_PDU
 
 
 async def test_a_request_sent_byte_by_byte_is_answered_once(serve: "Serve") -> None:
@@ -101,10 +69,3 @@ async def test_the_longest_legal_frame_is_taken(serve: "Serve") -> None:
     async with serve() as running:
         wire = await running.connect()
         assert await wire.ask(b"\x41" + bytes(252)) == b"\xc1\x01"
-
-
-async def test_a_read_returns_the_present_value(serve: "Serve") -> None:
-    async with serve() as running:
-        wire = await running.connect()
-        running.bank.put(Identity(tick=123_456_789))
-        assert await wire.ask(bytes.fromhex("03 000a 0002")) == bytes.fromhex("03 04 075bcd15")

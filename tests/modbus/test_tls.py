@@ -89,15 +89,6 @@ async def test_no_certificate(serve: "Serve", pki: "Pki", caplog: pytest.LogCapt
         assert "peer did not return a certificate" in await refused_for(running, caplog)
 
 
-async def test_an_expired_certificate(serve: "Serve", pki: "Pki", caplog: pytest.LogCaptureFixture) -> None:
-    files = pki.keep("expired", pki.authority.issue_client("expired", "operator", days=-1))
-    context = bare_context(pki)
-    context.load_cert_chain(files.certificate, files.key)
-    async with serve(CONTROL_MAP, tls=pki.server, client=pki.client(None)) as running:
-        await turned_away(running, context)
-        assert "certificate has expired" in await refused_for(running, caplog)
-
-
 async def test_a_certificate_of_another_authority(serve: "Serve", pki: "Pki", caplog: pytest.LogCaptureFixture) -> None:
     files = pki.keep("foreign", Authority.new("site", 1).issue_client("foreign", "operator"))
     context = bare_context(pki)

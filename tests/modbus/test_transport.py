@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from coldloop.errors import PeerUnreachableError
 from coldloop.modbus.transport import NONSENSE, NoAnswerError, Transport
 
 ROOT = Path(__file__).parents[2]
@@ -147,11 +146,6 @@ async def test_transaction_ids_begin_again_after_the_last() -> None:
         transport._wire._last_id = 0xFFFE  # noqa: SLF001
         for pdu in (b"a", b"b", b"c"):
             assert await transport.transact([pdu], 60.0) == [pdu]
-
-
-async def test_nobody_listens(free_port: int) -> None:
-    with pytest.raises(PeerUnreachableError, match=f"nothing listens as plant at 127.0.0.1:{free_port}"):
-        await Transport("plant", "127.0.0.1", free_port, 60.0, None).open()
 
 
 def test_pymodbus_makes_frames_and_the_identity_by_its_public_names() -> None:

@@ -14,13 +14,6 @@ def budget(power: float = 1.0, tau_1_s: float = TAU_1_S) -> PlcBudget:
     return PlcBudget(BudgetSettings(power=power), tau_1_s)
 
 
-@pytest.mark.parametrize("ticks", range(2, 21))
-def test_the_reference_plc_does_4_tau_u_minus_1_iterations_of_the_ode_solver(ticks: int) -> None:
-    tau_u = ticks * 0.25
-    assert budget().iterations(ticks) == budget().q(ticks) == round(4 * tau_u - 1)
-    assert budget().ladder[budget().q(ticks) - 1] == ticks
-
-
 def test_the_reference_plc_does_9_iterations_of_a_solver_twice_as_slow_in_5_s() -> None:
     assert budget(tau_1_s=0.5).iterations(20) == 9
     assert PlcBudget(BudgetSettings(preparation_slots=0), 0.5).iterations(20) == 10

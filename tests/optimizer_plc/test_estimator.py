@@ -269,10 +269,3 @@ def test_an_optimiser_that_begins_within_a_session_believes_that_the_plant_rests
     program.plan(Update(1, 0, 1000, 77, load=model.w0, u_before=u, u=u, y=outputs, x=tuple(model.x0.tolist())))
     believed = respond(prediction.C, prediction.D, prediction.G, program.state.belief.x[: len(rest.x)], moved, 0.0)
     assert np.allclose(believed, y, rtol=1e-3, atol=1e-3 * np.abs(y).max())
-
-
-def test_at_the_operating_point_that_is_the_operating_point(prediction: PredictionModel) -> None:
-    belief = no_belief(prediction.n_states)
-    begin_at_rest(rest_map(prediction), belief, np.zeros(3), 0.0, load_known=True, level=0.0)
-    assert not belief.x.any()
-    assert belief.numbers[0].tolist() == (0.0, 0.0, 1)

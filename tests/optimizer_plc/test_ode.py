@@ -122,13 +122,6 @@ def test_it_stays_put_at_an_optimum(
         assert answer.cost == pytest.approx(answer.guessed, rel=1e-9, abs=1e-6)
 
 
-def test_a_guess_outside_the_box_is_projected_into_it(problem: PredictiveProblem, situations: "Situations") -> None:
-    qp = problem.at(situations(np.random.default_rng(13)))
-    guess = np.full(49, -1e3)
-    assert (ode_solver(OdeSettings()).solve(qp, guess, (0,)).z == qp.low).all()
-    assert (guess == -1e3).all(), "the caller's guess is not touched"
-
-
 def test_the_same_start_gives_the_same_bits_whatever_was_solved_before(
     problem: PredictiveProblem, situations: "Situations"
 ) -> None:

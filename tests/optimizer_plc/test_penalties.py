@@ -60,11 +60,6 @@ def test_what_is_set_to_the_default_of_its_key_is_set_too() -> None:
     assert chosen.penalties.output_rows == 30.0
 
 
-def test_settings_of_a_preset_survive_being_written_and_read() -> None:
-    chosen = ProgramSettings(preset=Preset.AS_PRINTED)
-    assert ProgramSettings.model_validate(chosen.model_dump(mode="json")) == chosen
-
-
 @pytest.mark.parametrize("preset", Preset)
 def test_a_preset_names_keys_that_there_are(preset: Preset) -> None:
     chosen = ProgramSettings(preset=preset)

@@ -110,16 +110,6 @@ def test_only_the_heaters_rate_rows_of_the_last_two_intervals_are_left_out(probl
     assert np.allclose(np.abs(rate_rows).max(axis=1), GAIN)
 
 
-@pytest.mark.parametrize("shorter", [10, 25])
-def test_the_trivial_parametrisation_has_7_variables_and_10_rows_a_sample(
-    prediction: PredictionModel, shorter: int
-) -> None:
-    design = trivial_design(ControlDesign(decision_instants=(1, shorter), constraint_instants=(1,)))
-    problem = PredictiveProblem(prediction, design, InputLimits())
-    assert problem.size == 7 * shorter
-    assert problem.Gamma.shape == (10 * shorter, 7 * shorter)
-
-
 def test_the_trivial_parametrisation_of_the_whole_horizon_has_700_variables_and_1000_rows(
     prediction: PredictionModel,
 ) -> None:

@@ -10,21 +10,9 @@ KNOTS = np.array([1.0, 2.0, 4.0, 8.0, 16.0, 50.0, 100.0])
 
 Array = NDArray[np.float64]
 
-shifts = st.floats(0.0, 1.0)
 knot_sets = st.lists(st.integers(1, 120), min_size=2, max_size=9, unique=True).map(
     lambda knots: np.array(sorted(knots), float)
 )
-
-
-@given(knots=knot_sets)
-def test_a_shift_by_nothing_is_the_identity(knots: Array) -> None:
-    assert (shift(knots, 0.0) == np.eye(len(knots))).all()
-
-
-@given(knots=knot_sets, by=st.floats(0.0, 50.0), value=st.floats(-1e3, 1e3))
-def test_a_constant_profile_is_unchanged_by_any_shift(knots: Array, by: float, value: float) -> None:
-    constant = np.full(len(knots), value)
-    assert shift(knots, by) @ constant == pytest.approx(constant, rel=1e-12, abs=1e-12)
 
 
 @given(knots=knot_sets, by=st.floats(0.0, 50.0))
@@ -32,18 +20,6 @@ def test_a_shifted_value_is_an_average_of_the_old_ones(knots: Array, by: float) 
     S = shift(knots, by)
     assert (S >= 0).all()
     assert S.sum(axis=1) == pytest.approx(np.ones(len(knots)), rel=1e-12)
-
-
-@given(a=st.floats(0.0, 20.0), b=st.floats(0.0, 20.0), slope=st.floats(-5, 5), level=st.floats(-50, 50))
-def test_shifts_of_an_affine_profile_add_up_up_to_the_end_of_the_horizon(
-    a: float, b: float, slope: float, level: float
-) -> None:
-    affine = level + slope * KNOTS
-    once, twice = shift(KNOTS, a + b) @ affine, shift(KNOTS, b) @ shift(KNOTS, a) @ affine
-    within = [k for k, knot in enumerate(KNOTS) if knot + a + b <= KNOTS[-2]]
-    assert twice[within] == pytest.approx(once[within], rel=1e-9, abs=1e-9)
-    expected = level + slope * np.minimum(KNOTS + a, KNOTS[-1])
-    assert shift(KNOTS, a) @ affine == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 @given(values=st.lists(st.floats(-100, 100), min_size=7, max_size=7), by=st.floats(0.0, 120.0))
@@ -66,8 +42,3 @@ def test_a_profile_is_constant_before_its_first_knot_and_meets_each_knot() -> No
         [0, 0, 1],
         [0, 0, 1],
     ]
-
-
-def test_a_tick_is_a_twentieth_of_a_sampling_period() -> None:
-    ramp = KNOTS
-    assert (shift(KNOTS, 1 / 20) @ ramp)[:-1] == pytest.approx(ramp[:-1] + 0.05)

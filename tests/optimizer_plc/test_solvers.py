@@ -1,7 +1,6 @@
 """What holds for each of the solvers, and what the borrowed ones need to be told."""
 
 import importlib
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 from coldloop.errors import ConfigurationError
 from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Verdict
-from optimizer_plc.budget import PlcBudget
 from optimizer_plc.computing_settings import FastGradientSettings, InteriorPointSettings, QpoasesSettings
 from optimizer_plc.qp.penalties import Preset
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
@@ -84,7 +82,7 @@ def test_the_exact_ones_end_at_the_optimum(name: str, optimum: "Optimum", seed: 
 @pytest.mark.parametrize(
     ("name", "accuracy"), [("ode", 2e-2), ("fast-gradient", 1e-10), ("interior-point", 1e-11), ("hybrid", 2e-2)]
 )
-@pytest.mark.parametrize("seed", range(20, 35))
+@pytest.mark.parametrize("seed", range(20, 25))
 def test_the_penalised_ones_end_at_the_penalised_optimum(
     name: str,
     accuracy: float,
@@ -318,11 +316,6 @@ def test_casadi_is_not_imported_unless_it_is_needed(processes: "Processes") -> N
     assert processes.run_python(program)[0].strip() == "False"
 
 
-def test_qpoases_gets_ten_iterations_from_five_seconds_on_the_reference_plc() -> None:
-    budget = PlcBudget(ProgramSettings().budget, QpoasesSettings().tau_1_s)
-    assert budget.iterations(20) == 10
-
-
 # -- the fast gradient method -----------------------------------------------------------------------------------------
 
 
@@ -340,23 +333,6 @@ def test_without_momentum_a_step_never_raises_the_cost(harsh_jumps: "list[Jump]"
     for qp, guess in harsh_jumps:
         first = solver.solve(qp, guess, (1,))
         assert first.cost <= first.guessed
-
-
-@pytest.mark.night  # compiles each solver for it; test_arithmetic.py has the default's
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: fast_gradient_solver(FastGradientSettings(alpha=30.0)),
-        lambda: interior_point_solver(InteriorPointSettings(alpha=30.0)),
-    ],
-)
-def test_single_precision_stays_single(make: Callable[[], Solver]) -> None:
-    rng = np.random.default_rng(26)
-    qp = convex_problem(rng, 5, 7)
-    single = QuadraticProblem(*(np.asarray(v, np.float32) for v in qp[:-1]), constant=0.0)
-    z = answer(make(), single, np.zeros(5, np.float32), 500)
-    assert z.dtype == np.float32
-    assert z == pytest.approx(answer(make(), qp, np.zeros(5), 500), abs=1e-4)
 
 
 # -- the interior-point method ----------------------------------------------------------------------------------------
@@ -400,7 +376,7 @@ def test_its_structure_changes_nothing_but_the_work(problem: PredictiveProblem, 
 
 @pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("name", EVERY)
-@pytest.mark.parametrize("updating_period_s", [0.0, 5.0])
+@pytest.mark.parametrize("updating_period_s", [0.0, pytest.param(5.0, marks=pytest.mark.night)])
 def test_every_solver_closes_the_loop(name: str, updating_period_s: float, model: LtiModel) -> None:
     section = OptimizerSection(program=ProgramSettings(solver=SolverName(name)))
     rig = OneProcessRig(Settings(optimizer_plc=section))

@@ -8,7 +8,6 @@ import pytest
 
 from coldloop.process.load_profile import LOAD_SPAN
 from coldloop.registers.audit import EventKind, JournalAnswer, JournalPage, JournalQuery
-from coldloop.registers.common import SessionPace
 from coldloop.registers.plant import (
     LOAD_ROWS,
     LoadStep,
@@ -32,11 +31,6 @@ SESSION_ADDRESS, LOAD_ADDRESS = 400, 1000
 
 def float_write(address: int, value: float) -> bytes:
     return struct.pack(">BHHBf", 16, address, 2, 4, value)
-
-
-def test_a_session_that_begins_by_itself_shows_its_pace(switch_on: "SwitchOn") -> None:
-    rack = switch_on(session={"mode": "realtime", "factor": 3.0})
-    assert rack.bank.get(SessionPace) == SessionPace(1, 1, 3.0, 0)
 
 
 @pytest.fixture

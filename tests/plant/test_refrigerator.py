@@ -11,14 +11,9 @@ from scipy.integrate import solve_ivp
 from coldloop.process.signals import OUTPUT_NAMES
 from plant.cold_box.equilibrium import Equilibrium
 from plant.cold_box.model import build_model
-from plant.components.nitrogen_bath import LATENT_HEAT
-from plant.components.turbine import expand
 from plant.helium.properties import (
     WARM_CP,
     load_helium,
-    saturation,
-    supply_enthalpy_and_density,
-    vapour_enthalpy_and_cp,
 )
 from plant.integrator import advance
 from plant.numeric import RealArray
@@ -32,7 +27,6 @@ from plant.refrigerator.physics import (
     SIGNAL_NAMES,
     STATE_NAMES,
     advance_refrigerator,
-    inventory,
     rates,
     read,
 )
@@ -87,26 +81,6 @@ def test_the_cold_box_feels_what_it_feels_alone(rest: Point) -> None:
     assert rest.d[0] + 75.0 == pytest.approx(459.74, abs=0.05)
 
 
-def test_the_cold_part_balances_its_energy(rest: Point) -> None:
-    """What helium carries out at the warm end, the turbine's shaft and the nitrogen take up all the heat."""
-    y, s = outputs_of(rest), signals_of(rest)
-    flow = 1e-3 * s["M12"]
-    h_in, _ = supply_enthalpy_and_density(16e5, 305.0, HELIUM)
-    P = 1e5 * y["P8"]
-    h_10, _ = vapour_enthalpy_and_cp(P, y["T10"], saturation(P, HELIUM).T, HELIUM.vapour)
-    h_out = h_10 + WARM_CP * (s["T11"] - y["T10"])
-    shaft = turbine_power(y)
-    nitrogen = 1e-3 * s["M_GN2"] * LATENT_HEAT - 1e-3 * s["M_GN2"] * 4.9e3
-    assert flow * (h_out - h_in) == pytest.approx(rest.d[0] + 75.0 - shaft - nitrogen, abs=1.0)
-
-
-def turbine_power(y: dict[str, float]) -> float:
-    h_6, _ = supply_enthalpy_and_density(16e5, y["T6"], HELIUM)
-    exhaust = expand(PLANT.box.turbine, 0.05, h_6, 1e5 * y["P6"], 1e5 * y["P3"], HELIUM)
-    flow = PLANT.box.turbine.nozzle * 1e5 * y["P6"] / np.sqrt(y["T6"])
-    return float(flow * (h_6 - exhaust.h_out))
-
-
 def test_electrical_power_leaves_as_heat_but_for_what_warms_the_gas(rest: Point) -> None:
     s = signals_of(rest)
     warmed = 1e-6 * s["M_NC"] * (WARM_CP * 5.0 + 2.953e-3 * 14.95e5)
@@ -123,34 +97,6 @@ def test_the_shipped_file_is_that_of_the_reference_refrigerator(rest: Point) -> 
     lines = line_model(jacobian(*found[:4], PLANT, HELIUM))
     gains = lq_gains(lines, PLANT.station.actuator.lag, FILE.weights)
     assert gains == pytest.approx(np.array(FILE.gains), rel=1e-6)
-
-
-def test_another_refrigerator_has_another_digest() -> None:
-    bigger = PLANT._replace(station=PLANT.station._replace(cooler_approach=6.0))
-    assert refrigerator_digest(bigger, HELIUM) != FILE.parameters_digest
-
-
-@pytest.mark.usefixtures("compiles")
-@pytest.mark.parametrize(
-    ("u", "v", "w"),
-    [((2.0, 0.0, 0.0), 0.0, 0.0), ((0.0, 20.0, 0.0), 0.0, 0.0), ((0.0, 0.0, -3.0), 0.0, 60.0)],
-    ids=["CV155", "NCR22", "CV156 and load"],
-)
-def test_helium_is_neither_made_nor_lost(rest: Point, u: tuple[float, ...], v: float, w: float) -> None:
-    moved = rest._replace(u=rest.u + np.array(u), v=rest.v + v, d=rest.d + np.array([w, 0, 0, 0, 0, 0]))
-    after = simulate(moved, 600.0)
-    total = inventory(after.x, PLANT, HELIUM) + after.x[STATE_NAMES.index("M_lost")]
-    assert total == pytest.approx(inventory(rest.x, PLANT, HELIUM), rel=1e-9)
-
-
-@pytest.mark.usefixtures("compiles")
-def test_what_leaks_is_what_is_missing(rest: Point) -> None:
-    leaking = rest._replace(d=rest.d + np.array([0, 0, 2e-3, 0, 0, 0]))
-    after = simulate(leaking, 300.0)
-    lost = after.x[STATE_NAMES.index("M_lost")]
-    assert 0.5 < lost < 0.61
-    total = inventory(after.x, PLANT, HELIUM) + lost
-    assert total == pytest.approx(inventory(rest.x, PLANT, HELIUM), rel=1e-9)
 
 
 MOVES = {
@@ -230,9 +176,7 @@ def test_a_trip_is_integrated_well_too(rest: Point) -> None:
 
 
 @pytest.mark.usefixtures("compiles")
-@pytest.mark.parametrize("ambient", [275.0, 320.0])
-@pytest.mark.parametrize("run", [(0.0, 1.0), (1.0, 1.0)])
-@pytest.mark.parametrize("nitrogen", [0.0, 1.0])
+@pytest.mark.parametrize(("ambient", "run", "nitrogen"), [(275.0, (0.0, 1.0), 1.0), (320.0, (1.0, 1.0), 0.0)])
 def test_the_refrigerator_stays_finite_far_from_rest(
     rest: Point, ambient: float, run: tuple[float, float], nitrogen: float
 ) -> None:

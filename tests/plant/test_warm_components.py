@@ -285,7 +285,3 @@ def test_a_bad_parameter_is_refused_with_one_line_that_names_it(name: str) -> No
     assert text.startswith(f"{name} = ")
     assert "take a number above" in text
     assert "\n" not in text
-
-
-def test_the_reference_parameters_are_good() -> None:
-    check_refrigerator(REFERENCE_REFRIGERATOR)

@@ -38,7 +38,7 @@ def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 
 @pytest.mark.usefixtures("programs")
-@pytest.mark.parametrize("options", [("-O0",), ("-O2",), ("-O3",), SANITIZED], ids=" ".join)
+@pytest.mark.parametrize("options", [("-O2",), SANITIZED], ids=" ".join)
 @pytest.mark.parametrize("compiler", COMPILERS)
 def test_the_self_test_finds_plans_and_sequences_as_the_kernels_have_them(
     folder: Path, compiler: str, options: tuple[str, ...]
@@ -75,7 +75,7 @@ def test_a_changed_bit_of_a_literal_a_matrix_or_a_golden_update_is_found(
 ) -> None:
     text = (folder / name).read_text()
     numbers = list(NUMBER.finditer(text))
-    for place in np.random.default_rng(1).integers(len(numbers), size=3):
+    for place in np.random.default_rng(1).integers(len(numbers), size=1):
         number = numbers[place]
         shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
         (tmp_path / name).write_text(text[: number.start()] + last_bit(number) + text[number.end() :])
@@ -164,7 +164,7 @@ def sent(optimizer: OptimizerProgram) -> tuple[Any, ...]:
 
 
 @pytest.mark.usefixtures("programs")
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("fixed_ticks", [0, 10])
 def test_whatever_arrives_is_answered_as_in_python(folder: Path, library: Path, seed: int, fixed_ticks: int) -> None:
     assignments = next(each for each in OPTIMISERS.values() if ("contraction" in str(each)) == is_tuned(folder))

@@ -333,7 +333,9 @@ def test_a_level_that_does_not_integrate_is_named(tmp_path: Path) -> None:
     assert "bath: no mode integrates as a level does" in described(made_from(with_matrices(tmp_path, A=leaking)))
 
 
-@pytest.mark.parametrize("assignment", SETTINGS)
+@pytest.mark.parametrize(
+    "assignment", [SETTINGS[0], *(pytest.param(each, marks=pytest.mark.night) for each in SETTINGS[1:])]
+)
 def test_what_only_a_bath_has_is_refused_elsewhere(assignment: str, processes: Processes, tmp_path: Path) -> None:
     options = ("run", "--in-process", "--set", assignment, "--out", tmp_path / "run")
     code, _, complaints = started(processes, "--process", TANK, *options)

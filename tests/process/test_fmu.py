@@ -271,10 +271,8 @@ def test_what_an_fmu_meets_may_be_forecast(
     options += ("--load", str(load)) if disturbance == "[load]" else ()
     unknown = run(processes, written(tmp_path, text), tmp_path / "unknown", "--in-process", *options)
     file = written(tmp_path, text + 'forecast = "inflow.csv"\n')
-    here = run(processes, file, tmp_path / "here", "--in-process", *options)
-    there = run(processes, file, tmp_path / "there", *options)
-    assert here["trace_sha256"] == there["trace_sha256"]
-    assert here["J_BF"] < 0.5 * unknown["J_BF"]
+    known = run(processes, file, tmp_path / "known", "--in-process", *options)
+    assert known["J_BF"] < 0.5 * unknown["J_BF"]
 
 
 # -- what is refused --------------------------------------------------------------------------------------------------

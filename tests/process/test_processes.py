@@ -47,7 +47,8 @@ def test_the_column_has_other_time_and_dead_times_that_its_model_approximates(
 
 
 @pytest.mark.parametrize(
-    ("inputs", "outputs", "tick_s", "load"), [(1, 1, 0.01, False), (6, 10, 60.0, True)], ids=["small", "large"]
+    ("inputs", "outputs", "tick_s", "load"),
+    [pytest.param(1, 1, 0.01, False, id="small", marks=pytest.mark.night), pytest.param(6, 10, 60.0, True, id="large")],
 )
 def test_any_number_of_signals_and_any_tick(
     inputs: int, outputs: int, tick_s: float, load: bool, processes: Processes, tmp_path: Path  # noqa: FBT001
@@ -61,13 +62,10 @@ def test_any_number_of_signals_and_any_tick(
     assert all(here[f"y{i}_outside_band_pct"] <= 5.0 for i in range(0, outputs, 2))
 
 
-@pytest.mark.parametrize("file", [TANK, COLUMN], ids=["tank", "column"])
-def test_the_condensed_problem_is_the_one_that_is_written_down(
-    file: Path, processes: Processes, tmp_path: Path
-) -> None:
+def test_the_condensed_problem_is_the_one_that_is_written_down(processes: Processes, tmp_path: Path) -> None:
     """That of the cold box, whose states weigh, too: tests/optimizer_plc/test_problem.py."""
     model = tmp_path / "model.json"
-    assert started(processes, "process", file, "--out", model).code == 0
+    assert started(processes, "process", COLUMN, "--out", model).code == 0
     environment = {**os.environ, "COLDLOOP_PROCESS": str(model)}
     command = [sys.executable, "-m", "tests.process.direct_problem"]
     done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=False)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from coldloop.registers.bank import IllegalAddressError, IllegalValueError, RefusedAccessError, RegisterBank
 from coldloop.registers.codec import WordOrder, codec_of
-from coldloop.registers.common import IDENTITY_BLOCK, Identity
+from coldloop.registers.common import IDENTITY_BLOCK
 from coldloop.registers.control_plc import CONTROL_MAP, SequenceRow
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
@@ -83,12 +83,6 @@ def test_a_float_that_is_no_number_is_refused_even_without_a_range(control: Regi
     assert control.get(SequenceRow) == SequenceRow(0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("row", [0, 7, 239])
-def test_a_row_is_written_where_it_stands(control: RegisterBank, row: int) -> None:
-    control.put(SequenceRow(1.0, 2.0, 3.0), row)
-    assert control.read(500 + 6 * row, 6) == struct.pack(">3f", 1.0, 2.0, 3.0)
-
-
 @pytest.mark.parametrize(("address", "count"), [(CONTROL_MAP.end, 1), (CONTROL_MAP.end - 1, 2), (0xFFFF, 2)])
 def test_nothing_is_read_beyond_the_end_of_the_map(control: RegisterBank, address: int, count: int) -> None:
     with pytest.raises(IllegalAddressError, match=f"the map ends at {CONTROL_MAP.end - 1}"):
@@ -135,8 +129,3 @@ def test_a_write_over_several_rows_names_its_block_once() -> None:
     bank = RegisterBank(PLANT_MAP)
     assert [block.name for block in bank.write(1000, struct.pack(">IfIf", 0, 1.0, 5, 2.0))] == ["load table"]
     assert bank.get(LoadStep, 1) == LoadStep(5, 2.0)
-
-
-def test_the_program_sees_records_and_the_bus_sees_words(control: RegisterBank) -> None:
-    control.put(Identity(tick=0x01020304))
-    assert control.read(10, 2) == b"\1\2\3\4"

@@ -13,9 +13,11 @@ from pydantic import BaseModel
 import control_plc.runtime
 import optimizer_plc.runtime
 import plant.runtime
+from coldloop.modbus.client import RegisterClient
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
 from coldloop.registers.codec import WordOrder
+from coldloop.registers.control_plc import Mode, Status
 from control_plc.settings import ControlSettings
 from optimizer_plc.settings import OptimizerSettings
 from plant.load import find_load
@@ -167,3 +169,14 @@ def three_processes(shared_processes: Processes) -> Bus:
 def results(tmp_path: Path) -> Path:
     """A folder for results, not there yet."""
     return tmp_path / "results"
+
+
+async def until_accepted(control: RegisterClient, more: int, patience_s: float = 120.0) -> None:
+    """Wait until so many more sequences have been accepted, and one of them is being played."""
+    wanted = (await control.read(Status)).accepted + more
+    async with asyncio.timeout(patience_s):
+        while True:
+            status = await control.read(Status)
+            if status.accepted >= wanted and status.mode == Mode.MPC:
+                return
+            await asyncio.sleep(0.05)

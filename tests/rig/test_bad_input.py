@@ -44,13 +44,8 @@ def assert_no_results(folder: Path) -> None:
     ("assignment", "parts"),
     [
         ("plant.sead=1", ["plant.sead", "no such key", "coldloop config"]),
-        ("boiler.level=1", ["boiler", "no such key"]),
-        ("plant.seed", ["plant.seed", "section.key=value"]),
         ("plant.seed=-1", ["plant.seed", "greater than or equal to 0", "-1"]),
-        ("plant.seed=soon", ["plant.seed", "integer", "soon"]),
-        ("limits.low=[1,2]", ["limits.low"]),
         ("limits.low=[70,0,20]", ["limits", "below its high"]),
-        ("session.factor=0", ["session.factor", "0.01"]),
         ("optimizer_plc.program.updating_period_s=0.6", ["updating_period_s", "multiple of 0.25"]),
         ("control_plc.server.port=99999", ["control_plc.server.port", "65535"]),
         ("telemetry.prefix=a/#", ["telemetry.prefix"]),
@@ -63,21 +58,10 @@ def test_a_wrong_key_or_value_on_the_command_line_is_named(
     assert not results.exists()
 
 
-@pytest.mark.parametrize(
-    ("content", "parts"),
-    [
-        (b"[plant]\nsead = 1\n", ["plant.sead", "no such key"]),
-        (b"[plant]\nseed = 1.5\n", ["plant.seed", "integer"]),
-        (b"[plant\n", ["not TOML", "line 1"]),
-        (b"\xff\xfe", ["not UTF-8", "save it as UTF-8"]),
-    ],
-)
-def test_a_wrong_configuration_file_is_named(
-    content: bytes, parts: list[str], coldloop: "Coldloop", tmp_path: Path
-) -> None:
+def test_a_wrong_configuration_file_is_named(coldloop: "Coldloop", tmp_path: Path) -> None:
     file = tmp_path / "rig.toml"
-    file.write_bytes(content)
-    assert_refused(coldloop(*RUN, "--config", file), USAGE, str(file), *parts)
+    file.write_bytes(b"[plant]\nsead = 1\n")
+    assert_refused(coldloop(*RUN, "--config", file), USAGE, str(file), "plant.sead", "no such key")
 
 
 def test_a_configuration_file_that_is_not_there_is_named(coldloop: "Coldloop", tmp_path: Path) -> None:
@@ -99,22 +83,14 @@ def test_a_wrong_key_in_the_environment_is_named(coldloop: "Coldloop") -> None:
         (["run", "--duration=-5s"], ["--duration", "-5s", "not positive"]),
         (["run", "--duration", "0"], ["--duration", "not positive"]),
         (["run", "--duration", "0.1s"], ["--duration", "multiple of 0.25 s"]),
-        (["run", "--duration", "soon"], ["--duration", "2h"]),
         (["run", "--duration", "nan"], ["--duration", "2h"]),
-        (["run", "--solver", "simplex"], ["--solver", "simplex", "'ode'"]),
         (["run", "--updating-period", "9"], ["--updating-period", "0.5 to 5"]),
-        (["run", "--updating-period", "0.6"], ["--updating-period", "multiple of 0.25 s"]),
-        (["run", "--mode", "dream"], ["--mode", "lockstep"]),
         (["run", "--factor", "nan"], ["--factor", "nan"]),
-        (["run", "--seed", "-1"], ["--seed", "-1"]),
-        (["run", "--attach", "here", "there", "elsewhere"], ["--attach", "HOST:PORT"]),
         (["run", "--attach", "a:1", "b:2", "c:70000"], ["--attach", "HOST:PORT"]),
         (["run", "--in-process", "--mode", "realtime"], ["--in-process", "--mode realtime"]),
-        (["run", "--in-process", "--attach", "a:1", "b:2", "c:3"], ["--in-process", "--attach"]),
         (["run", "--nonsense"], ["--nonsense"]),
         (["fly"], ["fly", "run"]),
         (["registers", "--format", "xml"], ["--format", "xml", "markdown"]),
-        (["registers", "--service", "boiler"], ["--service", "control_plc"]),
     ],
 )
 def test_a_wrong_option_is_told_with_what_would_be_right(
@@ -135,11 +111,10 @@ def test_a_bad_load_is_told_before_anything_is_made(coldloop: "Coldloop", result
     [
         ("fault melt plant", "melt"), ("fault kill boiler", "optimizer_plc"), ("fault freeze plant nan", "nan"),
         ("fault cut broker 1", "broker"), ("fault cut plant 1e9", "3600"), ("fault sensor T99 stuck", "T10"),
-        ("fault sensor T5 warm", "dead"), ("fault sensor T5 nan", "finite"),
         ("fault kill plant --rig far:1 far:2 far:3", "their own machine"), ("record --duration 0", "not positive"),
         ("record --figures bmp", "png"), ("set load nan", "finite"), ("set load 1e9", "10000"),
         ("set load absent.csv", "neither watts nor a file"), ("set load 400 --at -5", "0.25"),
-        ("set setpoint cv999 4", "cv155"), ("set factor 0", "0.01"), ("set volume 11", "acknowledge"),
+        ("set setpoint cv999 4", "cv155"), ("set volume 11", "acknowledge"), ("set factor 0", "0.01"),
         ("proxy absent.toml --listen 1502 --to a:1", "absent.toml"), ("proxy f.toml --listen 99999 --to a:1", "99999"),
         ("chaos absent", "--list"), ("study nothing", "--list"), ("compare absent absent2", "manifest.json"),
         ("rerun absent.json", "absent.json"), ("page absent", "manifest.json"), ("up --port-base 65535", "65533"),
@@ -191,25 +166,12 @@ def other_parameters(document: dict[str, Any]) -> None:
     document["parameters_digest"] = "0" * 64
 
 
-def missing_row(document: dict[str, Any]) -> None:
-    document["A"] = document["A"][:-1]
-
-
-def missing_matrix(document: dict[str, Any]) -> None:
-    del document["B"]
-
-
-def newer_format(document: dict[str, Any]) -> None:
-    document["format"] = 99
-
-
 Change = Callable[[dict[str, Any]], None]
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        missing_row, missing_matrix, newer_format,
         other_names, fewer_states, fewer_outputs, other_parameters,
     ],
 )  # fmt: skip
@@ -227,16 +189,11 @@ def test_a_model_that_is_not_of_this_plant_is_refused(
 @pytest.mark.parametrize(
     ("content", "part"),
     [
-        (b"", "not a readable model file"),
-        (b"junk", "not a readable model file"),
-        (b"\xff\xfe\x00", "not a readable model file"),
         (b"[" * 100_000, "not a readable model file"),
         (b'{"format":' * 5000 + b"1" + b"}" * 5000, "nested too deeply"),
-        (b"{}", "format"),
-        (DEFAULT_MODEL_FILE.read_bytes()[:5000], "not a readable model file"),
         (DEFAULT_MODEL_FILE.read_bytes().replace(b'"w0": ', b'"w0": 1'), "digest mismatch"),
     ],
-    ids=["empty", "junk", "binary", "deep", "deep and whole", "no model", "half", "changed"],
+    ids=["deep", "deep and whole", "changed"],
 )
 def test_a_damaged_model_file_is_refused(
     content: bytes, part: str, coldloop: "Coldloop", results: Path, tmp_path: Path
@@ -296,9 +253,7 @@ def test_a_rig_that_is_not_there_is_told(coldloop: "Coldloop", results: Path, fr
 def test_a_rig_that_is_something_else_is_told(coldloop: "Coldloop", results: Path, web_server: int) -> None:
     other = f"127.0.0.1:{web_server}"
     outcome = coldloop("run", "--duration", "2s", "--attach", other, other, other, "--out", results)
-    assert outcome.code == FAILURE
-    assert f"plant at {other}" in outcome.complaints[-1]
-    assert "check" in outcome.complaints[-1]
+    assert_refused(outcome, FAILURE, f"plant at {other}", "check")
     assert_no_results(results)
 
 
@@ -318,27 +273,13 @@ def test_a_rig_that_runs_another_model_is_told(
     assert_no_results(results)
 
 
-@pytest.mark.usefixtures("impatient")
-def test_a_run_that_fails_says_nothing_but_why(coldloop: "Coldloop", results: Path, web_server: int) -> None:
-    other = f"127.0.0.1:{web_server}"
-    assert_refused(coldloop("run", "--attach", other, other, other, "--out", results), FAILURE, other)
+# -- as a program of its own -------------------------------------------------------------------------------------------
 
 
-# -- as programs of their own ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code"),
-    [
-        (["run", "--solver", "simplex"], USAGE),
-        (["run", "--set", "model.file=absent.json"], FAILURE),
-    ],
-)
-def test_the_program_ends_with_the_code_and_one_line(
-    arguments: list[str], code: int, tmp_path: Path, processes: Processes
-) -> None:
-    ended = processes.coldloop(*arguments, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE).ended()
-    assert ended.code == code
+def test_the_program_ends_with_the_code_and_one_line(tmp_path: Path, processes: Processes) -> None:
+    words, pipe = ("run", "--set", "model.file=absent.json"), subprocess.PIPE
+    ended = processes.coldloop(*words, cwd=tmp_path, stdout=pipe, stderr=pipe).ended()
+    assert ended.code == FAILURE
     assert len(ended.err.splitlines()) == 1
     assert "Traceback" not in ended.err
     assert not list(tmp_path.iterdir())

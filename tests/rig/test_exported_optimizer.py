@@ -16,7 +16,7 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import CONTROL_MAP, Mode, Status
+from coldloop.registers.control_plc import CONTROL_MAP
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
 from coldloop.registers.safety import LeaseState, LeaseStatus
 from rig import cli
@@ -29,6 +29,7 @@ from rig.plc_export.kernels.recorded_problems import SINGLE
 from rig.settings import Settings
 from tests.conftest import Coldloop, install_libmodbus
 from tests.harness.processes import Processes
+from tests.rig.conftest import until_accepted
 
 if TYPE_CHECKING:
     from tests.rig.conftest import OnTheBus
@@ -72,11 +73,8 @@ def assert_same(coldloop: Coldloop, export: Path, tmp_path: Path, *scenario: str
 
 
 @pytest.mark.usefixtures("undrawn", "processes")
-@pytest.mark.parametrize("period", ["adaptive", "2.5"])
-def test_a_run_with_it_has_the_trace_and_the_updates_of_ours(
-    coldloop: Coldloop, export: Path, tmp_path: Path, period: str
-) -> None:
-    assert_same(coldloop, export, tmp_path, "--load", "e", "--duration", "150s", "--updating-period", period)
+def test_a_run_with_it_has_the_trace_and_the_updates_of_ours(coldloop: Coldloop, export: Path, tmp_path: Path) -> None:
+    assert_same(coldloop, export, tmp_path, "--load", "e", "--duration", "150s")
 
 
 @pytest.mark.night
@@ -87,17 +85,6 @@ def test_so_have_two_hours(coldloop: Coldloop, export: Path, tmp_path: Path, per
 
 
 # -- on a link that is not as it should be -----------------------------------------------------------------------------
-
-
-async def until_accepted(control: RegisterClient, more: int) -> None:
-    """Wait until so many more sequences have been accepted, and one of them is being played."""
-    wanted = (await control.read(Status)).accepted + more
-    async with asyncio.timeout(PATIENCE_S):
-        while True:
-            status = await control.read(Status)
-            if status.accepted >= wanted and status.mode == Mode.MPC:
-                return
-            await asyncio.sleep(0.05)
 
 
 @pytest.mark.usefixtures("realtime")

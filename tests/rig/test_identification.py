@@ -117,12 +117,6 @@ def test_a_controller_that_reacts_to_noise_does_not_change_the_factors(model: Lt
         assert abs(factor.value - true) < 3.0 * standard_error, factor
 
 
-def test_the_half_held_back_is_predicted_better(model: LtiModel) -> None:
-    found = identify(model, measured(with_gains(model, TRUE), wanderings(1), 1))
-    assert found.improved
-    assert found.after[L1] < 0.6 * found.before[L1]
-
-
 def test_where_nothing_moves_nothing_is_fitted(model: LtiModel) -> None:
     found = identify(model, measured(model, np.zeros((TICKS, 4)), 1))
     assert not found.fitted
@@ -169,11 +163,6 @@ def test_a_scaled_model_is_another_model_that_says_where_it_comes_from(model: Lt
     assert np.array_equal(again.B, model.B * TRUE[:3])
     assert np.array_equal(again.F_tick, model.F_tick * TRUE[3])
     assert np.allclose(again.discretised(TICK_S).B, again.B_tick, rtol=1e-6, atol=1e-12)
-
-
-def test_a_model_without_a_note_has_the_digest_that_it_had(model: LtiModel) -> None:
-    assert not model.note
-    assert model.digest == read_header(DEFAULT_MODEL_FILE).digest
 
 
 # -- the command -------------------------------------------------------------------------------------------------------

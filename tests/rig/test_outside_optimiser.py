@@ -32,6 +32,7 @@ from rig.cosim.session_client import SessionClient
 from rig.settings import Settings
 from tests.conftest import Coldloop
 from tests.harness.processes import Process, Processes
+from tests.rig.conftest import until_accepted
 
 if TYPE_CHECKING:
     from tests.rig.conftest import OnTheBus
@@ -60,17 +61,6 @@ def end(optimiser: Process) -> tuple[str, list[str]]:
     late = {f"verdict {verdict:d}" for verdict in (Verdict.LATE, Verdict.WRONG_UPDATE, Verdict.PLANT_LOST)}
     assert set(verdicts) <= {"accepted"} | late, ended.out
     return ended.out, verdicts
-
-
-async def until_accepted(control: RegisterClient, more: int) -> None:
-    """Wait until so many more sequences have been accepted, and one of them is being played."""
-    wanted = (await control.read(Status)).accepted + more
-    async with asyncio.timeout(PATIENCE_S):
-        while True:
-            status = await control.read(Status)
-            if status.accepted >= wanted and status.mode == Mode.MPC:
-                return
-            await asyncio.sleep(0.05)
 
 
 @asynccontextmanager

@@ -94,21 +94,19 @@ def test_the_exergy_of_the_example_sums_to_what_is_put_in(coldloop: "Coldloop") 
 
 
 WRONG_VALUES = {
-    "nef6.ua_w_per_k": ["0", "-21500", "nan", "1e9", '"21500"'],
-    "nef6.volume_l": ["0"], "nef6.aluminium_kg": ["-150"],
-    "nef5.ua_w_per_k": ["0"], "nef5.volume_l": ["-30"], "nef5.wet_level_pct": ["0", "120"],
-    "nef5.capacity_kj_per_k": ["0"], "nef5.cv167_area_mm2": ["0", "1.3e-6"], "nef5.cv167_lag_s": ["0.1"],
-    "nef5.cv167_fastest_pct_per_s": ["-1"],
-    "nc1.displacement_l_per_s": ["0", "-380", "0.038", "1e9", "inf", "true", "[380]"],
-    "nc1.filling": ["0", "1.2"], "nc2.slip": ["-0.1", "0.5"], "nc2.isothermal_efficiency": ["0", "1.5", "55"],
-    "nc2.built_in_ratio": ["1", "0"], "nc1.mismatch": ["-0.05"], "nc2.motor_efficiency": ["0", "95"],
-    "station.hp_volume_m3": ["0", "1e6"], "station.lp_volume_m3": ["-1.5"], "station.buffer_volume_m3": ["nan"],
-    "station.buffer_bar": ["0", "600"], "station.cv956_area_mm2": ["0", "3.4e-5"], "station.cv952_area_mm2": ["-20"],
-    "station.cv953_area_mm2": ["inf"], "station.valve_lag_s": ["0"], "station.cooler_approach_k": ["-5", "300"],
-    "station.run_up_s": ["0"], "station.run_down_s": ["0.01"],
-    "hp_relief.pressure_bar": ["0", "18e5"], "lp_relief.span_bar": ["0"], "buffer_relief.area_mm2": ["-1"],
+    "nef6.ua_w_per_k": ["0"], "nef6.volume_l": ["0"], "nef6.aluminium_kg": ["-150"], "nef5.ua_w_per_k": ["0"],
+    "nef5.volume_l": ["-30"], "nef5.wet_level_pct": ["120"], "nef5.capacity_kj_per_k": ["0"],
+    "nef5.cv167_area_mm2": ["1.3e-6"], "nef5.cv167_lag_s": ["0.1"], "nef5.cv167_fastest_pct_per_s": ["-1"],
+    "nc1.displacement_l_per_s": ["0", "0.038", "1e9", "inf", "true"], "nc1.filling": ["1.2"], "nc2.slip": ["0.5"],
+    "nc2.isothermal_efficiency": ["55"], "nc2.built_in_ratio": ["1"], "nc1.mismatch": ["-0.05"],
+    "nc2.motor_efficiency": ["95"], "station.hp_volume_m3": ["1e6"], "station.lp_volume_m3": ["-1.5"],
+    "station.buffer_volume_m3": ["nan"], "station.buffer_bar": ["600"], "station.cv956_area_mm2": ["3.4e-5"],
+    "station.cv952_area_mm2": ["-20"], "station.cv953_area_mm2": ["inf"], "station.valve_lag_s": ["0"],
+    "station.cooler_approach_k": ["300"], "station.run_up_s": ["0"], "station.run_down_s": ["0.01"],
+    "hp_relief.pressure_bar": ["18e5"], "lp_relief.span_bar": ["0"], "buffer_relief.area_mm2": ["-1"],
     "boundaries.p_hp_bar": ["25"],
 }  # fmt: skip
+"""Each key is refused at an end of its range; how else a number may be wrong is tried on one of them."""
 WITHOUT_SEARCH = [
     *(
         ("[{}]\n{} = {}\n[nc1]".format(*key.split("."), value) if not key.startswith("nc1.") else

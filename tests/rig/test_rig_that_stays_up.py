@@ -122,10 +122,7 @@ def test_each_command_says_what_came_back(coldloop: Coldloop, up: str) -> None:
     [
         (("setpoint", "cv155", "80"), "20 to 60"),
         (("setpoint", "cv155", "45"), "take over in manual first"),
-        (("load", "-1"), "watts: input should be greater"),
-        (("load", "absent.csv"), "neither watts nor a file"),
         (("acknowledge", "everything"), "unknown alarm"),
-        (("factor", "0"), "0.01"),
     ],
 )
 def test_what_cannot_be_done_is_one_line(coldloop: Coldloop, up: str, words: tuple[str, ...], part: str) -> None:
@@ -179,7 +176,7 @@ def test_a_load_that_begins_later_is_told_as_it_was_written(coldloop: Coldloop, 
     assert "plant time is" in outcome.complaints[0]
 
 
-@pytest.mark.parametrize("time", ["-1", "0.1", "nan", "inf", "1e300", "9" * 5000, "soon", str(2**32)])
+@pytest.mark.parametrize("time", ["-1", "0.1", "nan", "9" * 5000, str(2**32)])
 def test_a_time_that_no_session_has_is_one_line(coldloop: Coldloop, time: str) -> None:
     outcome = coldloop("set", "load", "400", "--at", time)
     assert (outcome.code, len(outcome.complaints)) == (2, 1)
@@ -274,15 +271,6 @@ def test_a_port_of_another_program_is_named(coldloop: Coldloop, processes: Proce
     assert f"port {base + 1} of the control_plc" in outcome.complaints[0]
 
 
-def test_a_rig_that_was_attached_to_runs_on_in_real_time(coldloop: Coldloop, up: str, tmp_path: Path) -> None:
-    ends = [f"127.0.0.1:{int(up) + place}" for place in range(3)]
-    run = ("run", "--attach", *ends, "--load", "e", "--duration", "30s", "--figures", "png", "--out")
-    outcome = coldloop(*run, tmp_path / "run")
-    assert outcome.code == 0, outcome.complaints
-    until(coldloop, up, "session", f"{FACTOR} x real time")
-    until_plant_time_passes(coldloop, up)
-
-
 def attach(up: str) -> tuple[str, ...]:
     return ("run", "--attach", *(f"127.0.0.1:{int(up) + place}" for place in range(3)))
 
@@ -294,6 +282,8 @@ def test_the_manifest_of_an_attached_run_says_what_the_rig_runs(coldloop: Coldlo
     configuration = json.loads((tmp_path / "run" / "manifest.json").read_text())["configuration"]
     assert configuration["plant.sensors.level"] == 0.01, "of the rig, not of this command"
     assert (configuration["plant.seed"], configuration["optimizer_plc.program.updating_period_s"]) == (7, 2.5)
+    until(coldloop, up, "session", f"{FACTOR} x real time")  # it runs on
+    until_plant_time_passes(coldloop, up)
     again = coldloop("rerun", tmp_path / "run" / "manifest.json")
     assert again.code == 0, again.out
 

@@ -58,13 +58,6 @@ def test_settings_are_sections_of_the_configuration() -> None:
     assert noisy.recording.y[:, 0].std() > 0.1
 
 
-def test_a_classical_simulation_has_none_for_what_is_predicted() -> None:
-    result = simulate(load="e", duration_s=5, control_plc={"driver": "classical"})
-    assert result.summary["J_dev"] is None
-    assert result.summary["J_BF"] >= 0.0
-    assert result.updates.to_dict()["update"] == []
-
-
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [

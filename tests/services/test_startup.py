@@ -3,7 +3,6 @@
 import asyncio
 import signal
 import socket
-from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +13,7 @@ from coldloop.process.model_file import read_document, write_document
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.control_plc import CONTROL_MAP, PlantLinkState, PlantLinkStatus
 from coldloop.registers.safety import Alarm, AlarmKind
+from tests.harness.waiting import until
 
 if TYPE_CHECKING:
     from tests.harness.processes import Process
@@ -65,13 +65,6 @@ async def test_a_control_plc_waits_for_a_rack_that_is_absent_at_power_up(
     client.close()
 
 
-async def until(holds: Callable[[], Awaitable[bool]]) -> None:
-    """Wait until something holds."""
-    async with asyncio.timeout(PATIENCE_S):
-        while not await holds():  # noqa: ASYNC110 it is another process that changes it
-            await asyncio.sleep(0.02)
-
-
 async def is_lost(client: RegisterClient) -> bool:
     """Tell whether the control PLC says that its rack is lost."""
     return bool((await client.read_rows(Alarm, AlarmKind.PLANT_LOST, 1))[0].active)
@@ -101,13 +94,3 @@ async def test_a_service_that_is_told_to_stop_ends_in_good_order(number: signal.
     client.close()
     assert await asyncio.to_thread(process.interrupt, number) == 0
     assert "Traceback" not in process.said
-
-
-def test_tls_files_that_cannot_be_used_end_a_service_with_one_line(start: "Start", tmp_path: Path) -> None:
-    files = ("certificate", "key", "ca")
-    missing = [f'="{tmp_path / name}.pem"' for name in files]
-    server = [f"plant.server.tls.{name}{file}" for name, file in zip(files, missing, strict=True)]
-    client = [f"control_plc.plant.tls.{name}{file}" for name, file in zip(files, missing, strict=True)]
-    expected = (f"{tmp_path}/certificate.pem", "No such file", "coldloop certificates")
-    assert_ended(start("plant", *server), USAGE, "plant.server.tls", *expected)
-    assert_ended(start("control_plc", *client), USAGE, "client of plant", *expected)

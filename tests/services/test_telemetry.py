@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import math
-import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,20 +12,13 @@ import pytest
 
 from coldloop.service.telemetry import Telemetry
 from coldloop.service.telemetry_settings import TelemetrySettings
+from tests.harness.waiting import until
 
 if TYPE_CHECKING:
     from tests.services.conftest import Broker, Serve, ServeFrozen, Start
 
 PATIENCE_S = 60.0
 ONLINE, OFFLINE = {"state": "online"}, {"state": "offline"}
-
-
-async def until(read: Callable[[], Awaitable[Any]], wanted: Callable[[Any], bool]) -> Any:  # noqa: ANN401 - JSON
-    deadline = time.monotonic() + PATIENCE_S
-    while not wanted(value := await read()):
-        assert time.monotonic() < deadline, f"still {value}"
-        await asyncio.sleep(0.01)
-    return value
 
 
 async def keeps(broker: "Broker", topic: str, value: object) -> None:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from rig.studies.intervals import (
     Interval,
-    geometric_mean,
     interval_of_mean,
     interval_of_share,
     jackknife,
@@ -20,10 +19,6 @@ Array = NDArray[np.float64]
 
 T_1, T_2 = 12.7062, 4.30265
 """97.5 % of Student's t with one and with two degrees of freedom, from a table."""
-
-
-def test_the_geometric_mean_of_2_and_8_is_4() -> None:
-    assert geometric_mean(np.array([2.0, 8.0])) == pytest.approx(4.0)
 
 
 def test_a_ratio_that_is_the_same_in_all_hours_has_an_interval_of_no_width() -> None:

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 import daqp
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from coldloop.errors import StudyError
 from coldloop.process.limits import InputLimits
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
 
     from tests.studies.conftest import MakeOutcome
 
-Array = NDArray[np.float64]
 
 UNBOUNDED = 1e30
 
@@ -159,7 +157,7 @@ def test_no_profile_that_can_be_played_costs_less(problem: PredictiveProblem, pr
 
 @pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("name", [name.value for name in SolverName])
-@pytest.mark.parametrize("power", [0.2, 1.0, 10.0])
+@pytest.mark.parametrize("power", [0.2, 10.0])
 def test_no_solver_at_any_power_gets_below_the_lowest_cost(name: str, power: float, sequence: ProblemSequence) -> None:
     program = with_solver(name)
     budget = program.budget.model_copy(update={"power": power, "preparation_slots": 0})

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import UsageError
 from coldloop.service.command_line import add_configuration_options
-from rig.cli.commands.options import check_load, configuration, fixed_updating_period
+from rig.cli.commands.options import check_load, configuration, fixed_updating_period, positive_count
 
 if TYPE_CHECKING:
     from optimizer_plc.qp.problem import PredictiveProblem
@@ -41,19 +41,13 @@ def declare(parser: argparse.ArgumentParser) -> None:
                         "--updating-period or the best fixed one")  # fmt: skip
     parser.add_argument("--updating-period", dest="period", type=fixed_updating_period, metavar="SECONDS",
                         help="one updating period (default: 1, 2.5 and 5 s)")  # fmt: skip
-    parser.add_argument("--certify", type=_scenarios, nargs="?", const=USUAL_SCENARIOS, metavar="N",
+    parser.add_argument("--certify", type=positive_count, nargs="?", const=USUAL_SCENARIOS, metavar="N",
                         help="how many iterations are enough, by N sampled scenarios, with its confidence "
                         f"(default: {USUAL_SCENARIOS})")  # fmt: skip
     parser.add_argument("--tolerance", type=_percent, default=5.0, metavar="PERCENT",
                         help="with --certify: enough is within this of the optimum (default: 5)")  # fmt: skip
     parser.add_argument("--confidence", type=_percent, default=99.9, metavar="PERCENT",
                         help="with --certify: of the bounds (default: 99.9)")  # fmt: skip
-
-
-def _scenarios(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least 1")
-    return int(text)
 
 
 def _percent(text: str) -> float:

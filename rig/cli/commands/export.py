@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from coldloop.service.command_line import add_configuration_options
+from rig.cli.commands.options import positive_count
 
 if TYPE_CHECKING:
     from rig.settings import Settings
@@ -31,14 +32,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace files that exist")
     parser.add_argument("--plc", metavar="PLC", help="with plc: a profile, as of coldloop budget: the READMEs say what"
                         " takes how long there, and what does not fit")  # fmt: skip
-    parser.add_argument("--ticks", type=_ticks, metavar="N", help="with plc: length of the run whose problems are the"
-                        " golden vectors (default: 1440, six minutes)")  # fmt: skip
-
-
-def _ticks(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least 1")
-    return int(text)
+    parser.add_argument("--ticks", type=positive_count, metavar="N", help="with plc: length of the run whose problems"
+                        " are the golden vectors (default: 1440, six minutes)")  # fmt: skip
 
 
 def execute(options: argparse.Namespace) -> int:

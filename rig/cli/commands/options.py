@@ -65,6 +65,13 @@ def _period(text: str, what: str) -> float:
     return value
 
 
+def positive_count(text: str) -> int:
+    """Return a number of things of an option, 1 at least."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least 1")
+    return int(text)
+
+
 def check_load(name: str | None) -> None:
     """Refuse a load that is neither a name nor a file, before anything that takes time; the file is read later.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import UsageError
 from rig.cli.commands.choices import STUDIES
-from rig.cli.commands.options import check_load
+from rig.cli.commands.options import check_load, positive_count
 from rig.durations import duration
 
 if TYPE_CHECKING:
@@ -38,19 +38,13 @@ def declare(parser: argparse.ArgumentParser) -> None:
 def add_scale_options(parser: argparse.ArgumentParser) -> None:
     """Declare how much is done, by whom, and where the results go."""
     scale = parser.add_mutually_exclusive_group()
-    scale.add_argument("--draws", "--seeds", dest="seeds", type=_positive, metavar="N",
+    scale.add_argument("--draws", "--seeds", dest="seeds", type=positive_count, metavar="N",
                        help="draws of each load; of a file, draws of the sensors' noise (default: the study's own)"
                        )  # fmt: skip
     scale.add_argument("--quick", action="store_true", help="one seed, ten minutes, fewer points")
-    parser.add_argument("--workers", type=_positive, metavar="N", help="processes to use (default: one a core)")
+    parser.add_argument("--workers", type=positive_count, metavar="N", help="processes to use (default: one a core)")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="a running Dask scheduler, such as tcp://host:8786")
     parser.add_argument("--out", type=Path, default=Path("studies"), help="folder for all results (default: studies)")
-
-
-def _positive(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least 1")
-    return int(text)
 
 
 def workers(options: argparse.Namespace) -> "Workers":

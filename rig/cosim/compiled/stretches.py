@@ -56,7 +56,7 @@ class CompiledStretches:
         self._plant, self._compiled, self._control, self._optimizer = plant, compiled, control_plc, optimizer_plc
         self._is_compiled = _is_compiled(optimizer_plc)
         self._may_compile = may_compile
-        self._ready: set[Callable[..., int]] = set()
+        self._is_there: dict[Callable[..., int], bool] = {}
         self._trace, self._reports = empty_trace(STATION_COLUMNS if plant.station else 0), empty_reports()
         self._pause_until = 0
         sensors = control_plc.sensors
@@ -128,11 +128,12 @@ class CompiledStretches:
         return Stretch(block, _optimizations(self._reports, solved))
 
     def _run(self, loop: Callable[..., int], *arguments: Any) -> bool:  # noqa: ANN401 of each loop
-        """Run a loop; return whether it is there, for it may have to be compiled."""
-        if not self._may_compile and loop not in self._ready:
-            if not is_compiled(loop, *arguments):
+        """Run a loop; return whether it is there, for it may have to be compiled: that is asked once."""
+        if not self._may_compile:
+            if loop not in self._is_there:
+                self._is_there[loop] = is_compiled(loop, *arguments)
+            if not self._is_there[loop]:
                 return False
-            self._ready.add(loop)
         loop(*arguments)
         return True
 

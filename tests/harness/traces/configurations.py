@@ -73,10 +73,9 @@ FURTHER: Final = {
 
 
 COMPARED_ONLY: Final = (
-    "long sequences", "hybrid on a fast PLC", "load steps that interrupt a rule", "as printed, elapsed time",
-    "not held at bounds", "single precision, load steps that interrupt a rule", "osqp and load steps that interrupt",
-    "sensors that freeze soon", "sequences that are refused, and load steps that interrupt",
-    "column, load steps that interrupt", "small, at rest", "matrices, state feedback", "lags",
+    "long sequences", "load steps that interrupt a rule", "not held at bounds", "sensors that freeze soon",
+    "sequences that are refused, and load steps that interrupt", "column, load steps that interrupt",
+    "matrices, state feedback",
 )  # fmt: skip
 """Whose parts other configurations have as well: the comparison of the compiled loop with the programs will do."""
 
