@@ -66,7 +66,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
 
 
 @pytest.mark.usefixtures("compiles")
-@pytest.mark.parametrize("target", FILES)
+@pytest.mark.parametrize("target", ["c", "st", pytest.param("plcopen", marks=pytest.mark.night)])
 def test_the_sources_and_a_readme_are_written(exported: Exported, target: str) -> None:
     out, printed = exported(target)
     assert printed.splitlines() == [str(out / name) for name in FILES[target]]

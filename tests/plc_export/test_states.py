@@ -1,6 +1,8 @@
-"""Kernels with states, parts of arrays and records of results compute in C what they compute in Python."""
+"""Kernels with states, parts of arrays and records of results do in Structured Text what they do in Python.
 
-import ctypes
+In C the whole optimiser does so (test_whole_optimizer.py).
+"""
+
 import math
 from typing import Any, NamedTuple, cast
 
@@ -12,8 +14,6 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from rig.plc_export.c.printer import Printer
-from rig.plc_export.c.text import helpers, records_in
 from rig.plc_export.structured_text import constants
 from rig.plc_export.structured_text.constants import Constants, configuration, in_pieces, types_in
 from rig.plc_export.structured_text.lowering import Lowering
@@ -23,10 +23,7 @@ from rig.plc_export.structured_text.printer import StructuredTextPrinter, global
 from rig.plc_export.templates import template
 from rig.plc_export.tree.reading import Program
 from rig.plc_export.tree.subset import UnfitKernelError, type_of
-from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, compiled
 from tests.plc_export.st_interpreter import Machine
-
-needs_compiler = pytest.mark.skipif(not COMPILERS, reason=NO_COMPILER)
 
 Array = NDArray[np.float32]
 N = 4
@@ -143,39 +140,6 @@ def reads_behind(m: State) -> None:
     now.count, now.sum = 7, m.one.z[m.numbers[0].count]
 
 
-# -- in C --------------------------------------------------------------------------------------------------------------
-
-
-class CNumbers(ctypes.Structure):
-    """`NUMBERS`."""
-
-    _fields_ = (("count", ctypes.c_int32), ("done", ctypes.c_bool), ("sum", ctypes.c_float))
-
-
-class CMark(ctypes.Structure):
-    """`MARK`."""
-
-    _fields_ = (("kind", ctypes.c_int32), ("size", ctypes.c_float))
-
-
-class CPart(ctypes.Structure):
-    """`Part`."""
-
-    _fields_ = (("numbers", CNumbers * 1), ("z", ctypes.c_float * N))
-
-
-class CState(ctypes.Structure):
-    """`State`."""
-
-    _fields_ = (("numbers", CNumbers * 1), ("one", CPart), ("other", CPart), ("marks", CMark * N))
-
-
-class CTable(ctypes.Structure):
-    """`Table`."""
-
-    _fields_ = (("rows", ctypes.POINTER(ctypes.c_float)),)
-
-
 def empty() -> State:
     def numbers() -> Any:  # noqa: ANN401 records
         return np.zeros(1, NUMBERS)
@@ -192,51 +156,11 @@ def function(entry: object, *arguments: object) -> tuple[Program, Any]:
 TABLE = Table(np.arange(3 * N, dtype=np.float32).reshape(3, N) - np.float32(4.0))
 
 
-@pytest.fixture(scope="module")
-def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
-    folder = tmp_path_factory.mktemp("states")
-    program, _ = function(advance, TABLE, empty(), np.zeros(N, np.float32), 0)
-    printer = Printer(np.float32)
-    text = "\n".join(printer.function(each, "" if each.name == "advance" else "static ") for each in program.functions)
-    types = [each.type for one in program.functions for each in one.parameters]
-    made = [kind for each in program.functions for kind in printer.made_in(each)]
-    records = "\n".join(map(printer.structure, records_in([*types, *made])))
-    literals = f"static const float literals[] = {{{', '.join(printer.literals)}}};"
-    head = "#include <math.h>\n#include <stdbool.h>\n#include <stdint.h>"
-    prototype = "".join(f"{printer.signature(each)};\n" for each in program.functions if each.name == "advance")
-    source = "\n".join((head, records, literals, helpers("float", text), prototype, text))
-    (folder / "states.c").write_text(source)
-    return ctypes.CDLL(str(compiled(folder, COMPILERS[0], "-O2", "-shared", "-fPIC")))
-
-
 def shown(numbers: Any) -> tuple[int, bool, float]:  # noqa: ANN401 records
     return int(numbers[0]["count"]), bool(numbers[0]["done"]), float(numbers[0]["sum"])
 
 
-def shown_in_c(numbers: Any) -> tuple[int, bool, float]:  # noqa: ANN401 records
-    return numbers[0].count, numbers[0].done, numbers[0].sum
-
-
 finite = st.floats(-50.0, 50.0, width=32)
-STEPS = st.lists(st.tuples(st.lists(finite, min_size=N, max_size=N), st.integers(0, 2)), min_size=1, max_size=4)
-
-
-@pytest.mark.usefixtures("compiles", "programs")
-@needs_compiler
-@settings(deadline=None)
-@given(steps=STEPS)
-def test_a_state_goes_the_same_way(library: ctypes.CDLL, steps: list[tuple[list[float], int]]) -> None:
-    m, c = empty(), CState()
-    table = CTable(TABLE.rows.ctypes.data_as(ctypes.POINTER(ctypes.c_float)))
-    for values, row in steps:
-        z = np.array(values, np.float32)
-        advance(TABLE, m, z, row)
-        library.advance(ctypes.byref(table), ctypes.byref(c), z.ctypes.data_as(ctypes.c_void_p), row)
-        assert shown(m.numbers) == shown_in_c(c.numbers)
-        for part, in_c in ((m.one, c.one), (m.other, c.other)):
-            assert shown(part.numbers) == shown_in_c(in_c.numbers)
-            assert part.z.tolist() == list(in_c.z)
-        assert [tuple(each) for each in m.marks.tolist()] == [(each.kind, each.size) for each in c.marks]
 
 
 def test_a_number_that_is_read_behind_its_assignment_is_refused() -> None:

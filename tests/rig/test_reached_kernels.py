@@ -10,7 +10,7 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 from coldloop.kernels.compiled import _parts, cache_folder, forms_of
-from coldloop.kernels.description import label
+from coldloop.kernels.ownership import label
 from coldloop.kernels.reach import reached
 from rig.cosim.one_process import OneProcessRig
 from rig.results.recording import Recorder

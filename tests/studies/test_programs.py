@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from coldloop.kernels.description import is_decisive_module
+from coldloop.kernels.ownership import is_decisive_module
 from coldloop.kernels.reach import reached
 from rig.cosim.compiled.cold_box_plants import advance_box
 from rig.studies.request import Procedure, RunRequest, perform, programs, programs_digest

@@ -8,7 +8,7 @@ from typing import Any, Final, Protocol, TypeVar
 
 from numba.extending import overload
 
-from coldloop.kernels.description import Implementations
+from coldloop.kernels.implementations import Implementations
 from coldloop.process.loaded import PROCESS
 from plant.program import PlantProgram
 from rig.cosim.compiled.records import Array, PlantState

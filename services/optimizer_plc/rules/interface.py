@@ -12,7 +12,7 @@ import numpy as np
 from numba.extending import overload
 from numpy.typing import NDArray
 
-from coldloop.kernels.description import Implementations
+from coldloop.kernels.implementations import Implementations
 from coldloop.registers.optimizer_plc import UpdatingRuleStatus
 from optimizer_plc.rules.assessment import Assessment, Observation
 

@@ -31,8 +31,8 @@ from numba.core.serialize import dumps
 from numpy.typing import NDArray
 
 from coldloop.kernels.cache_folder import CacheFolder, find_cache_folder
-from coldloop.kernels.description import label
 from coldloop.kernels.first_use import needs_compiling
+from coldloop.kernels.ownership import label
 from coldloop.kernels.reach import digest
 
 P = ParamSpec("P")

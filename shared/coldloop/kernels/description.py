@@ -8,29 +8,20 @@ import dataclasses
 import dis
 import functools
 import hashlib
-import io
 import sys
-import sysconfig
 import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from enum import Enum
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from types import CodeType, FunctionType, MappingProxyType, MethodType, ModuleType
-from typing import Any, Final, NamedTuple, TypeVar
+from types import CodeType, FunctionType, ModuleType
+from typing import Any, Final, NamedTuple
 
-import numpy as np
+from coldloop.kernels.data import Plain, described
+from coldloop.kernels.implementations import Implementations, overloads_of
+from coldloop.kernels.ownership import is_decisive, is_decisive_module, is_own, label
 
-F = TypeVar("F")
-
-PROJECT: Final = frozenset({"coldloop", "plant", "control_plc", "optimizer_plc", "hmi", "rig", "tests"})
-"""Packages that are ours wherever they are installed; what is not part of an installed distribution is ours, too."""
-NOT_DECISIVE: Final = frozenset({
-    "coldloop.kernels.cache_folder", "coldloop.kernels.compiled", "coldloop.kernels.description",
-    "coldloop.kernels.first_use", "coldloop.kernels.lean_numba", "coldloop.kernels.reach", "coldloop.service.logs",
-})  # fmt: skip
-"""Modules that decide where results are kept and what is logged, and not what results are."""
 OF_MODULE: Final = frozenset({
     "__builtins__", "__cached__", "__doc__", "__file__", "__loader__", "__name__", "__package__", "__path__", "__spec__"
 })  # fmt: skip
@@ -53,27 +44,6 @@ OF_FUNCTION: Final = 0x3
 """Flags of the code of each function, which numba takes away from kernels that are profiled."""
 PLAIN: Final = (bool, int, float, complex, str, bytes, type(None), type(Ellipsis), type(NotImplemented), range, slice)
 
-Plain = Any
-"""Nested tuples of text, numbers and bytes, whose `repr` is the same in every process."""
-
-
-class Implementations(dict[type, F]):
-    """Implementations of a function by the class of its first argument.
-
-    A kernel's signature decides which one is called. So a class counts with its implementations, and the function does
-    not count with those that this process happens to have.
-
-    Args:
-        name: Of the function.
-    """
-
-    tables: Final[list["Implementations[Any]"]] = []
-
-    def __init__(self, name: str) -> None:
-        super().__init__()
-        self.name = name
-        self.tables.append(self)
-
 
 class Reference(NamedTuple):
     """An object that another one refers to."""
@@ -81,34 +51,6 @@ class Reference(NamedTuple):
     holder: Any
     compiled: bool
     """It is referred to by compiled code, for which a class is no more than the layout of its data."""
-
-
-def label(value: Any) -> str:  # noqa: ANN401 anything
-    """Return the full name of a function or a class, or that of an object's type."""
-    name = getattr(value, "__qualname__", None) or getattr(value, "__name__", None)
-    if not isinstance(name, str):
-        return label(type(value))
-    return f"{getattr(value, '__module__', None)}.{name}"
-
-
-@functools.cache
-def is_own(module: str | None) -> bool:
-    """Return whether a module is ours: neither Python's nor that of an installed distribution."""
-    package = (module or "").partition(".")[0]
-    if package in PROJECT:
-        return True
-    if not package or package in sys.builtin_module_names or package in sys.stdlib_module_names - {"__main__"}:
-        return False
-    found = sys.modules.get(package)
-    places = [getattr(found, "__file__", None), *getattr(found, "__path__", ())]
-    installed = {Path(sysconfig.get_path(kind)) for kind in ("purelib", "platlib")}
-    return any(place and installed.isdisjoint(Path(place).parents) for place in places)
-
-
-def is_decisive(holder: Any) -> bool:  # noqa: ANN401 anything
-    """Return whether more counts of a function, a class or an instance than its name."""
-    module = getattr(holder, "__module__", None)
-    return module not in NOT_DECISIVE and is_own(module)
 
 
 class Describer:
@@ -146,7 +88,7 @@ class Describer:
         """Return the description of data, or of what is used like data."""
         if type(value) in PLAIN:
             return (type(value).__name__, "" if value == sys.executable else repr(value))
-        return _described(value, self)
+        return described(value, self)
 
     def items(self, items: Iterable[tuple[Any, Any]]) -> Plain:
         """Return the description of pairs, in their order."""
@@ -256,13 +198,14 @@ class Describer:
         )  # fmt: skip
 
     def _field(self, field: Any) -> Plain:  # noqa: ANN401
-        return tuple(self._annotation(getattr(field, part)) for part in OF_FIELD)
+        return tuple(self.annotation(getattr(field, part)) for part in OF_FIELD)
 
-    def _annotation(self, annotation: Any) -> Plain:  # noqa: ANN401
+    def annotation(self, annotation: Any) -> Plain:  # noqa: ANN401
+        """Return the description of a type that is written down, with its arguments."""
         origin = typing.get_origin(annotation)
         if origin is None:
             return self.value(annotation)
-        return (self.value(origin), tuple(map(self._annotation, typing.get_args(annotation))))
+        return (self.value(origin), tuple(map(self.annotation, typing.get_args(annotation))))
 
     def _implementations(self, kind: type) -> Plain:
         tables = sorted((table.name, table[kind]) for table in Implementations.tables if kind in table)
@@ -274,50 +217,6 @@ class Describer:
         content = {name: getattr(holder, name) for name in slots} | getattr(holder, "__dict__", {})
         kept = ((name, value) for name, value in content.items() if not _is_computed(kind, name))
         return ("instance", self.value(kind), self.items(sorted(kept, key=lambda item: item[0])))
-
-
-def is_decisive_module(name: str) -> bool:
-    """Return whether what a module has counts."""
-    return name not in NOT_DECISIVE and is_own(name)
-
-
-def overloads_of(function: FunctionType) -> list[tuple[Any, Any]]:
-    """Return what takes a function's place in compiled code, and how it is compiled, as far as modules are imported."""
-    _read_overloads()
-    return _overloads.by_function.get(function, [])
-
-
-def registrations() -> int:
-    """Return how many overloads and implementations there are."""
-    _read_overloads()
-    overloads, tables = _overloads.by_function.values(), Implementations.tables
-    return sum(map(len, overloads)) + sum(map(len, tables))
-
-
-def _read_overloads() -> None:
-    templates = sys.modules.get("numba.core.typing.templates")
-    if templates is None:
-        return
-    registered = templates.builtin_registry.globals
-    for held, kind in registered[_overloads.seen :]:
-        if isinstance(held, FunctionType) and is_own(held.__module__):
-            found = [each for each in getattr(kind, "templates", ()) if hasattr(each, "_overload_func")]
-            _overloads.by_function.setdefault(held, []).extend(
-                (each._overload_func, {**each._jit_options, "strict": each._strict})  # noqa: SLF001 numba has no other way
-                for each in found
-            )
-    _overloads.seen = len(registered)
-
-
-class _Overloads:
-    """What has been read of numba's registry."""
-
-    def __init__(self) -> None:
-        self.seen = 0
-        self.by_function: dict[FunctionType, list[tuple[Any, Any]]] = {}
-
-
-_overloads = _Overloads()
 
 
 def _has_docstring(code: CodeType) -> bool:
@@ -376,140 +275,3 @@ def _is_computed(kind: type, name: str) -> bool:
 
 def _without(content: Mapping[str, Any], names: frozenset[str]) -> dict[str, Any]:
     return {name: value for name, value in content.items() if name not in names}
-
-
-# -- data ----------------------------------------------------------------------------------------------------------
-
-
-@functools.singledispatch
-def _described(value: Any, describer: Describer) -> Plain:  # noqa: ANN401
-    if type(value).__module__.startswith("numba."):
-        return _of_numba(value, describer)
-    plain = tuple(kind.__repr__(value) for kind in (int, float, str, bytes) if isinstance(value, kind))
-    if is_decisive(type(value)):
-        return (describer.refer(value), plain)
-    if dataclasses.is_dataclass(value):
-        return (label(value), describer.items((f.name, getattr(value, f.name)) for f in dataclasses.fields(value)))
-    if typing.get_origin(value) is not None:
-        return describer._annotation(value)  # noqa: SLF001 of the same module
-    return ("named", label(value), plain)
-
-
-def _of_numba(value: Any, describer: Describer) -> Plain:  # noqa: ANN401
-    """Describe a kernel, or an intrinsic function."""
-    if hasattr(value, "py_func"):
-        options = tuple(sorted((name, repr(option)) for name, option in value.targetoptions.items()))
-        return ("kernel", describer.refer(value.py_func, compiled=True), options)
-    if hasattr(value, "_defn"):
-        return ("intrinsic", describer.value(value._defn))  # noqa: SLF001 numba has no other way
-    return ("named", label(value))
-
-
-@_described.register
-def _(value: FunctionType, describer: Describer) -> Plain:
-    return describer.refer(value)
-
-
-@_described.register
-def _(value: MethodType, describer: Describer) -> Plain:
-    return ("method", describer.value(value.__func__), describer.value(value.__self__))
-
-
-@_described.register
-def _(value: type, describer: Describer) -> Plain:
-    return describer.refer(value)
-
-
-@_described.register
-def _(value: ModuleType, _: Describer) -> Plain:
-    return ("module", value.__name__)
-
-
-@_described.register(classmethod)
-@_described.register(staticmethod)
-def _(value: Any, describer: Describer) -> Plain:  # noqa: ANN401
-    return (type(value).__name__, describer.value(value.__func__))
-
-
-@_described.register
-def _(value: property, describer: Describer) -> Plain:
-    return ("property", describer.value((value.fget, value.fset, value.fdel)))
-
-
-@_described.register
-def _(value: functools.cached_property, describer: Describer) -> Plain:  # type: ignore[type-arg]
-    return ("cached property", describer.value(value.func))
-
-
-@_described.register
-def _(value: functools.partial, describer: Describer) -> Plain:  # type: ignore[type-arg]
-    return ("partial", describer.value((value.func, value.args, value.keywords)))
-
-
-@_described.register(type(functools.cache(label)))
-def _(value: Any, describer: Describer) -> Plain:  # noqa: ANN401
-    return ("cached", describer.value(value.__wrapped__))
-
-
-@_described.register
-def _(value: Enum, describer: Describer) -> Plain:
-    return ("member", describer.value(type(value)), value.name)
-
-
-@_described.register(tuple)
-@_described.register(list)
-def _(value: Any, describer: Describer) -> Plain:  # noqa: ANN401
-    return (describer.value(type(value)), tuple(map(describer.value, value)))
-
-
-@_described.register(set)
-@_described.register(frozenset)
-def _(value: Any, describer: Describer) -> Plain:  # noqa: ANN401
-    return (label(value), tuple(map(describer.value, sorted(value, key=_place))))
-
-
-def _place(value: Any) -> Plain:  # noqa: ANN401
-    """Return a key that orders the elements of a set in the same way in every process."""
-    return repr(Describer(compiled=True).value(value))
-
-
-@_described.register(dict)
-@_described.register(MappingProxyType)
-def _(value: Any, describer: Describer) -> Plain:  # noqa: ANN401
-    return (describer.value(type(value)), describer.items(value.items()))
-
-
-@_described.register
-def _(value: Implementations, _: Describer) -> Plain:  # type: ignore[type-arg]
-    return ("implementations", value.name)
-
-
-@_described.register
-def _(value: np.ndarray, describer: Describer) -> Plain:
-    content = describer.value(value.tolist()) if value.dtype.hasobject else hashlib.sha256(value.tobytes()).digest()
-    return ("array", repr(value.dtype), value.shape, content)
-
-
-@_described.register
-def _(value: np.generic, _: Describer) -> Plain:
-    return (repr(value.dtype), value.tobytes())
-
-
-@_described.register
-def _(value: np.dtype, _: Describer) -> Plain:
-    return ("dtype", repr(value), value.itemsize)
-
-
-@_described.register
-def _(_: io.TextIOBase, __: Describer) -> Plain:
-    """Describe a stream, which another one may have taken the place of."""
-    return ("stream",)
-
-
-@_described.register
-def _(value: Path, _: Describer) -> Plain:
-    """Describe a file by its content, wherever it is."""
-    try:
-        return ("file", value.name, hashlib.sha256(value.read_bytes()).digest())
-    except OSError:
-        return ("path", value.name)

@@ -12,7 +12,9 @@ import threading
 from collections.abc import Iterator
 from typing import Any, Final
 
-from coldloop.kernels.description import Describer, Plain, Reference, registrations
+from coldloop.kernels.data import Plain
+from coldloop.kernels.description import Describer, Reference
+from coldloop.kernels.implementations import registrations
 
 Key = tuple[int, bool]
 
