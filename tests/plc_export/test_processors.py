@@ -13,8 +13,7 @@ from coldloop.process.limits import InputLimits
 from rig.plc_export.c.guard_files import GuardExport
 from rig.plc_export.kernels.golden_calls import golden_calls
 from rig.plc_export.kernels.guard_program import GuardKernels
-from tests.plc_export.c_programs import write
-from tests.plc_export.test_c99 import STRICT
+from tests.plc_export.c_programs import STRICT, write
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples" / "processes"
