@@ -23,7 +23,6 @@ from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
 from rig.results.recording import MemorySink, Recorder
 from rig.settings import Settings
-from tests.harness import configurations
 from tests.harness.configurations import COMPILED, LEFT_TO_PROGRAMS, UNUSUAL
 
 pytestmark = pytest.mark.usefixtures("compiles")
@@ -46,11 +45,6 @@ class Counted(CompiledStretches):
         stretch = super().ahead(until)
         Counted.ticks += len(stretch.block.load) if stretch else 0
         return stretch
-
-
-@pytest.fixture(scope="module")
-def lively(mean_load: float) -> LoadProfile:
-    return configurations.lively(mean_load)
 
 
 def left_by(assignments: tuple[str, ...], load: LoadProfile, ticks: int, *, compiled: bool) -> Left:
