@@ -64,7 +64,7 @@ USUALLY = {
     "sequences that are refused", "an impatient watchdog", "loads that cannot be held", "suspects",
 }  # fmt: skip
 """One of each kind; the others differ from one of them in a part of the configuration."""
-NEARLY_ALL = {"adaptive": 1250, "hybrid": 1250, "load steps that interrupt": 1250, "refrigerator": 1375}
+NEARLY_ALL = {"adaptive": 1250, "hybrid": 1250, "load steps that interrupt": 1250, "refrigerator": 1000}
 """Of 1500 ticks that the loop does at least, where nothing unusual happens."""
 
 
