@@ -139,7 +139,7 @@ faults = [
 """
 
 
-@pytest.mark.night  # test_testing.py kills each service of a rig that is up
+@pytest.mark.night  # test_rig_that_stays_up.py kills each service of a rig that is up
 @pytest.mark.usefixtures("processes", "undrawn")
 def test_whatever_is_killed_the_plant_is_not_hurt_and_mpc_comes_back(coldloop: "Coldloop", tmp_path: Path) -> None:
     plan, out = tmp_path / "kills.toml", tmp_path / "out"

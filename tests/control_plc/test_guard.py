@@ -182,6 +182,12 @@ def test_breaks_that_follow_one_another_do_not_give_a_full_rate_each() -> None:
     assert guard.applied.ncr22 == pytest.approx(85.0)
 
 
+def test_what_is_applied_outside_an_open_window_begins_a_new_one() -> None:
+    guard = OutputGuard(InputLimits(), SequenceRow(43.0, 75.0, 36.0))
+    guard.begin_at(5, SequenceRow(50.0, 75.0, 36.0))
+    assert guard.admit(6, SequenceRow(43.0, 75.0, 36.0), update=False).cv155 == pytest.approx(49.5)
+
+
 @settings(max_examples=2 * settings.default.max_examples)
 @given(
     applied=st.tuples(*[st.floats(0.0, 200.0, width=32)] * 3),

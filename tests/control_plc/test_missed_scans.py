@@ -10,7 +10,7 @@ import pytest
 from coldloop.process.cold_box import L1, T5
 from coldloop.process.limits import InputLimits
 from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import Mode, Operator, OperatorMode, SequenceRow
+from coldloop.registers.control_plc import Mode, Operator, OperatorMode, SequenceRow, Verdict
 from coldloop.session.time_base import TimeBase
 from control_plc.guard import OutputGuard
 from control_plc.retained_state import ControlStateStore, RetainedControlState
@@ -121,8 +121,10 @@ def test_time_that_goes_back_begins_anew(bench: "Bench", at: "At") -> None:
 def test_a_tick_back_changes_nothing_of_what_is_played(bench: "Bench", at: "At") -> None:
     bench.play([at(0.3)] * 40, ticks=10)
     bench.scans(3)
-    bench.program.rejoin(bench.program.tick - 1, bench.program.applied)
+    tick = bench.program.tick
+    bench.program.rejoin(tick - 1, bench.program.applied)
     assert bench.scan()[0] == as_transmitted(at(0.3))
+    assert bench.program.tick == tick
     assert bench.program.remaining <= 40
 
 
@@ -131,6 +133,23 @@ def test_the_guard_never_takes_over_what_is_no_number() -> None:
     guard.begin_at(7, SequenceRow(math.nan, math.inf, 36.0))
     assert guard.applied == U0
     assert guard.admit(7, SequenceRow(math.nan, 80.0, -math.inf), update=True) == SequenceRow(43.0, 80.0, 36.0)
+
+
+def test_no_input_moves_by_more_than_its_rate_within_the_slew_time_however_many_sequences_begin() -> None:
+    guard = OutputGuard(InputLimits(slew_s=1.0), U0)
+    applied = [guard.admit(tick, U0._replace(ncr22=150.0), update=True).ncr22 for tick in range(12)]
+    for tick in range(12):
+        for later in range(tick + 1, min(12, tick + 4)):
+            assert applied[later] - applied[tick] <= 10.0
+    assert applied[-1] == pytest.approx(75.0 + 10.0 * 3)
+
+
+def test_a_sequence_is_judged_as_it_would_be_played(bench: "Bench", at: "At") -> None:
+    """Two steps of the full rate in neighbouring ticks are within no rate, whatever the windows say."""
+    assert bench.plan(10)
+    zigzag = [at(0.5), at(0.0), at(-0.5)] * 6
+    assert bench.offer(bench.sequence(zigzag)).verdict == Verdict.RATE_EXCEEDED
+    assert bench.offer(bench.sequence([at(0.5)] * 18)).verdict == Verdict.ACCEPTED
 
 
 def test_a_sensor_that_shows_nothing_new_for_a_while_without_scans_is_frozen_by_plant_time(bench: "Bench") -> None:

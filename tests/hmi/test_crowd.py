@@ -65,7 +65,11 @@ NO_HTTP = "\x16\x03\x01\x02\x00 nothing of the kind\r\n\r\n"
 
 
 @pytest.mark.parametrize(
-    "texts", [(IDLE,), (HALF_A_HEAD,), (HALF_A_BODY,), (KEPT_ALIVE,), (IDLE, HALF_A_HEAD, HALF_A_BODY, ALWAYS, NO_HTTP)]
+    "texts",
+    [
+        (IDLE, HALF_A_HEAD, HALF_A_BODY, KEPT_ALIVE, ALWAYS, NO_HTTP),
+        *(pytest.param((one,), marks=pytest.mark.night) for one in (IDLE, HALF_A_HEAD, HALF_A_BODY, KEPT_ALIVE)),
+    ],
 )
 def test_a_crowd_keeps_nobody_out(small_site: Site, texts: tuple[str, ...]) -> None:
     with crowd(small_site, 3 * CONNECTIONS, *texts):

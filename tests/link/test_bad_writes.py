@@ -2,11 +2,9 @@
 
 from typing import TYPE_CHECKING
 
-import pytest
-
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Status
+from coldloop.registers.control_plc import Status
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
 from coldloop.registers.plant import PLANT_MAP, LoadStep, PlantSession
@@ -22,30 +20,6 @@ START_S = PATIENCE_S = 90.0
 def address_of(register_map: RegisterMap, record: type[tuple[object, ...]], field: str) -> int:
     registers = {register.name: register.address for register in register_map.block_of(record).registers(0)}
     return registers[field]
-
-
-@pytest.mark.parametrize(
-    ("service", "register_map", "session"),
-    [("plant", PLANT_MAP, PlantSession), ("control_plc", CONTROL_MAP, ControlSession)],
-    ids=["plant", "control PLC"],
-)
-async def test_real_time_without_a_factor_is_refused_and_the_service_lives(
-    service: str,
-    register_map: RegisterMap,
-    session: type[tuple[object, ...]],
-    processes: "Processes",
-    wire: "WireTo",
-) -> None:
-    process = processes.service(service)
-    client = RegisterClient(register_map, host="127.0.0.1", port=process.port, timeout_s=PATIENCE_S)
-    await client.connect(START_S)
-    async with wire(process.port) as simple:
-        for name, value in (("realtime", 1), ("session", 0), ("realtime", 0)):
-            address = address_of(register_map, session, name)
-            assert await simple.set_register(address, value) == ILLEGAL_VALUE
-    assert (await client.read(Identity)).session == 0
-    assert process.alive
-    client.close()
 
 
 async def test_a_number_of_load_steps_that_makes_no_load_is_refused_and_the_clock_of_the_plant_goes_on(

@@ -16,7 +16,9 @@ WITHOUT: Final = ("--without", "optimizer")
 
 
 @pytest.mark.usefixtures("realtime")
-@pytest.mark.parametrize("case", [TANK, COLUMN], ids=["tank", "column"])
+@pytest.mark.parametrize(
+    "case", [pytest.param(TANK, id="tank", marks=pytest.mark.night), pytest.param(COLUMN, id="column")]
+)
 def test_pi_controllers_by_registers_drive_a_process(case: Case, processes: Processes, tmp_path: Path) -> None:
     with up(case, processes, tmp_path, *WITHOUT) as site, site.optimiser() as optimiser:
         optimiser.introduce()
@@ -45,7 +47,9 @@ def falls_silent(optimiser: Optimiser, rows: bytes) -> None:
 
 
 @pytest.mark.usefixtures("realtime")
-@pytest.mark.parametrize("breaks_off", [closes, closes_in_a_request, falls_silent])
+@pytest.mark.parametrize(
+    "breaks_off", [closes_in_a_request, *(pytest.param(one, marks=pytest.mark.night) for one in (closes, falls_silent))]
+)
 def test_one_that_breaks_off_in_a_sequence_leaves_the_ladder_to_act_without_a_step(
     breaks_off: Callable[[Optimiser, bytes], None], processes: Processes, tmp_path: Path
 ) -> None:

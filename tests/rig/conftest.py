@@ -30,6 +30,7 @@ from rig.cosim.session_client import SessionClient
 from rig.cosim.wiring import SERVICES, endpoints_on, wired
 from rig.results.recording import Recorder, Recording
 from rig.settings import Settings
+from tests.harness import configurations
 from tests.harness.processes import Processes
 
 PATIENCE_S = 120.0
@@ -45,6 +46,12 @@ S = TypeVar("S", bound=BaseModel)
 def mean_load() -> float:
     """The load of the operating point, W."""
     return read_header(Settings().model.file).w0
+
+
+@pytest.fixture(scope="session")
+def lively(mean_load: float) -> LoadProfile:
+    """A load that moves from the first minute on."""
+    return configurations.lively(mean_load)
 
 
 @pytest.fixture(scope="session")

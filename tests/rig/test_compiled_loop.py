@@ -23,7 +23,6 @@ from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
 from rig.results.recording import MemorySink, Recorder
 from rig.settings import Settings
-from tests.harness import configurations
 from tests.harness.configurations import COMPILED, LEFT_TO_PROGRAMS, UNUSUAL
 
 pytestmark = pytest.mark.usefixtures("compiles")
@@ -48,11 +47,6 @@ class Counted(CompiledStretches):
         return stretch
 
 
-@pytest.fixture(scope="module")
-def lively(mean_load: float) -> LoadProfile:
-    return configurations.lively(mean_load)
-
-
 def left_by(assignments: tuple[str, ...], load: LoadProfile, ticks: int, *, compiled: bool) -> Left:
     chosen = load_configuration(Settings, environment={}, assignments=assignments).settings
     sink = MemorySink()
@@ -70,7 +64,7 @@ USUALLY = {
     "sequences that are refused", "an impatient watchdog", "loads that cannot be held", "suspects",
 }  # fmt: skip
 """One of each kind; the others differ from one of them in a part of the configuration."""
-NEARLY_ALL = {"adaptive": 1250, "hybrid": 1250, "load steps that interrupt": 1250, "refrigerator": 1375}
+NEARLY_ALL = {"adaptive": 1250, "hybrid": 1250, "load steps that interrupt": 1250, "refrigerator": 1000}
 """Of 1500 ticks that the loop does at least, where nothing unusual happens."""
 
 

@@ -105,6 +105,11 @@ def test_a_preset_acts_beside_a_file_with_every_key(
     assert {key: value for key, (value, _) in in_environment.items()} == plain(f"{PROGRAM}preset={asked}")
 
 
+def test_state_feedback_acts_beside_a_file_with_every_key(coldloop: "Coldloop", tmp_path: Path) -> None:
+    there = effective(written(coldloop, tmp_path), f"{PROGRAM}estimator.kind=state-feedback")
+    assert there[f"{PROGRAM}estimator.disturbances"][0] == []
+
+
 def test_what_is_set_beside_the_preset_comes_before_it(coldloop: "Coldloop", tmp_path: Path) -> None:
     file = written(coldloop, tmp_path)
     there = effective(file, f"{PROGRAM}preset=as-printed", f"{PROGRAM}penalties.box=3", f"{PROGRAM}ode.alpha=7")

@@ -15,7 +15,6 @@ from optimizer_plc.settings import AdaptiveSettings, OptimizerSection, ProgramSe
 from plant.settings import PlantSection, SensorSettings
 from rig.cosim.scenario import Scenario
 from rig.settings import Settings
-from tests.harness import configurations
 
 if TYPE_CHECKING:
     from rig.results.recording import Recording
@@ -23,11 +22,6 @@ if TYPE_CHECKING:
     from tests.rig.conftest import Bus, OnTheBus, Simulate
 
 NOISY = PlantSection(sensors=SensorSettings(level=0.02, speed=0.5, temperature=0.02, pressure=0.002))
-
-
-@pytest.fixture
-def lively(mean_load: float) -> LoadProfile:
-    return configurations.lively(mean_load)
 
 
 def three_minutes(load: LoadProfile, period_s: float = 0.0, seed: int = 1) -> Scenario:
