@@ -92,7 +92,7 @@ def _print_version(_: argparse.Namespace) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; return its exit code: 0 done, 1 failed, 2 wrong usage, 130 interrupted."""
+    """Run a command; return its exit code: 0 done, 1 failed, 2 wrong usage, 3 not finite, 130 interrupted."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     with INTERRUPTION:
         if "_ARGCOMPLETE" in os.environ:

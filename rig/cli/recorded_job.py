@@ -7,7 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
+from coldloop.errors import NOT_FINITE
 from coldloop.process.loaded import PROCESS
+from coldloop.process.lti_model import load as load_model
 from rig.cosim.job import Job
 from rig.figures.worker import FigureProcess
 from rig.results.folders import claim_folder, claim_folder_of_now
@@ -21,7 +23,7 @@ SHORT_RUN_TICKS: Final = 2400
 
 
 def record(job: Job, options: argparse.Namespace, figure: FigureProcess) -> int:
-    """Do a job with the options --out and --force; return the exit code.
+    """Do a job with the options --out and --force; return the exit code, `NOT_FINITE` where updates had no answer.
 
     Raises:
         ColdloopError: It is not complete; what was recorded is in the folder.
@@ -32,7 +34,10 @@ def record(job: Job, options: argparse.Namespace, figure: FigureProcess) -> int:
     with _progress(job) as sinks:
         summary = run_into(out, job, plain_arguments(options), figure, sinks)
     _tell(out, summary)
-    return 0
+    if not summary["failed_updates"]:
+        return 0
+    sys.stderr.write(f"coldloop: {_failure(summary, job)}\n")
+    return NOT_FINITE
 
 
 @contextmanager
@@ -45,6 +50,17 @@ def _progress(job: Job) -> Iterator[list[Sink]]:
 
     with RunProgress(job.scenario.ticks) as progress:
         yield [progress]
+
+
+def _failure(summary: dict[str, Any], job: Job) -> str:
+    from rig.process_file.judgement import unheld  # noqa: PLC0415 a run that succeeds does without
+
+    failed, model = summary["failed_updates"], load_model(job.effective.settings.model.file)
+    return "; ".join(filter(None, (
+        f"{failed} of {failed + summary['updates']} updates have no answer: what the optimiser computed is not finite",
+        unheld(PROCESS.banded, model.A),
+        "docs/fail-safe.md#no-answer",
+    )))  # fmt: skip
 
 
 def _tell(out: Path, summary: dict[str, Any]) -> None:

@@ -1,5 +1,6 @@
 """What there is to know of a process before it is controlled, as text: rest, modes, gains, and what is wrong."""
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -120,6 +121,13 @@ def _too_coarse(signal: Input | Output, ends: tuple[float, float], least: float,
     return [f"{signal.name} has steps of {step:.2g} {signal.unit}, too coarse for {what}; count it from another zero"]
 
 
+def unheld(banded: Sequence[Output], A: Array) -> str:
+    """Return that nothing but MPC holds a plant (n, n), where a mode grows and no output has a loop; else nothing."""
+    if any(one.band and one.band.loop for one in banded) or np.linalg.eigvals(A).real.max() <= NOTHING:
+        return ""
+    return "nothing holds this plant when MPC has no answer: a mode grows, and no output has a loop"
+
+
 def _dead_times(made: Made) -> list[str]:
     """Return which dead times are not whole ticks; the simulated plant has the nearest that is."""
     tick_s, lags = made.process.tick_s, made.linear.parameters.get("lags", ())
@@ -138,6 +146,7 @@ def _warnings(made: Made) -> list[str]:
     fastest, slowest = -poles.real.min(), -poles.real.max()
     if poles.real.max() > NOTHING:
         found.append(f"unstable: a mode grows with {poles.real.max():.3g} /s; nothing may be late for longer")
+        found += [f"fail-safe: {text}" for text in (unheld(process.banded, made.own_A),) if text]
     elif slowest > NOTHING and process.decision_instants[-1] * sample_s * slowest < 1.0:
         found.append(f"horizon: it ends before the slowest mode, {1 / slowest:.3g} s, has moved much")
     if fastest * sample_s > 20.0:

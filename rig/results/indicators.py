@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import CONTROLLED, STATE_NAMES, TICK_S, TICKS_PER_SAMPLE
+from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.prediction import state_weights
@@ -101,7 +102,7 @@ class RunEvaluation(Sink):
         self._stage_costs = 0.0
         self._j_dev = self._j_cst = self._weighted = self._violations = self._largest = 0.0
         self._taus = self._squared_taus = self._delivered = self._known = 0
-        self.ticks = self.updates = self.iterations = 0
+        self.ticks = self.updates = self.iterations = self.failed_updates = 0
 
     def block(self, block: SampleBlock) -> None:
         """Take ticks."""
@@ -114,7 +115,10 @@ class RunEvaluation(Sink):
         self.ticks += len(block.load)
 
     def update(self, update: Optimization) -> None:
-        """Take an update."""
+        """Take an update; one without an answer has no prediction."""
+        if update.verdict == Verdict.NO_ANSWER:
+            self.failed_updates += 1
+            return
         delivered = update.tick + update.tau_u
         self._j_dev += update.j_dev
         self._j_cst += update.j_cst

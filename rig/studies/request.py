@@ -23,6 +23,7 @@ from coldloop.process.cold_box import COLD_BOX, L1, T5
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.signals import STATION_SIGNAL_NAMES, TICK_S
+from coldloop.registers.control_plc import Verdict
 from coldloop.service.start import main as start_service
 from optimizer_plc.solvers import make_solver
 from rig.cosim.linear_plant import LinearRig
@@ -115,6 +116,8 @@ class Outcome:
     """Columns of the trace, by name; empty unless it was asked for."""
     events: list[Happening] = field(default_factory=list)
     """What the journals say, if the trace was asked for."""
+    failed_updates: int = 0
+    """Updates that had no answer."""
 
     def column(self, name: str) -> Series:
         """Return a column of the updates."""
@@ -253,6 +256,7 @@ def _outcome(recording: Recording, settings: Settings, trace_ticks: int) -> Outc
         events=[Happening(service, event.tick, event.kind, event.subject) for service, event in recording.events]
         if trace_ticks
         else [],
+        failed_updates=sum(row.verdict == Verdict.NO_ANSWER for row in recording.updates),
     )
 
 

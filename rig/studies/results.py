@@ -22,6 +22,7 @@ def conduct(study: Study, options: StudyOptions, workers: Workers, folder: Path)
     requests = checked_requests(study, options, folder)
     outcomes = perform_all(requests, Store(folder / RUNS), workers, study.name)
     result = study.evaluate(options, outcomes)
+    result.failed_runs = sum(outcome.failed_updates > 0 for outcome in outcomes.values())
     with writing(folder / study.name):
         _write(study, result, folder / study.name)
     return result

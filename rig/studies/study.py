@@ -140,6 +140,8 @@ class StudyResult:
     """Paragraphs for the report."""
     always_shown: bool = False
     """Whether the report has all rows, however many there are."""
+    failed_runs: int = 0
+    """Runs in which updates had no answer."""
 
     def note(self, claim: str, value: float) -> None:
         """Add the value of one more draw."""

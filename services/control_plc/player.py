@@ -4,6 +4,7 @@ Pure. `tick` is the tick of the scan in progress; `earliest` the first tick that
 Scans can be missed and time can leap, so everything here goes by ticks, never by the number of calls.
 """
 
+from collections.abc import Sequence
 from enum import IntEnum
 
 from coldloop.process.signals import LAST_NUMBER, TICKS_PER_SAMPLE
@@ -254,7 +255,7 @@ class SequencePlayer:
         header, rows = sequence
         if not self.invited:
             return Verdict.NOT_INVITED
-        if not 1 <= header.length == len(rows):
+        if header.length != len(rows):
             return Verdict.WRONG_LENGTH
         if checksum(header, rows) != header.crc:
             return Verdict.BAD_CRC
@@ -269,7 +270,12 @@ class SequencePlayer:
             return Verdict.WRONG_UPDATE
         if header.first_tick != self.next_update_tick or header.first_tick - self.update.tick != header.tau_u:
             return Verdict.WRONG_TICK
+        return self._judge_rows(rows, header.first_tick, earliest)
+
+    def _judge_rows(self, rows: Sequence[SequenceRow], first_tick: int, earliest: int) -> Verdict:
+        if not rows:
+            return Verdict.NO_ANSWER
         if self._guard.out_of_range(rows):
             return Verdict.OUT_OF_RANGE
-        meanwhile = [self.row(tick) for tick in range(earliest, header.first_tick)]
-        return self._guard.judge(rows, header.first_tick, meanwhile)
+        meanwhile = [self.row(tick) for tick in range(earliest, first_tick)]
+        return self._guard.judge(rows, first_tick, meanwhile)

@@ -85,6 +85,8 @@ def take_update(c: Constants, rule: UpdatingRule, starts: Starts, m: OptimizerSt
 def follow(c: Constants, m: OptimizerState, latched: Latched) -> int:
     """Find out what is played from an update on; return its q, `BY_THE_RULE`, `FIRST` or `AFTER_A_STEP`."""
     now, u = m.numbers[0], latched.u - c.estimator.u0
+    if now.solved and m.sent.numbers[0].length == 0:
+        forget_failure(m)
     elapsed = latched.tick - now.tick if now.planned else 0
     known = now.planned or latched.tick == 0  # a session begins at the operating point
     if not (known and 0 <= elapsed <= LONGEST_GAP_TICKS and knows_what_is_played(m, latched.playing)):
@@ -102,6 +104,16 @@ def follow(c: Constants, m: OptimizerState, latched: Latched) -> int:
         m.rule[OF_PROBLEM] = m.u.dtype.type(0.0)
         return AFTER_A_STEP
     return BY_THE_RULE if in_time else now.q
+
+
+@kernel
+def forget_failure(m: OptimizerState) -> None:
+    """Forget all that led to an answer that was none: the next update is one without a past."""
+    now, real = m.numbers[0], m.u.dtype.type
+    now.sequences = max(now.sequences, m.sent.numbers[0].number)
+    now.guessed_before = now.delivered_before = real(np.inf)
+    now.planned = now.solved = False
+    m.rule[:] = real(0.0)
 
 
 @kernel

@@ -1,6 +1,5 @@
 """What the optimiser believes of the plant's state at an updating instant."""
 
-from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -9,7 +8,7 @@ from numpy.typing import NDArray
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.compiled import kept, kernel
 from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import OUTPUT_NAMES, SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
+from coldloop.process.signals import OUTPUT_NAMES, STATE_NAMES, TICK_S
 from optimizer_plc.computing_settings import (
     SIGNALS,
     EstimatorKind,
@@ -28,8 +27,9 @@ from optimizer_plc.plausibility import (
     plausibility_of,
 )
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
-from optimizer_plc.qp.linear_algebra import add_transposed_product, cholesky, cholesky_solve, multiply, respond
+from optimizer_plc.qp.linear_algebra import add_transposed_product, respond
 from optimizer_plc.qp.prediction import PredictionModel, Transition
+from optimizer_plc.riccati import gains_after
 
 Array = NDArray[np.float64]
 
@@ -261,7 +261,11 @@ def walks_of(prediction: PredictionModel, settings: EstimatorSettings) -> Array:
 
 
 def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -> StationaryGains:
-    """Return what the Kalman filter corrects with after every updating period; what is forecast it leaves alone."""
+    """Return what the Kalman filter corrects with after every updating period; what is forecast it leaves alone.
+
+    Raises:
+        ConfigurationError: There is none for a period.
+    """
     nx = prediction.n_estimated
     C = np.ascontiguousarray(np.hstack([prediction.C[:, :nx], prediction.G]))
     steps = {ticks: (step.A[:nx, :nx], step.F[:nx, 0]) for ticks, step in prediction.transitions.items()}
@@ -271,112 +275,3 @@ def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -
     gains, inverses = np.split(found, [nx + 1], axis=2)
     gains = np.insert(gains, [nx] * len(prediction.ahead), 0.0, axis=2)
     return StationaryGains(np.ascontiguousarray(gains), np.ascontiguousarray(inverses))
-
-
-def gains_after(
-    steps: Mapping[int, tuple[Array, Array]], C: Array, drift: Array, sensors: Array, of_time: bool, periods: int  # noqa: FBT001
-) -> Array:  # fmt: skip
-    """Return the stationary gains, transposed, beside the inverse covariances, shape (steps, n_y, n + 1 + n_y).
-
-    Args:
-        steps: A (n, n) and F (n,) over so many ticks.
-        C: Outputs by states and load mismatch, shape (n_y, n + 1).
-        drift: Standard deviations of the process noise in a sampling period, shape (n + 1,).
-        sensors: Standard deviations of the measurements, shape (n_y,).
-        of_time: The latter are those of a mean over a sampling period.
-        periods: Steps of the Riccati recursion at most.
-    """
-    P, n, found = np.diag(100.0 * drift**2), len(drift) - 1, []
-    for ticks, (step, load) in steps.items():
-        A = np.eye(n + 1)
-        A[:n, :n], A[:n, n] = step, load
-        process = drift**2 * (ticks * TICK_S / SAMPLING_PERIOD_S)
-        measured = sensors**2 * (SAMPLING_PERIOD_S / (ticks * TICK_S) if of_time else 1.0)
-        gain = stationary_gain(A, C, process, measured, P, periods)
-        found.append(np.hstack([gain.T, inverse_covariance(A, C, process, measured, P)]))
-    return np.array(found)
-
-
-def inverse_covariance(A: Array, C: Array, process: Array, sensors: Array, P: Array) -> Array:
-    """Return the inverse (n_y, n_y) of the innovation's covariance; P (n, n) is that of the state before the period.
-
-    `process` (n) and `sensors` (n_y) are variances.
-    """
-    before = multiply(multiply(A, P), np.ascontiguousarray(A.T)) + np.diag(process)
-    S = multiply(multiply(C, before), np.ascontiguousarray(C.T)) + np.diag(sensors)
-    inverse, skyline = np.eye(len(C)), cholesky(S)
-    for column in inverse:
-        cholesky_solve(S, skyline, column)
-    return inverse
-
-
-@kernel
-def _measure(P: Array, C: Array, sensor: float, output: int, column: Array) -> None:
-    """Write the gain of one scalar measurement into `column` and update P by it."""
-    n = P.shape[0]
-    variance = sensor
-    for i in range(n):
-        column[i] = 0.0
-        for j in range(n):
-            column[i] += P[i, j] * C[output, j]
-    for i in range(n):
-        variance += C[output, i] * column[i]
-    for i in range(n):
-        for j in range(n):
-            P[i, j] -= column[i] * column[j] / variance
-    for i in range(n):
-        column[i] /= variance
-
-
-@kernel
-def stationary_gain(A: Array, C: Array, process: Array, sensors: Array, P: Array, periods: int) -> Array:
-    """Return the stationary gain (n, n_y) by the Riccati recursion from P, which ends as the stationary covariance.
-
-    `process` (n) and `sensors` (n_y) are variances. Sensors are independent, so measurements are taken one after the
-    other and no matrix is inverted.
-    """
-    n, m = A.shape[0], C.shape[0]
-    columns = np.zeros((m, n))
-    previous = np.zeros((m, n))
-    At = np.ascontiguousarray(A.T)
-    for _ in range(periods):
-        P[:] = multiply(multiply(A, P), At)
-        for i in range(n):
-            P[i, i] += process[i]
-        for output in range(m):
-            _measure(P, C, sensors[output], output, columns[output])
-        if _settled(columns, previous):
-            break
-    return _joint_gain(columns, C)
-
-
-@kernel
-def _settled(columns: Array, previous: Array) -> bool:
-    """Return whether no state's gains (a column each) have changed by more than 1e-10 of its largest; remember them."""
-    settled = True
-    for i in range(columns.shape[1]):
-        change, size = 0.0, 0.0
-        for output in range(columns.shape[0]):
-            change = max(change, abs(columns[output, i] - previous[output, i]))
-            size = max(size, abs(columns[output, i]))
-            previous[output, i] = columns[output, i]
-        settled = settled and change <= 1e-10 * size
-    return settled
-
-
-@kernel
-def _joint_gain(columns: Array, C: Array) -> Array:
-    """Return the matrix that does at once what the scalar corrections `columns` (n_y, n) do one after the other."""
-    m, n = columns.shape
-    gain = np.zeros((n, m))
-    for source in range(m):
-        x = np.zeros(n)
-        for output in range(m):
-            residual = 1.0 if output == source else 0.0
-            for j in range(n):
-                residual -= C[output, j] * x[j]
-            for i in range(n):
-                x[i] += columns[output, i] * residual
-        for i in range(n):
-            gain[i, source] = x[i]
-    return gain

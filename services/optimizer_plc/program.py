@@ -8,6 +8,7 @@ of the session. Pure: no sockets, no clock, no sleeping.
 import numpy as np
 from numpy.typing import NDArray
 
+from coldloop.errors import ConfigurationError
 from coldloop.kernels.first_use import kernels_of
 from coldloop.process.limits import InputLimits
 from coldloop.process.loaded import PROCESS
@@ -43,6 +44,12 @@ from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers import KernelSolver, make_solver
 
 Array = NDArray[np.float64]
+
+
+@np.errstate(over="ignore")
+def _single(value: float) -> float:
+    """Return a number as registers carry it: infinite beyond single precision."""
+    return float(np.float32(value))
 
 
 def _described(settings: ProgramSettings) -> str:
@@ -83,6 +90,11 @@ class OptimizerProgram:
         self.restart(0.0)
         planned = self.plan(first)
         sequence = self.solve()
+        if not sequence.rows:
+            raise ConfigurationError(
+                "optimizer_plc.program.design: the problem at the operating point has no finite answer; where a mode"
+                " grows the horizon may be too long: shorten decision_instants"
+            )
         self.prediction()
         self.answered(late=False)
         self.plan(first._replace(update=1, tick=planned.next_update_tick, playing=sequence.header.number))
@@ -180,7 +192,10 @@ class OptimizerProgram:
         return int(self._now["iterations"])
 
     def solve(self) -> InputSequence:
-        """Predict the state at t_{i+1}, shift the profile, iterate; return the sequence to play from there."""
+        """Predict the state at t_{i+1}, shift the profile, iterate; return the sequence to play from there.
+
+        It has no rows where something was not finite.
+        """
         n = self._iterations
         if ahead := len(self._forecasts):
             self.state.belief.x[-ahead:] = self._ahead(int(self._now["tick"]) + int(self._now["ticks"]))
@@ -235,8 +250,8 @@ class OptimizerProgram:
         end = self._prediction.n_estimated
         constants[list(self.disturbances)] = belief.x[end - len(self.disturbances) : end]
         return ModelDeviation(
-            float(belief.numbers[0]["mismatch"]), tuple(constants[n_y:].tolist()), tuple(constants[:n_y].tolist()),
-            tuple(np.sqrt(belief.surprise).tolist()),
+            _single(belief.numbers[0]["mismatch"]), tuple(map(_single, constants[n_y:])),
+            tuple(map(_single, constants[:n_y])), tuple(map(_single, np.sqrt(belief.surprise))),
         )  # fmt: skip
 
     @property
@@ -251,14 +266,14 @@ class OptimizerProgram:
 
     def report(self, verdict: Verdict) -> Optimization:
         """Return what was done with the last update, once the control PLC has answered."""
-        if not self._sent["length"]:
+        if not (self._sent["length"] or self._now["solved"]):
             raise RuntimeError("call solve before report")
         now, sent = self._now, self._sent
         return Optimization(
             update=int(now["update"]), tick=int(now["tick"]), tau_u=int(now["ticks"]), q=int(now["q"]),
-            iterations=int(sent["iterations"]), verdict=verdict, j_effective=float(now["effective"]),
-            j_hot_start=float(sent["hot_start"]), j_delivered=float(sent["delivered"]), j_dev=float(sent["j_dev"]),
-            j_cst=float(sent["j_cst"]), violation=float(sent["violation"]), efficiency=float(now["efficiency"]),
-            mismatch=float(now["mismatch"]), contraction=float(now["contraction"]), gamma=float(now["gamma"]),
-            load_mismatch=float(self.state.belief.numbers[0]["mismatch"]),
+            iterations=int(sent["iterations"]), verdict=verdict,
+            load_mismatch=_single(self.state.belief.numbers[0]["mismatch"]), j_effective=_single(now["effective"]),
+            j_hot_start=_single(sent["hot_start"]), j_delivered=_single(sent["delivered"]),
+            **{name: _single(sent[name]) for name in ("j_dev", "j_cst", "violation")},
+            **{name: _single(now[name]) for name in ("efficiency", "mismatch", "contraction", "gamma")},
         )  # fmt: skip

@@ -14,7 +14,7 @@ from coldloop.kernels.compiled import kernel
 from coldloop.process.signals import BATH, OUTPUT_NAMES
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.estimator import Estimator, begin_prediction, correct, predict
-from optimizer_plc.plausibility import suspects_of
+from optimizer_plc.plausibility import are_finite, suspects_of
 from optimizer_plc.qp.costs import OutputMaps, augmented_cost, output_maps, predicted_indicators
 from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
@@ -31,7 +31,8 @@ Array = NDArray[np.float64]
 
 BY_THE_RULE: Final = 0
 """The q that `plan` is given when the rule is to decide it."""
-
+LARGEST: Final = 1e38
+"""What registers carry, in single precision."""
 
 LEVEL, TEMPERATURE, FEED_TEMPERATURE = (
     map(OUTPUT_NAMES.index, (BATH.level, BATH.temperature, BATH.feed_temperature)) if BATH else (0, 0, 0)
@@ -208,8 +209,25 @@ def pose(c: Constants, m: OptimizerState) -> tuple[QuadraticProblem, Array]:
 
 
 @kernel
+def is_answer(m: OptimizerState) -> bool:
+    """Return whether estimate, profile and rows are finite, and costs numbers; all but J_i may be infinite."""
+    sent = m.sent
+    s, rows, effective = sent.numbers[0], sent.rows, m.numbers[0].effective
+    costs = effective + s.hot_start + s.last_but_one + s.delivered + s.j_dev + s.j_cst + s.violation
+    finite = not math.isnan(costs) and effective <= m.u.dtype.type(LARGEST)
+    finite = finite and np.isfinite(s.w) and are_finite(sent.x) and are_finite(sent.z)
+    for tick in range(s.length):
+        for i in range(rows.shape[1]):
+            finite = finite and np.isfinite(rows[tick, i])
+    return finite
+
+
+@kernel
 def deliver(c: Constants, m: OptimizerState, qp: QuadraticProblem, answer: Answer) -> None:
-    """Make the sequence of an answer after q - 1 and q iterations, and judge its profile."""
+    """Make the sequence of an answer after q - 1 and q iterations, and judge its profile.
+
+    There are no rows where it is none (`is_answer`).
+    """
     now, sent = m.numbers[0], m.sent
     s = sent.numbers[0]
     s.hot_start = with_floor(answer.guessed, qp.constant, c.floor)
@@ -221,6 +239,8 @@ def deliver(c: Constants, m: OptimizerState, qp: QuadraticProblem, answer: Answe
     s.j_dev, s.j_cst, s.violation = predicted_indicators(c.predicted, qp, sent.z, sent.x, s.w, c.n_inputs)
     s.number, s.first_tick = now.sequences + 1, now.tick + now.ticks
     s.length = write_rows(c, sent.z, now.ticks, sent.rows)
+    if not is_answer(m):
+        s.length = 0
     now.solved = True
 
 
@@ -346,6 +366,8 @@ def judge_played(c: Constants, m: OptimizerState, load: float, y: Array) -> floa
     now.suspects = suspects_of(m.belief.readings)
     now.most_open = most_open(c, m.u, y)
     now.shortage = shortage(c, m.belief.x, w, load, now.most_open, real(0.0))
+    if not abs(now.shortage) <= real(LARGEST):  # by an estimate that leads to no answer
+        now.shortage = real(0.0)
     find_target(c.target, m.belief.x, w, m.belief.numbers[0].mismatch, now.most_open, m.target)
     qp = problem_at(c, m.belief.x, w, m.playing.u_before, played.share, m.target, now.most_open)
     return with_floor(augmented_cost(qp, m.playing.z, c.alpha), qp.constant, c.floor)
@@ -370,7 +392,7 @@ def begin_period(
 ) -> None:  # fmt: skip
     """Begin the period of a q, step (5): its length, and what fits; then step (2), what was sent is played."""
     now = m.numbers[0]
-    now.q = min(wanted, c.most)
+    now.q = max(min(wanted, c.most), 1)  # costs that are no numbers lead a rule anywhere
     adaptive = min(c.periods[now.q] + now.allowance, c.fitting.shape[0] - 1)
     now.ticks = c.fixed_ticks if c.fixed_ticks > 0 else adaptive
     now.iterations = c.fitting[max(now.ticks - now.allowance, 0)]  # where a period cannot grow, they are fewer

@@ -22,6 +22,8 @@ A message is one line that says what, where, and what to do.
 
 from typing import Final
 
+NOT_FINITE: Final = 3
+"""Exit code of a run, or a study, that is complete, and in which updates had no answer."""
 BUSY: Final = 6
 """Modbus exception code of a server at which another client holds the lease of the role."""
 

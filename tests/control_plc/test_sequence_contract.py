@@ -70,7 +70,7 @@ def wrong(bench: "Bench", at: At, fault: str) -> InputSequence:
 
 
 FAULTS = {
-    "no rows": Verdict.WRONG_LENGTH,
+    "no rows": Verdict.NO_ANSWER,
     "a length that is not that of the rows": Verdict.WRONG_LENGTH,
     "torn rows": Verdict.BAD_CRC,
     "a CRC with one bit wrong": Verdict.BAD_CRC,

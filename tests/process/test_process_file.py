@@ -17,6 +17,7 @@ from rig.process_file.judgement import described
 from rig.process_file.linearised import lag_model
 from rig.process_file.making import Made, made_from
 from tests.harness.installed import installed
+from tests.harness.unstable_plants import pendulum, stirred_tank
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
@@ -149,6 +150,12 @@ def test_what_is_wrong_with_a_process_is_said_in_words(tmp_path: Path) -> None:
     )
     kink = HEATER.replace("(u[0] -", "(abs(u[0] - 50.0) + 50.0 -")
     assert "kink" in described(made(tmp_path, plant=kink)) or "controllability" in described(made(tmp_path, plant=kink))
+
+
+def test_an_unstable_plant_without_loops_is_held_by_nothing_but_mpc(tmp_path: Path) -> None:
+    warning = "fail-safe: nothing holds this plant when MPC has no answer"
+    assert warning in described(made_from(pendulum(tmp_path)))
+    assert warning not in described(made_from(stirred_tank(tmp_path)))
 
 
 def test_an_integrator_that_grows_or_shrinks_by_rounding_alone_is_neither_unstable_nor_slow(tmp_path: Path) -> None:

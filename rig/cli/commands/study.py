@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from coldloop.errors import UsageError
+from coldloop.errors import NOT_FINITE, UsageError
 from rig.cli.commands.choices import STUDIES
 from rig.cli.commands.options import check_load, positive_count
 from rig.durations import duration
@@ -82,11 +82,10 @@ def execute(options: argparse.Namespace) -> int:
         for name, study in everything.items():
             sys.stdout.write(f"{name:18} {study.title}\n")
         return 0
-    _do(everything[options.name], options)
-    return 0
+    return _do(everything[options.name], options)
 
 
-def _do(study: "Study", options: argparse.Namespace) -> None:
+def _do(study: "Study", options: argparse.Namespace) -> int:
     from rig.studies.results import conduct
     from rig.studies.shards import Shard, conduct_shard, merge
     from rig.studies.study import RUNS
@@ -103,8 +102,14 @@ def _do(study: "Study", options: argparse.Namespace) -> None:
         shard = Shard.parse(options.shard)
         runs = conduct_shard(study, asked, workers(options), options.out, shard)
         sys.stdout.write(f"shard {shard} of {study.name}: {runs} runs in {options.out / RUNS}\n")
-        return
+        return 0
     result = conduct(study, asked, workers(options), options.out)
     for what, values in result.values.items():
         sys.stdout.write(f"{what}: {', '.join(f'{value:.4g}' for value in values)}\n")
     sys.stdout.write(f"results in {options.out / study.name}\n")
+    if not result.failed_runs:
+        return 0
+    sys.stderr.write(
+        f"coldloop: in {result.failed_runs} runs updates have no answer: what the optimiser computed is not finite\n"
+    )
+    return NOT_FINITE

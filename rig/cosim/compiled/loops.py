@@ -209,7 +209,7 @@ def answer(
     scheme.solve(o.constants, o.method, m)
     offered, length = rows[1], m.sent.numbers[0].length
     offered[:length] = m.sent.rows[:length]
-    accepted = s.next_update - s.first_tick <= s.length
+    accepted = length > 0 and s.next_update - s.first_tick <= s.length
     for tick in range(length):
         accepted = accepted and in_range(w.limits, offered[tick])
     if not accepted:

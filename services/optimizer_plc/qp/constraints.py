@@ -92,9 +92,9 @@ def rate_rows(design: ControlDesign, limits: InputLimits, penalties: PenaltySett
                 gained.append(gains_of_inputs[i])
     gains = np.array(gained)
     return RateRows(
-        Gamma=np.array(rows) * gains[:, None],
+        Gamma=np.reshape(rows, (-1, size)) * gains[:, None],
         bounds=np.array(bounds) * gains,
         first=np.array(first),
-        before=np.ascontiguousarray((np.array(before) * gains[:, None]).T),
+        before=np.ascontiguousarray((np.reshape(before, (-1, N_INPUTS)) * gains[:, None]).T),
         gains=gains,
     )

@@ -98,6 +98,8 @@ class Verdict(IntEnum):
     """No sequence is played now: an operator drives, or a sensor that MPC needs is bad."""
     PLANT_LOST = 12
     """The rack has not been synchronised for a while."""
+    NO_ANSWER = 13
+    """It has no rows: the optimiser has no answer to the update."""
 
 
 class PlantLinkState(IntEnum):
@@ -283,7 +285,7 @@ class Acknowledgement(NamedTuple):
         int,
         u16(
             "0 none, 1 accepted, 2 late, 3 wrong update, 4 wrong tick, 5 wrong length, 6 wrong model, 7 bad CRC, "
-            "8 out of range, 9 rate exceeded, 10 repeated, 11 not invited, 12 plant lost",
+            "8 out of range, 9 rate exceeded, 10 repeated, 11 not invited, 12 plant lost, 13 no answer",
             values=Verdict,
         ),
     ]
