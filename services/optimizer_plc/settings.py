@@ -6,8 +6,10 @@ from typing import Annotated, ClassVar, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator, model_validator
 
+from coldloop.config import flattened
 from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, Endpoint
 from coldloop.modbus.settings import ServerSettings
+from coldloop.process.declaration import FURTHEST_WEIGHT
 from coldloop.process.limits import InputLimits
 from coldloop.process.load_profile import LOAD_SPAN
 from coldloop.process.model_settings import ModelSettings
@@ -35,11 +37,22 @@ from optimizer_plc.computing_settings import (
     QpoasesSettings,
 )
 from optimizer_plc.qp.design import ColdEndSettings, ControlDesign
-from optimizer_plc.qp.penalties import OF_ALPHA, OF_PRESETS, PRESETS, PenaltySettings, Preset, alpha_of, completed
+from optimizer_plc.qp.penalties import (
+    DEFAULT_PENALTIES,
+    OF_ALPHA,
+    OF_PRESETS,
+    PRESETS,
+    PenaltySettings,
+    Preset,
+    alpha_of,
+    completed,
+)
 
 SHOWN: Final = ("limits", "optimizer_plc.program")
 """What of the configuration decides results: shown in the registers."""
 ADAPTIVE = 0
+LARGEST: Final = 1e18
+"""Of a number in the program's settings."""
 
 
 class SolverName(StrEnum):
@@ -177,6 +190,21 @@ class ProgramSettings(BaseModel):
         for key in ALPHAS:
             name = key.partition(".")[0]
             self.__dict__[name] = completed(getattr(self, name), {"alpha": alpha})
+        return self
+
+    @model_validator(mode="after")
+    def _within_single_precision(self) -> Self:
+        for key, value in flattened(self.model_dump(mode="json")).items():
+            for number in value if isinstance(value, list) else [value]:
+                if isinstance(number, float) and not (number == 0.0 or 1.0 / LARGEST <= abs(number) <= LARGEST):
+                    raise ValueError(f"{key} = {number:g}: give 0 or a size from {1.0 / LARGEST:g} to {LARGEST:g}: "
+                                     "single precision holds its square")  # fmt: skip
+        most = FURTHEST_WEIGHT * alpha_of(DEFAULT_PENALTIES, ControlDesign())
+        for key in ALPHAS:
+            alpha = getattr(self, key.partition(".")[0]).alpha
+            if alpha > most:
+                raise ValueError(f"{key} = {alpha:g}: at most {most:g}; it is penalties.output_rows times the largest "
+                                 "design.violation_weight if it is not set")  # fmt: skip
         return self
 
     @model_validator(mode="after")

@@ -69,7 +69,7 @@ def output_rows(condensed: Condensed, design: ControlDesign, weights: Array, y0:
 
 
 def rate_rows(design: ControlDesign, limits: InputLimits, penalties: PenaltySettings) -> RateRows:
-    """Return the rows of the rates, scaled by what breaking them costs."""
+    """Return the rows of the rates, scaled by what breaking them costs; there may be none."""
     ranges = np.asarray(limits.high) - np.asarray(limits.low)
     size = (N_INPUTS + N_SLACKS) * len(design.decision_instants)
     gains_of_inputs = np.sqrt(penalties.rate_rows) / np.array(design.input_scale)
@@ -92,9 +92,9 @@ def rate_rows(design: ControlDesign, limits: InputLimits, penalties: PenaltySett
                 gained.append(gains_of_inputs[i])
     gains = np.array(gained)
     return RateRows(
-        Gamma=np.array(rows) * gains[:, None],
+        Gamma=np.array(rows).reshape(-1, size) * gains[:, None],
         bounds=np.array(bounds) * gains,
         first=np.array(first),
-        before=np.ascontiguousarray((np.array(before) * gains[:, None]).T),
+        before=np.ascontiguousarray((np.array(before).reshape(-1, N_INPUTS) * gains[:, None]).T),
         gains=gains,
     )

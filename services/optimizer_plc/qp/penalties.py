@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated, Any, Final
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+from pydantic import BaseModel, ConfigDict, Field
 
 from coldloop.process.loaded import PROCESS
 from coldloop.process.per_signal import PositivePerInput
@@ -20,15 +20,15 @@ class PenaltySettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    output_rows: PositiveFloat = 30.0
+    output_rows: Annotated[float, Field(gt=0.0, le=1e6)] = 30.0
     """alpha over rho, the weight of a band violation. A violation v is shared between its slack and its row: the row
     keeps v / (1 + output_rows), and J has output_rows / (1 + output_rows) rho v^2 for it."""
     rate_rows: PositivePerInput = (16.0,) * N_INPUTS
     """Weight of the rate rows over alpha, per square of `design.input_scale`. With the squares of `input_scale` the
     rows are in % and W, all with the same alpha, as the paper prints it."""
-    box: Annotated[float, Field(ge=0.0)] = 0.0
+    box: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
     """Weight of the box over alpha, per square of a scaled variable. Iterates are projected into the box whatever this
-    is; it acts at the middle stage of a step of the ODE-based solver only."""
+    is; it acts at the middle stage of a step of the ODE-based solver only, which with 1e5 hardly moves."""
     first_knot_in_box: bool = True
     """Whether the first knot keeps the rate from the input before it as a bound of the box, too, and not as a row only.
     Where it does not, its input is moved to within that rate before it is sent."""

@@ -200,6 +200,13 @@ class Bath:
         return (*filter(None, (self.pressure_state, self.level_state)), *self.temperature_states)
 
 
+FURTHEST_WEIGHT: Final = 1e5
+"""Largest factor between a weight of the cost and the process's own, or the usual one.
+
+With `violation_weight` 1e6 times as large J of the cold box is 1.4 times as large, with 1e10 its inputs do not move:
+the other terms of the cost are below the 7 digits of single precision.
+"""
+
 NO_LOAD: Final = Load(name="no load", unit="", span=(0.0, 1.0), walk=1e-6)
 """The load of a process that has none."""
 
