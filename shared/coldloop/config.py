@@ -5,7 +5,7 @@ value as TOML, or else as text. Every value remembers where it came from.
 
 Some settings decide others, as a preset does. A section says so in a class variable `decides`: by key, the keys that
 follow from it, both relative to the section. Such a setting on the command line also replaces what the environment and
-the file have of them.
+the file have of them. What a section has to say of values that were not set is in its property `notes`.
 """
 
 import json
@@ -49,10 +49,16 @@ class Configuration(Generic[M]):
         """Return (dotted key, value, source) of every value."""
         rows = flattened(self.settings.model_dump(mode="json"))
         usual = flattened(type(self.settings)().model_dump(mode="json"))
+        notes = self.notes()
         return [
-            (key, value, self.sources.get(key, DEFAULT if value == usual.get(key) else DERIVED))
+            (key, value, self.sources.get(key) or notes.get(key, DEFAULT if value == usual.get(key) else DERIVED))
             for key, value in rows.items()
         ]
+
+    def notes(self) -> dict[str, str]:
+        """Return what sections say (`notes`, by key) of values that nothing has set."""
+        found = _notes(self.settings)
+        return {key: note for key, note in found.items() if key not in self.sources}
 
 
 class _Layers:
@@ -157,6 +163,14 @@ def _check_values(settings: BaseModel, sources: Mapping[str, str]) -> None:
             raise ConfigurationError(f"{_where(key, sources)}: contains a NUL character; remove it")
         if value == Path():  # an empty text
             raise ConfigurationError(f"{_where(key, sources)}: is empty; name a file, or leave the key out")
+
+
+def _notes(section: BaseModel, prefix: str = "") -> dict[str, str]:
+    found = {prefix + key: note for key, note in getattr(section, "notes", {}).items()}
+    for name, value in section:
+        if isinstance(value, BaseModel):
+            found |= _notes(value, f"{prefix}{name}.")
+    return found
 
 
 def _decided(model: type[BaseModel], prefix: str = "") -> dict[str, list[str]]:

@@ -112,7 +112,9 @@ class ControlDesign(BaseModel):
             raise ValueError("each output_low must be below its output_high")
         widths = (high - low for low, high in zip(self.output_low, self.output_high, strict=True))
         if any(not 0.0 <= margin <= width / 2.0 for margin, width in zip(self.band_margin, widths, strict=True)):
-            raise ValueError("each band_margin must be at least 0 and at most half of its band")
+            raise ValueError(
+                "each band_margin, that of the preset too, must be at least 0 and at most half of its band"
+            )
         return self
 
 

@@ -56,8 +56,11 @@ class Preset(StrEnum):
     in their own units, and cost_scale is the one whose costs come down with the iterations as in the paper's figure."""
 
 
+UNMEASURED: Final[Mapping[str, Any]] = PROCESS.tuned.get("unmeasured", {})
+"""What section `estimator` of the preset `tuned` has instead where the load is not measured."""
 PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
-    Preset.TUNED: PROCESS.tuned or {"estimator": {"disturbances": ("outputs",)}},
+    Preset.TUNED: {name: values for name, values in PROCESS.tuned.items() if name != "unmeasured"}
+    or {"estimator": {"disturbances": ("outputs",)}},
     Preset.PAPER: {},
     Preset.AS_PRINTED: {
         "penalties": {
@@ -78,7 +81,7 @@ OF_ALPHA: Final = ("penalties.output_rows", "design.violation_weight")
 """Keys that decide alpha: see `alpha_of`."""
 
 
-def completed(section: BaseModel, values: Mapping[str, Any]) -> BaseModel:
-    """Return a section with the values for those of its keys that were not set explicitly."""
-    missing = {key: value for key, value in values.items() if key not in section.model_fields_set}
-    return section.model_copy(update=missing) if missing else section
+def filled(section: object, values: Mapping[str, Any]) -> object:
+    """Return a section, as it is given, with values for those of its keys that were not set; to be validated."""
+    given = section.model_dump(exclude_unset=True) if isinstance(section, BaseModel) else section
+    return {**values, **given} if isinstance(given, Mapping) else given

@@ -244,7 +244,8 @@ class Process:
     moves_as_one: bool = False
     """Whether all outputs move when any do: one that rests meanwhile is frozen, whatever the inputs do."""
     tuned: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
-    """Settings of the preset `tuned`, by section; an estimate of the constants of all outputs where there are none."""
+    """Settings of the preset `tuned`, by section; an estimate of the constants of all outputs where there are none. In
+    `unmeasured` is what `estimator` has instead where the load is not measured."""
     plants: tuple[str, ...] = ("of-process",)
     """Kinds of plant that simulate it, by their names in the configuration; the first by default."""
     decimals: Mapping[str, int] = field(default_factory=lambda: MappingProxyType({}))
