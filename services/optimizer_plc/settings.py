@@ -263,6 +263,15 @@ class ProgramSettings(BaseModel):
         """Name of the solver in use."""
         return self.outside.solver or self.solver
 
+    @property
+    def iteration_s(self) -> float:
+        """Time of an iteration of the solver in use, at P = 1."""
+        if self.outside.solver:
+            return self.outside.tau_1_s
+        if self.solver is SolverName.HYBRID:
+            return max(self.ode.tau_1_s, self.interior_point.tau_1_s)
+        return float(getattr(self, self.solver.replace("-", "_")).tau_1_s)
+
     @model_validator(mode="after")
     def _own_arithmetic(self) -> Self:
         if self.arithmetic is Arithmetic.FLOAT32 and self.outside.names:
