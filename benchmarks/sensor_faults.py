@@ -17,7 +17,6 @@ from plant.load import find_load
 from plant.own_model import own_header
 from plant.program import PlantProgram
 from plant.settings import MismatchSettings
-from rig.cosim.compiled.stretches import CompiledStretches
 from rig.cosim.one_process import OneProcessRig, Programs, load_table
 from rig.cosim.scenario import Scenario
 from rig.results.recording import Recorder
@@ -89,10 +88,8 @@ def run(settings: Settings, load_name: str, seed: int, output: int, fault: str, 
     programs, listener = Programs(cast("PlantProgram", plant), control, optimizer), Recorder(ticks)
     optimizer.restart(0.0)
     control.restart(session=1)
-    stretches, begin = CompiledStretches(plant.sound, control, optimizer, load), round(SETTLED_S / TICK_S)
-    while control.tick < begin:
-        if stretches.ahead(begin) is None:
-            programs.tick(listener)
+    while control.tick < round(SETTLED_S / TICK_S):
+        programs.tick(listener)
     lowest, highest, modes = [math.inf] * 2, [-math.inf] * 2, set[str]()
     while control.tick < ticks:
         programs.tick(listener)

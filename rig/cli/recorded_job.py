@@ -16,6 +16,7 @@ from rig.results.folders import claim_folder, claim_folder_of_now
 from rig.results.recording import Sink
 from rig.results.way import Way
 from rig.runs.manifest import plain_arguments
+from rig.runs.remarks import remarks
 from rig.runs.running import run_into
 
 SHORT_RUN_TICKS: Final = 2400
@@ -31,6 +32,9 @@ def record(job: Job, options: argparse.Namespace, figure: FigureProcess) -> int:
     name = "session" if job.way is Way.RECORDED else Path(job.effective.settings.plant.load).stem
     out = options.out or claim_folder_of_now(Path("runs"), name)
     claim_folder(out, force=options.force)
+    if job.way is not Way.RECORDED:
+        sys.stdout.write("".join(f"{line}\n" for line in remarks(job.effective)))
+        sys.stdout.flush()
     with _progress(job) as sinks:
         summary = run_into(out, job, plain_arguments(options), figure, sinks)
     _tell(out, summary)

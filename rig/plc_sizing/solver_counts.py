@@ -10,11 +10,6 @@ from rig.plc_sizing.reference_plc import ACTIVE_ROWS, WORKING_SET
 from rig.plc_sizing.sizes import QpSizes
 
 
-def iteration_s(program: ProgramSettings) -> float:
-    """Return the time of an iteration of the solver in use, at P = 1."""
-    return program.outside.tau_1_s if program.outside.solver else SOLVERS[program.solver].tau_1_s(program)
-
-
 class SolverCount(NamedTuple):
     """An iteration of a solver, with the usual number of active rows or of constraints held."""
 

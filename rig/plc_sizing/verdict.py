@@ -10,7 +10,6 @@ from optimizer_plc.settings import ProgramSettings
 from rig.plc_sizing.memory import Footprint
 from rig.plc_sizing.profile import PlcProfile
 from rig.plc_sizing.reference_plc import reference_curve
-from rig.plc_sizing.solver_counts import iteration_s
 
 ROUNDING = 1e-9
 MANY = 1000
@@ -51,7 +50,7 @@ def capacity(size: int, needed: Footprint, memory_bytes: int, budget: PlcBudget)
 
 def fits(profile: PlcProfile, program: ProgramSettings, problem: PredictiveProblem, needed: Footprint) -> bool:
     """Return whether a PLC has memory and time for a problem; as `verdict`."""
-    budget = PlcBudget(program.budget, iteration_s(program))
+    budget = PlcBudget(program.budget, program.iteration_s)
     return min(capacity(problem.size, needed, profile.memory_bytes, budget)) + ROUNDING >= problem.size
 
 
@@ -64,7 +63,7 @@ def verdict(profile: PlcProfile, program: ProgramSettings, problem: PredictivePr
         problem: The problem in single precision.
         needed: What it takes in memory.
     """
-    budget = PlcBudget(program.budget, iteration_s(program))
+    budget = PlcBudget(program.budget, program.iteration_s)
     limits = capacity(problem.size, needed, profile.memory_bytes, budget)
     problem_text = f"the problem ({problem.size} variables, {len(problem.Gamma)} rows) with {program.solver_name}"
     if not fits(profile, program, problem, needed):
@@ -72,11 +71,7 @@ def verdict(profile: PlcProfile, program: ProgramSettings, problem: PredictivePr
         if limits.by_memory < problem.size:
             lacks.append(f"it takes {needed.total:,} of {profile.memory_bytes:,} bytes")
         if limits.by_time < problem.size:
-            needed_s, longest_s = budget.times.slots + budget.times.iteration, MAX_PERIOD_TICKS * TICK_S
-            lacks.append(
-                f"the slot of the preparation and an iteration take {needed_s:.3g} s, and the longest updating period "
-                f"is {longest_s:g} s"
-            )
+            lacks.append(budget.too_slow())
         return f"{profile.name}: {problem_text} does not fit: {', and '.join(lacks)}."
     memory = f"{needed.total / 1e3:,.0f} of {profile.memory_bytes / 1e3:,.0f} kB"
     longest, shortest = budget.ladder[-1], budget.ladder[0]

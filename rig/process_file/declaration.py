@@ -15,7 +15,7 @@ from pydantic import (
 )
 
 from coldloop.config import load_configuration
-from coldloop.process.declaration import Bath
+from coldloop.process.declaration import FURTHEST_WEIGHT, Bath
 
 MOST_SIGNALS: Final = 32
 """Outputs at most: registers have a bit for each."""
@@ -33,6 +33,12 @@ Span = tuple[FiniteFloat, FiniteFloat]
 
 class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+def _near(given: float | None, usual: float, what: str) -> None:
+    if given is not None and not usual / FURTHEST_WEIGHT <= given <= usual * FURTHEST_WEIGHT:
+        raise ValueError(f"{what} = {given:g} is further than a factor of {FURTHEST_WEIGHT:g} from the usual one, "
+                         f"{usual:g}: single precision loses the other terms of the cost")  # fmt: skip
 
 
 def _rising(span: Span, what: str) -> None:
@@ -81,7 +87,13 @@ class InputSection(_Section):
         for what, value in (("at", self.at), ("safe", self.at if self.safe is None else self.safe)):
             if not self.low <= value <= self.high:
                 raise ValueError(f"{self.name}: {what} = {value:g} is outside low to high")
+        _near(self.weight, self.usual_weight, f"{self.name}: weight")
         return self
+
+    @property
+    def usual_weight(self) -> float:
+        """What `weight` is if it is not given."""
+        return 0.01 / ((self.high - self.low) / 4) ** 2
 
 
 class OutputSection(_Section):
@@ -137,6 +149,16 @@ class OutputSection(_Section):
             if self.alarm[0] > edges[0] or self.alarm[1] < edges[1]:
                 raise ValueError(f"{self.name}: alarm begins inside {edges[0]:g} to {edges[1]:g}; widen it")
         return self
+
+    @model_validator(mode="after")
+    def _weighed(self) -> Self:
+        if self.edges is not None:
+            _near(self.penalty, self.usual_penalty(self.edges), f"{self.name}: penalty")
+        return self
+
+    def usual_penalty(self, edges: Span) -> float:
+        """Return what `penalty` is if it is not given."""
+        return 1.0 / ((edges[1] - edges[0]) / (20 if self.setpoint is None else 2)) ** 2
 
     @property
     def edges(self) -> Span | None:

@@ -98,7 +98,7 @@ def _process(file: ProcessFile, linear: Linearised) -> Process:
                 name=one.name, unit=one.unit, register=one.name.lower(), description=one.description or one.name,
                 span=(min(one.low, 0.0), max(one.high, 0.0)), low=one.low, high=one.high, rate=one.rate,
                 safe=one.at if one.safe is None else one.safe, scale=(one.high - one.low) / 4,
-                weight=one.weight or 0.01 / ((one.high - one.low) / 4) ** 2, walk=one.rate / 10,
+                weight=one.weight or one.usual_weight, walk=one.rate / 10,
             )
             for one in file.inputs
         ),
@@ -129,9 +129,9 @@ def _output(one: OutputSection, at_rest: float) -> Output:
     band, loop = None, one.loop
     if one.edges is not None:
         low, high = one.edges
-        margin, close = (0.0, (high - low) / 20) if one.setpoint is None else ((high - low) / 2, (high - low) / 2)
+        margin = 0.0 if one.setpoint is None else (high - low) / 2
         band = Band(
-            low=low, high=high, weight=one.penalty or 1.0 / close**2, margin=margin, alarm=one.alarm,
+            low=low, high=high, weight=one.penalty or one.usual_penalty(one.edges), margin=margin, alarm=one.alarm,
             loop=None if loop is None else Loop(
                 input=loop.input, gain=loop.gain, integral_time_s=loop.integral_time_s,
                 setpoint_offset=0.0 if one.setpoint is None else one.setpoint - at_rest,

@@ -8,6 +8,7 @@ result.trace.to_dict()["T5"]
 result.plot("run.png")
 """
 
+import warnings
 from argparse import ArgumentTypeError
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -35,6 +36,7 @@ from rig.results.indicators import RunEvaluation, StageCost
 from rig.results.recording import MemorySink, Recorder, Recording
 from rig.results.run_folder import batch_series
 from rig.results.tables import events_table, station_table, trace_table, updates_table
+from rig.runs.remarks import enforced, too_slow
 from rig.runs.run_files import summary_of
 from rig.runs.running import make_scenario
 from rig.settings import Settings
@@ -138,6 +140,7 @@ def simulate(
     duration_s: float | str | None = None,
     seed: int | None = None,
     config: str | Path | None = None,
+    enforce: bool = False,
     **settings: Mapping[str, Any] | object,
 ) -> Simulation:
     """Run the three programs in this process, in lock-step; return what they did.
@@ -150,6 +153,7 @@ def simulate(
         seed: Seed of the sensors' noise; by default 1.
         config: TOML file with further settings, such as one that `coldloop config` has written. An argument that is
             given comes before it.
+        enforce: Lengthen the updating period to what the PLC takes. Otherwise a warning says where it is too short.
         settings: Sections of the configuration, such as `plant={"sensors": {"level": 0.01}}`; they come before the
             file. The environment has no influence.
 
@@ -159,6 +163,10 @@ def simulate(
     effective = configured(
         load=load, solver=solver, updating_period=updating_period, seed=seed, config=config, sections=settings
     )
+    if enforce:
+        effective = enforced(effective)
+    for line in filter(None, [too_slow(effective.settings.optimizer_plc.program)]):
+        warnings.warn(line, stacklevel=2)
     return _run(effective, _ticks(duration_s))
 
 

@@ -11,7 +11,6 @@ from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from optimizer_plc.budget import PlcBudget
 from rig.cosim.one_process import OneProcessRig
-from rig.plc_sizing.solver_counts import iteration_s
 from rig.settings import Settings
 from rig.studies.intervals import Interval, geometric_mean, mean_ratio
 from rig.studies.loop_cost import ADAPTIVE, loop_cost, require_costs
@@ -38,7 +37,7 @@ def adaptive_gain(
         done: Is called with the number of runs done and that of all.
     """
     program = settings.optimizer_plc.program
-    budget = PlcBudget(program.budget, iteration_s(program))
+    budget = PlcBudget(program.budget, program.iteration_s)
     fitting = [period for period in FIXED_S if budget.times.holds(round(period / TICK_S))]
     fixed = fitting or [FIXED_S[-1]] if period_s is None else [period_s]
     rig, runs = OneProcessRig(settings), list(product((ADAPTIVE, *fixed), names))

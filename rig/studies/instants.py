@@ -16,7 +16,7 @@ from optimizer_plc.qp.design import ControlDesign
 from rig.cosim.ideal_loop import run_ideal_loop
 from rig.plc_sizing.budget_tables import counted_sizes, problem_of
 from rig.plc_sizing.memory import estimator_memory, footprint
-from rig.plc_sizing.solver_counts import SOLVERS, iteration_s
+from rig.plc_sizing.solver_counts import SOLVERS
 from rig.settings import Settings
 from rig.studies.intervals import geometric_mean
 from rig.studies.loop_cost import ADAPTIVE, loop_cost, require_costs
@@ -95,7 +95,7 @@ def _judged(settings: Settings, label: str, names: Sequence[str], configured: fl
     problem, prediction = problem_of(settings)
     run = partial(run_ideal_loop, settings, ticks=TICKS_PER_SAMPLE)
     flops = SOLVERS[program.solver].operations(counted_sizes(problem).without_zeros).flops
-    plc = PlcBudget(program.budget, iteration_s(program) * flops / (configured or flops))
+    plc = PlcBudget(program.budget, program.iteration_s * flops / (configured or flops))
     costs = tuple(loop_cost(settings, name, ADAPTIVE, run) for name in names)
     require_costs(costs)
     return Judged(

@@ -166,7 +166,7 @@ class OdeSettings(BaseModel):
 
     alpha: PositiveFloat = PENALTY_WEIGHT
     """Penalty weight."""
-    cost_scale: PositiveFloat = 1e-4
+    cost_scale: Annotated[float, Field(gt=0, le=1.0)] = 1e-4
     """The flow is that of cost_scale * J: the rule for the first step size is not scale invariant."""
     tolerance: PositiveFloat = 1.0
     """Local error accepted in one step, in scaled variables."""
@@ -204,8 +204,8 @@ class OsqpSettings(BaseModel):
     """Weight that its answers are judged with; not OSQP's relaxation."""
     rho: PositiveFloat = 10.0
     """Step size of the multipliers: with less, truncated answers are worse, with more, convergence is slower."""
-    relaxation: Annotated[float, Field(gt=0.0, lt=2.0)] = 1.6
-    """What OSQP calls alpha."""
+    relaxation: Annotated[float, Field(ge=0.1, lt=2.0)] = 1.6
+    """What OSQP calls alpha; it moves an iterate by this share."""
     tau_1_s: PositiveFloat = 0.05 * PROCESS.share("osqp")
     """25,763 operations, dense, at 0.529 Mflop/s (`docs/budget.md`)."""
 

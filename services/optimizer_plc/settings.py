@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Annotated, ClassVar, Final, Self
+from typing import Annotated, Any, ClassVar, Final, Self
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationInfo, field_validator, model_validator
 
+from coldloop.config import as_toml, flattened
 from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, Endpoint
 from coldloop.modbus.settings import ServerSettings
+from coldloop.process.declaration import FURTHEST_WEIGHT
 from coldloop.process.limits import InputLimits
 from coldloop.process.load_profile import LOAD_SPAN
 from coldloop.process.model_settings import ModelSettings
@@ -35,11 +37,27 @@ from optimizer_plc.computing_settings import (
     QpoasesSettings,
 )
 from optimizer_plc.qp.design import ColdEndSettings, ControlDesign
-from optimizer_plc.qp.penalties import OF_ALPHA, OF_PRESETS, PRESETS, PenaltySettings, Preset, alpha_of, completed
+from optimizer_plc.qp.penalties import (
+    DEFAULT_PENALTIES,
+    OF_ALPHA,
+    OF_PRESETS,
+    PRESETS,
+    UNMEASURED,
+    PenaltySettings,
+    Preset,
+    alpha_of,
+    filled,
+)
 
 SHOWN: Final = ("limits", "optimizer_plc.program")
 """What of the configuration decides results: shown in the registers."""
 ADAPTIVE = 0
+LARGEST: Final = 1e18
+"""Of a number in the program's settings."""
+
+
+WITH_ALPHA: Final = ("ode", "qpoases", "osqp", "fast_gradient", "interior_point", "daqp", "outside")
+"""Sections that have a weight of broken constraints."""
 
 
 class SolverName(StrEnum):
@@ -113,10 +131,17 @@ class AdaptiveSettings(BaseModel):
         return self
 
 
+def left_out(key: str, estimator: EstimatorSettings) -> str:
+    """Return why this estimator cannot have a preset's value of a key of `optimizer_plc.program`; empty: it can."""
+    if estimator.kind is EstimatorKind.STATE_FEEDBACK and key.startswith(("estimator.", "plausibility.")):
+        return "state-feedback estimates nothing"
+    return ""
+
+
 class ProgramSettings(BaseModel):
     """What the optimiser's program is to do."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
     solver: SolverName = SolverName.ODE
     arithmetic: Arithmetic = Arithmetic.FLOAT64
@@ -165,18 +190,53 @@ class ProgramSettings(BaseModel):
             raise ValueError(f"an updating period is a multiple of {TICK_S:g} s from {shortest} on, or 0 for adaptive")
         return value
 
+    @model_validator(mode="before")
+    @classmethod
+    def _with_preset(cls, given: Any) -> Any:  # noqa: ANN401 whatever is given
+        """Take what was not set from the preset, before all of it is checked."""
+        try:
+            preset = Preset(given.get("preset", Preset.TUNED))
+            estimator = EstimatorSettings.model_validate(given.get("estimator", {}))
+        except (AttributeError, ValueError):
+            return given  # which is refused
+        if preset is Preset.TUNED and not estimator.load_known:
+            given = {**given, "estimator": filled(given.get("estimator", {}), UNMEASURED)}
+        values = {
+            section: {key: value for key, value in keys.items() if not left_out(f"{section}.{key}", estimator)}
+            for section, keys in PRESETS[preset].items()
+        }
+        return {**given, **{section: filled(given.get(section, {}), keys) for section, keys in values.items()}}
+
+    @field_validator(*WITH_ALPHA, mode="before")
+    @classmethod
+    def _with_alpha(cls, section: Any, others: ValidationInfo) -> Any:  # noqa: ANN401 whatever is given
+        """Take alpha from the penalties where it was not set."""
+        if not {"penalties", "design"} <= others.data.keys():
+            return section  # one of them is refused
+        return filled(section, {"alpha": alpha_of(others.data["penalties"], others.data["design"])})
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """What the preset has and is not applied, by key relative to this section, with the reason."""
+        return {
+            f"{section}.{key}": f"preset {self.preset} has {as_toml(value)}, not applied: {reason}"
+            for section, keys in PRESETS[self.preset].items() for key, value in keys.items()
+            if (reason := left_out(f"{section}.{key}", self.estimator))
+        }  # fmt: skip
+
     @model_validator(mode="after")
-    def _completed(self) -> Self:
-        """Take what was not set from the preset, and alpha of the solvers from the penalties."""
-        for name, values in PRESETS[self.preset].items():
-            usual_filter = self.estimator.kind is EstimatorKind.KALMAN and self.estimator.load_known
-            if name in ("estimator", "plausibility") and not usual_filter:
-                continue  # state feedback estimates nothing, and an unmeasured load needs a walk of its own
-            self.__dict__[name] = completed(getattr(self, name), values)  # before it is used: it is frozen then
-        alpha = alpha_of(self.penalties, self.design)
+    def _within_single_precision(self) -> Self:
+        for key, value in flattened(self.model_dump(mode="json")).items():
+            for number in value if isinstance(value, list) else [value]:
+                if isinstance(number, float) and not (number == 0.0 or 1.0 / LARGEST <= abs(number) <= LARGEST):
+                    raise ValueError(f"{key} = {number:g}: give 0 or a size from {1.0 / LARGEST:g} to {LARGEST:g}: "
+                                     "single precision holds its square")  # fmt: skip
+        most = FURTHEST_WEIGHT * alpha_of(DEFAULT_PENALTIES, ControlDesign())
         for key in ALPHAS:
-            name = key.partition(".")[0]
-            self.__dict__[name] = completed(getattr(self, name), {"alpha": alpha})
+            alpha = getattr(self, key.partition(".")[0]).alpha
+            if alpha > most:
+                raise ValueError(f"{key} = {alpha:g}: at most {most:g}; it is penalties.output_rows times the largest "
+                                 "design.violation_weight if it is not set")  # fmt: skip
         return self
 
     @model_validator(mode="after")
@@ -203,6 +263,15 @@ class ProgramSettings(BaseModel):
         """Name of the solver in use."""
         return self.outside.solver or self.solver
 
+    @property
+    def iteration_s(self) -> float:
+        """Time of an iteration of the solver in use, at P = 1."""
+        if self.outside.solver:
+            return self.outside.tau_1_s
+        if self.solver is SolverName.HYBRID:
+            return max(self.ode.tau_1_s, self.interior_point.tau_1_s)
+        return float(getattr(self, self.solver.replace("-", "_")).tau_1_s)
+
     @model_validator(mode="after")
     def _own_arithmetic(self) -> Self:
         if self.arithmetic is Arithmetic.FLOAT32 and self.outside.names:
@@ -214,15 +283,12 @@ class ProgramSettings(BaseModel):
         return self
 
 
-ALPHAS: Final = tuple(
-    f"{name}.alpha"
-    for name, field in ProgramSettings.model_fields.items()
-    if "alpha" in getattr(field.annotation, "model_fields", ())
-)
+ALPHAS: Final = tuple(f"{name}.alpha" for name in WITH_ALPHA)
 """The weight of broken constraints, by solver: keys of `optimizer_plc.program` that follow from the penalties."""
 ProgramSettings.decides = {
     "preset": (*OF_PRESETS, *ALPHAS),
     "estimator.kind": ("estimator.disturbances",),
+    "estimator.load_known": ("estimator.load_walk_w",),
     **dict.fromkeys(OF_ALPHA, ALPHAS),
 }
 

@@ -5,7 +5,7 @@ value as TOML, or else as text. Every value remembers where it came from.
 
 Some settings decide others, as a preset does. A section says so in a class variable `decides`: by key, the keys that
 follow from it, both relative to the section. Such a setting on the command line also replaces what the environment and
-the file have of them.
+the file have of them. What a section has to say of values that were not set is in its property `notes`.
 """
 
 import json
@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
@@ -30,6 +30,8 @@ MOST_BYTES: Final = 1_000_000
 """Size of a configuration file, at most."""
 WHOLE: Final = "configuration"
 """What is wrong if no key is, but several together."""
+LARGEST: Final = 3.4e38
+"""Of a number: registers and records have single precision."""
 MOST_SHOWN: Final = 200
 """Characters of a wrong value that a message shows."""
 
@@ -47,10 +49,16 @@ class Configuration(Generic[M]):
         """Return (dotted key, value, source) of every value."""
         rows = flattened(self.settings.model_dump(mode="json"))
         usual = flattened(type(self.settings)().model_dump(mode="json"))
+        notes = self.notes()
         return [
-            (key, value, self.sources.get(key, DEFAULT if value == usual.get(key) else DERIVED))
+            (key, value, self.sources.get(key) or notes.get(key, DEFAULT if value == usual.get(key) else DERIVED))
             for key, value in rows.items()
         ]
+
+    def notes(self) -> dict[str, str]:
+        """Return what sections say (`notes`, by key) of values that nothing has set."""
+        found = _notes(self.settings)
+        return {key: note for key, note in found.items() if key not in self.sources}
 
 
 class _Layers:
@@ -138,14 +146,31 @@ def load_configuration(
         if file is not None and all(source == str(file) for source in layers.sources.values()):
             text = f"{file}: {text.removeprefix(f'{file}: ').removeprefix(f'{WHOLE}: ')}"
         raise ConfigurationError(text) from None
-    for key, value in flattened(settings.model_dump()).items():
-        if not _is_finite(value):
-            raise ConfigurationError(f"{_where(key, layers.sources)}: input should be finite (got {value!r})")
-        if _has_nul(value):
-            raise ConfigurationError(f"{_where(key, layers.sources)}: contains a NUL character; remove it")
-        if value == Path():  # an empty text
-            raise ConfigurationError(f"{_where(key, layers.sources)}: is empty; name a file, or leave the key out")
+    _check_values(settings, layers.sources)
     return Configuration(settings, layers.sources)
+
+
+def _check_values(settings: BaseModel, sources: Mapping[str, str]) -> None:
+    """Refuse values that no key can have, in one line."""
+    for key, value in flattened(settings.model_dump()).items():
+        for most, wrong in (
+            (inf, "input should be finite"),
+            (LARGEST, f"is beyond {LARGEST:g}; give a smaller number"),
+        ):
+            if not _is_within(most, value):
+                raise ConfigurationError(f"{_where(key, sources)}: {wrong} (got {value!r})")
+        if _has_nul(value):
+            raise ConfigurationError(f"{_where(key, sources)}: contains a NUL character; remove it")
+        if value == Path():  # an empty text
+            raise ConfigurationError(f"{_where(key, sources)}: is empty; name a file, or leave the key out")
+
+
+def _notes(section: BaseModel, prefix: str = "") -> dict[str, str]:
+    found = {prefix + key: note for key, note in getattr(section, "notes", {}).items()}
+    for name, value in section:
+        if isinstance(value, BaseModel):
+            found |= _notes(value, f"{prefix}{name}.")
+    return found
 
 
 def _decided(model: type[BaseModel], prefix: str = "") -> dict[str, list[str]]:
@@ -160,12 +185,11 @@ def _decided(model: type[BaseModel], prefix: str = "") -> dict[str, list[str]]:
     return found
 
 
-def _is_finite(value: object) -> bool:
-    if isinstance(value, Mapping):
-        return all(map(_is_finite, value.values()))
-    if isinstance(value, list | tuple):
-        return all(map(_is_finite, value))
-    return not isinstance(value, float) or isfinite(value)
+def _is_within(most: float, value: object) -> bool:
+    """Return whether all numbers of a value are finite and at most this large."""
+    if isinstance(value, Mapping | list | tuple):
+        return all(_is_within(most, part) for part in (value.values() if isinstance(value, Mapping) else value))
+    return not isinstance(value, float) or (isfinite(value) and abs(value) <= most)
 
 
 def _has_nul(value: object) -> bool:

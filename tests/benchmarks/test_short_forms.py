@@ -1,4 +1,4 @@
-"""Benchmarks that measure speed run in a short form and print their figures, which a busy machine may make any."""
+"""Every benchmark runs in a short form and prints its figures, which a busy machine may make any."""
 
 import json
 import re
@@ -9,13 +9,30 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import Coldloop
 from tests.harness.processes import Processes
 
-FOLDER = Path(__file__).parents[2] / "benchmarks"
+FOLDER, EXAMPLES = (Path(__file__).parents[2] / name for name in ("benchmarks", "examples"))
 PATIENCE_S = 600.0
 """The first one may have to compile the kernels."""
 
 Benchmark = Callable[..., str]
+
+SHORT_FORMS = {
+    "clock_skew": ("--ppm 200 --factor 200 --hours 0.02", r"\+200 ppm.* at tick \d+"),
+    "crowd": ("--flood --clients 5 --seconds 15", r"5 clients and a flood: .* deadline misses\. \d+ answers"),
+    "fuzz_servers": ("--frames 300 --bytes 3000", r"(?s)plant .*control_plc .*optimizer_plc "),
+    "interrupted_runs": ("--count 2 --only networked --latest 3", r"^0 did not end as they should"),
+    "kill_instants": ("--count 1 --gap 60", r"first alarm at most"),
+    "lanes": ("--ticks 50 --look-ups 1000 --repeat 1", r"(?s)8 plants: .*independent: ratio [0-9.]+"),
+    "long_run_memory": ("--hours 1 --out {folder}/runs", r"^14400 ticks, "),
+    "page_crowd": ("--seconds 15 --browsers 2", r"the page and 2 browsers: .* deadline misses\. \S"),
+    "peers": ("--help", r"an interpreter that has Coldloop"),
+    "realtime": ("--case 20 20s", r"in 80 scans"),
+    "study_workers": ("--duration 20s", r"two workers \d+ s, ratio [0-9.]+"),
+}
+"""Arguments of those that have no test of their own below, and a pattern of what they print; `peers` needs packages
+that are not installed here."""
 
 
 @pytest.fixture
@@ -45,6 +62,37 @@ TIMED = {
     "run_speed.py --load a --duration 20s --repeat 1": (r"one trace: True()", 2),
 }
 """Benchmarks with what they print of it, and how often."""
+
+
+def test_every_benchmark_is_run_by_a_test() -> None:
+    named = {
+        *SHORT_FORMS,
+        *(one.partition(".")[0] for one in TIMED),
+        *re.findall(r'printed_by\("(\w+)\.py"', Path(__file__).read_text(encoding="utf-8")),
+    }
+    assert named | {"qp_peers"} == {file.stem for file in FOLDER.glob("*.py")}, "qp_solvers runs qp_peers"
+
+
+@pytest.mark.night
+@pytest.mark.parametrize("name", SHORT_FORMS)
+def test_a_short_form_ends_and_prints(printed_by: Benchmark, tmp_path: Path, name: str) -> None:
+    arguments, pattern = SHORT_FORMS[name]
+    text = printed_by(f"{name}.py", *arguments.format(folder=tmp_path).split())
+    assert re.search(pattern, text, re.MULTILINE), text
+
+
+def test_a_dead_sensor_is_noticed(printed_by: Benchmark) -> None:
+    text = printed_by("sensor_faults.py", "--outputs", "L1", "--faults", "dead", "--minutes", "6")
+    assert re.search(r"^L1 \| dead \| 0 s bad \|", text, re.MULTILINE), text
+
+
+@pytest.mark.night
+@pytest.mark.usefixtures("undrawn")
+def test_a_cool_down_is_drawn(printed_by: Benchmark, coldloop: Coldloop, tmp_path: Path) -> None:
+    files = ("--config", EXAMPLES / "cool_down.toml", "--load", EXAMPLES / "cool_down.csv")
+    assert coldloop("run", "--in-process", *files, "--duration", "1min", "--out", tmp_path / "run").code == 0
+    printed_by("cool_down_figure.py", str(tmp_path / "run"), str(tmp_path / "figure.png"))
+    assert (tmp_path / "figure.png").stat().st_size > 1000
 
 
 @pytest.mark.night

@@ -7,7 +7,13 @@ import pytest
 from pydantic import ValidationError
 
 from coldloop.process.limits import InputLimits
-from optimizer_plc.computing_settings import PENALTY_WEIGHT, EstimatorKind, EstimatorSettings, OdeSettings
+from optimizer_plc.computing_settings import (
+    PENALTY_WEIGHT,
+    EstimatorKind,
+    EstimatorSettings,
+    OdeSettings,
+    PlausibilitySettings,
+)
 from optimizer_plc.qp.costs import augmented_cost, indicators
 from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.penalties import PRESETS, PenaltySettings, Preset
@@ -41,11 +47,22 @@ def test_the_tuned_preset_is_the_default_and_differs_from_the_paper_s_in_the_est
 def test_state_feedback_estimates_no_disturbances_whatever_the_preset() -> None:
     chosen = ProgramSettings.model_validate({"estimator": {"kind": "state-feedback"}})
     assert chosen.estimator == EstimatorSettings(kind=EstimatorKind.STATE_FEEDBACK)
+    assert chosen.plausibility == PlausibilitySettings()
+    assert list(chosen.notes) == ["estimator.disturbances", "estimator.load_walk_w", "plausibility.sigmas"]
 
 
-def test_a_load_that_is_not_measured_is_estimated_as_before() -> None:
-    chosen = ProgramSettings.model_validate({"estimator": {"load_known": False}})
-    assert chosen.estimator == EstimatorSettings(load_known=False)
+def test_a_preset_holds_where_the_load_is_not_measured_with_a_walk_of_its_own() -> None:
+    chosen, usual = ProgramSettings.model_validate({"estimator": {"load_known": False}}), ProgramSettings()
+    assert chosen.estimator == EstimatorSettings(load_known=False, disturbances=("outputs",), load_walk_w=10.0)
+    assert chosen.model_copy(update={"estimator": usual.estimator}) == usual
+    own = ProgramSettings.model_validate({"estimator": {"load_known": False, "load_walk_w": 30.0}})
+    assert own.estimator.load_walk_w == 30.0
+    assert not chosen.notes
+
+
+def test_what_a_preset_has_is_checked_with_the_rest() -> None:
+    with pytest.raises(ValidationError, match="band_margin, that of the preset too"):
+        ProgramSettings.model_validate({"design": {"output_low": (59.95, 9.0), "output_high": (60.05, 16.0)}})
 
 
 def test_a_preset_fills_what_is_not_set() -> None:

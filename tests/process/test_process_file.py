@@ -202,6 +202,8 @@ BAD_FILES = {
     "constraints behind the horizon": (ONE_BY_ONE + "[prediction]\ndecision_instants = [1, 2]\n", "constraint"),
     "a state that is none": (ONE_BY_ONE + '[[states]]\nname = "pressure"\nwalk = 1.0\n', "pressure"),
     "an output outside its sensor's range": (changed("range = [200.0, 500.0]", "range = [0.0, 10.0]"), "temperature"),
+    "an input that weighs nothing": (changed('name = "power"', 'name = "power"\nweight = 1e-12'), "power: weight"),
+    "a penalty without end": (changed("range = [200.0, 500.0]", "range = [200.0, 500.0]\npenalty = 1e12"), "penalty"),
     "a keyword of Python": (changed('name = "power"', 'name = "in"'), "in"),
     "a column of the trace": (changed('name = "temperature"', 'name = "tau_u_s"'), "tau_u_s"),
     "a load outside its span": (ONE_BY_ONE + '[load]\nname = "d"\nat = 5.0\nspan = [0.0, 1.0]\n', "d"),

@@ -24,6 +24,7 @@ pytestmark = pytest.mark.usefixtures("programs")
 USAGE, FAILURE = 2, 1
 
 RUN = ("run", "--in-process", "--duration", "2s")
+DESIGN = "optimizer_plc.program.design."
 
 
 def assert_refused(outcome: "Outcome", code: int, *parts: str) -> None:
@@ -49,6 +50,13 @@ def assert_no_results(folder: Path) -> None:
         ("optimizer_plc.program.updating_period_s=0.6", ["updating_period_s", "multiple of 0.25"]),
         ("control_plc.server.port=99999", ["control_plc.server.port", "65535"]),
         ("telemetry.prefix=a/#", ["telemetry.prefix"]),
+        (f"{DESIGN}violation_weight=[1e12,1e12]", ["violation_weight", "from 0.001 to 1e+07", "single precision"]),
+        (f"{DESIGN}input_scale=[1e-6,50,10]", ["input_scale", "from 0.1 to 1000"]),
+        (f"{DESIGN}pressure_scale=1e-6", ["pressure_scale", "from 20 to 200000"]),
+        ("optimizer_plc.program.penalties.output_rows=1e12", ["output_rows", "1000000"]),
+        ("optimizer_plc.program.ode.alpha=1e12", ["ode.alpha", "at most 3e+08"]),
+        ("optimizer_plc.program.adaptive.cost_floor=1e200", ["cost_floor", "1e+18"]),
+        ("plant.sensors.level=1e200", ["plant.sensors.level", "3.4e+38"]),
     ],
 )
 def test_a_wrong_key_or_value_on_the_command_line_is_named(
@@ -56,6 +64,11 @@ def test_a_wrong_key_or_value_on_the_command_line_is_named(
 ) -> None:
     assert_refused(coldloop(*RUN, "--set", assignment, "--out", results), USAGE, "--set", *parts)
     assert not results.exists()
+
+
+@pytest.mark.parametrize("assignment", ["limits.rate=[100,1000,100]", "optimizer_plc.program.budget.power=1e12"])
+def test_a_value_that_is_only_large_runs(assignment: str, coldloop: "Coldloop", results: Path) -> None:
+    assert coldloop(*RUN, "--set", assignment, "--out", results).code == 0
 
 
 def test_a_wrong_configuration_file_is_named(coldloop: "Coldloop", tmp_path: Path) -> None:

@@ -126,6 +126,9 @@ def add_loop_options(parser: argparse.ArgumentParser, loads: str) -> None:
     parser.add_argument("--updating-period", type=updating_period, metavar="adaptive|SECONDS",
                         help="default: adaptive")  # fmt: skip
     parser.add_argument("--seed", type=int, help="seed of the sensors' noise (default: 1)")
+    parser.add_argument("--enforce", action="store_true",
+                        help="lengthen the updating period to what the PLC takes; refuse where the longest is too"
+                        " short")  # fmt: skip
 
 
 def add_result_options(parser: argparse.ArgumentParser, folder: str) -> None:
@@ -240,12 +243,17 @@ def configuration(options: argparse.Namespace) -> "Configuration[Settings]":
 
     given: Mapping[str, Any] = vars(options)
     site = _tls_site(given["tls"]) if given.get("tls") is not None else {}
-    return load_configuration(
+    effective = load_configuration(
         Settings,
         file=options.config,
         assignments=[*options.assignments, *given.get("further_assignments", ())],
         options=site | {key: (given[name], flag) for name, (key, flag) in KEYS.items() if given.get(name) is not None},
     )
+    if given.get("enforce"):
+        from rig.runs.remarks import enforced
+
+        return enforced(effective)
+    return effective
 
 
 def operator_settings(options: argparse.Namespace) -> "OperatorSettings":

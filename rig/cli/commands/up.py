@@ -36,8 +36,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Start the rig; end it with Ctrl-C."""
     check_load(options.load)
-    from rig.cli.commands.options import configuration, exported
+    from rig.cli.commands.options import configuration, exported, tell
     from rig.live.started_rigs import RigLock, check_ports, detached, ports_from
+    from rig.runs.remarks import remarks
     from rig.runs.running import check_certificates
 
     effective = configuration(options)
@@ -61,6 +62,8 @@ def execute(options: argparse.Namespace) -> int:
     from rig.live.up import UpRig
     from rig.until_interrupted import run_until_interrupted
 
+    for line in remarks(effective) if not options.without else ():
+        tell(line)
     services = REQUIRED if options.without else SERVICES
     rig = UpRig(effective.settings, ports, options.tls, page=page, cuttable=options.cuttable, services=services,
                 optimizer=optimizer)  # fmt: skip

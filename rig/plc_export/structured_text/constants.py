@@ -137,7 +137,7 @@ def in_pieces(constants: Mapping[Path, Array]) -> tuple[dict[Path, Array], Split
     found: dict[Path, Array] = {}
     split: dict[Path, list[tuple[Path, int]]] = {}
     for path, values in constants.items():
-        rows = LARGEST_LIST // (4 * values[0].size) if values.ndim > 1 and len(values) else 0
+        rows = LARGEST_LIST // (4 * values[0].size) if values.ndim > 1 and values.size else 0
         if 4 * values.size <= LARGEST_LIST or not rows:
             found[path] = values
             continue

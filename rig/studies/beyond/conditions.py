@@ -43,5 +43,5 @@ LINEAR: Final = {
 LEFT_OUT: Final = (
     "Several errors at once, and sensors that fail, are not tried. "
     "Costs and bands are of true values under bias, and of measured ones, which are noisy, under noise. "
-    f"Under '{ESTIMATED}' `tuned` has the estimator of `paper`, and no period can be interrupted: rules run without."
+    f"Under '{ESTIMATED}' no period can be interrupted: rules run without."
 )

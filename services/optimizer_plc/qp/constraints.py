@@ -69,7 +69,7 @@ def output_rows(condensed: Condensed, design: ControlDesign, weights: Array, y0:
 
 
 def rate_rows(design: ControlDesign, limits: InputLimits, penalties: PenaltySettings) -> RateRows:
-    """Return the rows of the rates, scaled by what breaking them costs."""
+    """Return the rows of the rates, scaled by what breaking them costs; there may be none."""
     ranges = np.asarray(limits.high) - np.asarray(limits.low)
     size = (N_INPUTS + N_SLACKS) * len(design.decision_instants)
     gains_of_inputs = np.sqrt(penalties.rate_rows) / np.array(design.input_scale)

@@ -5,10 +5,21 @@ The paper leaves weights and scaling open; `docs/science.md` says why these were
 
 from enum import StrEnum
 from itertools import pairwise
-from typing import Annotated, Self
+from typing import Annotated, Final, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    PositiveFloat,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
+from coldloop.process.declaration import FURTHEST_WEIGHT
 from coldloop.process.loaded import PROCESS
 from coldloop.process.per_signal import PerBand, PerInput, PositivePerBand
 from coldloop.process.signals import BATH
@@ -27,6 +38,11 @@ def _rising_instants(instants: tuple[int, ...]) -> tuple[int, ...]:
 Instants = Annotated[tuple[int, ...], AfterValidator(_rising_instants)]
 
 
+FURTHEST_SCALE: Final = 100.0
+"""Largest factor between a scale and the process's own. With scales of inputs that are 1e-3 of it the first step of the
+ODE-based solver is so short that the inputs of the cold box hardly move."""
+
+
 class Target(StrEnum):
     """What the cost is about: where the plant should come to rest."""
 
@@ -35,6 +51,15 @@ class Target(StrEnum):
     """Where the plant, as it is estimated to be, rests at the operating point's load."""
     LOAD = "load"
     """Where it rests at the present load."""
+
+
+Numbers = float | tuple[float, ...]
+SCALES: Final = ("input_scale", "pressure_scale", "level_scale", "temperature_scale")
+WEIGHTS: Final = ("input_weight", "state_weight", "violation_weight")
+
+
+def _numbers(value: Numbers) -> tuple[float, ...]:
+    return value if isinstance(value, tuple) else (value,)
 
 
 class ControlDesign(BaseModel):
@@ -66,6 +91,17 @@ class ControlDesign(BaseModel):
         """N_p, in sampling periods."""
         return self.decision_instants[-1]
 
+    @field_validator(*SCALES, *WEIGHTS)
+    @classmethod
+    def _near_the_process(cls, value: Numbers, info: ValidationInfo) -> Numbers:
+        name = str(info.field_name)
+        furthest = FURTHEST_SCALE if name in SCALES else FURTHEST_WEIGHT
+        for own, given in zip(_numbers(cls.model_fields[name].default), _numbers(value), strict=True):
+            if not own / furthest <= given <= own * furthest:
+                raise ValueError(f"each must be from {own / furthest:g} to {own * furthest:g}, around {own:g}: "
+                                 "beyond that single precision loses the other terms of the cost")  # fmt: skip
+        return value
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if self.target is not Target.OPERATING_POINT and BATH is None:
@@ -76,9 +112,9 @@ class ControlDesign(BaseModel):
             raise ValueError("each output_low must be below its output_high")
         widths = (high - low for low, high in zip(self.output_low, self.output_high, strict=True))
         if any(not 0.0 <= margin <= width / 2.0 for margin, width in zip(self.band_margin, widths, strict=True)):
-            raise ValueError("each band_margin must be at least 0 and at most half of its band")
-        if min(*self.input_scale, *self.input_weight) <= 0:
-            raise ValueError("input_scale and input_weight must be positive")
+            raise ValueError(
+                "each band_margin, that of the preset too, must be at least 0 and at most half of its band"
+            )
         return self
 
 

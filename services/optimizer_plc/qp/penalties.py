@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated, Any, Final
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+from pydantic import BaseModel, ConfigDict, Field
 
 from coldloop.process.loaded import PROCESS
 from coldloop.process.per_signal import PositivePerInput
@@ -20,15 +20,15 @@ class PenaltySettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    output_rows: PositiveFloat = 30.0
+    output_rows: Annotated[float, Field(gt=0.0, le=1e6)] = 30.0
     """alpha over rho, the weight of a band violation. A violation v is shared between its slack and its row: the row
     keeps v / (1 + output_rows), and J has output_rows / (1 + output_rows) rho v^2 for it."""
     rate_rows: PositivePerInput = (16.0,) * N_INPUTS
     """Weight of the rate rows over alpha, per square of `design.input_scale`. With the squares of `input_scale` the
     rows are in % and W, all with the same alpha, as the paper prints it."""
-    box: Annotated[float, Field(ge=0.0)] = 0.0
+    box: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
     """Weight of the box over alpha, per square of a scaled variable. Iterates are projected into the box whatever this
-    is; it acts at the middle stage of a step of the ODE-based solver only."""
+    is; it acts at the middle stage of a step of the ODE-based solver only, which with 1e5 hardly moves."""
     first_knot_in_box: bool = True
     """Whether the first knot keeps the rate from the input before it as a bound of the box, too, and not as a row only.
     Where it does not, its input is moved to within that rate before it is sent."""
@@ -56,8 +56,11 @@ class Preset(StrEnum):
     in their own units, and cost_scale is the one whose costs come down with the iterations as in the paper's figure."""
 
 
+UNMEASURED: Final[Mapping[str, Any]] = PROCESS.tuned.get("unmeasured", {})
+"""What section `estimator` of the preset `tuned` has instead where the load is not measured."""
 PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
-    Preset.TUNED: PROCESS.tuned or {"estimator": {"disturbances": ("outputs",)}},
+    Preset.TUNED: {name: values for name, values in PROCESS.tuned.items() if name != "unmeasured"}
+    or {"estimator": {"disturbances": ("outputs",)}},
     Preset.PAPER: {},
     Preset.AS_PRINTED: {
         "penalties": {
@@ -78,7 +81,7 @@ OF_ALPHA: Final = ("penalties.output_rows", "design.violation_weight")
 """Keys that decide alpha: see `alpha_of`."""
 
 
-def completed(section: BaseModel, values: Mapping[str, Any]) -> BaseModel:
-    """Return a section with the values for those of its keys that were not set explicitly."""
-    missing = {key: value for key, value in values.items() if key not in section.model_fields_set}
-    return section.model_copy(update=missing) if missing else section
+def filled(section: object, values: Mapping[str, Any]) -> object:
+    """Return a section, as it is given, with values for those of its keys that were not set; to be validated."""
+    given = section.model_dump(exclude_unset=True) if isinstance(section, BaseModel) else section
+    return {**values, **given} if isinstance(given, Mapping) else given

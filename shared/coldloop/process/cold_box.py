@@ -94,6 +94,7 @@ COLD_BOX: Final = Process(
     moves_as_one=True,
     tuned={
         "estimator": {"disturbances": ("outputs",), "load_walk_w": 1.0},
+        "unmeasured": {"load_walk_w": 10.0},
         "cold_end": {"approach_k": 0.3},
         "design": {"band_margin": (0.1, 0.3)},
         "plausibility": {"sigmas": 6.0},

@@ -200,6 +200,13 @@ class Bath:
         return (*filter(None, (self.pressure_state, self.level_state)), *self.temperature_states)
 
 
+FURTHEST_WEIGHT: Final = 1e5
+"""Largest factor between a weight of the cost and the process's own, or the usual one.
+
+With `violation_weight` 1e6 times as large J of the cold box is 1.4 times as large, with 1e10 its inputs do not move:
+the other terms of the cost are below the 7 digits of single precision.
+"""
+
 NO_LOAD: Final = Load(name="no load", unit="", span=(0.0, 1.0), walk=1e-6)
 """The load of a process that has none."""
 
@@ -237,7 +244,8 @@ class Process:
     moves_as_one: bool = False
     """Whether all outputs move when any do: one that rests meanwhile is frozen, whatever the inputs do."""
     tuned: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
-    """Settings of the preset `tuned`, by section; an estimate of the constants of all outputs where there are none."""
+    """Settings of the preset `tuned`, by section; an estimate of the constants of all outputs where there are none. In
+    `unmeasured` is what `estimator` has instead where the load is not measured."""
     plants: tuple[str, ...] = ("of-process",)
     """Kinds of plant that simulate it, by their names in the configuration; the first by default."""
     decimals: Mapping[str, int] = field(default_factory=lambda: MappingProxyType({}))

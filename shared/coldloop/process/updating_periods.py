@@ -11,6 +11,10 @@ ROUNDING: Final = 1e-5
 """Share of an iteration that may be missing: times come through registers in single precision."""
 
 
+MOST_ITERATIONS: Final = 1_000_000
+"""In an updating period, however fast the PLC: solvers have converged long before."""
+
+
 class ComputingTimes(NamedTuple):
     """Times of one solver on its PLC, s."""
 
@@ -21,7 +25,8 @@ class ComputingTimes(NamedTuple):
 
     def iterations(self, ticks: int) -> int:
         """Return the iterations that fit into an updating period; at least one is always done."""
-        return max(1, math.floor((ticks * TICK_S - self.slots) / self.iteration + ROUNDING))
+        fitting = (ticks * TICK_S - self.slots) / self.iteration + ROUNDING
+        return max(1, math.floor(min(fitting, MOST_ITERATIONS)))
 
     def holds(self, ticks: int) -> bool:
         """Return whether one iteration fits into an updating period."""
