@@ -193,3 +193,8 @@ def test_a_device_as_the_place_for_results_is_refused_and_stays(command: str, co
     assert len(outcome.complaints) == 1
     assert "/dev/full" in outcome.complaints[0]
     assert Path("/dev/full").is_char_device()
+
+
+def test_a_parser_is_made_for_each_command() -> None:
+    for command in COMMANDS:
+        assert f"{command} " in make_parser(command).format_help()
