@@ -6,6 +6,7 @@ own output on standard output.
 
 import compileall
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -26,6 +27,8 @@ LOOK_S: Final = 0.2
 WAITING: Final = 2
 """Processes beside those that the cores have work for: some wait for kernels that others compile."""
 ROOT: Final = Path(__file__).parents[1]
+SELDOM: Final = re.compile(r"/site-packages/(.*/tests?/|(pip|setuptools|mypy|mypyc)/)")
+"""Of the packages: tests of theirs, and what is no module of a program; a third of all."""
 
 
 def plant() -> None:
@@ -151,11 +154,11 @@ def run_modules() -> None:
 
 
 def all_modules() -> None:
-    """Write the bytecode of the project and of all that is installed."""
+    """Write the bytecode of the project and of what is installed, but for tests and what is seldom imported."""
     projects = [find_spec(name) for name in ("coldloop", "plant", "control_plc", "optimizer_plc", "hmi", "rig")]
     folders = [place for spec in projects if spec for place in spec.submodule_search_locations or ()]
     for folder in (*folders, sysconfig.get_path("purelib")):
-        compileall.compile_dir(folder, quiet=2)  # some packages have templates that are no Python
+        compileall.compile_dir(folder, quiet=2, rx=SELDOM)  # some packages have templates that are no Python
 
 
 def tests() -> None:
