@@ -60,7 +60,7 @@ def left_by(assignments: tuple[str, ...], load: LoadProfile, ticks: int, *, comp
 
 
 USUALLY = {
-    "adaptive", "hybrid", "load steps that interrupt", "refrigerator", "single precision", "osqp",
+    "adaptive", "load steps that interrupt", "refrigerator", "single precision", "osqp",
     "sequences that are refused", "an impatient watchdog", "loads that cannot be held", "suspects",
 }  # fmt: skip
 """One of each kind; the others differ from one of them in a part of the configuration."""
