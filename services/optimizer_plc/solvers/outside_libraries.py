@@ -3,7 +3,8 @@
 They get J itself: each row may be broken, and by how much is a variable t >= 0 that costs alpha t^2. So there always is
 a point that keeps all rows, and an answer is judged by what was minimised.
 
-- All three count iterations and hand out the iterate at their limit. Each count is a solve of its own: nothing is kept.
+- All three are throttled: they count iterations and hand out the iterate at their limit. Each count is a solve of its
+  own, with the library's own settings but for tolerances: nothing is kept.
 - Clarabel and PIQP are interior-point methods that begin at a point of their own, whatever the guess. An iteration is
   a predictor and a corrector.
 - QPALM, a proximal augmented Lagrangian method, begins at the guess. An iteration is a semismooth Newton step or an
@@ -131,7 +132,7 @@ class Qpalm(Library):
     name = "qpalm"
 
     def iterated(self, p: SoftProblem, first: Array, count: int) -> tuple[Array | None, int]:
-        """Begin at `first`, with the multipliers 2 alpha t of its rows."""
+        """Begin at `first`, with multipliers of 0: those of its broken rows make truncated answers worse."""
         from scipy import sparse  # noqa: PLC0415 only what needs it loads it
 
         n, m = len(p.g), len(p.u)
@@ -144,7 +145,7 @@ class Qpalm(Library):
         settings.verbose, settings.max_iter = False, count
         settings.eps_abs = settings.eps_rel = 100.0 * TOLERANCE  # at an optimum it may not get nearer, and not end
         solver = self.library.Solver(data, settings)
-        solver.warm_start(first, np.concatenate([p.H.diagonal()[-m:] * first[-m:], np.zeros(n)]))
+        solver.warm_start(first, np.zeros(m + n))
         solver.solve()
         usable = str(solver.info.status) in {"solved", "maximum iterations reached"}
         return np.array(solver.solution.x) if usable else None, solver.info.iter
