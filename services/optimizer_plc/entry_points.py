@@ -36,9 +36,11 @@ def made(part: Part, name: str, *given: object) -> Any:  # noqa: ANN401 the call
 
 @contextmanager
 def in_its_name(part: Part, name: str, what: str = "") -> Iterator[None]:
-    """Call what is not ours: whatever it raises is a `ConfigurationError` of one line, with its name."""
+    """Call what is not ours: what it raises is a `ConfigurationError` of one line, with its name unless it is one."""
     try:
         yield
+    except ConfigurationError:
+        raise
     except Exception as error:
         said = " ".join(str(error).split())
         raise ConfigurationError(f"{part} {name}: {what}{type(error).__name__}: {said}") from error

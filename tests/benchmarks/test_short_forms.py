@@ -109,7 +109,7 @@ def test_all_solvers_take_part_in_the_comparison(printed_by: Benchmark) -> None:
     text = printed_by("qp_solvers.py", "--hours", "e", "--minutes", "5", "--iterations", "5")
     for name in ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "hybrid", "daqp"):
         assert len(re.findall(rf"^{name} ", text, re.MULTILINE)) == 2 + (name in {"ode", "interior-point"}), text
-    for name, module in {"piqp": "piqp", "proxqp": "proxsuite", "clarabel": "clarabel"}.items():
+    for name, module in {"piqp": "piqp", "proxqp": "proxsuite", "clarabel": "clarabel", "qpalm": "qpalm"}.items():
         found = numbers(rf"^{name} .*?([0-9.]+) /\s+[0-9.e+]+\s+[0-9.]+$", text)
         assert found == ([] if find_spec(module) is None else [pytest.approx(1.0, abs=0.02)]), "converged at the end"
         assert (f"without {name}" in text or f", {name}" in text) == (find_spec(module) is None)

@@ -121,7 +121,8 @@ def add_loop_options(parser: argparse.ArgumentParser, loads: str) -> None:
     load.completer = lambda **_: LOADS  # type: ignore[attr-defined]  # argcomplete looks for it
     parser.add_argument("--solver", choices=SOLVERS, help="default: ode")
     parser.add_argument("--outside-solver", metavar="NAME",
-                        help="a solver that is installed beside, by its entry point (`docs/extending.md`)")  # fmt: skip
+                        help="clarabel, piqp, qpalm (each an extra of this name), or a solver that is installed"
+                        " beside, by its entry point (`docs/extending.md`)")  # fmt: skip
     parser.add_argument("--preset", choices=PRESETS, help="of solver and estimator (default: tuned)")
     parser.add_argument("--updating-period", type=updating_period, metavar="adaptive|SECONDS",
                         help="default: adaptive")  # fmt: skip

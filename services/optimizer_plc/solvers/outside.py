@@ -20,7 +20,8 @@ Array = NDArray[np.float64]
 class OutsideMethod(Protocol):
     """What an entry point makes: min z' Phi z + z' phi under Gamma z <= gamma and low <= z <= high, cut off anywhere.
 
-    There is no factor 1/2 before Phi. The same problem, guess and count give the same bits.
+    There is no factor 1/2 before Phi. The same problem, guess and count give the same bits. If it has an attribute
+    `alpha`, that is set to the weight of broken rows that its answers are judged with.
     """
 
     def solve(self, problem: QuadraticProblem, guess: Array, iterations: int) -> tuple[Array, int]:
@@ -35,6 +36,8 @@ class OutsideSolver:
         self.tau_1_s = settings.tau_1_s
         self.name = settings.solver
         self._method: OutsideMethod = made(Part.SOLVER, settings.solver)
+        if hasattr(self._method, "alpha"):
+            self._method.alpha = settings.alpha
 
     def reset(self) -> None:
         """Forget earlier problems, where the method has something to forget."""
