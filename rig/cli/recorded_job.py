@@ -29,12 +29,12 @@ def record(job: Job, options: argparse.Namespace, figure: FigureProcess) -> int:
     Raises:
         ColdloopError: It is not complete; what was recorded is in the folder.
     """
+    told = [] if job.way in (Way.RECORDED, Way.ATTACHED) else remarks(job.effective)  # of a PLC that is ours
     name = "session" if job.way is Way.RECORDED else Path(job.effective.settings.plant.load).stem
     out = options.out or claim_folder_of_now(Path("runs"), name)
     claim_folder(out, force=options.force)
-    if job.way is not Way.RECORDED:
-        sys.stdout.write("".join(f"{line}\n" for line in remarks(job.effective)))
-        sys.stdout.flush()
+    sys.stdout.write("".join(f"{line}\n" for line in told))
+    sys.stdout.flush()
     with _progress(job) as sinks:
         summary = run_into(out, job, plain_arguments(options), figure, sinks)
     _tell(out, summary)

@@ -91,6 +91,11 @@ class StageCost:
         return cost
 
 
+def has_no_answer(update: Optimization) -> bool:
+    """Return whether an update had no answer; in real time it may have been rejected for another reason first."""
+    return update.verdict == Verdict.NO_ANSWER or not math.isfinite(update.j_dev + update.j_cst + update.violation)
+
+
 class RunEvaluation(Sink):
     """Sums the indicators of a run, and its digest, in constant memory; ticks that are unknown add nothing."""
 
@@ -116,7 +121,7 @@ class RunEvaluation(Sink):
 
     def update(self, update: Optimization) -> None:
         """Take an update; one without an answer has no prediction."""
-        if update.verdict == Verdict.NO_ANSWER:
+        if has_no_answer(update):
             self.failed_updates += 1
             return
         delivered = update.tick + update.tau_u

@@ -5,6 +5,7 @@ from dataclasses import replace
 from coldloop.config import Configuration
 from coldloop.errors import UsageError
 from coldloop.process.signals import TICK_S
+from coldloop.session.settings import TimeMode
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.settings import ProgramSettings
 from rig.settings import Settings
@@ -13,8 +14,20 @@ PERIOD = "optimizer_plc.program.updating_period_s"
 
 
 def remarks(effective: Configuration[Settings]) -> list[str]:
-    """Return what a user should know before a run, a line each; usually nothing."""
-    found, left_out = [too_slow(effective.settings.optimizer_plc.program)], effective.notes()
+    """Return what a user should know before a run, a line each; usually nothing.
+
+    Raises:
+        UsageError: In real time no answer would ever be there in time.
+    """
+    program, realtime = effective.settings.optimizer_plc.program, effective.settings.session.mode is TimeMode.REALTIME
+    ticks, budget = round(program.updating_period_s / TICK_S), _budget(program)
+    if realtime and ticks and not budget.is_enough(ticks):
+        raise UsageError(
+            f"{PERIOD} = {program.updating_period_s:g}: this PLC (P = {program.budget.power:g}) needs"
+            f" {budget.answer_after_s(1):.3g} s for an answer with {program.solver_name}, and in real time none comes"
+            " sooner: give a longer period, adaptive, or --enforce"
+        )
+    found, left_out = [too_slow(program)], effective.notes()
     if left_out:
         found.append(f"not applied of the preset: {', '.join(left_out)}; `coldloop config` says why")
     return [*filter(None, found)]

@@ -23,7 +23,6 @@ from coldloop.process.cold_box import COLD_BOX, L1, T5
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.signals import STATION_SIGNAL_NAMES, TICK_S
-from coldloop.registers.control_plc import Verdict
 from coldloop.service.start import main as start_service
 from optimizer_plc.solvers import make_solver
 from rig.cosim.linear_plant import LinearRig
@@ -32,7 +31,7 @@ from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
 from rig.cosim.wiring import SERVICES
 from rig.results.folders import installed_version
-from rig.results.indicators import Indicators, StageCost, evaluate
+from rig.results.indicators import Indicators, StageCost, evaluate, has_no_answer
 from rig.results.recording import Recorder, Recording
 from rig.settings import Settings
 from rig.studies.paired_run import harsh_run, paired_indicators, paired_run
@@ -256,7 +255,7 @@ def _outcome(recording: Recording, settings: Settings, trace_ticks: int) -> Outc
         events=[Happening(service, event.tick, event.kind, event.subject) for service, event in recording.events]
         if trace_ticks
         else [],
-        failed_updates=sum(row.verdict == Verdict.NO_ANSWER for row in recording.updates),
+        failed_updates=sum(map(has_no_answer, recording.updates)),
     )
 
 

@@ -28,7 +28,7 @@ class Branch(StrEnum):
     FIRST = "first"
     """There is no period before this one."""
     BEGUN_AGAIN = "begun again"
-    """The optimiser was restarted, or another client has moved the inputs."""
+    """The optimiser was restarted, had no answer before, or another client has moved the inputs."""
     INTERRUPTED = "interrupted"
     """A load step ended the period before."""
     LATE = "late"
@@ -209,6 +209,8 @@ def _why_not_played(update: Optimization, before: Optimization | None, rule: Upd
     if before is None:
         return Branch.UNKNOWN
     elapsed = update.tick - before.tick
+    if before.verdict == Verdict.NO_ANSWER:
+        return Branch.BEGUN_AGAIN
     if elapsed < before.tau_u and before.verdict in {Verdict.NONE, Verdict.WRONG_UPDATE}:
         return Branch.INTERRUPTED
     if elapsed != before.tau_u and update.q == rule.q_first != before.q:

@@ -91,9 +91,14 @@ def _first(found: Explanation, rule: UpdatingRuleStatus) -> str:
 
 def _begun_again(found: Explanation, rule: UpdatingRuleStatus) -> str:
     return (
-        f"{_change(found)} because the optimiser had to start over (a restart, or another client moved the inputs): "
-        f"q starts at {rule.q_first}."
+        f"{_change(found)} because the optimiser had to start over ({_why_again(found)}): q starts at {rule.q_first}."
     )
+
+
+def _why_again(found: Explanation) -> str:
+    if found.before is not None and found.before.verdict == Verdict.NO_ANSWER:
+        return "the update before has no answer: what was computed is not finite"
+    return "a restart, or another client moved the inputs"
 
 
 def _unknown(found: Explanation, _rule: UpdatingRuleStatus) -> str:

@@ -85,12 +85,13 @@ def take_update(c: Constants, rule: UpdatingRule, starts: Starts, m: OptimizerSt
 def follow(c: Constants, m: OptimizerState, latched: Latched) -> int:
     """Find out what is played from an update on; return its q, `BY_THE_RULE`, `FIRST` or `AFTER_A_STEP`."""
     now, u = m.numbers[0], latched.u - c.estimator.u0
-    if now.solved and m.sent.numbers[0].length == 0:
+    failed = now.solved and m.sent.numbers[0].length == 0
+    if failed:
         forget_failure(m)
     elapsed = latched.tick - now.tick if now.planned else 0
     known = now.planned or latched.tick == 0  # a session begins at the operating point
     if not (known and 0 <= elapsed <= LONGEST_GAP_TICKS and knows_what_is_played(m, latched.playing)):
-        begin_again(c, m, latched, u)
+        begin_again(c, m, latched, u, failed and m.playing.numbers[0].number == latched.playing)
     elif 0 < elapsed != now.ticks:
         predict_played(c, m, elapsed)
     interrupted = now.planned and 0 < elapsed < now.ticks and 0 < c.load_step < abs(latched.load - now.load)
@@ -125,9 +126,10 @@ def knows_what_is_played(m: OptimizerState, number: int) -> bool:
 
 
 @kernel
-def begin_again(c: Constants, m: OptimizerState, latched: Latched, u: Array) -> None:
+def begin_again(c: Constants, m: OptimizerState, latched: Latched, u: Array, plays_on: bool) -> None:  # noqa: FBT001
     """Forget what was sent: others have moved the inputs since, to u (3,), from which the next profile sets out.
 
+    After an update without an answer nobody has: the rest of the sequence `plays_on`, and moves them meanwhile.
     For want of a past the plant is believed to rest: a filter that began at the operating point would take minutes.
     """
     estimator, played, zero = c.estimator, m.playing.numbers[0], m.u.dtype.type(0.0)
@@ -136,7 +138,8 @@ def begin_again(c: Constants, m: OptimizerState, latched: Latched, u: Array) -> 
     begin_at_rest(c.rest, m.belief, u, load, estimator.load_known, level)
     hold(u, c.input_scale, c.n_inputs, m.playing.z)
     m.playing.u_before[:] = u
-    played.first_tick, played.length = latched.tick, 0
+    if not plays_on:
+        played.first_tick, played.length = latched.tick, 0
     m.sent.numbers[0].length = 0
     m.numbers[0].planned = False
 

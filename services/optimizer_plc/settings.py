@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from enum import StrEnum
+from math import inf
 from typing import Annotated, Any, ClassVar, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationInfo, field_validator, model_validator
@@ -36,7 +37,7 @@ from optimizer_plc.computing_settings import (
     PlausibilitySettings,
     QpoasesSettings,
 )
-from optimizer_plc.qp.design import ColdEndSettings, ControlDesign
+from optimizer_plc.qp.design import SCALES, WEIGHTS, ColdEndSettings, ControlDesign
 from optimizer_plc.qp.penalties import (
     DEFAULT_PENALTIES,
     OF_ALPHA,
@@ -226,9 +227,13 @@ class ProgramSettings(BaseModel):
 
     @model_validator(mode="after")
     def _within_single_precision(self) -> Self:
+        near = {f"design.{name}" for name in (*SCALES, *WEIGHTS)}
         for key, value in flattened(self.model_dump(mode="json")).items():
+            if key in near:  # to the process's own, whose units may be large or small
+                continue
+            largest = inf if key in ALPHAS else LARGEST
             for number in value if isinstance(value, list) else [value]:
-                if isinstance(number, float) and not (number == 0.0 or 1.0 / LARGEST <= abs(number) <= LARGEST):
+                if isinstance(number, float) and not (number == 0.0 or 1.0 / LARGEST <= abs(number) <= largest):
                     raise ValueError(f"{key} = {number:g}: give 0 or a size from {1.0 / LARGEST:g} to {LARGEST:g}: "
                                      "single precision holds its square")  # fmt: skip
         most = FURTHEST_WEIGHT * alpha_of(DEFAULT_PENALTIES, ControlDesign())

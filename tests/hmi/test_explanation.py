@@ -208,6 +208,15 @@ def test_the_first_update_one_after_a_restart_and_one_whose_predecessor_is_unkno
     assert unknown.q_before is None
 
 
+def test_a_period_after_an_update_without_an_answer() -> None:
+    """Its q is that of a first one; here the session's last one happens to be the same."""
+    before = optimization(4, 100, 9, verdict=Verdict.NO_ANSWER, j_effective=math.nan)
+    found = explain(optimization(5, 110, 9), before, None, RULE)
+    assert found.branch is Branch.BEGUN_AGAIN
+    assert "the update before has no answer" in sentence(found, RULE)
+    assert "q starts at 9" in sentence(found, RULE)
+
+
 def test_the_time_line_of_the_plc_and_what_was_predicted_and_came() -> None:
     """0.13 s of preparation and 9 iterations of 0.25 s: an answer after 2.38 s of 2.5 s."""
     update, after = optimization(3, 30, 9, j_delivered=8.0), optimization(4, 40, 9, j_effective=8.25)

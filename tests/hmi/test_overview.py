@@ -146,3 +146,20 @@ def test_a_register_of_every_block_is_in_the_detail_view(page: "Page") -> None:
     assert page.locator("#detail tr:visible").count() == 3
     texts = [page.locator("#detail tr:visible td.value").nth(place).text_content() for place in range(3)]
     assert all(re.fullmatch(r"123\.4560", text) for text in texts)
+
+
+DASH = "\N{EN DASH}"
+NOT_FINITE = """async () => {
+  const { state, take } = await import("./static/js/store.js");
+  const update = { ...state.update.update, j_effective: null, j_delivered: null, load_mismatch: null, gamma: null };
+  take({ ...state, values: {}, whole: false, update: { ...state.update, update } });
+  return new Promise((shown) => requestAnimationFrame(() => shown(
+    ["tau-u-q", "load-facts"].map((id) => document.getElementById(id).textContent))));
+}"""
+
+
+def test_an_update_without_an_answer_has_dashes(page: "Page") -> None:
+    eventually(lambda: "J = " in (page.text_content("#tau-u-q") or ""), "an update is shown")
+    cost, facts = page.evaluate(NOT_FINITE)
+    assert cost.endswith(f"J = {DASH}")
+    assert f"estimated mismatch{DASH}" in facts

@@ -17,6 +17,7 @@ from coldloop.process.model_file import read_document, write_document
 from coldloop.registers.control_plc import Mode
 from tests.harness.process_files import COLUMN, TANK, made
 from tests.harness.processes import Processes
+from tests.harness.unstable_plants import pendulum
 from tests.process.runs import run, started
 
 ROOT: Final = Path(__file__).parents[2]
@@ -144,3 +145,18 @@ def test_the_registers_that_are_listed_are_those_of_the_process(processes: Proce
     names = [f"{one['block']} {one['name']} {one['unit']}" for one in json.loads(listed)]
     assert "measurement y.h1 cm" in names
     assert not [name for name in names if re.search(r"station|surroundings|model range|CV155|NCR22|\bT5\b|\bK\b", name)]
+
+
+UNITS = {
+    "giganewtons": ("low = -10.0\nhigh = 10.0\nrate = 200.0", "low = -1e9\nhigh = 1e9\nrate = 1e9"),
+    "nanoradians": ("band = [-0.1, 0.1]", "band = [-1e-9, 1e-9]"),
+}
+
+
+@pytest.mark.parametrize("units", UNITS)
+def test_weights_are_as_small_or_large_as_the_units_make_them(units: str, processes: Processes, tmp_path: Path) -> None:
+    file = pendulum(tmp_path)
+    file.write_text(file.read_text(encoding="utf-8").replace(*UNITS[units]), encoding="utf-8")
+    code, told, complaints = started(processes, "--process", file, "config")
+    assert code == 0, complaints
+    assert "design.violation_weight = " in told

@@ -146,6 +146,16 @@ def test_the_mean_period_is_that_over_time_and_the_one_per_update_is_beside_it(m
     assert found.tau_u_mean_per_update == pytest.approx(10 / 6)
 
 
+@pytest.mark.parametrize("verdict", [Verdict.NO_ANSWER, Verdict.LATE, Verdict.NOT_INVITED, Verdict.NONE])
+def test_an_update_without_an_answer_is_counted_and_adds_nothing_whatever_it_was_rejected_for(
+    model: LtiModel, verdict: Verdict
+) -> None:
+    evaluation = RunEvaluation(model, DESIGN)
+    for each in (update(0, 4, 10.0), update(4, 4, math.nan)._replace(verdict=verdict), update(8, 4, 5.0)):
+        evaluation.update(each)
+    assert (evaluation.updates, evaluation.failed_updates, evaluation.indicators.J_dev) == (2, 1, 15.0)
+
+
 def test_what_does_not_exist_is_not_a_number(model: LtiModel) -> None:
     found = evaluated(model, at_rest(model, 4))
     of_updates = (found.J_dev, found.J_open_mean, found.c2, found.tau_u_mean, found.tau_u_mean_per_update)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import pyarrow.parquet
@@ -12,7 +13,7 @@ from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Update, Verdict
 from optimizer_plc.estimator import Estimator
 from optimizer_plc.program import OptimizerProgram
-from rig import cli
+from rig import cli, simulate
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
 from rig.results.recording import MemorySink, Recorder
@@ -79,6 +80,17 @@ def test_after_an_update_without_an_answer_the_next_one_has_one(optimizer: Optim
     assert sequence.header.number > failed.header.number
     assert len(sequence.rows) == sequence.header.length > 0
     assert optimizer.report(Verdict.ACCEPTED).j_delivered < 2.0
+
+
+@pytest.mark.usefixtures("compiles")
+def test_the_next_sequence_begins_where_the_rest_of_the_one_before_has_led(gains_times: Break) -> None:
+    """After 15 ticks its next sampling period is still to come, amid the period without an answer."""
+    gains_times(DIVERGING)
+    updates = simulate("e", updating_period=3.75, duration_s=1800).recording.updates
+    verdicts = [update.verdict for update in updates]
+    after = [later for before, later in pairwise(verdicts) if before == Verdict.NO_ANSWER]
+    assert len(after) > 5
+    assert set(after) == {Verdict.ACCEPTED}
 
 
 @pytest.fixture

@@ -53,6 +53,20 @@ def test_a_plc_that_cannot_do_what_is_simulated_is_named_and_refused_by_enforce(
     assert why in coldloop("up", "--enforce", "--set", f"{POWER}0.05").complaints[0]
 
 
+def test_in_real_time_a_period_in_which_no_answer_comes_is_refused_before_anything_starts(
+    coldloop: "Coldloop", tmp_path: Path
+) -> None:
+    """The optimiser PLC would refuse the session; with --enforce the period is long enough."""
+    short = ("--load", "a", "--set", f"{POWER}0.3", "--updating-period", "0.5")
+    why = "this PLC (P = 0.3) needs 1.4 s for an answer with ode"
+    run = ("run", "--mode", "realtime", "--duration", "1s", "--out", tmp_path / "run")
+    for command in (run, ("up", "--detach"), ("up",)):
+        refused = coldloop(*command, *short)
+        assert (refused.code, len(refused.complaints)) == (2, 1), refused.complaints
+        assert why in refused.complaints[0]
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_fixed_period_is_lengthened_to_what_the_plc_takes(coldloop: "Coldloop", tmp_path: Path) -> None:
     settings = ("--set", f"{POWER}0.5", "--updating-period", "0.5")
     outcome = coldloop(*RUN, "--duration", "10s", *settings, "--enforce", "--out", tmp_path / "run")

@@ -46,6 +46,7 @@ def execute(options: argparse.Namespace) -> int:
         effective, {**dict.fromkeys(PLACES, "give --port-base"), "session.autostart": "it begins a session"}
     )
     check_certificates(effective.settings)
+    told = [] if options.without else remarks(effective)
     optimizer = exported(options.optimizer, effective.settings)
     ports = ports_from(options.port_base)
     lock = RigLock(ports[0], options.locked)
@@ -62,7 +63,7 @@ def execute(options: argparse.Namespace) -> int:
     from rig.live.up import UpRig
     from rig.until_interrupted import run_until_interrupted
 
-    for line in remarks(effective) if not options.without else ():
+    for line in told:
         tell(line)
     services = REQUIRED if options.without else SERVICES
     rig = UpRig(effective.settings, ports, options.tls, page=page, cuttable=options.cuttable, services=services,

@@ -49,7 +49,7 @@ typedef struct {
     int32_t number;
     int32_t update;
     int32_t first_tick;
-    int32_t length;
+    int32_t length; /* 0 where there is no answer: send the header alone, which is rejected (verdict 13) */
     int32_t tau_u;
     float rows[MOST_ROWS][N_INPUTS]; /* a row for each tick */
 } Sequence;

@@ -1,5 +1,5 @@
 // Starts the page: views, theme, links, the state of the stream.
-import { ask, connect, element, indexed, isStale, onChange, pageIsSilent, signal, state, take } from "./store.js";
+import { ask, connect, digits, element, indexed, isStale, onChange, pageIsSilent, signal, state, take } from "./store.js";
 import { bindAll, bindNames, controlledBar, inputBar, loadBar, measuredBar } from "./values.js";
 import { hideTrends, initTrends, recolourStrips, recolourTrends, refreshStrips, showTrends } from "./trends.js";
 import { initWhy, pick, recolourWhy, showWhy } from "./why.js";
@@ -60,13 +60,13 @@ function bars() {
 
 function overview() {
   const { load } = state.catalog.process, { decimals } = signal("plant.load status.watts");
-  const loadText = (value, digits = decimals) => `${value.toFixed(Math.max(0, digits))} ${load.unit}`;
+  const loadText = (value, digits = decimals) => (value === null ? "–" : `${value.toFixed(Math.max(0, digits))} ${load.unit}`);
   const tau = byId("tau-u"), facts = byId("load-facts");
   onChange(({ update, names }) => {
     if (update || names === null) {
       const found = state.update;
       tau.textContent = found ? `${found.period_s.toFixed(2)} s` : "–";
-      byId("tau-u-q").textContent = found ? `q = ${found.q}, J = ${Number(found.update.j_effective.toPrecision(4))}` : "";
+      byId("tau-u-q").textContent = found ? `q = ${found.q}, J = ${digits(found.update.j_effective)}` : "";
       byId("tau-u-sentence").replaceChildren(...(found ? indexed(found.sentence) : ["No update yet."]));
     }
     const values = state.values, upcoming = values["plant.load status.upcoming"];

@@ -41,6 +41,9 @@ export function isStale(name) {
   return pageIsSilent() || state.stale.some((one) => name === one || (one.endsWith(".") && name.startsWith(one)));
 }
 
+// A number as short as that; a dash where it is not finite, or not known.
+export function digits(value, count = 4) { return value === null || value === undefined ? "–" : Number(value.toPrecision(count)).toString(); }
+
 export function signal(name) { return state.catalog.signals[name] || null; }
 
 // Why there is no stream: an answer that says so is the server's, such as an expired login.

@@ -1,10 +1,9 @@
 // Explanation of the updating period of one update.
-import { ask, element, indexed, onChange, shape, state, timeText } from "./store.js";
+import { ask, digits, element, indexed, onChange, shape, state, timeText } from "./store.js";
 import { leastSpread, makeChart } from "./charts.js";
 
 let following = true, shown = null, charts = null, window_ = [0, 1], asked = 0;
 const byId = (id) => document.getElementById(id);
-const digits = (value, count = 4) => (value === null || value === undefined ? "–" : Number(value.toPrecision(count)).toString());
 
 function quantities(found) {
   const u = found.update, before = found.before;
