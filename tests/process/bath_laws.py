@@ -63,7 +63,8 @@ class Laws:
     def rest(self, watts: float, u: Array, y: Array) -> Array:
         """Return where the plant is believed to rest."""
         state, nothing = self.program.state, np.zeros(0)
-        begin_again(self.c, state, Latched(0, 0, 0, watts, MODEL.u0 + u, MODEL.u0 + u, y, MODEL.x0, nothing), u)
+        latched = Latched(0, 0, 0, watts, MODEL.u0 + u, MODEL.u0 + u, y, MODEL.x0, nothing)
+        begin_again(self.c, state, latched, u, False)  # noqa: FBT003 a kernel
         return state.belief.x[: len(MODEL.x0)]
 
 
