@@ -52,17 +52,20 @@ class PeriodsStudy:
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Compare the adaptive period, in each regime, with the best fixed one of other draws, if there are any."""
         drawn, result, summary = loads(options, *"abcdef"), StudyResult(COLUMNS, [], {}), []
-        costs, means = {}, {}
+        costs, means, training = {}, {}, np.array([load.draw == 1 for load in drawn])
         for regime in REGIMES:
             found = [[outcomes[run] for run in _runs(load, regime)] for load in drawn]
             for load, some in zip(drawn, found, strict=True):
                 result.rows += [_row(regime, load.name, *one) for one in zip(PERIODS_S, some, strict=True)]
             costs[regime] = np.array([[one.indicators.J_BF for one in some] for some in found]).T
             means[regime] = float(np.mean([some[0].indicators.tau_u_mean for some in found]))
-            best, ratio = judged(costs[regime], np.array([load.draw == 1 for load in drawn]))
+            best, ratio = judged(costs[regime], training)
             result.note(f"{regime}: J_BF of the adaptive period over fixed {PERIODS_S[best]:g} s", ratio.value)
             summary.append((regime, f"{means[regime]:.2f}", f"{PERIODS_S[best]:g}", ratio.text(), pays(ratio)))
-        result.remarks.append(markdown_table(SUMMARY, summary, "J_BF of the adaptive period over the best fixed one"))
+        fresh = _has_others(training)
+        chosen = "on the first draws, judged on the others" if fresh else "on the same, which favours it"
+        title = f"J_BF of the adaptive period over the best fixed one, chosen {chosen}"
+        result.remarks.append(markdown_table(SUMMARY, summary, title))
         result.remarks.append(markdown_table(COLUMNS, [tuple(map(_text, row)) for row in result.rows], "All runs"))
         result.figures["cost against period"] = _figure(costs, means)
         return result
@@ -79,10 +82,14 @@ def judged(costs: Array, training: NDArray[np.bool_]) -> tuple[int, Interval]:
         StudyError: A loop costs nothing.
     """
     require_costs(costs)
-    if training.all() or not training.any():
+    if not _has_others(training):
         return over_best_fixed(costs)
     best, _ = over_best_fixed(costs[:, training])
     return best, mean_ratio(costs[0, ~training], costs[best, ~training])
+
+
+def _has_others(training: NDArray[np.bool_]) -> bool:
+    return bool(training.any() and not training.all())
 
 
 def _runs(load: Load, regime: str) -> list[RunRequest]:
