@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from coldloop.process.signals import BATH, OUTPUT_NAMES
+from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.estimator import Estimator, begin_prediction, correct, predict
 from optimizer_plc.plausibility import are_finite, suspects_of
@@ -23,7 +24,7 @@ from optimizer_plc.qp.target import TargetSearch, bounds_at, find_target, least_
 from optimizer_plc.rules.assessment import Assessment, Observation, assessed
 from optimizer_plc.rules.interface import UpdatingRule, decide_by
 from optimizer_plc.session_state import Delivery, OptimizerState
-from optimizer_plc.settings import ProgramSettings
+from optimizer_plc.settings import ProgramSettings, RuleName
 from optimizer_plc.solvers.interface import Answer, Costs
 from optimizer_plc.solvers.kernel_solver import solve_by
 
@@ -129,10 +130,28 @@ def constants_of(
         level=LEVEL, temperature=TEMPERATURE, feed_temperature=FEED_TEMPERATURE,
         opening_per_k=real(settings.cold_end.opening_per_k),
         opening_from=real(settings.cold_end.opening_from - estimator.u0[target.feed]),
-        load_step=real(settings.interrupting_load_step_w), sequence_ticks=settings.sequence_ticks,
+        load_step=real(settings.interrupting_load_step_w), sequence_ticks=shortest_sequence(settings, budget),
         fixed_ticks=0, most=len(budget.ladder), periods=np.array([0, *budget.ladder]),
         fitting=np.array([budget.iterations(ticks) for ticks in range(MAX_PERIOD_TICKS + 1)]),
     )  # fmt: skip
+
+
+def shortest_sequence(settings: ProgramSettings, budget: PlcBudget) -> int:
+    """Return the rows that a sequence has at least, so that it lasts until the next one can arrive.
+
+    All sequences last for two updating periods. Where the rule may choose one more than twice as long as the one
+    before they last for that; where a load step may interrupt, in the last tick of a period, for another one after it.
+    """
+    if settings.interrupting_load_step_w:
+        return min(max(settings.sequence_ticks, 2 * MAX_PERIOD_TICKS - 1), SEQUENCE_ROWS)
+    ladder, adaptive = budget.ladder, settings.adaptive
+    leap, most = len(ladder), len(ladder)
+    if not settings.outside.rule:
+        own = adaptive.rule is RuleName.CONTRACTION
+        leap, most = (most, adaptive.contraction.q_step) if own else (adaptive.delta, adaptive.q_max)
+    last = min(most, len(ladder)) - 1
+    followed = ((ticks, ladder[min(place + leap, last)]) for place, ticks in enumerate(ladder[:last]))
+    return max(settings.sequence_ticks, *(longest for ticks, longest in followed if longest > 2 * ticks), 0)
 
 
 @kernel
