@@ -236,7 +236,8 @@ def shut_by(openings: tuple[float, float, float], high: float, low: float) -> tu
 def opened_by(openings: tuple[float, float, float], high: float, low: float) -> tuple[float, float, float]:
     """Return the openings (%) with which each pressure beyond its limit is relieved: fully after half of its way.
 
-    The integrals do not know of this. With both beyond their limits, as when the turbine trips, the buffer is a second bypass.
+    The integrals do not know of this. With both beyond their limits, as when the turbine trips, the buffer is a second
+    bypass.
     """
     return openings[0], max(openings[1], min(200.0 * high, 100.0)), max(openings[2], min(200.0 * low, 100.0))
 
