@@ -178,7 +178,8 @@ def problem_at(
     if idle >= 0:
         held, real = u_before[idle] / c.input_scale[idle], x.dtype.type
         for i in range(idle, c.n_inputs, u_before.shape[0]):
-            low[i], high[i] = max(held - real(ROOM), c.maps.low[i]), min(held + real(ROOM), c.maps.high[i])
+            low[i] = max(held - real(ROOM), c.maps.low[i])
+            high[i] = min(held + real(ROOM), c.maps.high[i])
     return QuadraticProblem(c.Phi, phi, c.Gamma, gamma, low, high, constant)
 
 

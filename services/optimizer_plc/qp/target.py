@@ -172,7 +172,9 @@ def bounds_at(c: TargetSearch, x: Array, most_open: float, idle: int, at: float)
     low, high = c.low.copy(), c.high.copy()
     high[c.feed] = max(min(high[c.feed], most_open), low[c.feed])
     if idle >= 0:
-        low[idle] = high[idle] = min(max(at, low[idle]), high[idle])
+        held = min(max(at, low[idle]), high[idle])
+        low[idle] = held
+        high[idle] = held
     one = x.dtype.type(1.0)
     for i in range(low.shape[0]):
         if c.constants[i] >= 0:
