@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import UsageError
+from coldloop.kernels.cache_folder import find_cache_folder
 from coldloop.process.declaration import VARIABLE
 from rig.interpreter import PYTHON
 
@@ -51,10 +52,8 @@ def _split(arguments: Sequence[str]) -> tuple[list[str], str | None]:
 
 def _made(path: Path) -> Path:
     """Return the model file of a process file, made by a process of its own: this one is loaded with no process yet."""
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "coldloop" / "processes"
-    root.mkdir(parents=True, exist_ok=True)
     place = hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
-    out = root / f"{path.stem}-{place}.json"
+    out = find_cache_folder("processes") / f"{path.stem}-{place}.json"
     environment = {name: value for name, value in os.environ.items() if name != VARIABLE}
     made = subprocess.run(  # noqa: S603 our own program
         [*PYTHON, "-m", "rig", "process", str(path), "--out", str(out)], env=environment, capture_output=True,

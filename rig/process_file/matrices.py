@@ -40,8 +40,9 @@ def from_matrices(file: ProcessFile, folder: Path, given: str) -> Linearised:
     k = 1 + len(file.disturbances)
     shapes = {"A": (n, n), "B": (n, m), "F": (n, k), "C": (p, n), "D": (p, m), "G": (p, k)}
     full: dict[str, Any] = {name: M.get(name, np.zeros(shape)) for name, shape in shapes.items()}
-    full |= {name: full[name][:, np.newaxis] for name in ("F", "G") if full[name].ndim == 1}
     for name, shape in shapes.items():
+        if full[name].ndim < len(shape) and full[name].size == np.prod(shape):  # a number, or a list that is a row
+            full[name] = full[name].reshape(shape)
         if full[name].shape != shape:
             raise UsageError(
                 f"{given}: {name} has shape {full[name].shape}, and not {shape} for {n} states, {m} inputs, {p} outputs"
@@ -57,7 +58,7 @@ def from_matrices(file: ProcessFile, folder: Path, given: str) -> Linearised:
 def _of_file(path: Path) -> dict[str, Array]:
     try:
         if path.suffix == ".json":
-            stored: Mapping[str, Any] = dict(parsed_json(path.read_text(encoding="utf-8")))
+            stored: Mapping[str, Any] = dict(parsed_json(path.read_bytes()))
         else:
             with np.load(path, allow_pickle=False) as archive:
                 stored = dict(archive)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from coldloop.errors import ColdloopError, ConfigurationError, UsageError
+from coldloop.text_file import read_text
 
 COST: Final = 2**14
 BLOCK_SIZE: Final = 8
@@ -87,13 +88,10 @@ class Users:
         if file is None:
             return
         try:
-            lines = file.read_text(encoding="utf-8").splitlines()
+            lines = _lines(file)
             mode = file.stat().st_mode
-        except (OSError, UnicodeDecodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-            raise ConfigurationError(
-                f"hmi.login.users: {file}: {reason}; `python -m hmi.users {file} NAME operate` writes it"
-            ) from None
+        except (OSError, UsageError) as error:
+            raise ConfigurationError(f"hmi.login.users: {error}") from None
         if mode & stat.S_IWOTH:
             raise ConfigurationError(f"hmi.login.users: {file}: everyone can write to it; `chmod o-w {file}`")
         for number, line in enumerate(lines, 1):
@@ -109,6 +107,10 @@ class Users:
         user = self._users.get(name)
         right = is_password(password, user.hash if user else NOBODYS_HASH)
         return user if right else None
+
+
+def _lines(file: Path) -> list[str]:
+    return read_text(file, f"`python -m hmi.users {file} NAME operate` writes it").splitlines()
 
 
 def _user(line: str, place: str) -> User:
@@ -146,7 +148,7 @@ def write_user(file: Path, name: str, role: PageRole, password: str) -> None:
     if len(password) < SHORTEST_PASSWORD:
         raise UsageError(f"user '{name}': a password has {SHORTEST_PASSWORD} characters or more")
     try:
-        lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+        lines = _lines(file) if file.exists() else []
         kept = [line for line in lines if line.partition(":")[0] != name]
         file.touch(mode=0o600)
         file.chmod(0o600)
@@ -166,7 +168,7 @@ def main() -> int:
         if sys.stdin.isatty():
             password = getpass.getpass(f"password of {options.name}: ")
         else:
-            password = sys.stdin.readline().rstrip("\r\n")
+            password = sys.stdin.readline().removeprefix("\ufeff").rstrip("\r\n")
         write_user(options.file, options.name, PageRole(options.role), password)
     except ColdloopError as error:
         sys.stderr.write(f"hmi.users: {error}\n")

@@ -227,13 +227,14 @@ def _tls_site(folder: Path) -> dict[str, tuple[object, str]]:
     """Return the settings of a folder of `coldloop certificates`, and where they come from."""
     from coldloop.config import flattened
     from coldloop.parsing import parsed_toml
+    from coldloop.text_file import read_text
 
     file = folder / "tls.toml"
+    remedy = f"make it with `coldloop certificates --out {folder}`"
     try:
-        content = parsed_toml(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise UsageError(f"{file}: {reason}; make it with `coldloop certificates --out {folder}`") from None
+        content = parsed_toml(read_text(file, remedy))
+    except ValueError as error:
+        raise UsageError(f"{file}: {error}; {remedy}") from None
     return {key: (value, "--tls") for key, value in flattened(content).items()}
 
 
