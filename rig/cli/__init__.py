@@ -41,12 +41,15 @@ COMMANDS: Final = {
     "model": "the prediction model",
     "new": "a folder with a process file and a plant to begin with",
     "process": "a process file: checked, linearised, judged, made into a model file",
+    "import": "a historian's export made into a record for a process file",
     "design": "which decision and constraint instants the problem needs, by what each set costs",
     "exergy": "where a refrigerator loses the exergy that it is given",
     "identify": "by how much the gains of the prediction model should be scaled to predict a recorded run",
     "config": "the effective configuration and where each value comes from",
     "completion": "a script that completes commands and options in a shell",
 }
+MODULES: Final = {"import": "import_record"}
+"""Of commands that are words of Python."""
 INTERRUPTED = 130
 OF_THE_COLD_BOX: Final = ("study", "reproduce", "model", "exergy")
 """Commands that are about its equations, its loads or the paper's figures."""
@@ -73,7 +76,7 @@ def make_parser(chosen: str | None) -> argparse.ArgumentParser:
     for name, summary in COMMANDS.items():
         command = commands.add_parser(name, help=summary)
         if name == chosen:
-            module = import_module(f"rig.cli.commands.{name}")
+            module = import_module(f"rig.cli.commands.{MODULES.get(name, name)}")
             command.description = module.__doc__
             module.declare(command)
             command.set_defaults(execute=module.execute)

@@ -1,0 +1,83 @@
+"""`coldloop import`: a historian's export made into a record for `plant.step_test`; says what it assumed and dropped.
+
+It reads a line for each time or for each reading; commas, semicolons or tabs; dates, or seconds from any start. Inputs
+hold between readings, outputs are averaged, and gaps cut the record into pieces.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("export", type=Path, metavar="RECORD", help="text file of a historian or a spreadsheet")
+    parser.add_argument(
+        "--inputs",
+        nargs="+",
+        required=True,
+        metavar="NAME",
+        help="inputs, load, other disturbances, which hold between readings; others are outputs",
+    )
+    parser.add_argument(
+        "--map",
+        action="append",
+        default=[],
+        metavar="TAG=NAME",
+        help="name of a tag in the record; other tags are then left out; TAG=time_s: column of time",
+    )
+    parser.add_argument("--zone", metavar="ZONE", help="of times without one, as in Europe/Berlin")
+    parser.add_argument(
+        "--good",
+        nargs="+",
+        default=[],
+        metavar="TEXT",
+        help="what a quality says of good readings, beside good, ok and such words, and 192 to 255",
+    )
+    parser.add_argument(
+        "--every",
+        type=_positive,
+        metavar="SECONDS",
+        help="between rows (default: what is usual between the readings of an output)",
+    )
+    parser.add_argument(
+        "--gap", type=_positive, metavar="SECONDS", help="without a reading that cuts the record (default: 5 rows)"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the record to write")  # fmt: skip
+
+
+def _positive(text: str) -> float:
+    if not 0.0 < float(text) < float("inf"):
+        raise ValueError
+    return float(text)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Write the record; print what was done."""
+    from importlib.util import find_spec
+    from zoneinfo import available_timezones
+
+    from coldloop.errors import UsageError
+    from coldloop.whole_file import require_regular_file, whole_text
+    from rig.results.folders import writing
+
+    if find_spec("pandas") is None:
+        raise UsageError("import needs pandas: install it with pip install 'coldloop[records]'")
+    from rig.process_file.historian import Request, record_of
+
+    out: Path = options.out
+    require_regular_file(out)
+    if out.resolve() == options.export.resolve():
+        raise UsageError(f"{out}: is the export; name another file with --out")
+    names = dict(each.rpartition("=")[::2] for each in options.map)
+    if "" in {*names, *names.values()}:
+        raise UsageError("--map: write --map TAG=NAME")
+    if options.zone is not None and options.zone not in available_timezones():
+        raise UsageError(f"--zone {options.zone}: no such zone; write one as in Europe/Berlin, or UTC")
+    inputs, good = tuple(options.inputs), tuple(options.good)
+    request = Request(options.export, names, inputs, options.zone, good, options.every, options.gap)
+    text, said = record_of(request)
+    with writing(out):
+        whole_text(out, text)
+    sys.stdout.write("".join(f"{line}\n" for line in (*said, f"written    to {out}")))
+    return 0
