@@ -50,6 +50,10 @@ GAP: Final = 5.0
 """Periods without a reading beyond which a record is cut, unless another gap is given."""
 BY_CHANGE: Final = 2.0
 """Periods between the readings of an input beyond which they are its changes, so that no reading is missing."""
+MISSING: Final = 1.5
+"""Usual periods of an input beyond which a reading is missing: if it steps there, it is not known when, ..."""
+STEP: Final = 0.1
+"""... a step being so much of its standard deviation."""
 SNAP: Final = 0.01
 """Part by which a usual period is off a number of two digits that is meant."""
 EARLY: Final = 1e-3
@@ -249,7 +253,9 @@ def _record(signals: Mapping[str, tuple[Array, Array]], request: Request, said: 
     columns, covered = {"time_s": grid}, np.ones(len(grid), bool)
     for name, (times, values) in signals.items():
         at = times - start
-        for k in np.flatnonzero(np.diff(at) > (request.gap_s or GAP * period_s)) if name in even else ():
+        without, step = np.diff(at), np.abs(np.diff(values)) > STEP * values.std() if name in request.inputs else False
+        cut = (without > (request.gap_s or GAP * period_s)) | (step & (without > MISSING * usual[name]))
+        for k in np.flatnonzero(cut) if name in even else ():
             covered &= (grid <= at[k]) | (grid >= at[k + 1])
         columns[name] = (_held if name in request.inputs else _averaged)(at, values, grid, period_s)
     pieces = np.split(np.arange(len(grid)), np.flatnonzero(np.diff(covered)) + 1)
