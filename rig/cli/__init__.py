@@ -29,12 +29,12 @@ COMMANDS: Final = {
     "plot": "draw a recorded run again, as PNG, PDF or SVG",
     "report": "one HTML page of a recorded run, with interactive plots",
     "compare": "a table and a figure of several recorded runs",
-    "export": "a recorded run as CSV, MATLAB or HDF5 files; or the solver as C99 or Structured Text for a PLC",
+    "export": "a recorded run as CSV, MATLAB or HDF5 files; or the optimiser as C99 or Structured Text for a PLC",
     "chaos": "a run with injected faults, and its evaluation",
     "proxy": "a proxy that delays, loses, damages, cuts or refuses Modbus/TCP traffic",
     "study": "do the runs of a study and draw its figure",
     "reproduce": "all studies of the paper, one report and a scorecard",
-    "budget": "what the reference PLC can compute, and in which time",
+    "budget": "what a PLC can compute, and in which time",
     "events": "the journal of a running service",
     "registers": "the register maps",
     "certificates": "certificates for Modbus/TCP Security on a test site",
@@ -64,7 +64,7 @@ class OneLineParser(argparse.ArgumentParser):
 
 def make_parser(chosen: str | None) -> argparse.ArgumentParser:
     """Return the parser of all commands, with the options of the chosen one; other commands are not imported."""
-    parser = OneLineParser(prog="coldloop", description="A networked PLC rig for fast MPC on a helium refrigerator.")
+    parser = OneLineParser(prog="coldloop", description="Can this predictive controller run on that PLC, and how often should it update? A networked PLC rig for fast MPC.")
     parser.add_argument("--version", action="version", version=_version())
     parser.add_argument(OPTION, metavar="FILE", help="another process than the cold box: a process file, or a"
                         " model file made from one")  # fmt: skip
