@@ -177,8 +177,11 @@ class Clients:
             self.granted = 0
             self._note(EventKind.SESSION, asked.realtime, caller.name, value=asked.factor)
         elif record is SessionPace:
-            self.pending_time_base = pace = self._bank.get(SessionPace).of(program.session)
+            pace = self._bank.get(SessionPace).of(program.session)
             self._bank.put(SessionPace.shown(program.session, pace))
+            if pace == (self.pending_time_base or self._sessions.pace):
+                return
+            self.pending_time_base = pace
             self._note(EventKind.PACE, pace_subject(pace), caller.name, value=pace.factor)
         elif record is Operator:
             self._operate(self._bank.get(Operator), caller.name)
@@ -186,6 +189,8 @@ class Clients:
             program.alarms.command(self._bank.get(AlarmCommand), caller.name)
         elif record is WatchdogTime:
             time = self._bank.get(WatchdogTime).time
+            if time == program.watchdog.time:
+                return
             self._note(EventKind.WATCHDOG_TIME, time, caller.name, cause=program.watchdog.time)
             program.watchdog.set(time, program.tick)
         elif record is JournalQuery:
