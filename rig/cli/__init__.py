@@ -47,6 +47,14 @@ COMMANDS: Final = {
     "config": "the effective configuration and where each value comes from",
     "completion": "a script that completes commands and options in a shell",
 }
+QUESTION: Final = (
+    "Can this predictive controller run on that PLC, and how often should it update? A networked PLC rig for fast MPC."
+)
+EXTRAS: Final = {
+    "CoolProp": "tables", "aiohttp": "hmi", "casadi": "qpoases", "distributed": "studies", "fmpy": "fmu",
+    "h5py": "hdf5", "jinja2": "report", "markdown_it": "report", "plotly": "report",
+}  # fmt: skip
+"""The extra that brings a package which not every command needs."""
 INTERRUPTED = 130
 OF_THE_COLD_BOX: Final = ("study", "reproduce", "model", "exergy")
 """Commands that are about its equations, its loads or the paper's figures."""
@@ -64,7 +72,7 @@ class OneLineParser(argparse.ArgumentParser):
 
 def make_parser(chosen: str | None) -> argparse.ArgumentParser:
     """Return the parser of all commands, with the options of the chosen one; other commands are not imported."""
-    parser = OneLineParser(prog="coldloop", description="Can this predictive controller run on that PLC, and how often should it update? A networked PLC rig for fast MPC.")
+    parser = OneLineParser(prog="coldloop", description=QUESTION)
     parser.add_argument("--version", action="version", version=_version())
     parser.add_argument(OPTION, metavar="FILE", help="another process than the cold box: a process file, or a"
                         " model file made from one")  # fmt: skip
@@ -129,6 +137,12 @@ def _execute(parser: argparse.ArgumentParser, given: Sequence[str]) -> int:
     except ColdloopError as error:
         sys.stderr.write(f"coldloop: {error}\n")
         return error.exit_code
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in EXTRAS:
+            raise
+        sys.stderr.write(f"coldloop: {given[0]} needs {package}: pip install 'coldloop[{EXTRAS[package]}]'\n")
+        return UsageError.exit_code
     except KeyboardInterrupt:
         sys.stderr.write("coldloop: interrupted\n")
         return INTERRUPTED
