@@ -44,6 +44,7 @@ COMMANDS: Final = {
     "design": "which decision and constraint instants the problem needs, by what each set costs",
     "exergy": "where a refrigerator loses the exergy that it is given",
     "identify": "by how much the gains of the prediction model should be scaled to predict a recorded run",
+    "docs": "the pages of the documentation, one of them or a section",
     "config": "the effective configuration and where each value comes from",
     "completion": "a script that completes commands and options in a shell",
 }

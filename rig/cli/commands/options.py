@@ -127,7 +127,7 @@ def add_loop_options(parser: argparse.ArgumentParser, loads: str) -> None:
     parser.add_argument("--solver", choices=SOLVERS, help="default: ode")
     parser.add_argument("--outside-solver", metavar="NAME",
                         help="clarabel, piqp, qpalm (each an extra of this name), or a solver that is installed"
-                        " beside, by its entry point (`docs/extending.md`)")  # fmt: skip
+                        " beside, by its entry point (`coldloop docs extending`)")  # fmt: skip
     parser.add_argument("--preset", choices=PRESETS, help="of solver and estimator (default: tuned)")
     parser.add_argument("--updating-period", type=updating_period, metavar="adaptive|SECONDS",
                         help="default: adaptive")  # fmt: skip
