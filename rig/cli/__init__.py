@@ -116,9 +116,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except BrokenPipeError:
             _discard_output()
             return 0
-        except OSError as error:  # commands report errors of their own files: what is left is standard output
+        except OSError as error:  # commands report errors of their own files: what is left is mostly standard output
+            place = error.filename or (f"{given[0]}" if _output_works() else "standard output")
             _discard_output()
-            sys.stderr.write(f"coldloop: {error.filename or 'standard output'}: {error.strerror or error}\n")
+            sys.stderr.write(f"coldloop: {place}: {error.strerror or error}\n")
             return 1
         return code
 
@@ -157,6 +158,15 @@ def _complete() -> NoReturn:
     parser = make_parser(words[1] if len(words) > 1 and words[1] in COMMANDS else None)
     autocomplete(parser)
     sys.exit(0)
+
+
+def _output_works() -> bool:
+    """Return whether what waits to be written to standard output can be: after a failure it still waits."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        return False
+    return True
 
 
 def _discard_output() -> None:

@@ -1,12 +1,14 @@
 """What every request passes: whose it is, where it comes from, how often, and the headers of every answer."""
 
 import asyncio
+import logging
 import re
 import time
 from collections.abc import Awaitable, Callable
 from typing import Final
 
 from aiohttp import hdrs, web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from hmi.access import (
     LOCAL_NAMES,
@@ -53,6 +55,16 @@ PASSWORDS_AT_ONCE: Final = 2
 """Passwords that are checked at a time: each takes a core and 16 MB."""
 
 _RUN: Final = re.compile(r"\A/run/\d+/")
+
+
+def told_in_a_line(record: logging.LogRecord) -> bool:
+    """Take the traceback off what aiohttp logs of a malformed request (a filter of its logger)."""
+    error = record.exc_info[1] if record.exc_info else None
+    if isinstance(error, HttpProcessingError):
+        record.msg, record.exc_info = f"{record.getMessage()}: {error.message.splitlines()[0]}", None
+        record.args = ()
+    return True
+
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 

@@ -2,7 +2,9 @@
 
 import asyncio
 import contextlib
+import io
 import json
+import logging
 from collections.abc import Callable
 from http import HTTPStatus
 from http.client import HTTPConnection
@@ -11,6 +13,7 @@ from pathlib import Path
 import aiohttp
 import pytest
 from aiohttp import web
+from aiohttp.http_exceptions import BadStatusLine
 from aiohttp.test_utils import make_mocked_request
 
 from coldloop.errors import ConfigurationError, UsageError
@@ -31,7 +34,7 @@ from hmi.access import (
 )
 from hmi.audit import Audit
 from hmi.connections import Connections
-from hmi.guard import Guard
+from hmi.guard import Guard, told_in_a_line
 from hmi.page_server import PageServer, PageSite
 from hmi.process_image import Model
 from hmi.settings import HmiSection, LoginSettings
@@ -278,6 +281,19 @@ def logins(limit: LoginLimit, clock: Clock, wrong: Callable[[int], str]) -> list
         if found[-1]:
             limit.succeeded("proxy", "anna")
     return found
+
+
+def test_a_malformed_request_is_one_line_in_the_log() -> None:
+    stream = io.StringIO()
+    handler = logging.StreamHandler(stream)
+    handler.addFilter(told_in_a_line)
+    log = logging.Logger("aiohttp.server")  # noqa: LOG001 of this test alone
+    log.addHandler(handler)
+    for error in (BadStatusLine("GET / HTTP/9.9\n"), ValueError("ours")):
+        log.error("Error handling request from %s", "127.0.0.1", exc_info=error)
+    malformed, *ours = stream.getvalue().splitlines()
+    assert malformed.startswith("Error handling request from 127.0.0.1: ")
+    assert ours[-1] == "ValueError: ours"
 
 
 @pytest.mark.parametrize("wrong", [lambda _: "scraper", lambda i: f"guess {i}"], ids=["one name", "many names"])

@@ -1,5 +1,6 @@
 """The command line: it starts at once, completes, and writes no control sequences where nobody sees them."""
 
+import errno
 import json
 import subprocess
 import tomllib
@@ -194,6 +195,16 @@ def test_a_full_standard_output_is_one_line(processes: Processes) -> None:
         done = processes.coldloop("registers", stdout=full.fileno(), stderr=subprocess.PIPE).ended()
     assert done.code == 1
     assert done.err == "coldloop: standard output: No space left on device\n"
+
+
+def test_an_error_that_is_not_the_outputs_is_not_called_so(
+    coldloop: "Coldloop", monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(_: object) -> int:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr("rig.cli.commands.down.execute", refused)
+    assert coldloop("down").complaints == ["coldloop: down: Operation not permitted"]
 
 
 @pytest.mark.parametrize(
