@@ -29,12 +29,12 @@ COMMANDS: Final = {
     "plot": "draw a recorded run again, as PNG, PDF or SVG",
     "report": "one HTML page of a recorded run, with interactive plots",
     "compare": "a table and a figure of several recorded runs",
-    "export": "a recorded run as CSV, MATLAB or HDF5 files; or the solver as C99 or Structured Text for a PLC",
+    "export": "a recorded run as CSV, MATLAB or HDF5 files; or the optimiser as C99 or Structured Text for a PLC",
     "chaos": "a run with injected faults, and its evaluation",
     "proxy": "a proxy that delays, loses, damages, cuts or refuses Modbus/TCP traffic",
     "study": "do the runs of a study and draw its figure",
     "reproduce": "all studies of the paper, one report and a scorecard",
-    "budget": "what the reference PLC can compute, and in which time",
+    "budget": "what a PLC can compute, and in which time",
     "events": "the journal of a running service",
     "registers": "the register maps",
     "certificates": "certificates for Modbus/TCP Security on a test site",
@@ -45,11 +45,20 @@ COMMANDS: Final = {
     "design": "which decision and constraint instants the problem needs, by what each set costs",
     "exergy": "where a refrigerator loses the exergy that it is given",
     "identify": "by how much the gains of the prediction model should be scaled to predict a recorded run",
+    "docs": "the pages of the documentation, one of them or a section",
     "config": "the effective configuration and where each value comes from",
     "completion": "a script that completes commands and options in a shell",
 }
 MODULES: Final = {"import": "import_record"}
 """Of commands that are words of Python."""
+QUESTION: Final = (
+    "Can this predictive controller run on that PLC, and how often should it update? A networked PLC rig for fast MPC."
+)
+EXTRAS: Final = {
+    "CoolProp": "tables", "aiohttp": "hmi", "casadi": "qpoases", "distributed": "studies", "fmpy": "fmu",
+    "h5py": "hdf5", "jinja2": "report", "markdown_it": "report", "pandas": "records", "plotly": "report",
+}  # fmt: skip
+"""The extra that brings a package which not every command needs."""
 INTERRUPTED = 130
 OF_THE_COLD_BOX: Final = ("study", "reproduce", "model", "exergy")
 """Commands that are about its equations, its loads or the paper's figures."""
@@ -67,7 +76,7 @@ class OneLineParser(argparse.ArgumentParser):
 
 def make_parser(chosen: str | None) -> argparse.ArgumentParser:
     """Return the parser of all commands, with the options of the chosen one; other commands are not imported."""
-    parser = OneLineParser(prog="coldloop", description="A networked PLC rig for fast MPC on a helium refrigerator.")
+    parser = OneLineParser(prog="coldloop", description=QUESTION)
     parser.add_argument("--version", action="version", version=_version())
     parser.add_argument(OPTION, metavar="FILE", help="another process than the cold box: a process file, or a"
                         " model file made from one")  # fmt: skip
@@ -110,9 +119,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except BrokenPipeError:
             _discard_output()
             return 0
-        except OSError as error:  # commands report errors of their own files: what is left is standard output
+        except OSError as error:  # commands report errors of their own files: what is left is mostly standard output
+            place = error.filename or (f"{given[0]}" if _output_works() else "standard output")
             _discard_output()
-            sys.stderr.write(f"coldloop: {error.filename or 'standard output'}: {error.strerror or error}\n")
+            sys.stderr.write(f"coldloop: {place}: {error.strerror or error}\n")
             return 1
         return code
 
@@ -132,6 +142,12 @@ def _execute(parser: argparse.ArgumentParser, given: Sequence[str]) -> int:
     except ColdloopError as error:
         sys.stderr.write(f"coldloop: {error}\n")
         return error.exit_code
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in EXTRAS:
+            raise
+        sys.stderr.write(f"coldloop: {given[0]} needs {package}: pip install 'coldloop[{EXTRAS[package]}]'\n")
+        return UsageError.exit_code
     except KeyboardInterrupt:
         sys.stderr.write("coldloop: interrupted\n")
         return INTERRUPTED
@@ -145,6 +161,15 @@ def _complete() -> NoReturn:
     parser = make_parser(words[1] if len(words) > 1 and words[1] in COMMANDS else None)
     autocomplete(parser)
     sys.exit(0)
+
+
+def _output_works() -> bool:
+    """Return whether what waits to be written to standard output can be: after a failure it still waits."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        return False
+    return True
 
 
 def _discard_output() -> None:

@@ -54,16 +54,12 @@ def _positive(text: str) -> float:
 
 def execute(options: argparse.Namespace) -> int:
     """Write the record; print what was done."""
-    from importlib.util import find_spec
     from zoneinfo import available_timezones
 
     from coldloop.errors import UsageError
     from coldloop.whole_file import require_regular_file, whole_text
-    from rig.results.folders import writing
-
-    if find_spec("pandas") is None:
-        raise UsageError("import needs pandas: install it with pip install 'coldloop[records]'")
     from rig.process_file.historian import Request, record_of
+    from rig.results.folders import writing
 
     out: Path = options.out
     require_regular_file(out)

@@ -1,6 +1,6 @@
 """What the constrained predictive controller is asked to do: weights, bands and instants (paper, section IV).
 
-The paper leaves weights and scaling open; `docs/science.md` says why these were chosen.
+The paper leaves weights and scaling open; `docs/science.md` lists those of this project.
 """
 
 from enum import StrEnum
