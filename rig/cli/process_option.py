@@ -10,10 +10,14 @@ from typing import Final
 
 from coldloop.errors import UsageError
 from coldloop.kernels.cache_folder import find_cache_folder
-from coldloop.process.declaration import VARIABLE
+from coldloop.parsing import parsed_json
+from coldloop.process.declaration import VARIABLE, Process
 from rig.interpreter import PYTHON
 
 OPTION: Final = "--process"
+TRUST: Final = "--trust"
+READING: Final = ("report", "compare", "plot", "page", "export", "identify")
+"""Commands that take names, units and bands of a process from the folder of a run, and execute nothing in it."""
 LOADED: Final = "coldloop.process.loaded"
 """The module that reads it, once."""
 
@@ -25,6 +29,8 @@ def load_named_process(arguments: Sequence[str]) -> list[str]:
         UsageError: There is no file, or it cannot be made into a model file: what was said then is on standard error.
     """
     left, named = _split(arguments)
+    if named is None and not os.environ.get(VARIABLE) and LOADED not in sys.modules:
+        named = _of_run(left)
     if named is not None:
         path = Path(named)
         if not path.is_file():
@@ -34,6 +40,19 @@ def load_named_process(arguments: Sequence[str]) -> list[str]:
             raise UsageError(f"{OPTION} {named}: this interpreter is loaded with another process; begin a new one")
         os.environ[VARIABLE] = model
     return left
+
+
+def _of_run(arguments: Sequence[str]) -> str | None:
+    """Return the model file in the first folder of a run that a command only reads, or trusts; None for a cold box."""
+    if not arguments or not (arguments[0] in READING or (arguments[0] == "rerun" and TRUST in arguments)):
+        return None
+    places = [Path(each).parent if Path(each).name == "manifest.json" else Path(each) for each in arguments[1:]]
+    model = next((place / "inputs" / "model.json" for place in places if (place / "manifest.json").is_file()), None)
+    try:
+        Process.of(parsed_json(model.read_bytes())["process"] if model is not None else {})
+    except (OSError, ValueError, TypeError, KeyError):  # the command itself says what is wrong
+        return None
+    return str(model)
 
 
 def _split(arguments: Sequence[str]) -> tuple[list[str], str | None]:

@@ -131,13 +131,24 @@ class RunFolder:
     @property
     def remedy(self) -> str:
         """What to do where it is not the one that is loaded."""
-        return f"use --process {self.path / str(self._model)}" if self._process else "leave out --process"
+        if not self._process:
+            return "leave out --process"
+        return "name its file with --process; rerun --trust executes the plant that the folder holds"
+
+    @property
+    def model_digest(self) -> str | None:
+        """Digest of the copy of its model; None for the shipped one of the cold box."""
+        return self._document_of_model.get("digest")
 
     @property
     def _process(self) -> dict[str, Any]:
         """Declaration of the process, from the copy of its model; empty for the cold box."""
-        found: dict[str, Any] = {}
-        return read_document(self.path / self._model, "restore it").get("process", found) if self._model else found
+        found: dict[str, Any] = self._document_of_model.get("process", {})
+        return found
+
+    @property
+    def _document_of_model(self) -> dict[str, Any]:
+        return read_document(self.path / self._model, "restore it") if self._model else {}
 
     @property
     def _model(self) -> str | None:

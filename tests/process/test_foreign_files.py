@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
@@ -14,6 +15,7 @@ from coldloop.kernels.cache_folder import find_cache_folder
 from coldloop.process.model_file import read_document
 from coldloop.service.telemetry_settings import TelemetrySettings
 from hmi.users import PageRole, Users, write_user
+from plant.own.maker import _fmu_of, file_digest
 from rig.chaos.plan import find_plan
 from rig.cli.commands.options import _tls_site
 from rig.plc_sizing.profile import find_profile
@@ -196,7 +198,7 @@ def test_pieces_of_a_record_give_the_gains_of_the_whole(tmp_path: Path) -> None:
         assert one == pytest.approx(other, rel=0.1, abs=0.05)
 
 
-# -- where model files are made ---------------------------------------------------------------------------------------
+# -- where files are --------------------------------------------------------------------------------------------------
 
 
 def test_model_files_are_made_where_kernels_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -207,3 +209,18 @@ def test_model_files_are_made_where_kernels_are(tmp_path: Path, monkeypatch: pyt
     monkeypatch.delenv("COLDLOOP_CACHE_DIR")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert find_cache_folder("processes").parent.parent == tmp_path
+
+
+def test_an_fmu_is_found_where_it_was_or_beside_the_model_file(tmp_path: Path) -> None:
+    (tmp_path / "moved").mkdir()
+    fmu = tmp_path / "moved" / "tank.fmu"
+    fmu.write_bytes(b"here")
+    header: Any = SimpleNamespace(
+        file=tmp_path / "moved" / "model.json", plant_parameters={"file": str(tmp_path / "tank.fmu")},
+        parameters_digest=file_digest(fmu),
+    )  # fmt: skip
+    (tmp_path / "tank.fmu").write_bytes(b"another one")
+    assert _fmu_of(header) == fmu
+    fmu.write_bytes(b"changed")
+    with pytest.raises(ColdloopError, match=r"made from another .*tank\.fmu than is there or beside it"):
+        _fmu_of(header)
