@@ -45,7 +45,10 @@ SINCE_1970: Final = 1e8
 """Seconds from which on a number is one since 1970, ..."""
 FINER: Final = (1e11, 1e14, 1e17)
 """... and in milliseconds, microseconds, nanoseconds."""
-UNITS: Final = {"ms": 1e-3, "min": 60.0, "h": 3600.0}
+UNITS: Final = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
+DAYS: Final = (20_000.0, 80_000.0)
+"""Of a spreadsheet, since 1900, if its times are closer to each other than DAY_STEP."""
+DAY_STEP: Final = 0.01
 GAP: Final = 5.0
 """Periods without a reading beyond which a record is cut, unless another gap is given."""
 BY_CHANGE: Final = 2.0
@@ -96,8 +99,10 @@ def record_of(request: Request) -> tuple[str, list[str]]:
     missing = [name for name in (*request.inputs, *request.names.values()) if name not in {*signals, TIME}]
     if missing or len(signals) <= len(spelt):
         what = ", ".join(missing) or "outputs beside the inputs"
-        there = f"there are some of {', '.join(signals) or 'nothing'}"
-        raise UsageError(f"{table.where}: no readings of {what}; {there}; {' '.join(said[-1].split())}")
+        why = "".join(f"; {' '.join(line.split())}" for line in said[1:] if line.startswith(("dropped", "left")))
+        raise UsageError(
+            f"{table.where}: no readings of {what}; there are some of {', '.join(signals) or 'nothing'}{why}"
+        )
     return _record(signals, request, said), said
 
 
@@ -123,6 +128,9 @@ def _readings(table: Table, request: Request, said: list[str]) -> Frame:
         found = readings(cells[tag].map(names), value, next(iter(quality), None))
     else:
         own = {k: _name(table.names[k], tags) for k in range(len(keys)) if k not in {*times, *quality}}
+        called = [name for name in own.values() if name is not None]
+        if len({*called}) < len(called):
+            raise UsageError(f"{table.where}: two columns are {max(called, key=called.count)}; remove one")
         judges = _judges(keys, [k for k, name in own.items() if name is not None], quality)
         left = [table.names[k] for k, name in own.items() if name is None and keys[k]]
         free = [table.names[k] for k in quality if k not in judges.values()]
@@ -154,9 +162,8 @@ def _judges(keys: list[str], places: list[int], quality: list[int]) -> dict[int,
 
 def _times(table: Table, keys: list[str], tags: Mapping[str, str], cells: Frame) -> list[int]:
     """Return the columns of time: one, one for each signal, or date and time of day, which are then both in each."""
-    named = [k for k, key in enumerate(keys) if tags.get(key) == TIME] or [
-        k for k, key in enumerate(keys) if key in TIMES
-    ]
+    mapped = [k for k, key in enumerate(keys) if tags.get(key) == TIME]
+    named = mapped or [k for k, key in enumerate(keys) if key in TIMES]
     named = named or [0] * (keys[:1] in ([""], ["index"], ["unnamed: 0"]))
     if not named or cells.empty:
         raise UsageError(
@@ -222,10 +229,8 @@ def _seconds(stamps: Frame, lines: Frame, table: Table, request: Request, said: 
                 f"{table.where}, line {line}: {stamp!r} is no time, has no zone or one unlike the others, or is "
                 "there twice or never as clocks are changed; export stamps as in 2026-03-29T01:30:00Z"
             )
-        said.append(
-            f"times      {dates.min()} to {dates.max()}"
-            + ("" if zoned.any() or request.zone else ", of an unknown zone")
-        )
+        of = "" if zoned.any() or request.zone else ", of an unknown zone"
+        said.append(f"times      {dates.min()} to {dates.max()}{of}")
         found = (dates - dates.min()).dt.total_seconds()
     seconds: Array = stamps.map(dict(zip(texts, found, strict=True))).to_numpy(float)
     return seconds
@@ -237,7 +242,9 @@ def _unit_s(numbers: Array, table: Table) -> float:
     if largest > SINCE_1970:
         return float(1e-3 ** sum(largest > bound for bound in FINER))
     name = next((name for name in table.names if plain(name) in TIMES), "")
-    return next((factor for unit, factor in UNITS.items() if re.search(rf"[\W_]{unit}\W*$", name)), 1.0)
+    named = next((factor for unit, factor in UNITS.items() if re.search(rf"[\W_]{unit}\W*$", name)), None)
+    is_day = DAYS[0] < numbers.min() and largest < DAYS[1] and np.median(np.abs(np.diff(numbers))) < DAY_STEP
+    return named or (86_400.0 if is_day else 1.0)
 
 
 def _record(signals: Mapping[str, tuple[Array, Array]], request: Request, said: list[str]) -> str:
@@ -261,17 +268,16 @@ def _record(signals: Mapping[str, tuple[Array, Array]], request: Request, said: 
     pieces = np.split(np.arange(len(grid)), np.flatnonzero(np.diff(covered)) + 1)
     pieces = [piece for piece in pieces if covered[piece].all() and len(piece) >= FEWEST]
     if not pieces:
-        raise UsageError(
-            f"{request.path}: too short: nowhere {FEWEST} rows of {period_s:g} s with readings of all signals"
-        )
+        raise UsageError(f"{request.path}: too short: nowhere {FEWEST} rows of {period_s:g} s with all signals")
     outputs = ", ".join(name for name in signals if name not in request.inputs)
     spans = ", ".join(f"{grid[piece[0]]:g} to {grid[piece[-1]]:g} s" for piece in pieces)
     said.append(f"resampled  to {period_s:g} s: held {', '.join(request.inputs)}; averaged {outputs}")
-    said.append(f"record     {sum(map(len, pieces))} of {len(grid)} rows in {len(pieces)} pieces without gaps: {spans}")
+    said.append(f"record     {sum(map(len, pieces))} of {len(grid)} rows, pieces without gaps: {spans}")
     rows = np.concatenate(pieces)
-    columns[PIECE] = np.repeat(np.arange(1.0, len(pieces) + 1), [len(piece) for piece in pieces])
-    lines = np.column_stack([column[rows] if column is not columns[PIECE] else column for column in columns.values()])
-    return "\n".join([",".join(columns), *(",".join(f"{value:.10g}" for value in line) for line in lines)]) + "\n"
+    number = np.repeat(np.arange(1, len(pieces) + 1), [len(piece) for piece in pieces])
+    lines = np.column_stack([number, *(column[rows] for column in columns.values())])
+    cells = (",".join(f"{value:.10g}" for value in line) for line in lines)
+    return "\n".join([",".join([PIECE, *columns]), *cells]) + "\n"
 
 
 def _held(at: Array, values: Array, grid: Array, period_s: float) -> Array:

@@ -128,6 +128,9 @@ SHAPES: Final[dict[str, tuple[str | bytes, dict[str, Any]]]] = {
     "milliseconds from the start": (
         text([[1000 * row[0], *row[1:]] for row in CLEAN], header=["time_ms", *HEADER[1:]]), {},
     ),
+    "days of a spreadsheet": (
+        text([[46110.0 + row[0] / 86400.0, *row[1:]] for row in CLEAN], header=["Time", *HEADER[1:]]), {},
+    ),
     "another start": (text([[row[0] + 1234.5, *row[1:]] for row in CLEAN]), {}),
     "semicolons": (text(CLEAN, separator=";"), {}),
     "semicolons, decimal commas": (text(map(commas, CLEAN), separator=";"), {}),  # type: ignore[arg-type]
@@ -194,7 +197,7 @@ TOLD: Final = {
     "Latin-1": "read as Latin-1",
     "no zone at all": "of an unknown zone",
     "double lines": "92 readings at the time of a later one",
-    "gaps": "in 3 pieces without gaps: 0 to 250 s, 350 to 600 s, 660 to 995 s",
+    "gaps": "pieces without gaps: 0 to 250 s, 350 to 600 s, 660 to 995 s",
     "a word for a reading": "7 readings, no number: 'Bad' 7",
     "quality 192": "28 readings, not good by quality: '0' 28",
     "quality of each": "7 readings, not good by quality: 'Uncertain' 7",
@@ -245,6 +248,7 @@ REFUSED: Final[dict[str, tuple[str, dict[str, Any], str]]] = {
     "such an hour, zone by option": (text(stamped(NO_ZONE, AUTUMN)), CALL, "line 2: '2026-10-25 02:50:00' is no time"),
     "too short": (text(CLEAN[:8]), {}, "too short: nowhere 10 rows of 5 s"),
     "no such tag": (text(CLEAN), {"names": {"LT3": "x"}}, "none of 'time_s, a, b, y, z' is a signal"),
+    "two columns of one name": (text(CLEAN, header=["time", "a", "b", "y", "y"]), {}, "two columns are y; remove one"),
     "no outputs": (text(CLEAN), {"inputs": tuple("abyz")}, "no readings of outputs beside the inputs"),
     "quality that belongs to none": (
         text([[*row, 192, 192] for row in CLEAN], header=[*HEADER, "p.Quality", "r.Quality"]), {},

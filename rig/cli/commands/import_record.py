@@ -11,45 +11,18 @@ from pathlib import Path
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("export", type=Path, metavar="RECORD", help="text file of a historian or a spreadsheet")
-    parser.add_argument(
-        "--inputs",
-        nargs="+",
-        required=True,
-        metavar="NAME",
-        help="inputs, load, other disturbances, which hold between readings; others are outputs",
-    )
-    parser.add_argument(
-        "--map",
-        action="append",
-        default=[],
-        metavar="TAG=NAME",
-        help="name of a tag in the record; other tags are then left out; TAG=time_s: column of time",
-    )
-    parser.add_argument("--zone", metavar="ZONE", help="of times without one, as in Europe/Berlin")
-    parser.add_argument(
-        "--good",
-        nargs="+",
-        default=[],
-        metavar="TEXT",
-        help="what a quality says of good readings, beside good, ok and such words, and 192 to 255",
-    )
-    parser.add_argument(
-        "--every",
-        type=_positive,
-        metavar="SECONDS",
-        help="between rows (default: what is usual between the readings of an output)",
-    )
-    parser.add_argument(
-        "--gap", type=_positive, metavar="SECONDS", help="without a reading that cuts the record (default: 5 rows)"
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the record to write")  # fmt: skip
-
-
-def _positive(text: str) -> float:
-    if not 0.0 < float(text) < float("inf"):
-        raise ValueError
-    return float(text)
+    add = parser.add_argument
+    add("export", type=Path, metavar="RECORD", help="text file of a historian or a spreadsheet")
+    add("--inputs", nargs="+", required=True, metavar="NAME",
+        help="inputs, load, other disturbances, which hold between readings; others are outputs")  # fmt: skip
+    add("--map", action="append", default=[], metavar="TAG=NAME",
+        help="name of a tag in the record; other tags are then left out; TAG=time_s: column of time")  # fmt: skip
+    add("--zone", metavar="ZONE", help="of times without one, as in Europe/Berlin")
+    add("--good", nargs="+", default=[], metavar="TEXT",
+        help="what a quality says of good readings, beside good, ok and such words, and 192 to 255")  # fmt: skip
+    add("--every", type=float, metavar="SECONDS", help="between rows (default: as usual between an output's readings)")
+    add("--gap", type=float, metavar="SECONDS", help="without a reading that cuts the record (default: 5 rows)")
+    add("--out", type=Path, required=True, metavar="FILE", help="the record to write")
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -66,8 +39,10 @@ def execute(options: argparse.Namespace) -> int:
     if out.resolve() == options.export.resolve():
         raise UsageError(f"{out}: is the export; name another file with --out")
     names = dict(each.rpartition("=")[::2] for each in options.map)
-    if "" in {*names, *names.values()}:
-        raise UsageError("--map: write --map TAG=NAME")
+    if "" in {*names, *names.values()} or len({*names.values()}) < len(options.map):
+        raise UsageError("--map: write --map TAG=NAME, with another name for each tag")
+    if not all(given is None or 0.0 < given < float("inf") for given in (options.every, options.gap)):
+        raise UsageError("--every and --gap: a number of seconds above 0")
     if options.zone is not None and options.zone not in available_timezones():
         raise UsageError(f"--zone {options.zone}: no such zone; write one as in Europe/Berlin, or UTC")
     inputs, good = tuple(options.inputs), tuple(options.good)
