@@ -198,7 +198,8 @@ def _header(rows: Sequence[tuple[int, list[str]]], names: set[str]) -> int | Non
 
 def _rows(text: str, separator: str, where: str, error: type[UsageError]) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows that have anything in them, and the numbers of their lines."""
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True)
+    lines = io.StringIO(text, newline="")
+    reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)  # noqa: TID251
     try:
         for row in reader:
             cells = [cell.strip() for cell in row]
