@@ -11,6 +11,7 @@ from pydantic import BaseModel
 
 from coldloop.registers.maps import MAPS
 from rig.cli import make_parser
+from rig.cli.command_listing import command_listing
 from rig.cli.key_listing import key_listing
 from rig.cli.register_listing import FORMATS
 from rig.plc_sizing.profile import PlcProfile
@@ -33,6 +34,10 @@ def test_the_pages_of_keys_are_what_the_commands_print(model: type[BaseModel], p
     tables = key_listing(model)
     assert tables in (ROOT / "docs" / page).read_text(encoding="utf-8")
     assert "|  |\n" not in tables, "each key has a meaning"
+
+
+def test_the_page_of_commands_is_what_the_parsers_say() -> None:
+    assert (ROOT / "docs" / "commands.md").read_text(encoding="utf-8").endswith(command_listing())
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
