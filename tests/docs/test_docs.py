@@ -40,6 +40,13 @@ def test_the_page_of_commands_is_what_the_parsers_say() -> None:
     assert (ROOT / "docs" / "commands.md").read_text(encoding="utf-8").endswith(command_listing())
 
 
+def test_the_map_from_the_paper_to_the_code_names_what_is_there() -> None:
+    rows = re.findall(r"^\| I{1,3}.*|^\| [IV]+-.*", (ROOT / "docs" / "science.md").read_text("utf-8"), re.MULTILINE)
+    named = [path for row in rows for path in re.findall(r"`((?:services|shared|rig|tests)/[^`]+)`", row)]
+    assert len(named) > 30
+    assert [path for path in named if not (ROOT / path).exists()] == []
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_between_pages_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text(encoding="utf-8")):
