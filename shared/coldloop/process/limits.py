@@ -28,7 +28,9 @@ class InputLimits(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     low: PerInput = tuple(one.low for one in PROCESS.inputs)
+    """Least value."""
     high: PerInput = tuple(one.high for one in PROCESS.inputs)
+    """Largest value."""
     rate: PerInput = tuple(one.rate for one in PROCESS.inputs)
     """Largest change in one sampling period, up or down."""
     rate_reference: RateReference = RateReference.PER_UPDATE
