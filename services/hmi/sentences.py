@@ -36,7 +36,8 @@ def deviation(found: ModelDeviation, suspects: int = 0) -> str:
     """Return how the plant differs from its model, without the load, the most notable first; empty where it agrees.
 
     Last come the reading that is furthest from what is predicted, if it is surprising: the model, or its sensor, is
-    not what the filter takes it for; and those that are not used for that reason (bit i is output i).
+    not what the filter takes it for; and those that are not used for that reason (bit i is output i); and inputs
+    that have no effect (the bits after those).
     """
     parts = [
         (value, f"needs {abs(value):.3g} {unit} {'less' if value > 0 else 'more'} of {name}")
@@ -58,6 +59,8 @@ def deviation(found: ModelDeviation, suspects: int = 0) -> str:
     texts += [
         f"{name} is not used: it contradicts the others" for i, name in enumerate(OUTPUT_NAMES) if suspects >> i & 1
     ]
+    inputs = enumerate(INPUT_NAMES, len(OUTPUT_NAMES))
+    texts += [f"{name} is left where it is: it has no effect" for i, name in inputs if suspects >> i & 1]
     return ", ".join(texts)
 
 

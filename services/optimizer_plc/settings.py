@@ -164,7 +164,8 @@ class ProgramSettings(BaseModel):
     """So does an estimated load this near the largest one that the linear model holds with the feed at its limit."""
     sequence_ticks: Annotated[int, Field(ge=2, le=SEQUENCE_ROWS)] = 18
     """Shortest sequence sent; 18 rows fit into one Modbus request with their header. It is never shorter than two
-    updating periods: one to be played, one in case the next sequence is late."""
+    updating periods: one to be played, one in case the next sequence is late; nor than the longest time until the next
+    sequence of adaptive periods can arrive (`scheme.shortest_sequence`)."""
     adaptive: AdaptiveSettings = AdaptiveSettings()
     design: ControlDesign = ControlDesign()
     cold_end: ColdEndSettings = ColdEndSettings()

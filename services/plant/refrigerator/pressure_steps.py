@@ -125,6 +125,7 @@ def _measured(x: RealArray, signals: RealArray) -> StationMeasurement:
         turbine=True,
         overspeed=False,
         deviating=False,
+        suction=False,
     )
 
 
