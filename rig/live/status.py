@@ -2,6 +2,7 @@
 
 from typing import Final, NamedTuple
 
+from coldloop.number_text import value_text
 from coldloop.operating.execution import Clients
 from coldloop.operating.rings import last_update
 from coldloop.process.load_profile import LOAD_UNIT
@@ -64,7 +65,7 @@ def _pace(status: RigStatus) -> str:
         return "no session"
     if not pace.realtime:
         return "lock-step"
-    return f"paused (factor {pace.factor:g})" if pace.paused else f"{pace.factor:g} x real time"
+    return f"paused (factor {value_text(pace.factor)})" if pace.paused else f"{value_text(pace.factor)} x real time"
 
 
 def _tau_u(status: RigStatus) -> str:
@@ -75,12 +76,13 @@ def page(status: RigStatus) -> str:
     """Return the state as a page."""
     ladder, load, y = status.ladder, status.load, status.process.y
     known = any(y)  # a control PLC that was started again shows nothing before its first scan
-    following = f", {load.next_watts:g} {LOAD_UNIT} from {load.next_tick * TICK_S:g} s" if load.upcoming else ""
+    then = value_text(load.next_watts, LOAD_UNIT)
+    following = f", {then} from {load.next_tick * TICK_S:g} s" if load.upcoming else ""
     rows = [
         ("session", f"{status.plant.session}, {_pace(status)}, {status.plant.tick * TICK_S:.2f} s"),
         ("mode", f"{word_of(Mode, ladder.mode)} ({word_of(Cause, ladder.cause)}) since {ladder.since * TICK_S:g} s"),
         ("operator", word_of(OperatorMode, status.operator.mode)),
-        ("load", f"{load.watts:g} {LOAD_UNIT}{following}"),
+        ("load", f"{value_text(load.watts, LOAD_UNIT)}{following}"),
         *((OUTPUT_NAMES[i], f"{y[i]:.3f} {OUTPUT_UNITS[i]}" if known else "-") for i in CONTROLLED),
         ("tau_u", _tau_u(status)),
         ("alarms", "; ".join(status.alarms) or "none"),
