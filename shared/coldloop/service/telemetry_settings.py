@@ -14,17 +14,20 @@ class TelemetrySettings(BaseModel):
     broker: str = ""
     """Host of the broker; empty is off."""
     port: Annotated[int, Field(ge=1, le=65535)] = 1883
+    """Its TCP port."""
     username: str = ""
     """Name at the broker; empty is a broker that asks for none."""
     password_file: Path | None = None
     """File that holds the password for it, on one line. It is read at each connection; without TLS it is sent as it
     is, so this is for a private network."""
     prefix: Annotated[str, Field(pattern=r"^[^#+]+$")] = "coldloop"
+    """First part of all topics."""
     period_s: PositiveFloat = 1.0
     """Real time between snapshots."""
     queue: Annotated[int, Field(ge=1)] = 100
     """Snapshots kept while the broker is away; the oldest go first."""
     timeout_s: PositiveFloat = 5.0
+    """How long connecting may take, s."""
 
     @model_validator(mode="after")
     def _password_belongs_to_a_name(self) -> Self:
