@@ -232,6 +232,12 @@ export function asPicture(charts, legend) {
     ctx.drawImage(canvases[i], 0, top + 18 * devicePixelRatio);
     top += canvases[i].height + 18 * devicePixelRatio;
   });
-  ctx.fillText(legend, 8, top + 13 * devicePixelRatio);
+  let left = 8;
+  for (const entry of legend.querySelectorAll(".entry")) {
+    ctx.fillStyle = getComputedStyle(entry.querySelector("i")).backgroundColor;
+    ctx.fillRect(left, top + 5 * devicePixelRatio, 14 * devicePixelRatio, 8 * devicePixelRatio);
+    ctx.fillStyle = colour("ink"); ctx.fillText(entry.textContent, left + 18 * devicePixelRatio, top + 13 * devicePixelRatio);
+    left += ctx.measureText(entry.textContent).width + 34 * devicePixelRatio;
+  }
   return picture;
 }

@@ -121,7 +121,7 @@ export function initTrends(pick) {
   document.getElementById("hold").addEventListener("click", (event) => { held = !held; event.target.setAttribute("aria-pressed", String(held)); refresh(); });
   document.getElementById("unzoom").addEventListener("click", (event) => { zoom = null; event.target.hidden = true; refresh(); });
   document.getElementById("export-png").addEventListener("click", () => {
-    asPicture(charts || [], document.getElementById("trend-legend").textContent).toBlob((blob) => { const link = element("a", { href: URL.createObjectURL(blob), download: "coldloop-trends.png" }); link.click(); URL.revokeObjectURL(link.href); });
+    asPicture(charts || [], document.getElementById("trend-legend")).toBlob((blob) => { const link = element("a", { href: URL.createObjectURL(blob), download: "coldloop-trends.png" }); link.click(); URL.revokeObjectURL(link.href); });
   });
   pens = (localStorage.getItem("pens") || "").split(",").filter((name) => state.catalog.trended.includes(name)).slice(0, MOST_PENS);
   document.getElementById("pen-add").addEventListener("change", (event) => setPens([...pens, event.target.value]));
