@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
-from typing import Final, NoReturn
+from typing import Any, Final, NoReturn
 
 from coldloop import __version__
 from coldloop.errors import ColdloopError, UsageError, printable
@@ -77,7 +77,10 @@ OF_ANY_PROCESS: Final = ("periods",)
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """Reports a usage error as one line."""
+    """Reports a usage error as one line, and takes no abbreviations of options."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:  # noqa: ANN401 as argparse has them
+        super().__init__(*args, **{"allow_abbrev": False, **options})
 
     def error(self, message: str) -> NoReturn:
         """End with exit code 2."""

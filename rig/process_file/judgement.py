@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from coldloop.number_text import ends_text, number_text
 from coldloop.process.declaration import Input, Output, Process
 from rig.process_file.bath import exchanged
 from rig.process_file.making import Made
@@ -37,14 +38,15 @@ def described(made: Made) -> str:
 
 def _values(names: tuple[str, ...], values: Array, units: tuple[str, ...]) -> str:
     triples = zip(names, values, units, strict=True)
-    return "  ".join(
-        f"{name} {value if abs(value) > NOTHING else 0.0:.5g} {unit}".rstrip() for name, value, unit in triples
-    )
+    shown = (f"{n} {number_text(value if abs(value) > NOTHING else 0.0, 5)} {unit}" for n, value, unit in triples)
+    return "  ".join(map(str.rstrip, shown))
 
 
 def _rest(made: Made) -> list[str]:
     m, process = made.model, made.process
-    load = "" if not m.F.any() and not m.G.any() else f"; load {m.load_name} {m.w0:.5g} {m.load_unit}".rstrip()
+    load = (
+        "" if not m.F.any() and not m.G.any() else f"; load {m.load_name} {number_text(m.w0, 5)} {m.load_unit}".rstrip()
+    )
     problem = len(process.decision_instants) * (len(process.inputs) + 2 * len(process.bands))
     named = ((m.input_names, "input"), (m.output_names, "output"), (m.state_names, "state"))
     counted = ", ".join(f"{len(names)} {noun}{'s' * (len(names) != 1)}" for names, noun in named)
@@ -154,7 +156,9 @@ def _warnings(made: Made) -> list[str]:
     for band, output in zip(process.bands, process.banded, strict=True):
         value = float(m.y0[m.output_names.index(output.name)])
         if not band.margin and not band.low <= value <= band.high:
-            found.append(f"band: {output.name} rests at {value:.5g}, its band is {band.low:g} to {band.high:g}")
+            found.append(
+                f"band: {output.name} rests at {number_text(value, 5)}, its band is {ends_text(band.low, band.high)}"
+            )
     rows = [m.output_names.index(output.name) for output in process.banded]
     reach = m.discretised(process.decision_instants[-1] * sample_s).B * [one.scale for one in process.inputs]
     effect = (m.C[rows] @ reach) / [[band.high - band.low] for band in process.bands]

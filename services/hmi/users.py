@@ -169,7 +169,7 @@ def write_user(file: Path, name: str, role: PageRole, password: str) -> None:
 
 def main() -> int:
     """Write a user's line; return the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m hmi.users", description="Add a user of the operator's page.")
+    parser = argparse.ArgumentParser("python -m hmi.users", description="Add a user of the page.", allow_abbrev=False)
     parser.add_argument("file", type=Path)
     parser.add_argument("name")
     parser.add_argument("role", choices=[role.value for role in PageRole])

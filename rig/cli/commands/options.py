@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from coldloop.errors import UsageError
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import TICK_S
 from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS
 from coldloop.process.whole_ticks import whole_ticks
@@ -81,8 +82,10 @@ def check_load(name: str | None) -> None:
     """Refuse a load that is neither a name nor a file, before anything that takes time; the file is read later.
 
     Raises:
-        UsageError: There is no such load.
+        UsageError: There is no such load, or the process has none.
     """
+    if name is not None and not PROCESS.has_load:
+        raise UsageError(f"load '{name}': {PROCESS.name} has no load; leave it out")
     if name is not None and name.partition("@")[0] not in LOADS and not (name and Path(name).exists()):
         raise UsageError(f"load '{name}': neither a file nor one of {', '.join(LOADS)}")
 
