@@ -4,6 +4,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from rig.cli.commands.options import positive_count
+
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
@@ -12,12 +14,15 @@ def declare(parser: argparse.ArgumentParser) -> None:
     what.add_argument("--keys", action="store_true", help="list the keys of process files, as Markdown")
     parser.add_argument("--out", type=Path, metavar="MODEL",
                         help="write the model file; then --process MODEL, or COLDLOOP_PROCESS=MODEL")  # fmt: skip
+    parser.add_argument("--limit", type=positive_count, metavar="SECONDS",
+                        help="how long the plant, which runs in a process of its own, may take (default: 300)")  # fmt: skip
 
 
 def execute(options: argparse.Namespace) -> int:
     """Make, print; write the model file when there is --out."""
     from coldloop.errors import UsageError
     from coldloop.whole_file import require_regular_file
+    from rig.process_file.in_child import LIMIT_S, text_of_child
     from rig.process_file.judgement import described
     from rig.process_file.making import made_from
 
@@ -30,13 +35,18 @@ def execute(options: argparse.Namespace) -> int:
         require_regular_file(out)
         if out.resolve() == options.file.resolve():
             raise UsageError(f"{out}: is the process file; name another one with --out")
-    made = made_from(options.file)
-    sys.stdout.write(described(made))
+
+    def work() -> str:
+        made = made_from(options.file)
+        if out is not None:
+            try:
+                made.model.save(out)
+            except OSError as error:
+                raise UsageError(f"{out}: {error.strerror}; name a file that can be written with --out") from None
+        return described(made)
+
+    sys.stdout.write(text_of_child(options.file, work, options.limit or LIMIT_S))
     if out is not None:
-        try:
-            made.model.save(out)
-        except OSError as error:
-            raise UsageError(f"{out}: {error.strerror}; name a file that can be written with --out") from None
         sys.stdout.write(f"written to {out}\n")
     return 0
 

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from coldloop.errors import ModelFileError
 from coldloop.process.signals import STATE_NAMES, TICK_S
 from plant.numeric import RealArray
 from plant.own.disturbances import NO_DISTURBANCES, Disturbances, DisturbedPlant
-from plant.own.fmu_file import Fmu
+from plant.own.fmu_file import Fmu, Port
 from plant.program import HeatLoad, MeasurementNoise
 
 log = logging.getLogger("coldloop.plant")
@@ -46,9 +47,9 @@ class FmuSimulation:
 
     def __init__(self, fmu: Fmu, wiring: Wiring, tick_s: float) -> None:
         names = [*wiring.inputs, *([wiring.load] if wiring.load else []), *wiring.disturbances]
-        self._inputs = [fmu.reference(name) for name in names]
-        self._outputs = [fmu.reference(name) for name in wiring.outputs]
-        self._states = [fmu.reference(name) for name in wiring.states]
+        self._inputs = [fmu.port(name) for name in names]
+        self._outputs = [fmu.port(name) for name in wiring.outputs]
+        self._states = [fmu.port(name) for name in wiring.states]
         self._instance = fmu.instance(wiring.start)
         self._wiring = wiring
         self._step_s = tick_s / wiring.steps_per_tick
@@ -62,13 +63,17 @@ class FmuSimulation:
         """Return the outputs."""
         return self._instance.read(self._outputs)
 
+    def is_discrete(self, place: int) -> bool:
+        """Return whether an input, the load or another disturbance, in this order, takes whole numbers only."""
+        return self._inputs[place].is_discrete
+
     def states(self) -> RealArray:
         """Return the states that it shows."""
         return self._instance.read(self._states)
 
-    def read(self, references: Sequence[int]) -> RealArray:
-        """Return other real variables."""
-        return self._instance.read(references)
+    def read(self, ports: Sequence[Port]) -> RealArray:
+        """Return other variables."""
+        return self._instance.read(ports)
 
     def tick(self) -> None:
         """Go one tick forward.
@@ -86,7 +91,7 @@ class FmuSimulation:
         for _ in range(self._wiring.rest_ticks):
             self.tick()
 
-    def derivatives(self, of: Sequence[int]) -> RealArray:
+    def derivatives(self, of: Sequence[Port]) -> RealArray:
         """Return partial derivatives by states, inputs, load and k other disturbances, shape (of, n + m + 1 + k)."""
         by = [*self._states, *self._inputs]
         found = self._instance.derivatives(of, by)
@@ -164,8 +169,11 @@ class FmuPlant(DisturbedPlant):
         """Resume from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
         if own is None or not self._keeps_state:
             raise ValueError("the FMU cannot return to a state")
+        try:
+            self._simulation.return_to(own)
+        except ModelFileError as error:
+            raise ValueError(str(error)) from error
         super().resume(tick, x, u, y, noise_state)
-        self._simulation.return_to(own)
 
 
 def fmu_maker(fmu: Fmu, wiring: Wiring, u0: Sequence[float], w0: Sequence[float]) -> Callable[[], FmuSimulation]:
