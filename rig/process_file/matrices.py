@@ -78,7 +78,11 @@ def _of_state_space(file: ProcessFile, folder: Path, given: str) -> dict[str, Ar
     space = made_by(*source_of(folder, given), given)
     if getattr(space, "dt", None) not in (None, 0):
         raise UsageError(f"{given}: has a sampling time of {space.dt} s; give it in continuous time")
-    with foreign(f"{given}: no state space with A, B, C and D", "make one with control.ss(...), or SciPy's to_ss()", kind=UsageError):
+    with foreign(
+        f"{given}: no state space with A, B, C and D",
+        "make one with control.ss(...), or SciPy's to_ss()",
+        kind=UsageError,
+    ):
         if not hasattr(space, "A") and (hasattr(space, "num") or hasattr(space, "to_tf")):
             M = realised(space if hasattr(space, "num") else space.to_tf())
         else:
@@ -104,33 +108,25 @@ def realised(transfer: Any) -> dict[str, Array]:  # noqa: ANN401 of python-contr
     Raises:
         ValueError: One is not proper.
     """
+    from scipy.linalg import block_diag  # noqa: PLC0415 only what needs it loads it
+
     num, den = transfer.num, transfer.den
     if np.isscalar(den[0]):  # SciPy: one input, one denominator
         num = [[row] for row in np.atleast_2d(num)]
         den = [[den]] * len(num)
     p, m = len(num), len(num[0])
-    D, blocks = np.zeros((p, m)), list[tuple[Array, Array, Array]]()
-    for i in range(p):
-        alike: dict[tuple[float, ...], Array] = {}
-        for j in range(m):
-            below, above = (np.trim_zeros(np.asarray(one[i][j], dtype=np.float64), "f") for one in (den, num))
-            monic, n = below / below[0], len(below) - 1
-            if len(above) > n + 1:
-                raise ValueError(f"that of output {i + 1} by input {j + 1} is not proper")
-            b = np.pad(above / below[0], (n + 1 - len(above), 0))
-            D[i, j] = b[0]
-            alike.setdefault(tuple(monic[1:].tolist()), np.zeros((n, m)))[:, j] = b[1:] - monic[1:] * b[0]
-        for a, B in alike.items():
-            if a and B.any():
-                A, C = np.eye(len(a), k=1), np.zeros((p, len(a)))
-                A[:, 0] -= a
-                C[i, 0] = 1.0
-                blocks.append((A, B, C))
-    n = sum(len(A) for A, _, _ in blocks)
-    whole, first = np.zeros((n, n)), 0
-    for A, _, _ in blocks:
-        whole[first : first + len(A), first : first + len(A)] = A
-        first += len(A)
-    B = np.vstack([B for _, B, _ in blocks] or [np.zeros((0, m))])
-    C = np.hstack([C for _, _, C in blocks] or [np.zeros((p, 0))])
-    return {"A": whole, "B": B, "C": C, "D": D}
+    D, blocks = np.zeros((p, m)), dict[tuple[int, tuple[float, ...]], Array]()
+    for i, j in np.ndindex(p, m):
+        below, above = (np.trim_zeros(np.asarray(one[i][j], dtype=np.float64), "f") for one in (den, num))
+        if len(above) > len(below):
+            raise ValueError(f"that of output {i + 1} by input {j + 1} is not proper")
+        a, b = below[1:] / below[0], np.pad(above, (len(below) - len(above), 0)) / below[0]
+        D[i, j] = b[0]
+        blocks.setdefault((i, tuple(a.tolist())), np.zeros((len(a), m)))[:, j] = b[1:] - a * b[0]
+    seen = {key: B for key, B in blocks.items() if B.any()}
+    A = [np.eye(len(a), k=1) - np.outer(a, np.eye(1, len(a))) for _, a in seen]
+    C = [np.outer(np.eye(p)[i], np.eye(1, len(a))) for i, a in seen]
+    return {
+        "A": block_diag(*A) if A else np.zeros((0, 0)), "B": np.vstack([np.zeros((0, m)), *seen.values()]),
+        "C": np.hstack([np.zeros((p, 0)), *C]), "D": D,
+    }  # fmt: skip

@@ -211,7 +211,7 @@ class Lag(Fmi3Slave):
 @pytest.mark.usefixtures("programs")
 def test_elements_of_arrays_and_whole_numbers_are_inputs(tmp_path: Path) -> None:
     """dx/dt = (u[2] + n - x) / 20 where the pump is on: a gain of 1 of both."""
-    text = LAG.replace("import", "import Boolean, Dimension, Int32,", 1)
+    text = LAG.replace("Lag", "Pumped").replace("import", "import Boolean, Dimension, Int32,", 1)
     text = text.replace('Float64("u", causality=Fmi3Causality.input, variability=continuous, start=0.0)',
                         'Float64("u", causality=Fmi3Causality.input, variability=continuous, start=[0.0, 0.0], '
                         'dimensions=[Dimension(start="2")], getter=lambda: self.u, '
@@ -219,13 +219,15 @@ def test_elements_of_arrays_and_whole_numbers_are_inputs(tmp_path: Path) -> None
     discrete = "causality=Fmi3Causality.input, variability=Fmi3Variability.discrete"
     more = f'        self.register_variable(Int32("n", {discrete}, start=0))\n'
     more += f'        self.register_variable(Boolean("on", {discrete}, start=False))\n'
-    text = text.replace("self.u, self.y = 0.0, 0.0, 0.0", "self.u, self.n, self.on, self.y = 0.0, [0.0, 0.0], 0, False, 0.0")
+    text = text.replace(
+        "self.u, self.y = 0.0, 0.0, 0.0", "self.u, self.n, self.on, self.y = 0.0, [0.0, 0.0], 0, False, 0.0"
+    )
     text = text.replace("(self.u - self.y)", "(self.on * (self.u[1] + self.n) - self.y)")
     text = text.replace("\n    def do_step", f"{more}\n    def do_step")
-    (tmp_path / "lag.py").write_text(text, encoding="utf-8")
-    command = [sys.executable, "-m", "pythonfmu3", "build", "-f", "lag.py"]
+    (tmp_path / "pumped.py").write_text(text, encoding="utf-8")
+    command = [sys.executable, "-m", "pythonfmu3", "build", "-f", "pumped.py"]
     subprocess.run(command, check=True, cwd=tmp_path, capture_output=True)
-    toml = TANKS.replace("two_tanks.fmu", "Lag.fmu").split("[load]")[0].replace("[5.0, 8.0]", "[3.5, 4.5]")
+    toml = TANKS.replace("two_tanks.fmu", "Pumped.fmu").split("[load]")[0].replace("[5.0, 8.0]", "[3.5, 4.5]")
     toml = toml.replace('"u"', '"u[2]"').replace("[[outputs]]", NUMBER_OF_PUMPS + "[[outputs]]")
     found = made(tmp_path, toml.replace("[[inputs", "start = { on = 1.0 }\n[[inputs", 1))
     model = found.model

@@ -15,7 +15,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="MODEL",
                         help="write the model file; then --process MODEL, or COLDLOOP_PROCESS=MODEL")  # fmt: skip
     parser.add_argument("--limit", type=positive_count, metavar="SECONDS",
-                        help="how long the plant, which runs in a process of its own, may take (default: 300)")  # fmt: skip
+                        help="how long its plant may take, in a process of its own (default: 300)")  # fmt: skip
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -33,13 +33,13 @@ class Port(NamedTuple):
     type: str
     """Of the functions that set and get it."""
     place: int = 0
-    count: int = 1
+    size: int = 1
     """Elements of the array, which are set and read together."""
 
     @property
     def is_double(self) -> bool:
         """Whether it is a real number in double precision, of its own."""
-        return self.type in DOUBLE and self.count == 1
+        return self.type in DOUBLE and self.size == 1
 
     @property
     def is_discrete(self) -> bool:
@@ -189,7 +189,7 @@ class FmuInstance:
         for port, value in zip(ports, values, strict=True):
             alike = wholes.setdefault(port.type, {})
             if port.reference not in alike:
-                alike[port.reference] = [0.0] if port.count == 1 else self._get(port.type, {port.reference: port.count})
+                alike[port.reference] = [0.0] if port.size == 1 else self._get(port.type, {port.reference: port.size})
             alike[port.reference][port.place] = port.typed(value)
         for kind, alike in wholes.items():
             getattr(self._slave, f"set{kind}")(list(alike), [value for whole in alike.values() for value in whole])
@@ -199,7 +199,7 @@ class FmuInstance:
         found = np.empty(len(ports))
         with self._calling("does not give its variables"):
             for kind in dict.fromkeys(port.type for port in ports):
-                alike = {port.reference: port.count for port in ports if port.type == kind}
+                alike = {port.reference: port.size for port in ports if port.type == kind}
                 flat = self._get(kind, alike)
                 first = dict(zip(alike, accumulate(alike.values(), initial=0), strict=False))
                 for i, port in enumerate(ports):
