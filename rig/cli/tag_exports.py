@@ -10,7 +10,7 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import groupby
+from itertools import chain, count, groupby
 from typing import Any, Final, NamedTuple
 
 from coldloop.modbus.requests import MAX_READ_WORDS
@@ -37,7 +37,16 @@ class Tag(NamedTuple):
 
 
 def exported(register_map: RegisterMap) -> Iterator[Tag]:
-    """Yield the tags of a service, in the order of their addresses."""
+    """Yield the tags of a service, in the order of their addresses; names that would be the same have numbers."""
+    taken = set[str]()
+    for tag in _named(register_map):
+        numbered = (f"{tag.name}_{number}" for number in count(2))
+        name = next(one for one in chain([tag.name], numbered) if one.lower() not in taken)
+        taken.add(name.lower())
+        yield tag._replace(name=name)
+
+
+def _named(register_map: RegisterMap) -> Iterator[Tag]:
     for block in register_map.shown:
         if block.writer is not None and block.record is not Operator:
             continue

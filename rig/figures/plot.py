@@ -37,7 +37,7 @@ def with_unit(name: str, unit: str) -> str:
 
 
 LABELS: Final[Mapping[str, str]] = {
-    LOAD_COLUMN: with_unit(LOAD_WORD, PROCESS.load.unit),
+    **({LOAD_COLUMN: with_unit(LOAD_WORD, PROCESS.load.unit)} if PROCESS.has_load else {}),
     **{name: with_unit(name, unit) for name, unit in {**BANDED, **MOVED}.items()},
     "tau_u_s": "tau_u (s)",
     "stage_cost": "stage cost (1)",
@@ -98,9 +98,11 @@ def draw_run(curves: RunCurves) -> Figure:
         axes: list[Axes] = list(
             figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, gridspec_kw=PANELS)
         )
-        _curve(axes[0], time, curves.series[LOAD_COLUMN], LABELS[LOAD_COLUMN], PROCESS.load.name)
-        first = 1 + len(BANDED)
-        for place, (name, band) in zip(axes[1:first], curves.bounds.bands.items(), strict=True):
+        lead = int(PROCESS.has_load)
+        if lead:
+            _curve(axes[0], time, curves.series[LOAD_COLUMN], LABELS[LOAD_COLUMN], PROCESS.load.name)
+        first = lead + len(BANDED)
+        for place, (name, band) in zip(axes[lead:first], curves.bounds.bands.items(), strict=True):
             _curve(place, time, curves.series[name], LABELS[name], name)
             limit(place, curves.series[name], band, f"band {band[0]:g} to {band[1]:g} {BANDED[name]}".rstrip())
         behind = first + len(MOVED)

@@ -1,5 +1,6 @@
 """The linear model of an FMU at rest: by its own derivatives, by differences, or from a step test of it."""
 
+import re
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
@@ -217,8 +218,9 @@ def _differentiated(
 
 def _named(fmu: Fmu, wiring: Wiring) -> dict[str, str]:
     """Return names and units of the states, as names of signals are."""
-    names = ["".join(each if each.isalnum() else "_" for each in name).strip("_") for name in wiring.states]
-    unique = names if len(set(names)) == len(names) else [f"x{i}" for i in range(1, len(names) + 1)]
+    names = [re.sub(r"[^A-Za-z0-9]", "_", name).strip("_") for name in wiring.states]
+    told_apart = len({name.lower() for name in names}) == len(names) and all(name[:1].isalpha() for name in names)
+    unique = names if told_apart else [f"x{i}" for i in range(1, len(names) + 1)]
     return {name: fmu.variables[state].unit or "" for name, state in zip(unique, wiring.states, strict=True)}
 
 
