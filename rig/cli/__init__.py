@@ -24,7 +24,7 @@ COMMANDS: Final = {
     "page": "the operator's page of a rig that is up, or of recorded runs",
     "set": "load, mode, setpoint, factor, pause, resume, acknowledge: commands to a rig that is up",
     "record": "record a session that is under way, to be replayed",
-    "fault": "kill, freeze, sensor: inject faults into a rig that is up",
+    "fault": "kill, pause, sensor: inject faults into a rig that is up",
     "rerun": "repeat a recorded run and compare the traces",
     "plot": "draw a recorded run again, as PNG, PDF or SVG",
     "report": "one HTML page of a recorded run, with interactive plots",

@@ -122,7 +122,7 @@ def test_a_bad_load_is_told_before_anything_is_made(coldloop: "Coldloop", result
 @pytest.mark.parametrize(
     ("command", "part"),
     [
-        ("fault melt plant", "melt"), ("fault kill boiler", "optimizer_plc"), ("fault freeze plant nan", "nan"),
+        ("fault melt plant", "melt"), ("fault kill boiler", "optimizer_plc"), ("fault pause plant nan", "nan"),
         ("fault cut broker 1", "broker"), ("fault cut plant 1e9", "3600"), ("fault sensor T99 stuck", "T10"),
         ("fault kill plant --rig far:1 far:2 far:3", "their own machine"), ("record --duration 0", "not positive"),
         ("record --figures bmp", "png"), ("set load nan", "finite"), ("set load 1e9", "10000"),
