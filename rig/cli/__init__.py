@@ -115,7 +115,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _execute(parser: argparse.ArgumentParser, given: Sequence[str]) -> int:
-    options = parser.parse_args(given)
+    options, unknown = parser.parse_known_args(given)
+    if unknown:
+        parser.prog = " ".join([parser.prog, *given[: options.execute is not None]])
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     named = given[1] if len(given) > 1 else None
     if os.environ.get(VARIABLE) and given and given[0] in OF_THE_COLD_BOX and named not in OF_ANY_PROCESS:
         sys.stderr.write(f"coldloop: {given[0]}: of the cold box alone; leave out {OPTION} and unset {VARIABLE}\n")
