@@ -31,18 +31,16 @@ def text_of_child(path: Path, work: Callable[[], str], limit_s: float) -> str:
         child.join()
         code = child.exitcode or 0
         how = f"exit code {code}" if code >= 0 else signal.Signals(-code).name
-        raise UsageError(f"{path}: its plant has ended the process that it ran in ({how}); mend it") from None
+        found = UsageError(f"{path}: its plant has ended the process that it ran in ({how}); mend it")
     finally:
         child.kill()
         child.join()
-    if found is None:
-        raise UsageError(
-            f"{path}: its plant has not come to an end within {limit_s:g} s; mend it, or give it longer with "
-            "`coldloop process FILE --limit SECONDS --out MODEL`, and then --process MODEL"
-        )
-    if isinstance(found, ColdloopError):
-        raise found
-    return found
+    if isinstance(found, str):
+        return found
+    raise found or UsageError(
+        f"{path}: its plant has not come to an end within {limit_s:g} s; mend it, or give it longer with "
+        "`coldloop process FILE --limit SECONDS --out MODEL`, and then --process MODEL"
+    )
 
 
 def _work(work: Callable[[], str], limit_s: float, sender: Connection) -> None:

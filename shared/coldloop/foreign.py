@@ -10,16 +10,10 @@ from coldloop.errors import ColdloopError, ModelFileError
 def foreign(
     what: str, instead: str = "", *, kind: type[ColdloopError] = ModelFileError, said: Sequence[str] = ()
 ) -> Iterator[None]:
-    """Call code that is not ours: what it raises becomes one line.
+    """Call `what`, code that is not ours: what it raises, `SystemExit` too, becomes an error of a kind, in one line.
 
-    Args:
-        what: Names the code, and what it was called for.
-        instead: What happens instead, or what to do; the end of the line.
-        kind: The error that is raised; an error of this kind passes as it is.
-        said: What the code has reported itself, which is told in the place of its exception.
-
-    Raises:
-        ColdloopError: The code has raised, or has tried to end the process (`SystemExit`).
+    `instead` ends the line: what happens instead, or what to do; `said` is what the code has reported itself, which is
+    told in the place of its exception. An error of this kind passes as it is.
     """
     try:
         yield

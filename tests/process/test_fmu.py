@@ -15,7 +15,6 @@ import pytest
 
 from coldloop.errors import ColdloopError
 from plant.own.fmu import FmuSimulation, Wiring
-from plant.own.fmu_archive import unpacked
 from plant.own.fmu_file import Fmu
 from rig.process_file.judgement import described
 from rig.process_file.making import Made, made_from
@@ -374,19 +373,20 @@ def test_a_damaged_member_gets_one_line(place: str, compiled: Path, tmp_path: Pa
 
 
 def test_no_archive_is_unpacked_without_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By its directory, and by what comes out where the directory lies."""
+    """By its directory; where the directory lies, no more comes out, and the checksum is wrong."""
+    monkeypatch.setattr("plant.own.fmu_file.MOST_UNPACKED", 2 << 20)
     file = tmp_path / "two_tanks.fmu"
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
         packed.writestr("zeros", bytes(3 << 20))
     with pytest.raises(ColdloopError, match="unpacks to more than 2 MiB"):
-        unpacked(file, packed, 2 << 20)
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
-        packed.writestr("../outside", "")
-    with pytest.raises(ColdloopError, match="is outside the archive"):
-        unpacked(file, packed)
+        Fmu(file)
+    assert max(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file()) < 1 << 20
+    file.write_bytes(file.read_bytes().replace((3 << 20).to_bytes(4, "little"), (1 << 20).to_bytes(4, "little")))
+    with pytest.raises(ColdloopError, match="not a readable FMU: BadZipFile: Bad CRC-32"):
+        Fmu(file)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
     with pytest.raises(ColdloopError, match=r"cannot be unpacked into .*nowhere: No such file.*; free space there"):
-        unpacked(file, packed)
+        Fmu(file)
 
 
 # -- what is refused --------------------------------------------------------------------------------------------------

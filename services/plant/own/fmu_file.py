@@ -2,7 +2,10 @@
 
 import math
 import re
+import shutil
+import tempfile
 import weakref
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import accumulate
@@ -14,13 +17,14 @@ import numpy as np
 from coldloop.errors import ColdloopError, ModelFileError
 from coldloop.foreign import foreign
 from plant.numeric import RealArray
-from plant.own.fmu_archive import unpacked
 
 NUMBERS: Final = ("Real", "Float", "Integer", "Int", "UInt", "Boolean", "Enumeration")
 """Beginnings of the types of variables that are numbers here."""
 CONTINUOUS: Final = ("Real", "Float")
 DOUBLE: Final = ("Real", "Float64")
 """Types that derivatives can be asked for."""
+MOST_UNPACKED: Final = 512 * 1024 * 1024
+"""Bytes of all members of the archive."""
 ELEMENT: Final = re.compile(r"(.+)\[(\d+(?:,\s*\d+)*)\]")
 ERROR: Final = 3
 """Status of FMI from which on a message says what is wrong."""
@@ -71,7 +75,7 @@ class Fmu:
         self.path = path
         if not path.is_file():
             raise ModelFileError(f"{path}: no such file; plant.fmu names an FMU beside the process file")
-        self._folder = unpacked(path, self)
+        self._folder = self._unpacked(MOST_UNPACKED)
         self.findings: tuple[str, ...] = ()
         """What of its description breaks the standard, and does not keep it from being run."""
         with foreign(f"{path}: not a readable FMU", "get it anew from the tool that made it"):
@@ -90,6 +94,24 @@ class Fmu:
         self.is_single = bool(slave.canBeInstantiatedOnlyOncePerProcess)
         """Whether a new instance ends the one before it."""
         self._end_former: Any = None
+
+    def _unpacked(self, most: int) -> str:
+        """Return a folder with the members of the archive; zipfile gives no more of one than its directory says."""
+        folder = tempfile.gettempdir()
+        with foreign(f"{self.path}: not a readable FMU", "get it anew from where it comes from"):
+            try:
+                folder = tempfile.mkdtemp(prefix="coldloop-fmu-")
+                weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+                with zipfile.ZipFile(self.path) as archive:
+                    if sum(one.file_size for one in archive.infolist()) > most:
+                        raise ModelFileError(f"{self.path}: unpacks to more than {most >> 20} MiB; get a smaller one")
+                    archive.extractall(folder)
+            except OSError as error:
+                raise ModelFileError(
+                    f"{self.path}: cannot be unpacked into {folder}: {error.strerror or error}; free space there, or "
+                    "set TMPDIR to another folder"
+                ) from error
+        return folder
 
     def _check(self, slave: Any, platforms: Sequence[str], here: str) -> None:  # noqa: ANN401 FMPy has no types
         where, version = self.path, str(self.description.fmiVersion)
