@@ -9,8 +9,9 @@ import hashlib
 import io
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import chain, count, groupby
+from itertools import groupby
 from typing import Any, Final, NamedTuple
 
 from coldloop.modbus.requests import MAX_READ_WORDS
@@ -37,13 +38,11 @@ class Tag(NamedTuple):
 
 
 def exported(register_map: RegisterMap) -> Iterator[Tag]:
-    """Yield the tags of a service, in the order of their addresses; names that would be the same have numbers."""
-    taken = set[str]()
-    for tag in _named(register_map):
-        numbered = (f"{tag.name}_{number}" for number in count(2))
-        name = next(one for one in chain([tag.name], numbered) if one.lower() not in taken)
-        taken.add(name.lower())
-        yield tag._replace(name=name)
+    """Yield the tags of a service, in the order of their addresses; names that would be the same end with these."""
+    tags = list(_named(register_map))
+    count = Counter(tag.name.lower() for tag in tags)
+    for tag in tags:
+        yield tag._replace(name=f"{tag.name}_{tag.register.address}") if count[tag.name.lower()] > 1 else tag
 
 
 def _named(register_map: RegisterMap) -> Iterator[Tag]:

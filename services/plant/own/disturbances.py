@@ -92,3 +92,20 @@ class DisturbedPlant(PlantProgram):
             x, y = self._own_step(self._outside(w))
         met, next_tick = self.disturbances, self.tick + 1
         return np.append(x, met.at(next_tick)), np.append(y, met.shown(next_tick))
+
+    def _saved(self) -> dict[str, Any] | None:
+        """Return what the plant hides beside its states, as plain data; None if nothing, or if it cannot be saved."""
+        return None
+
+    def _return_to(self, saved: Mapping[str, Any] | None) -> None:
+        """Return to what `_saved` returned (ValueError or KeyError if it is not of this plant)."""
+
+    def retained(self) -> dict[str, Any]:
+        """Return what `resume` needs, as plain data."""
+        saved = self._saved()
+        return super().retained() | ({} if saved is None else {"own": saved})
+
+    def resume(self, *retained: Any, own: Mapping[str, Any] | None = None, **named: Any) -> None:  # noqa: ANN401
+        """Resume from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
+        self._return_to(own)
+        super().resume(*retained, **named)

@@ -153,27 +153,16 @@ class FmuPlant(DisturbedPlant):
         self._simulation.tick()
         return self._shown(), self._simulation.outputs()
 
-    def retained(self) -> dict[str, Any]:
-        """Return what `resume` needs, as plain data."""
-        return {**super().retained(), **({"own": self._simulation.saved()} if self._keeps_state else {})}
+    def _saved(self) -> dict[str, Any] | None:
+        return self._simulation.saved() if self._keeps_state else None
 
-    def resume(
-        self,
-        tick: int,
-        x: Sequence[float],
-        u: Sequence[float],
-        y: Sequence[float],
-        noise_state: Mapping[str, Any],
-        own: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Resume from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
-        if own is None or not self._keeps_state:
+    def _return_to(self, saved: Mapping[str, Any] | None) -> None:
+        if saved is None or not self._keeps_state:
             raise ValueError("the FMU cannot return to a state")
         try:
-            self._simulation.return_to(own)
+            self._simulation.return_to(saved)
         except ModelFileError as error:
             raise ValueError(str(error)) from error
-        super().resume(tick, x, u, y, noise_state)
 
 
 def fmu_maker(fmu: Fmu, wiring: Wiring, u0: Sequence[float], w0: Sequence[float]) -> Callable[[], FmuSimulation]:

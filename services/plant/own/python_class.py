@@ -163,21 +163,10 @@ class HiddenPythonPlant(PythonPlant):
         self._hidden = runge_kutta(self._equations, self._hidden, self._u, outside(w), TICK_S)
         return self._own, self._seen(self._hidden, w)
 
-    def retained(self) -> dict[str, Any]:
-        """Return what `resume` needs, as plain data."""
-        return {**super().retained(), "own": {"hidden": self._hidden.tolist()}}
+    def _saved(self) -> dict[str, Any]:
+        return {"hidden": self._hidden.tolist()}
 
-    def resume(
-        self,
-        tick: int,
-        x: Sequence[float],
-        u: Sequence[float],
-        y: Sequence[float],
-        noise_state: Mapping[str, Any],
-        own: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Resume from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
-        if own is None or len(own["hidden"]) != len(self._hidden):
+    def _return_to(self, saved: Mapping[str, Any] | None) -> None:
+        if saved is None or len(saved["hidden"]) != len(self._hidden):
             raise ValueError("the retained state is that of another plant")
-        super().resume(tick, x, u, y, noise_state)
-        self._hidden = np.array(own["hidden"], dtype=np.float64)
+        self._hidden = np.array(saved["hidden"], dtype=np.float64)
