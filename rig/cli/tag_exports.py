@@ -60,12 +60,7 @@ def _tags(block: Block, row: int, prefix: str) -> Iterator[Tag]:
     texts = {name for name, field in fields_of(block.record).items() if field.is_text}
     for register in block.registers(row):
         if register.name.partition(".")[0] not in texts:
-            yield Tag(tag_name(f"{prefix}_{register.name}"), block.name, register)
-
-
-def tag_name(text: str) -> str:
-    """Return a name of letters, digits and underscores."""
-    return _NOT_IN_NAMES.sub("_", text)
+            yield Tag(_NOT_IN_NAMES.sub("_", f"{prefix}_{register.name}"), block.name, register)
 
 
 def runs(tags: Sequence[Tag]) -> Iterator[list[Tag]]:

@@ -6,7 +6,6 @@ from typing import Final, NamedTuple
 
 from coldloop.modbus.endpoints import PLANT_PORT, Endpoint
 from coldloop.safety.retained import RetainSettings
-from coldloop.service.telemetry_settings import PREFIX
 from rig.cosim.answer_time import QUIET_S
 from rig.cosim.endpoints import RigEndpoints
 from rig.settings import Settings
@@ -69,8 +68,8 @@ def wired(settings: Settings, endpoints: RigEndpoints, detours: Detours | None =
 
     plant, control_plc = detours or (None, None)
     telemetry, port = settings.telemetry, endpoints.plant.port
-    if port != PLANT_PORT and telemetry.prefix == PREFIX:  # another rig may publish to the same broker
-        telemetry = telemetry.model_copy(update={"prefix": f"{PREFIX}/{port}"})
+    if port != PLANT_PORT and telemetry.prefix == type(telemetry)().prefix:  # another rig may have the same broker
+        telemetry = telemetry.model_copy(update={"prefix": f"{telemetry.prefix}/{port}"})
     return settings.model_copy(
         update={
             "telemetry": telemetry,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ModelFileError, UsageError
 from plant.own.fmu import FmuSimulation, Wiring
-from plant.own.fmu_file import Fmu
+from plant.own.fmu_file import DOUBLE, Fmu
 from plant.own.maker import FMU, file_digest
 from rig.process_file.declaration import ProcessFile
 from rig.process_file.identified import Record, identified
@@ -191,8 +191,8 @@ def _differentiated(
     """
     names = [*wiring.states, *wiring.inputs, wiring.load, *wiring.disturbances]
     outputs = [fmu.port(name) for name in wiring.outputs]
-    doubles = all(port.is_double for port in (*outputs, *(fmu.port(name) for name in names if name is not None)))
-    if not wiring.states or not doubles:
+    ports = [*outputs, *(fmu.port(name) for name in names if name is not None)]
+    if not wiring.states or not all(port.type in DOUBLE and port.size == 1 for port in ports):
         return None
     rates = [fmu.port(each.variable.name) for each in fmu.description.derivatives]
     if fmu.has_derivatives:
@@ -236,7 +236,7 @@ def _step_tested(file: ProcessFile, simulation: FmuSimulation, where: str) -> Re
     signals += [(one.name, one.at, one.span) for one in file.outside]
     steps = np.empty((count, len(signals)))
     for j, (_, at, (low, high)) in enumerate(signals):
-        size = max(STEP_SIZE * (high - low), float(simulation.is_discrete(j)))
+        size = max(STEP_SIZE * (high - low), float(simulation.inputs[j].is_discrete))
         levels, k = (max(low, at - size), min(high, at + size)), 0
         while k < count:
             hold = int(np.exp(generator.uniform(0.0, np.log(max(2.0, horizon / 2)))))

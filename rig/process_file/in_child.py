@@ -5,16 +5,12 @@ import signal
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Final
 
 from coldloop.errors import ColdloopError, UsageError
 from rig.interruption import SIGNALS
 
-LIMIT_S: Final = 300.0
-"""How long the plant of a process file may take, unless the user says otherwise."""
 
-
-def text_of_child(path: Path, work: Callable[[], str], limit_s: float) -> str:
+def text_of_child(path: Path, work: Callable[[], str], limit_s: int) -> str:
     """Return what a child process returns, which does this work on a process file.
 
     Raises:
@@ -26,27 +22,26 @@ def text_of_child(path: Path, work: Callable[[], str], limit_s: float) -> str:
     child.start()
     sender.close()
     try:
-        found: str | ColdloopError | None = receiver.recv() if receiver.poll(limit_s) else None
+        found: str | ColdloopError = receiver.recv()
     except EOFError:
         child.join()
         code = child.exitcode or 0
-        how = f"exit code {code}" if code >= 0 else signal.Signals(-code).name
-        found = UsageError(f"{path}: its plant has ended the process that it ran in ({how}); mend it")
-    finally:
-        child.kill()
-        child.join()
-    if isinstance(found, str):
-        return found
-    raise found or UsageError(
-        f"{path}: its plant has not come to an end within {limit_s:g} s; mend it, or give it longer with "
-        "`coldloop process FILE --limit SECONDS --out MODEL`, and then --process MODEL"
-    )
+        found = UsageError(
+            f"{path}: its plant has not come to an end within {limit_s} s; mend it, or give it longer with `coldloop "
+            "process FILE --limit SECONDS --out MODEL`, and then --process MODEL"
+            if code == -signal.SIGALRM
+            else f"{path}: its plant has ended the process that it ran in "
+            f"({signal.Signals(-code).name if code < 0 else f'exit code {code}'}); mend it"
+        )
+    if isinstance(found, ColdloopError):
+        raise found
+    return found
 
 
-def _work(work: Callable[[], str], limit_s: float, sender: Connection) -> None:
-    for number in SIGNALS:
+def _work(work: Callable[[], str], limit_s: int, sender: Connection) -> None:
+    for number in (*SIGNALS, signal.SIGALRM):
         signal.signal(number, signal.SIG_DFL)
-    signal.alarm(int(limit_s) + 1)  # where the parent has gone
+    signal.alarm(limit_s)  # it ends this process, whatever runs in it and whether its parent is still there
     try:
         found: str | ColdloopError = work()
     except ColdloopError as error:

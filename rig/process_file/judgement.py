@@ -144,15 +144,16 @@ def _inverse_responses(made: Made) -> list[str]:
     """Return which outputs with a band first move to the other side after a step of an input than where they end."""
     m, process, n, quarters = made.model, made.process, len(made.own_A), 4
     poles = np.linalg.eigvals(made.own_A)
-    endless = (poles.real > NOTHING).any() or (abs(poles.imag[poles.real > -NOTHING]) > NOTHING).any()
-    if endless or any(lag["delay_s"] for lag in made.linear.parameters.get("lags", ())):
-        return []  # a dead time is approximated by what moves so
+    delays = [lag["delay_s"] for lag in made.linear.parameters.get("lags", ())]  # approximated by what moves so
+    if any(delays) or poles.real.max() > NOTHING or (abs(poles.imag[poles.real > -NOTHING]) > NOTHING).any():
+        return []
     part_s = process.tick_s * process.ticks_per_sample / quarters
     times = part_s * np.arange(1, quarters * process.decision_instants[-1] + 1)
     part, x = m.discretised(part_s), np.zeros_like(m.B)
     moves = np.array([m.C @ (x := part.A @ x + part.B) + m.D for _ in times])
-    rests = bool((poles.real < -NOTHING).all())
-    ends = m.D - m.C[:, :n] @ np.linalg.solve(made.own_A, m.B[:n]) if rests else moves[-1]
+    ends = moves[-1]
+    if (poles.real < -NOTHING).all():
+        ends = m.D - m.C[:, :n] @ np.linalg.solve(made.own_A, m.B[:n])
     found = []
     for i, j in ((m.output_names.index(one.name), j) for one in process.banded for j in range(len(m.input_names))):
         share = moves[:, i, j] / (ends[i, j] or np.inf)

@@ -53,16 +53,13 @@ def linearised(file: ProcessFile, folder: Path) -> Linearised:
         found = _from_lags(file, plant)
     if not len(found.A):
         raise UsageError(
-            "plant: it has no states: its outputs follow the inputs at once, so there is nothing to predict; give its "
-            "dynamics, those of its actuators or sensors at least"
+            "plant: it has no states, so there is nothing to predict; give the dynamics of its actuators at least"
         )
     if file.prediction.step_test is not None:
         found = _by_record(file, found, folder / file.prediction.step_test)
     for name in ("A", "B", "F", "C", "D", "G", "x0", "y0"):
         if not np.isfinite(getattr(found, name)).all():
-            raise UsageError(
-                f"plant: {name} of the linear model is not finite; look for NaN or infinity at the operating point"
-            )
+            raise UsageError(f"plant: {name} of the linear model is not finite; look at the plant's equations there")
     return with_disturbances(file, found)
 
 

@@ -126,7 +126,5 @@ def realised(transfer: Any) -> dict[str, Array]:  # noqa: ANN401 of python-contr
     seen = {key: B for key, B in blocks.items() if B.any()}
     A = [np.eye(len(a), k=1) - np.outer(a, np.eye(1, len(a))) for _, a in seen]
     C = [np.outer(np.eye(p)[i], np.eye(1, len(a))) for i, a in seen]
-    return {
-        "A": block_diag(*A) if A else np.zeros((0, 0)), "B": np.vstack([np.zeros((0, m)), *seen.values()]),
-        "C": np.hstack([np.zeros((p, 0)), *C]), "D": D,
-    }  # fmt: skip
+    B = np.vstack([np.zeros((0, m)), *seen.values()])
+    return {"A": block_diag(*A)[: len(B), : len(B)], "B": B, "C": np.hstack([np.zeros((p, 0)), *C]), "D": D}

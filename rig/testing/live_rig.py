@@ -134,10 +134,10 @@ class LiveRig:
         services = {service: getattr(self, service) for service in SERVICES}
         for one in services.values():
             one.latest.clear()
-        if value := condition():
+        if condition():
             return ""
         read = (f"{service} {name} = {seen}" for service, one in services.items() for name, seen in one.latest.items())
-        return ", ".join(read) or f"it is {value!r}"
+        return ", ".join(read) or "it has read no register by name"
 
     def _tick_or_none(self) -> int | None:
         try:

@@ -125,7 +125,7 @@ class PlantRuntime:
     def _fail(self, error: BaseException) -> None:
         if self._failure is not None and not self._failure.done():
             tick = self.registers.rack.tick
-            said = error if isinstance(error, ColdloopError) else repr(error)
+            said = str(error) if isinstance(error, ColdloopError) else repr(error)
             self._failure.set_exception(ColdloopError(f"the plant has stopped at tick {tick}: {said}"))
 
     def _age(self) -> float:

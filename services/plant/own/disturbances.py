@@ -99,6 +99,8 @@ class DisturbedPlant(PlantProgram):
 
     def _return_to(self, saved: Mapping[str, Any] | None) -> None:
         """Return to what `_saved` returned (ValueError or KeyError if it is not of this plant)."""
+        if saved is not None:
+            raise ValueError("the retained state is that of another plant")
 
     def retained(self) -> dict[str, Any]:
         """Return what `resume` needs, as plain data."""

@@ -47,7 +47,7 @@ class FmuSimulation:
 
     def __init__(self, fmu: Fmu, wiring: Wiring, tick_s: float) -> None:
         names = [*wiring.inputs, *([wiring.load] if wiring.load else []), *wiring.disturbances]
-        self._inputs = [fmu.port(name) for name in names]
+        self.inputs = [fmu.port(name) for name in names]
         self._outputs = [fmu.port(name) for name in wiring.outputs]
         self._states = [fmu.port(name) for name in wiring.states]
         self._instance = fmu.instance(wiring.start)
@@ -57,15 +57,11 @@ class FmuSimulation:
 
     def put(self, u: RealArray, w: RealArray) -> None:
         """Set inputs, load (which may be none) and other disturbances."""
-        self._instance.put(self._inputs, [*u.tolist(), *w[0 if self._wiring.load else 1 :].tolist()])
+        self._instance.put(self.inputs, [*u.tolist(), *w[0 if self._wiring.load else 1 :].tolist()])
 
     def outputs(self) -> RealArray:
         """Return the outputs."""
         return self._instance.read(self._outputs)
-
-    def is_discrete(self, place: int) -> bool:
-        """Return whether an input, the load or another disturbance, in this order, takes whole numbers only."""
-        return self._inputs[place].is_discrete
 
     def states(self) -> RealArray:
         """Return the states that it shows."""
@@ -93,7 +89,7 @@ class FmuSimulation:
 
     def derivatives(self, of: Sequence[Port]) -> RealArray:
         """Return partial derivatives by states, inputs, load and k other disturbances, shape (of, n + m + 1 + k)."""
-        by = [*self._states, *self._inputs]
+        by = [*self._states, *self.inputs]
         found = self._instance.derivatives(of, by)
         no_load = len(self._states) + len(self._wiring.inputs)
         return found if self._wiring.load else np.insert(found, no_load, 0.0, axis=1)

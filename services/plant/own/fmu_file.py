@@ -41,11 +41,6 @@ class Port(NamedTuple):
     """Elements of the array, which are set and read together."""
 
     @property
-    def is_double(self) -> bool:
-        """Whether it is a real number in double precision, of its own."""
-        return self.type in DOUBLE and self.size == 1
-
-    @property
     def is_discrete(self) -> bool:
         """Whether values are rounded to whole numbers, or to false and true."""
         return not self.type.startswith(CONTINUOUS)
@@ -143,24 +138,25 @@ class Fmu:
         """
         element = None if name in self.variables else ELEMENT.fullmatch(name)
         variable = self.variables.get(element[1] if element else name)
-        if variable is None:
+        if variable is None or (element and not variable.dimensions):
             some = ", ".join(each.name for each in self.variables.values() if each.causality in ("input", "output"))
             raise ModelFileError(f"{self.path}: has no variable {name}; inputs and outputs are {some}"[:400])
         if not variable.type.startswith(NUMBERS):
             raise ModelFileError(f"{self.path}: {name} is no number")
         shape = tuple(variable.shape) if variable.dimensions else ()
-        count = math.prod(shape)
-        index = [int(one) - 1 for one in element[2].split(",")] if element else [0] * len(shape) if count == 1 else []
-        if len(index) != len(shape) or not all(0 <= i < size for i, size in zip(index, shape, strict=True)):
+        index = [int(one) - 1 for one in element[2].split(",")] if element else [0] * len(shape)
+        if (
+            len(index) != len(shape)
+            or (not element and math.prod(shape) > 1)
+            or not all(0 <= i < size for i, size in zip(index, shape, strict=True))
+        ):
             raise ModelFileError(
-                f"{self.path}: {name} is no single number: {variable.name} is an array of {shape}, whose elements are "
+                f"{self.path}: {name} is no single number: elements are "
                 f"{variable.name}[{','.join('1' for _ in shape)}] to {variable.name}[{','.join(map(str, shape))}]"
             )
         place = int(np.ravel_multi_index(index, shape)) if shape else 0
-        kind = variable.type
-        if kind == "Enumeration":
-            kind = "Integer" if self.is_fmi2 else "Int64"
-        return Port(int(variable.valueReference), kind, place, count)
+        kind = variable.type.replace("Enumeration", "Integer" if self.is_fmi2 else "Int64")
+        return Port(int(variable.valueReference), kind, place, math.prod(shape))
 
     @property
     def is_fmi2(self) -> bool:
@@ -169,11 +165,7 @@ class Fmu:
 
 
 class FmuInstance:
-    """A running instance of an FMU; made by `Fmu.instance`. All of it raises `ColdloopError` where the FMU fails.
-
-    Raises:
-        ModelFileError: It cannot be made or initialised.
-    """
+    """A running instance of an FMU; made by `Fmu.instance`. All of it raises `ColdloopError` where the FMU fails."""
 
     def __init__(self, fmu: Fmu, folder: str, start: Mapping[str, float]) -> None:
         from fmpy.simulation import instantiate_fmu  # noqa: PLC0415
@@ -198,6 +190,7 @@ class FmuInstance:
     def _calling(self, what: str) -> Iterator[None]:
         if not self.end.alive:
             raise ColdloopError(f"{self._fmu.path}: allows one instance at a time, and another has taken its place")
+        self._said.clear()
         with foreign(f"{self._fmu.path}: {what}", said=self._said):
             yield
 

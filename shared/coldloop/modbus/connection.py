@@ -67,8 +67,7 @@ class Connection(asyncio.Protocol):
         self._reading_paused = False
         self._queued = False
         self._secure = False
-        self._ended = False
-        """Whether the client will send no more."""
+        self._ended = False  # the client sends no more
         self._rate: RateLimit | None = None
         self._held: asyncio.TimerHandle | None = None
         self.requests = 0

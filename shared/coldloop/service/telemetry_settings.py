@@ -1,11 +1,9 @@
 """Configuration of telemetry, checked when it is made and immutable after."""
 
 from pathlib import Path
-from typing import Annotated, Final, Self
+from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, field_validator, model_validator
-
-PREFIX: Final = "coldloop"
 
 
 class TelemetrySettings(BaseModel):
@@ -21,7 +19,7 @@ class TelemetrySettings(BaseModel):
     password_file: Path | None = None
     """File that holds the password for it, on one line. It is read at each connection; without TLS it is sent as it
     is, so this is for a private network."""
-    prefix: Annotated[str, Field(pattern=r"^[^#+]+$")] = PREFIX
+    prefix: Annotated[str, Field(pattern=r"^[^#+]+$")] = "coldloop"
     """Of topics; a rig at other ports than the usual ones adds its first port, unless this is set."""
     period_s: PositiveFloat = 1.0
     """Real time between snapshots."""
