@@ -2,6 +2,7 @@
 
 import multiprocessing
 import signal
+import tempfile
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -18,27 +19,31 @@ def text_of_child(path: Path, work: Callable[[], str], limit_s: int) -> str:
     """
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
-    child = context.Process(target=_work, args=(work, limit_s, sender))
-    child.start()
-    sender.close()
-    try:
-        found: str | ColdloopError = receiver.recv()
-    except EOFError:
+    with tempfile.TemporaryDirectory(prefix="coldloop-") as folder:  # whatever ends the child, nothing is left
+        child = context.Process(target=_work, args=(work, limit_s, folder, sender))
+        child.start()
+        sender.close()
+        try:
+            found: str | ColdloopError = receiver.recv()
+        except EOFError:
+            found = ""
         child.join()
-        code = child.exitcode or 0
+    code = child.exitcode or 0
+    if code == -signal.SIGALRM:
         found = UsageError(
             f"{path}: its plant has not come to an end within {limit_s} s; mend it, or give it longer with `coldloop "
             "process FILE --limit SECONDS --out MODEL`, and then --process MODEL"
-            if code == -signal.SIGALRM
-            else f"{path}: its plant has ended the process that it ran in "
-            f"({signal.Signals(-code).name if code < 0 else f'exit code {code}'}); mend it"
         )
+    elif not found:
+        how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        found = UsageError(f"{path}: its plant has ended the process that it ran in ({how}); mend it")
     if isinstance(found, ColdloopError):
         raise found
     return found
 
 
-def _work(work: Callable[[], str], limit_s: int, sender: Connection) -> None:
+def _work(work: Callable[[], str], limit_s: int, folder: str, sender: Connection) -> None:
+    tempfile.tempdir = folder
     for number in (*SIGNALS, signal.SIGALRM):
         signal.signal(number, signal.SIG_DFL)
     signal.alarm(limit_s)  # it ends this process, whatever runs in it and whether its parent is still there

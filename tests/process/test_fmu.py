@@ -461,3 +461,4 @@ def test_an_fmu_that_does_not_start_says_why_in_its_own_words(tmp_path: Path, pr
     assert len(complaints.splitlines()) == 1
     assert "cannot be started" in complaints
     assert "No module named" in complaints
+    assert not list(Path(tempfile.gettempdir()).iterdir()), "nothing is left of it, unpacked or otherwise"

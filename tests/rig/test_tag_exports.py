@@ -56,7 +56,7 @@ def test_names_that_would_be_the_same_end_with_their_addresses() -> None:
     """Letters of other alphabets, and capitals, which some of these programs do not tell apart."""
 
     fields = {name: Annotated[float, f32("a state")] for name in ("\u03b1", "\u03b2", "level", "Level", "T")}
-    States = record("States", __name__, "states", fields)  # noqa: N806 a class
+    States = record("States", __name__, "states", fields)
     tags = exported(RegisterMap("plant", 1, (IDENTITY_BLOCK, Block("x", 100, States, ""))))
     names = [tag.name for tag in tags if tag.block == "x"]
     assert names == ["x___100", "x___102", "x_level_104", "x_Level_106", "x_T"]
