@@ -236,5 +236,5 @@ def _explained(error: ValidationError) -> str:
     where = ".".join(str(part) for part in first["loc"])
     message = " ".join(first["msg"].removeprefix("Value error, ").split())
     if first["type"] == "extra_forbidden":
-        message = "no such key; docs/chaos.md lists them"
+        message = "no such key; `coldloop docs chaos` lists them"
     return f"{where}: {message}" if where else message

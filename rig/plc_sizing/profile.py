@@ -13,7 +13,7 @@ from coldloop.config import load_configuration
 from coldloop.errors import ConfigurationError, UsageError
 from rig.plc_sizing.reference_plc import Array, fitted
 
-LISTING: Final = "docs/keys.md lists the keys"
+LISTING: Final = "`coldloop docs keys` lists the keys"
 SHIPPED: Final = files("rig.plc_sizing") / "profiles"
 FEWEST_SIZES: Final = 3
 """Of a factorisation, for a curve of three coefficients."""

@@ -255,7 +255,7 @@ def up(
         mode: `lockstep`, the default: plant time passes only in `advance` and `wait_until`; `realtime`: by the clock.
         factor: In real time: seconds of plant time in a second; by default 1.
         solver: `ode`, `qpoases`, `osqp`, `fast-gradient`, `interior-point`, `hybrid` or `daqp`; by default `ode`.
-        updating_period: Seconds from 0.5 to 5 in multiples of 0.25, or `adaptive`, the default.
+        updating_period: Seconds, from 2 ticks to a sampling period (0.5 to 5 s); `adaptive`, the default.
         seed: Seed of the sensors' noise, and of which frames a fault hits; by default 1.
         config: TOML file with further settings. An argument that is given comes before it.
         folder: Takes the logs; a temporary one if not given.

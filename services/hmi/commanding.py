@@ -70,7 +70,7 @@ class Commanding:
         if not isinstance(name, str) or not isinstance(password, str):
             return refusal(400, "user and password must be text")
         address = request.remote or ""
-        user = await self._guard.log_in(name, password, address)
+        user = await self._guard.log_in(name, password, address, self._guard.logins)
         if isinstance(user, web.Response):
             return user
         self._guard.sessions.end(request.cookies.get(cookie_name(request)))

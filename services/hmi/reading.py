@@ -266,7 +266,7 @@ class Reading:
                 auth = None
             if auth is None:
                 return refusal(401, "log in first, or send name and password (basic)")
-            user = await self._guard.log_in(auth.login, auth.password, request.remote or "")
+            user = await self._guard.log_in(auth.login, auth.password, request.remote or "", self._guard.scrapes)
             if isinstance(user, web.Response):
                 return user
         body = exposition(page_families(self._model, len(self._broadcast)))

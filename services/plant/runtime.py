@@ -43,12 +43,13 @@ class PlantRuntime:
 
     def on_write(self, block: Block, caller: Caller) -> None:
         """Take what a client has written, and see to it that the plant moves."""
+        before = self.registers.rack.session.pace
         self.registers.on_write(block, caller)
         rack = self.registers.rack
         if block.record is PlantSession:
             self._stop_clock()
             self._position = None
-        elif block.record is SessionPace:
+        elif block.record is SessionPace and rack.session.pace != before:
             self._change_pace()
         elif block.record is Actuators and rack.moving:
             if rack.session.pace.realtime:

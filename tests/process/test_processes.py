@@ -45,6 +45,8 @@ def test_the_column_has_other_time_and_dead_times_that_its_model_approximates(
     assert here["trace_sha256"] == there["trace_sha256"]
     assert here["ticks"] == 2 * 3600 / 3
     assert 6.0 <= here["tau_u_mean"] <= 60.0
+    of_12_s = run(processes, COLUMN, tmp_path / "fixed", "--in-process", *options, "--updating-period", "12")
+    assert of_12_s["tau_u_mean"] == 12.0
 
 
 @pytest.mark.parametrize(

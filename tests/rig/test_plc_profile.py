@@ -101,7 +101,7 @@ def test_whether_an_adaptive_period_pays_is_the_ratio_of_the_runs(coldloop: "Col
     ("text", "times", "says"),
     [
         ("name = ", "", "not TOML"),
-        (WHOLE.replace('name = "A PLC"\n', ""), "", "plc.toml: name: is missing; docs/keys.md lists the keys"),
+        (WHOLE.replace('name = "A PLC"\n', ""), "", "plc.toml: name: is missing; `coldloop docs keys` lists the keys"),
         ("", "", "plc.toml: name: is missing"),
         (WHOLE.replace("A PLC", r"A\nPLC"), "", "write it on one line"),
         (WHOLE.replace("1_000_000", "-1"), "", "memory_bytes"),

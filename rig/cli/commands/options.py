@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from coldloop.errors import UsageError
 from coldloop.process.signals import TICK_S
+from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS
+from coldloop.process.whole_ticks import whole_ticks
 from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.choices import FIGURE_FORMATS, LOADS, PRESETS, SOLVERS
 
@@ -42,27 +44,30 @@ class HostPort(NamedTuple):
     port: int
 
 
+SHORTEST_S: Final = SHORTEST_TICKS * TICK_S
+LONGEST_S: Final = LONGEST_TICKS * TICK_S
+
+
 def updating_period(text: str) -> float:
     """Return an updating period in seconds, 0 for `adaptive`."""
-    return 0.0 if text == "adaptive" else _period(text, "neither 'adaptive' nor seconds from 0.5 to 5")
+    return 0.0 if text == "adaptive" else _period(text, "neither 'adaptive' nor a")
 
 
 def fixed_updating_period(text: str) -> float:
     """Return an updating period in seconds."""
-    value = _period(text, "not seconds from 0.5 to 5")
-    if value < 2 * TICK_S or value % TICK_S:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a multiple of {TICK_S} s from 0.5 to 5 s")
-    return value
+    return _period(text, "not a")
 
 
 def _period(text: str, what: str) -> float:
     try:
-        value = float(text)
+        ticks = whole_ticks(float(text))
     except ValueError:
-        value = -1.0
-    if not 0 < value <= 5:
-        raise argparse.ArgumentTypeError(f"'{text}' is {what}")
-    return value
+        ticks = None
+    if ticks is None or not SHORTEST_TICKS <= ticks <= LONGEST_TICKS:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is {what} multiple of {TICK_S:g} s, a tick, from {SHORTEST_S:g} to {LONGEST_S:g} s"
+        )
+    return float(text)
 
 
 def positive_count(text: str) -> int:
@@ -122,7 +127,7 @@ def add_loop_options(parser: argparse.ArgumentParser, loads: str) -> None:
     parser.add_argument("--solver", choices=SOLVERS, help="default: ode")
     parser.add_argument("--outside-solver", metavar="NAME",
                         help="clarabel, piqp, qpalm (each an extra of this name), or a solver that is installed"
-                        " beside, by its entry point (`docs/extending.md`)")  # fmt: skip
+                        " beside, by its entry point (`coldloop docs extending`)")  # fmt: skip
     parser.add_argument("--preset", choices=PRESETS, help="of solver and estimator (default: tuned)")
     parser.add_argument("--updating-period", type=updating_period, metavar="adaptive|SECONDS",
                         help="default: adaptive")  # fmt: skip

@@ -62,7 +62,9 @@ def equations_of(source: str, name: str, where: str) -> Equations:
         states, guess = dict(made.states), np.array(made.guess, dtype=np.float64)
     for needed in ("derivatives", "outputs"):
         if not callable(getattr(made, needed, None)):
-            raise ModelFileError(f"{where}: {name} has no {needed}(x, u, w); docs/your-plant.md says what it needs")
+            raise ModelFileError(
+                f"{where}: {name} has no {needed}(x, u, w); `coldloop docs your-plant` says what it needs"
+            )
     if not isinstance(made.states, Mapping) or not all(re.fullmatch(NAME, str(each)) for each in states):
         raise ModelFileError(f'{where}: states of {name} are a dict of names and units, such as {{"T": "K"}}')
     if guess.shape != (len(states),):

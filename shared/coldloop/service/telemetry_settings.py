@@ -14,6 +14,7 @@ class TelemetrySettings(BaseModel):
     broker: str = ""
     """Host of the broker; empty is off."""
     port: Annotated[int, Field(ge=1, le=65535)] = 1883
+    """Its TCP port."""
     username: str = ""
     """Name at the broker; empty is a broker that asks for none."""
     password_file: Path | None = None
@@ -26,6 +27,7 @@ class TelemetrySettings(BaseModel):
     queue: Annotated[int, Field(ge=1)] = 100
     """Snapshots kept while the broker is away; the oldest go first."""
     timeout_s: PositiveFloat = 5.0
+    """How long connecting may take, s."""
 
     @field_validator("broker")
     @classmethod
