@@ -31,7 +31,7 @@ GROUPS: Final = {
         "down": "end a rig that is up",
         "status": "mode, load, outputs, updating period, alarms",
         "set": "load, mode, setpoint, factor, pause, resume, acknowledge",
-        "fault": "kill or freeze a service, fake a sensor, cut a link",
+        "fault": "kill or pause a service, fake a sensor, cut a link",
         "record": "record a session that is under way, to be replayed",
         "page": "the operator's page of a rig, or of recorded runs",
         "events": "the journal of a running service",
@@ -155,7 +155,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _execute(parser: argparse.ArgumentParser, given: Sequence[str]) -> int:
-    options = parser.parse_args(given)
+    options, unknown = parser.parse_known_args(given)
+    if unknown:
+        parser.prog = " ".join([parser.prog, *given[: options.execute is not None]])
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     named = given[1] if len(given) > 1 else None
     if os.environ.get(VARIABLE) and given and given[0] in OF_THE_COLD_BOX and named not in OF_ANY_PROCESS:
         sys.stderr.write(f"coldloop: {given[0]}: of the cold box alone; leave out {OPTION} and unset {VARIABLE}\n")

@@ -69,7 +69,7 @@ class Clients:
         self._waits = 0
         self._begun = 0
         """Sessions that have begun."""
-        self.lease = WriterLease("the optimiser's registers", self._silence_s, self._note_lease)
+        self.lease = WriterLease("the optimiser's registers", self._silence_s, self._note_lease, shared=True)
         self.changed = asyncio.Event()
         self.granted = 0
         """Lock-step scans every tick before this one."""

@@ -126,7 +126,8 @@ class PlantRuntime:
     def _fail(self, error: BaseException) -> None:
         if self._failure is not None and not self._failure.done():
             tick = self.registers.rack.tick
-            self._failure.set_exception(ColdloopError(f"the plant has stopped at tick {tick}: {error!r}"))
+            said = str(error) if isinstance(error, ColdloopError) else repr(error)
+            self._failure.set_exception(ColdloopError(f"the plant has stopped at tick {tick}: {said}"))
 
     def _age(self) -> float:
         """Return how long ago the present tick began by the rack's clock, in ticks; 0 while no clock runs.

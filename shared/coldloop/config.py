@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from math import inf, isfinite
+from math import inf, isfinite, isnan
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
@@ -294,6 +294,8 @@ def explained(
     if first["type"] == "missing":
         return f"{where}: is missing; {listing}"
     message = first["msg"].removeprefix("Value error, ")
+    if isinstance(first["input"], float) and isnan(first["input"]):
+        message = "not a number (NaN); give one, or leave the key out"
     if isinstance(first["input"], Mapping):  # a section, of which the message says enough
         return f"{where}: {message[0].lower()}{message[1:]}"
     given = repr(first["input"])

@@ -287,7 +287,7 @@ def operator_settings(options: argparse.Namespace) -> "OperatorSettings":
 
 
 def refuse_ineffective(effective: "Configuration[Settings]", keys: Mapping[str, str]) -> None:
-    """Refuse values from the command line that the command replaces by its own.
+    """Refuse values that the command replaces by its own; a file and the environment may repeat the default.
 
     Args:
         effective: The configuration.
@@ -296,10 +296,13 @@ def refuse_ineffective(effective: "Configuration[Settings]", keys: Mapping[str, 
     Raises:
         UsageError: One of them was set.
     """
-    for key, remedy in keys.items():
-        source = effective.sources.get(key, "")
-        if source.startswith("--"):
-            raise UsageError(f"{source}: has no effect on this command: {remedy}")
+    from coldloop.config import DEFAULT, flattened
+
+    usual = flattened(type(effective.settings)().model_dump(mode="json"))
+    for key, value, source in effective.effective():
+        if key in keys and (source.startswith("--") or (source != DEFAULT and value != usual.get(key))):
+            where = source if key in source.lower().replace("__", ".") else f"{source}: {key}"
+            raise UsageError(f"{where}: has no effect on this command: {keys[key]}")
 
 
 OWN_PORTS = "its services get free ports; `coldloop up --port-base` has fixed ones"

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, field_validator, model_validator
 
 from coldloop.errors import ConfigurationError
 from coldloop.text_file import read_text
@@ -24,13 +24,20 @@ class TelemetrySettings(BaseModel):
     """File that holds the password for it, on one line. It is read at each connection; without TLS it is sent as it
     is, so this is for a private network."""
     prefix: Annotated[str, Field(pattern=r"^[^#+]+$")] = "coldloop"
-    """First part of all topics."""
+    """Of topics; a rig at other ports than the usual ones adds its first port, unless this is set."""
     period_s: PositiveFloat = 1.0
     """Real time between snapshots."""
     queue: Annotated[int, Field(ge=1)] = 100
     """Snapshots kept while the broker is away; the oldest go first."""
     timeout_s: PositiveFloat = 5.0
     """How long connecting may take, s."""
+
+    @field_validator("broker")
+    @classmethod
+    def _is_a_host(cls, value: str) -> str:
+        if value.count(":") == 1 or set("/[]") & set(value):
+            raise ValueError("name its host alone; the port is telemetry.port")
+        return value
 
     @model_validator(mode="after")
     def _password_belongs_to_a_name(self) -> Self:
