@@ -36,7 +36,8 @@ def process_document() -> dict[str, Any]:
 
 
 def _output(one: Output) -> dict[str, Any]:
-    return {"name": one.name, "unit": one.unit, "bar": one.bar or _output_bar(one)}
+    dead_band = one.band.dead_band if one.band else 0.0
+    return {"name": one.name, "unit": one.unit, "bar": one.bar or _output_bar(one), "dead_band": dead_band}
 
 
 def _output_bar(one: Output) -> Range:
