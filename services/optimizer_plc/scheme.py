@@ -296,20 +296,18 @@ def shortage(c: Constants, x: Array, w: float, load: float, most_open: float, be
     at rest within the inputs' bounds and the limit of the feed, less a reserve, and with the least that it holds
     without the turbine's outlet getting too cold, by the constant error of that. The load itself (W), where it is
     measured, is compared with what the plant holds that is as its model. A shortage of the sign that was `before` ends
-    where twice the reserve is left: noise does not end it and begin it anew.
+    where the estimate has twice the reserve: noise does not end it and begin it anew.
     """
     if not c.target.limited:
         return none
     measured = load - c.estimator.w0 if c.estimator.load_known else w
     low, high = bounds_at(c.target, x, most_open)
     _, most = loads_held(c.target, low, high)
-    too_much = max(w + c.reserve - most, measured - c.largest_load)
+    more = c.reserve if before > none else none
+    less = c.reserve if before < none else none
+    too_much = max(w + c.reserve + more - most, measured - c.largest_load)
     warm = least_warm_load(c.target, low, high) - c.least_load_error
-    too_little = min(w - warm, min(w, measured) - c.least_load)
-    if before > none:
-        too_much += c.reserve
-    elif before < none:
-        too_little -= c.reserve
+    too_little = min(w - warm - less, min(w, measured) - c.least_load)
     return max(too_much, none) + min(too_little, none)
 
 

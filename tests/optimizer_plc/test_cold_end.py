@@ -66,24 +66,27 @@ def program_with(model: LtiModel, estimated: float, **settings: object) -> Optim
     return program
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_limit_goes_by_the_estimate_whatever_the_readings_show(model: LtiModel) -> None:
     approach = float(model.y0[T2] - model.y0[T1])
     for reading in (0.0, 0.5, math.nan):
-        program = program_with(model, 0.4 - approach)
-        assert followed(program, {T2: reading}, 240) == pytest.approx(55.0 - 70.0 * 0.1), "a time constant or more"
+        program = program_with(model, 0.33 - approach)
+        assert followed(program, {T2: reading}, 240) == pytest.approx(55.0 - 70.0 * 0.03), "after a time constant"
 
 
+@pytest.mark.usefixtures("compiles")
 def test_the_limit_follows_with_its_time_constant_so_that_noise_moves_it_little(model: LtiModel) -> None:
     approach = float(model.y0[T2] - model.y0[T1])
     program = program_with(model, 0.27 - approach)
     assert followed(program, {}, 4) == pytest.approx(55.0 + 70.0 * 0.03 / 60.0)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_readings_count_where_no_constant_is_estimated_and_the_model_where_they_are_left_out(model: LtiModel) -> None:
     settings = {"kind": "state-feedback"}
     program = OptimizerProgram(model, ProgramSettings.model_validate({"estimator": settings}), LIMITS)
     approach = float(model.y0[T2] - model.y0[T1])
-    assert followed(program, {T2: 0.4 - approach}, 240) == pytest.approx(48.0)
+    assert followed(program, {T2: 0.33 - approach}, 240) == pytest.approx(55.0 - 70.0 * 0.03)
     assert followed(program, {T2: 0.25 - approach}, 240) == pytest.approx(55.0 + 70.0 * 0.05)
     assert followed(program, {T2: math.nan}, 240) == pytest.approx(55.0 + 70.0 * (0.3 - approach))
 

@@ -94,10 +94,11 @@ def test_a_turbine_that_no_inputs_warm_enough_needs_the_load_with_which_it_is_wa
 
 
 def test_a_shortage_ends_where_twice_the_reserve_is_left(c: Constants) -> None:
-    begins, least = held(c, 55.0) - RESERVE_W, LEAST
+    begins, cold = held(c, 55.0) - RESERVE_W, {"colder": 20.0}
     assert short(c, begins - 0.5, 400.0, 55.0) == 0.0
     assert short(c, begins - RESERVE_W + 0.5, 400.0, 55.0, before=3.0) > 0.0
     assert short(c, begins - RESERVE_W - 0.5, 400.0, 55.0, before=3.0) == 0.0
     assert short(c, begins - 0.5, 400.0, 55.0, before=-3.0) == 0.0, "the other shortage gives this one nothing"
-    assert short(c, least + RESERVE_W - 0.5, 400.0, colder=-1.0, before=-3.0) < 0.0
-    assert short(c, least + RESERVE_W + 0.5, 400.0, colder=-1.0, before=-3.0) == 0.0
+    assert short(c, LARGEST - 0.5, LARGEST - 0.5, 60.0, before=-3.0) == 0.0
+    assert short(c, 400.0, 400.0, **cold, before=-3.0) == pytest.approx(short(c, 400.0, 400.0, **cold) - RESERVE_W)
+    assert short(c, 400.0, LEAST + 0.5, colder=-1.0, before=-3.0) == 0.0, "a load that is measured has no noise"

@@ -94,7 +94,7 @@ COLD_BOX: Final = Process(
         pressure_state="P1",
         level_state="V_l",
         temperature_states=tuple(state.name for state in _TEMPERATURES),
-        holdable_load=(128.0, 553.0),
+        holdable_load=(128.0, 515.0),
         load_reserve=20.0,
         least_load_error=25.0,
     ),
