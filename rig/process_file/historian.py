@@ -26,18 +26,8 @@ TIMES: Final = {
 DATES, CLOCKS = {"date", "datum", "fecha"}, {"time", "zeit", "uhrzeit"}
 """Names of two columns that are one of time."""
 TAGS: Final = {
-    "tag",
-    "tagname",
-    "tag name",
-    "tag_name",
-    "name",
-    "point",
-    "signal",
-    "variable",
-    "item",
-    "itemid",
-    "sensor",
-}
+    "tag", "tagname", "tag name", "tag_name", "name", "point", "signal", "variable", "item", "itemid", "sensor",
+}  # fmt: skip
 VALUES: Final = {"value", "val", "wert", "valeur", "valor", "_value", "reading"}
 NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,31}")
 WITH_ZONE: Final = r":\d\d.*(?:Z|UTC|GMT|[+-]\d\d(?::?\d\d)?)$"
