@@ -151,17 +151,12 @@ def _step(found: Explanation, *, shorter: bool) -> str:
 
 
 def _contraction(found: Explanation, rule: UpdatingRuleStatus) -> str:
-    q, before = found.q, found.before
-    if q == rule.q_max and before is not None and found.update.j_effective > before.j_delivered:
-        ratio = found.update.j_effective / before.j_delivered
-        return (
-            f"{_change(found)} because the cost that was reached is {ratio:.3g} times the one predicted: a mismatch "
-            f"triggers one long solve of q = {q}."
-        )
-    return (
-        f"{_change(found)} because of how much successive profiles have improved lately: the contraction rule goes "
-        f"from q = {rule.q_min} while they do to more in quiet; here q = {q}."
-    )
+    q, K = found.q, found.update.contraction
+    if found.q_before is not None and (q > found.q_before or q == found.q_before == rule.q_max > rule.q_min):
+        why = f"K = {K:.4g} is beyond its noise and Gamma = {found.update.gamma:.3g} < 0 asks for a longer period"
+    else:
+        why = f"K = {K:.4g} is within its noise, or Gamma = {found.update.gamma:.3g} asks for no longer period"
+    return f"{_change(found)} because {why}: the contraction rule has q = {q}, at rest {rule.q_min}."
 
 
 def _outside(found: Explanation, rule: UpdatingRuleStatus) -> str:  # noqa: ARG001 it says nothing of itself
