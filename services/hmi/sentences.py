@@ -155,17 +155,12 @@ def _step(found: Explanation, *, shorter: bool) -> str:
 
 
 def _contraction(found: Explanation, rule: UpdatingRuleStatus) -> str:
-    q, before = found.q, found.before
-    if q == rule.q_max and before is not None and found.update.j_effective > before.j_delivered:
-        ratio = number_text(found.update.j_effective / before.j_delivered, 3)
-        return (
-            f"{_change(found)} because the cost that was reached is {ratio} times the one predicted: a mismatch "
-            f"triggers one long solve of q = {q}."
-        )
-    return (
-        f"{_change(found)} because of how much successive profiles have improved lately: the contraction rule goes "
-        f"from q = {rule.q_min} while they do to more in quiet; here q = {q}."
-    )
+    q, K = found.q, found.update.contraction
+    if found.q_before is not None and (q > found.q_before or q == found.q_before == rule.q_max > rule.q_min):
+        why = f"K = {number_text(K, 4)} is beyond its noise and Gamma = {number_text(found.update.gamma, 3)} < 0 asks for a longer period"
+    else:
+        why = f"K = {number_text(K, 4)} is within its noise, or Gamma = {number_text(found.update.gamma, 3)} asks for no longer period"
+    return f"{_change(found)} because {why}: the contraction rule has q = {q}, at rest {rule.q_min}."
 
 
 def _outside(found: Explanation, rule: UpdatingRuleStatus) -> str:  # noqa: ARG001 it says nothing of itself
