@@ -55,9 +55,10 @@ def budget_tables(settings: Settings, period_s: float | None, executed: Callable
         executed: Returns what an iteration as exported takes.
     """
     problem, prediction = problem_of(settings)
+    limited = settings.optimizer_plc.program.cold_end.approach_k > 0.0
     return "\n".join([
         _speed(reference_curve(), problem.size),
-        _operations(problem, prediction, limited=settings.optimizer_plc.program.cold_end.approach_k > 0.0) + executed(problem),
+        _operations(problem, prediction, limited=limited) + executed(problem),
         _iterations(settings.optimizer_plc.program, problem, period_s),
         _memory(settings, problem, prediction, MEMORY_BYTES),
     ])  # fmt: skip

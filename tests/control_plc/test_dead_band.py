@@ -30,4 +30,4 @@ def test_the_alarm_is_raised_beyond_the_dead_band_and_returns_inside_the_band(be
 
 
 def test_dead_bands_are_a_fiftieth_of_the_bands() -> None:
-    assert (LEVEL, TEMPERATURE) == pytest.approx((0.04, 0.14))
+    assert pytest.approx((0.04, 0.14)) == (LEVEL, TEMPERATURE)

@@ -140,8 +140,7 @@ class ColdEndSettings(BaseModel):
     opening_per_k: PositiveFloat = 70.0
     """How far the feed may be from where it is, in % for each K that T2 - T1 is from it. Less slows load steps."""
     following_s: PositiveFloat = 60.0 * STRETCH
-    """Time constant with which the limit follows T2 - T1, as it is estimated: noise of 0.03 K alone would move it by 2 %,
-    and CV155 with it."""
+    """Time constant with which the limit follows T2 - T1, as it is estimated: noise of 0.03 K would move it by 2 %."""
     opening_from: FiniteFloat = 50.0
     """Opening, %, that is allowed in any case: should T1 or T2 be wrong."""
 
