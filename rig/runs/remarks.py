@@ -34,6 +34,8 @@ def remarks(effective: Configuration[Settings]) -> list[str]:
             " sooner: give a longer period, adaptive, or --enforce"
         )
     found, left_out = [too_slow(program), certificate(effective.settings)], effective.notes()
+    if not PROCESS.has_load and "plant.load" in effective.sources:
+        found.append(f"load {effective.settings.plant.load}: the {PROCESS.name} has no load; only the length is taken")
     if left_out:
         found.append(f"not applied of the preset: {', '.join(left_out)}; `coldloop config` says why")
     return [*filter(None, found)]
