@@ -155,11 +155,11 @@ def _step(found: Explanation, *, shorter: bool) -> str:
 
 
 def _contraction(found: Explanation, rule: UpdatingRuleStatus) -> str:
-    q, K = found.q, found.update.contraction
+    q, K, gamma = found.q, number_text(found.update.contraction, 4), number_text(found.update.gamma, 3)
     if found.q_before is not None and (q > found.q_before or q == found.q_before == rule.q_max > rule.q_min):
-        why = f"K = {number_text(K, 4)} is beyond its noise and Gamma = {number_text(found.update.gamma, 3)} < 0 asks for a longer period"
+        why = f"K = {K} is beyond its noise and Gamma = {gamma} < 0 asks for a longer period"
     else:
-        why = f"K = {number_text(K, 4)} is within its noise, or Gamma = {number_text(found.update.gamma, 3)} asks for no longer period"
+        why = f"K = {K} is within its noise, or Gamma = {gamma} asks for no longer period"
     return f"{_change(found)} because {why}: the contraction rule has q = {q}, at rest {rule.q_min}."
 
 
