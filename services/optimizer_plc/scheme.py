@@ -153,7 +153,7 @@ def shortest_sequence(settings: ProgramSettings, budget: PlcBudget) -> int:
     leap, most = len(ladder), len(ladder)
     if not settings.outside.rule:
         own = adaptive.rule is RuleName.CONTRACTION
-        leap, most = (most, adaptive.contraction.q_step) if own else (adaptive.delta, adaptive.q_max)
+        leap, most = (1, adaptive.contraction.q_max) if own else (adaptive.delta, adaptive.q_max)
     last = min(most, len(ladder)) - 1
     followed = ((ticks, ladder[min(place + leap, last)]) for place, ticks in enumerate(ladder[:last]))
     return max(settings.sequence_ticks, *(longest for ticks, longest in followed if longest > 2 * ticks), 0)
