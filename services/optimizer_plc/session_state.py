@@ -68,7 +68,7 @@ class OptimizerState(NamedTuple):
     target: Array
     """Inputs that the plant should come to rest at, scaled deviations, shape (3,)."""
     rule: Array
-    """What the rule of the updating period remembers, shape (2,)."""
+    """What the rule of the updating period remembers, shape (1,)."""
 
 
 def empty_state(n_states: int, size: int, real: Real) -> OptimizerState:

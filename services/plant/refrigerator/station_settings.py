@@ -45,6 +45,7 @@ class PiTuning(BaseModel):
     gain: PositiveFloat
     """kg/s per bar, or % per % for the nitrogen."""
     integral_s: PositiveFloat
+    """Integral time, s."""
 
 
 class StationAlarmSettings(BaseModel):
@@ -53,12 +54,17 @@ class StationAlarmSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     hp_high_bar: Bar = 16.8
+    """High pressure, bar, above."""
     hp_low_bar: Bar = 14.5
+    """High pressure, bar, below."""
     lp_high_bar: Bar = 1.15
+    """Low pressure, bar, above."""
     lp_low_bar: Bar = 0.97
+    """Low pressure, bar, below."""
     nitrogen_low: Percent = 25.0
     """%."""
     helium_lost_kg: PositiveFloat = 0.5
+    """Helium that is gone from the circuit, kg."""
     bath_relief_bar: Bar = 1.8
     """Of the bath; its relief valve opens at 1.8 bar."""
 
@@ -77,7 +83,9 @@ class CompressorStart(BaseModel):
     idle: Annotated[float, Field(gt=0, lt=1)] = 0.25
     """Share of its flow while it idles."""
     idle_s: Annotated[float, Field(ge=0, le=600)] = 10.0
+    """How long it idles, s."""
     load_s: Annotated[float, Field(gt=0, le=3600)] = 50.0
+    """How long the ramp takes, s."""
     second: Annotated[float, Field(ge=0, le=1)] = 0.7
     """Share of what the first one gives that the cold box takes when the second one is started."""
 
