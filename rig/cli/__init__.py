@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
-from typing import Final, NoReturn
+from typing import Any, Final, NoReturn
 
 from coldloop import __version__
 from coldloop.errors import ColdloopError, UsageError, printable
@@ -42,6 +42,7 @@ GROUPS: Final = {
     "a plant and its controller": {
         "new": "a folder with a process file and a plant to begin with",
         "process": "a process file, checked, linearised, judged, made into a model file",
+        "import": "a historian's export made into a record for a process file",
         "budget": "what a PLC can compute, and whether an adaptive period pays there",
         "model": "the prediction model",
         "design": "which decision and constraint instants the problem needs",
@@ -59,11 +60,13 @@ GROUPS: Final = {
     },
 }
 COMMANDS: Final = {name: said for group in GROUPS.values() for name, said in group.items()}
+MODULES: Final = {"import": "import_record"}
+"""Of commands that are words of Python."""
 QUESTION: Final = """Can this predictive controller run on that PLC, and how often should it update?
 A networked PLC rig for fast MPC."""
 EXTRAS: Final = {
     "CoolProp": "tables", "aiohttp": "hmi", "casadi": "qpoases", "distributed": "studies", "fmpy": "fmu",
-    "h5py": "hdf5", "jinja2": "report", "markdown_it": "report", "plotly": "report",
+    "h5py": "hdf5", "jinja2": "report", "markdown_it": "report", "pandas": "records", "plotly": "report",
 }  # fmt: skip
 """The extra that brings a package which not every command needs."""
 INTERRUPTED = 130
@@ -74,7 +77,10 @@ OF_ANY_PROCESS: Final = ("periods",)
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """Reports a usage error as one line."""
+    """Reports a usage error as one line, and takes no abbreviations of options."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:  # noqa: ANN401 as argparse has them
+        super().__init__(*args, **{"allow_abbrev": False, **options})
 
     def error(self, message: str) -> NoReturn:
         """End with exit code 2."""
@@ -94,7 +100,7 @@ def make_parser(chosen: str | None) -> argparse.ArgumentParser:
     for name in COMMANDS:
         command = commands.add_parser(name)
         if name == chosen:
-            module = import_module(f"rig.cli.commands.{name}")
+            module = import_module(f"rig.cli.commands.{MODULES.get(name, name)}")
             command.description = module.__doc__
             module.declare(command)
             command.set_defaults(execute=module.execute)

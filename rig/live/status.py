@@ -5,9 +5,11 @@ from collections.abc import Awaitable, Iterator
 from typing import Any, Final, NamedTuple
 
 from coldloop.errors import LinkError, PeerUnreachableError
+from coldloop.number_text import value_text
 from coldloop.operating.execution import Clients, CommandClient
 from coldloop.operating.rings import last_update
 from coldloop.process.load_profile import LOAD_UNIT
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import CONTROLLED, OUTPUT_NAMES, OUTPUT_UNITS, TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode, Process
@@ -109,7 +111,7 @@ def _pace(plant: PlantStatus) -> str:
         return "no session"
     if not pace.realtime:
         return "lock-step"
-    return f"paused (factor {pace.factor:g})" if pace.paused else f"{pace.factor:g} x real time"
+    return f"paused (factor {value_text(pace.factor)})" if pace.paused else f"{value_text(pace.factor)} x real time"
 
 
 def _tau_u(status: RigStatus) -> str:
@@ -129,10 +131,10 @@ def _rows(status: RigStatus) -> Iterator[tuple[str, str]]:
         mode, cause = word_of(Mode, control.ladder.mode), word_of(Cause, control.ladder.cause)
         yield "mode", f"{mode} ({cause}) since {control.ladder.since * TICK_S:g} s"
         yield "operator", word_of(OperatorMode, control.operator.mode)
-    if plant is not None:
-        load = plant.load
-        following = f", {load.next_watts:g} {LOAD_UNIT} from {load.next_tick * TICK_S:g} s" if load.upcoming else ""
-        yield "load", f"{load.watts:g} {LOAD_UNIT}{following}"
+    if plant is not None and PROCESS.has_load:
+        load, then = plant.load, value_text(plant.load.next_watts, LOAD_UNIT)
+        following = f", {then} from {load.next_tick * TICK_S:g} s" if load.upcoming else ""
+        yield "load", f"{value_text(load.watts, LOAD_UNIT)}{following}"
     if control is not None:
         known = any(control.y)  # a control PLC that was started again shows nothing before its first scan
         for i in CONTROLLED:

@@ -61,7 +61,7 @@ def from_matrices(file: ProcessFile, folder: Path, given: str) -> Linearised:
 def _of_file(path: Path) -> dict[str, Array]:
     try:
         if path.suffix == ".json":
-            stored: Mapping[str, Any] = dict(parsed_json(path.read_text(encoding="utf-8")))
+            stored: Mapping[str, Any] = dict(parsed_json(path.read_bytes()))
         else:
             with np.load(path, allow_pickle=False) as archive:
                 stored = dict(archive)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from coldloop.errors import ColdloopError, ConfigurationError, UsageError
+from coldloop.text_file import read_text
 
 COST: Final = 2**14
 BLOCK_SIZE: Final = 8
@@ -91,13 +92,10 @@ class Users:
         if file is None:
             return
         try:
-            lines = file.read_text(encoding="utf-8").splitlines()
+            lines = _lines(file)
             mode, folder = file.stat().st_mode, file.resolve().parent.stat().st_mode
-        except (OSError, UnicodeDecodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-            raise ConfigurationError(
-                f"hmi.login.users: {file}: {reason}; `python -m hmi.users {file} NAME operate` writes it"
-            ) from None
+        except (OSError, UsageError) as error:
+            raise ConfigurationError(f"hmi.login.users: {error}") from None
         for path, bits in ((file, mode), (file.parent, folder)):
             if bits & (stat.S_IWOTH | stat.S_IWGRP) and not bits & stat.S_ISVTX:
                 raise ConfigurationError(f"hmi.login.users: {path}: others can write to it; `chmod go-w {path}`")
@@ -118,6 +116,10 @@ class Users:
         user = self._users.get(name)
         right = is_password(password, user.hash if user else NOBODYS_HASH)
         return user if right else None
+
+
+def _lines(file: Path) -> list[str]:
+    return read_text(file, f"`python -m hmi.users {file} NAME operate` writes it").splitlines()
 
 
 def _user(line: str, place: str) -> User:
@@ -156,7 +158,7 @@ def write_user(file: Path, name: str, role: PageRole, password: str) -> None:
     if len(password) < SHORTEST_PASSWORD:
         raise UsageError(f"user '{name}': a password has {SHORTEST_PASSWORD} characters or more")
     try:
-        lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+        lines = _lines(file) if file.exists() else []
         kept = [line for line in lines if line.partition(":")[0] != name]
         file.touch(mode=0o600)
         file.chmod(0o600)
@@ -167,7 +169,7 @@ def write_user(file: Path, name: str, role: PageRole, password: str) -> None:
 
 def main() -> int:
     """Write a user's line; return the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m hmi.users", description="Add a user of the operator's page.")
+    parser = argparse.ArgumentParser("python -m hmi.users", description="Add a user of the page.", allow_abbrev=False)
     parser.add_argument("file", type=Path)
     parser.add_argument("name")
     parser.add_argument("role", choices=[role.value for role in PageRole])
@@ -176,7 +178,7 @@ def main() -> int:
         if sys.stdin.isatty():
             password = getpass.getpass(f"password of {options.name}: ")
         else:
-            password = sys.stdin.readline().rstrip("\r\n")
+            password = sys.stdin.readline().removeprefix("\ufeff").rstrip("\r\n")
         write_user(options.file, options.name, PageRole(options.role), password)
     except ColdloopError as error:
         sys.stderr.write(f"hmi.users: {error}\n")

@@ -5,11 +5,14 @@ import json
 import subprocess
 import tomllib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
+from coldloop.process.declaration import NO_LOAD
+from coldloop.process.loaded import PROCESS
 from coldloop.registers.maps import MAPS
 from coldloop.session.settings import TimeMode
 from optimizer_plc.qp.penalties import Preset
@@ -118,6 +121,7 @@ def test_a_plain_installation_says_which_extra_a_command_needs(tmp_path: Path, p
     lacking = [
         ["report", f"{tmp_path}/r"], ["export", f"{tmp_path}/r", "--hdf5"], ["page", f"{tmp_path}/r"],
         ["study", "periods", "--quick"], ["reproduce", "--quick"], ["run", "--solver", "qpoases", "--in-process"],
+        ["import", f"{tmp_path}/export.csv", "--inputs", "a", "--out", f"{tmp_path}/record.csv"],
     ]  # fmt: skip
     done = python("-c", WITHOUT_EXTRAS, json.dumps(run + lacking))
     complaints = [line for line in done.err.splitlines() if line.startswith("coldloop")]
@@ -148,6 +152,27 @@ def test_options_are_taken_before_and_behind_what_is_to_be_done() -> None:
     behind = parser.parse_args(["set", "load", "-1", "--port-base", "6020"])
     assert before.port_base == behind.port_base == 6020
     assert (before.new_load, before.assignments) == ("-1", ["a=1"])
+
+
+@pytest.mark.parametrize(
+    ("words", "cut"),
+    [
+        (("page", "--port", "3"), "--port"),
+        (("run", "--dur", "1h"), "--dur"),
+        (("set", "load", "400", "--a", "3"), "--a"),
+        (("fault", "sensor", "T5", "stuck", "--port-b", "6020"), "--port-b"),
+    ],
+)
+def test_an_abbreviation_of_an_option_is_none(words: tuple[str, ...], cut: str, coldloop: "Coldloop") -> None:
+    outcome = coldloop(*words)
+    assert outcome.code == 2
+    assert cut in outcome.complaints[-1]
+
+
+def test_a_load_of_a_process_that_has_none_is_refused(monkeypatch: pytest.MonkeyPatch, coldloop: "Coldloop") -> None:
+    monkeypatch.setattr("rig.cli.commands.options.PROCESS", replace(PROCESS, load=NO_LOAD, bath=None))
+    outcome = coldloop("run", "--load", "a")
+    assert (outcome.code, outcome.complaints) == (2, ["coldloop: load 'a': cold-box has no load; leave it out"])
 
 
 def test_version_is_an_option_and_a_command(coldloop: "Coldloop") -> None:

@@ -324,7 +324,7 @@ def test_a_second_rig_that_is_started_at_the_same_time_is_refused(coldloop: "Col
 @pytest.mark.usefixtures("realtime")
 def test_ctrl_c_while_a_detached_rig_starts_ends_that(processes: "Processes") -> None:
     base = str(processes.three_ports())
-    starting = processes.coldloop("up", "--det", "--port-base", base, "--load", "e")  # an abbreviation is taken, too
+    starting = processes.coldloop("up", "--detach", "--port-base", base, "--load", "e")
     lock, deadline = state_folder(int(base)) / LOCK_FILE, time.monotonic() + 120.0
     number = 0
     while number in (0, starting.popen.pid):  # it is locked by the command, and then by the process of the rig

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from coldloop.errors import UsageError
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import TICK_S
 from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS
 from coldloop.process.whole_ticks import whole_ticks
@@ -81,8 +82,10 @@ def check_load(name: str | None) -> None:
     """Refuse a load that is neither a name nor a file, before anything that takes time; the file is read later.
 
     Raises:
-        UsageError: There is no such load.
+        UsageError: There is no such load, or the process has none.
     """
+    if name is not None and not PROCESS.has_load:
+        raise UsageError(f"load '{name}': {PROCESS.name} has no load; leave it out")
     if name is not None and name.partition("@")[0] not in LOADS and not (name and Path(name).exists()):
         raise UsageError(f"load '{name}': neither a file nor one of {', '.join(LOADS)}")
 
@@ -232,13 +235,14 @@ def _tls_site(folder: Path) -> dict[str, tuple[object, str]]:
     """Return the settings of a folder of `coldloop certificates`, and where they come from."""
     from coldloop.config import flattened
     from coldloop.parsing import parsed_toml
+    from coldloop.text_file import read_text
 
     file = folder / "tls.toml"
+    remedy = f"make it with `coldloop certificates --out {folder}`"
     try:
-        content = parsed_toml(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise UsageError(f"{file}: {reason}; make it with `coldloop certificates --out {folder}`") from None
+        content = parsed_toml(read_text(file, remedy))
+    except ValueError as error:
+        raise UsageError(f"{file}: {error}; {remedy}") from None
     return {key: (value, "--tls") for key, value in flattened(content).items()}
 
 

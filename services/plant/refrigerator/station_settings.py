@@ -90,6 +90,28 @@ class CompressorStart(BaseModel):
     """Share of what the first one gives that the cold box takes when the second one is started."""
 
 
+class PressureProtection(BaseModel):
+    """Pressures that override the controller, fully from the second one on, and those that stop a compressor."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    hp_bar: tuple[Bar, Bar] = (17.0, 17.6)
+    """Above it the charge valve shuts and the discharge valve opens; the line's relief valve opens at 18 bar."""
+    lp_bar: tuple[Bar, Bar] = (0.99, 0.89)
+    """Below it the discharge valve shuts and the charge valve opens."""
+    trip_lp_bar: tuple[Annotated[float, Field(ge=0, le=1)], Annotated[float, Field(ge=0, le=1)]] = (0.75, 0.8)
+    """Low pressures that stop NC1 and NC2: the one stops first, so that the other may go on; 0 is never."""
+
+    @model_validator(mode="after")
+    def _bands_have_a_width(self) -> "PressureProtection":
+        if not self.hp_bar[0] < self.hp_bar[1]:
+            raise ValueError("hp_bar: write the high pressure at which it begins to act, then a higher one")
+        if not self.lp_bar[0] > self.lp_bar[1] > max(self.trip_lp_bar):
+            raise ValueError("lp_bar: write the low pressure at which it begins to act, then a lower one that is above "
+                             "both of trip_lp_bar")  # fmt: skip
+        return self
+
+
 class TurbineProtection(BaseModel):
     """How the turbine starts, and how fast it may turn."""
 
@@ -137,4 +159,13 @@ class StationSettings(BaseModel):
     """So far above its set point does the low pressure close the charge valve, whatever the high pressure asks for."""
     start: CompressorStart = CompressorStart()
     turbine: TurbineProtection = TurbineProtection()
+    protection: PressureProtection = PressureProtection()
     alarms: StationAlarmSettings = StationAlarmSettings()
+
+    @model_validator(mode="after")
+    def _limits_are_beyond_set_points(self) -> "StationSettings":
+        high, low = self.protection.hp_bar[0], self.protection.lp_bar[0]
+        if not (self.hp_bar < high and low < self.lp_bar):
+            raise ValueError(f"set points are to be within the limits of protection: hp_bar below {high:g} bar, lp_bar "
+                             f"above {low:g} bar")  # fmt: skip
+        return self

@@ -5,6 +5,9 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, field_validator, model_validator
 
+from coldloop.errors import ConfigurationError
+from coldloop.text_file import read_text
+
 
 class TelemetrySettings(BaseModel):
     """Where to publish to."""
@@ -46,8 +49,8 @@ class TelemetrySettings(BaseModel):
         """Return the password, if one is set.
 
         Raises:
-            OSError: The file cannot be read.
+            ConfigurationError: The file cannot be read.
         """
         if self.password_file is None:
             return None
-        return self.password_file.read_text(encoding="utf-8").rstrip("\r\n")
+        return read_text(self.password_file, "telemetry.password_file names it", ConfigurationError).rstrip("\r\n")
