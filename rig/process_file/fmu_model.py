@@ -67,12 +67,11 @@ def from_fmu(file: ProcessFile, folder: Path, name: str) -> Linearised:
         for one in filter(None, [*wiring.inputs, wiring.load, *wiring.disturbances])
         if fmu.port(one).is_discrete
     ]
-    found = None
     try:
         found = _differentiated(file, fmu, wiring, simulation)
     except ModelFileError as error:  # and the instance may be of no more use
         notes.append(f"warning    FMU: {error}; a step test of it makes the model instead")
-        simulation, wiring = _at_rest(file, fmu, wiring)
+        found, (simulation, wiring) = None, _at_rest(file, fmu, wiring)
     if found is None:
         tested = identified(_step_tested(file, simulation, str(fmu.path)))
         wiring = replace(wiring, states=())

@@ -48,7 +48,6 @@ def _work(work: Callable[[], str], limit_s: int, folder: str, sender: Connection
         signal.signal(number, signal.SIG_DFL)
     signal.alarm(limit_s)  # it ends this process, whatever runs in it and whether its parent is still there
     try:
-        found: str | ColdloopError = work()
+        sender.send(work())
     except ColdloopError as error:
-        found = error
-    sender.send(found)
+        sender.send(error)

@@ -12,8 +12,8 @@ def foreign(
 ) -> Iterator[None]:
     """Call `what`, code that is not ours: what it raises, `SystemExit` too, becomes an error of a kind, in one line.
 
-    `instead` ends the line: what happens instead, or what to do; `said` is what the code has reported itself, which is
-    told in the place of its exception. An error of this kind passes as it is.
+    `instead` ends the line: what happens instead, or what to do. `said` is what the code has reported, told in the
+    place of its exception. An error of this kind passes as it is.
     """
     try:
         yield

@@ -56,8 +56,7 @@ class DisturbedPlant(PlantProgram):
         arguments: Of `PlantProgram`.
     """
 
-    whose = "the plant"
-    """What is told where equations that are not ours fail."""
+    whose = "the plant"  # in messages
 
     def __init__(self, disturbances: Disturbances, **arguments: Any) -> None:  # noqa: ANN401 of the base
         self.disturbances = disturbances

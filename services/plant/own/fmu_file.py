@@ -21,10 +21,8 @@ from plant.numeric import RealArray
 NUMBERS: Final = ("Real", "Float", "Integer", "Int", "UInt", "Boolean", "Enumeration")
 """Beginnings of the types of variables that are numbers here."""
 CONTINUOUS: Final = ("Real", "Float")
-DOUBLE: Final = ("Real", "Float64")
-"""Types that derivatives can be asked for."""
-MOST_UNPACKED: Final = 512 * 1024 * 1024
-"""Bytes of all members of the archive."""
+DOUBLE: Final = ("Real", "Float64")  # what derivatives can be asked for
+MOST_UNPACKED: Final = 512 * 1024 * 1024  # bytes
 ELEMENT: Final = re.compile(r"(.+)\[(\d+(?:,\s*\d+)*)\]")
 ERROR: Final = 3
 """Status of FMI from which on a message says what is wrong."""

@@ -66,7 +66,6 @@ class Connection(asyncio.Protocol):
         self._output_blocked = False
         self._reading_paused = False
         self._queued = False
-        self._secure = False
         self._ended = False  # the client sends no more
         self._rate: RateLimit | None = None
         self._held: asyncio.TimerHandle | None = None
@@ -95,13 +94,13 @@ class Connection(asyncio.Protocol):
         """Find out who it is, and begin to serve (event loop callback)."""
         self._transport = cast("asyncio.Transport", transport)
         self._idle_timer = self._loop.call_later(self._settings.idle_timeout_s, self._check_idle)
+        secure = transport.get_extra_info("ssl_object")
+        self._secure = secure is not None
         address = transport.get_extra_info("peername")
         if not address:  # gone again
             self.abort()
             return
         self.peer = f"{address[0]}:{address[1]}"
-        secure = transport.get_extra_info("ssl_object")
-        self._secure = secure is not None
         if secure is None:
             self._welcome(caller_at(address[0], self.peer, self._settings.access))
         else:
