@@ -63,7 +63,7 @@ def _failure(summary: dict[str, Any], job: Job) -> str:
     return "; ".join(filter(None, (
         f"{failed} of {failed + summary['updates']} updates have no answer: what the optimiser computed is not finite",
         unheld(PROCESS.banded, model.A),
-        "docs/fail-safe.md#no-answer",
+        "`coldloop docs fail-safe#no-answer`",
     )))  # fmt: skip
 
 

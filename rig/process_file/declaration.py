@@ -19,7 +19,7 @@ from coldloop.process.declaration import FURTHEST_WEIGHT, Bath
 
 MOST_SIGNALS: Final = 32
 """Outputs at most: registers have a bit for each."""
-LISTING: Final = "docs/keys.md lists all keys"
+LISTING: Final = "`coldloop docs keys` lists all keys"
 
 RESERVED: Final = frozenset((
     "tick", "session", "holder", "generation", "crc", "mode", "update", "u", "time_s", "load", "load_w", "cause",

@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from coldloop.number_text import ends_text, number_text
 from coldloop.process.declaration import Input, Output, Process
 from rig.process_file.bath import exchanged
 from rig.process_file.making import Made
@@ -18,6 +19,8 @@ SMALL: Final = 1e-6
 """Singular value, over the largest, below which a direction counts as none."""
 SHARE: Final = 0.01
 """Of a rate or a band, that is still to be told apart."""
+INVERSE: Final = 0.1
+"""Move to the other side, over the change in the end, from which on it is told."""
 NOTHING: Final = 1e-12
 """What is smaller is rounding."""
 
@@ -37,14 +40,15 @@ def described(made: Made) -> str:
 
 def _values(names: tuple[str, ...], values: Array, units: tuple[str, ...]) -> str:
     triples = zip(names, values, units, strict=True)
-    return "  ".join(
-        f"{name} {value if abs(value) > NOTHING else 0.0:.5g} {unit}".rstrip() for name, value, unit in triples
-    )
+    shown = (f"{n} {number_text(value if abs(value) > NOTHING else 0.0, 5)} {unit}" for n, value, unit in triples)
+    return "  ".join(map(str.rstrip, shown))
 
 
 def _rest(made: Made) -> list[str]:
     m, process = made.model, made.process
-    load = "" if not m.F.any() and not m.G.any() else f"; load {m.load_name} {m.w0:.5g} {m.load_unit}".rstrip()
+    load = (
+        "" if not m.F.any() and not m.G.any() else f"; load {m.load_name} {number_text(m.w0, 5)} {m.load_unit}".rstrip()
+    )
     problem = len(process.decision_instants) * (len(process.inputs) + 2 * len(process.bands))
     named = ((m.input_names, "input"), (m.output_names, "output"), (m.state_names, "state"))
     counted = ", ".join(f"{len(names)} {noun}{'s' * (len(names) != 1)}" for names, noun in named)
@@ -138,6 +142,32 @@ def _dead_times(made: Made) -> list[str]:
     ]
 
 
+def _inverse_responses(made: Made) -> list[str]:
+    """Return which outputs with a band first move to the other side after a step of an input than where they end."""
+    m, process, n, quarters = made.model, made.process, len(made.own_A), 4
+    poles = np.linalg.eigvals(made.own_A)
+    delays = [lag["delay_s"] for lag in made.linear.parameters.get("lags", ())]  # approximated by what moves so
+    if any(delays) or poles.real.max() > NOTHING or (abs(poles.imag[poles.real > -NOTHING]) > NOTHING).any():
+        return []
+    part_s = process.tick_s * process.ticks_per_sample / quarters
+    times = part_s * np.arange(1, quarters * process.decision_instants[-1] + 1)
+    part, x = m.discretised(part_s), np.zeros_like(m.B)
+    moves = np.array([m.C @ (x := part.A @ x + part.B) + m.D for _ in times])
+    ends = moves[-1]
+    if (poles.real < -NOTHING).all():
+        ends = m.D - m.C[:, :n] @ np.linalg.solve(made.own_A, m.B[:n])
+    found = []
+    for i, j in ((m.output_names.index(one.name), j) for one in process.banded for j in range(len(m.input_names))):
+        share = moves[:, i, j] / (ends[i, j] or np.inf)
+        far = np.flatnonzero(np.abs(share) > INVERSE)
+        if far.size and share[far[0]] < 0.0:
+            back = np.flatnonzero(share[far[0] :] > 0.0)
+            until = f"until {times[far[0] + back[0]]:.3g} s" if back.size else "longer than the horizon"
+            step = f"after a step of {m.input_names[j]} {m.output_names[i]} first moves the other way"
+            found.append(f"inverse response: {step}, by {-share.min():.2g} of its change in the end, {until}")
+    return found
+
+
 def _warnings(made: Made) -> list[str]:
     """Return what a control engineer would want to know, in words."""
     m, process, found = made.model, made.process, list[str]()
@@ -154,7 +184,9 @@ def _warnings(made: Made) -> list[str]:
     for band, output in zip(process.bands, process.banded, strict=True):
         value = float(m.y0[m.output_names.index(output.name)])
         if not band.margin and not band.low <= value <= band.high:
-            found.append(f"band: {output.name} rests at {value:.5g}, its band is {band.low:g} to {band.high:g}")
+            found.append(
+                f"band: {output.name} rests at {number_text(value, 5)}, its band is {ends_text(band.low, band.high)}"
+            )
     rows = [m.output_names.index(output.name) for output in process.banded]
     reach = m.discretised(process.decision_instants[-1] * sample_s).B * [one.scale for one in process.inputs]
     effect = (m.C[rows] @ reach) / [[band.high - band.low] for band in process.bands]
@@ -165,6 +197,7 @@ def _warnings(made: Made) -> list[str]:
     if process.bath is not None:
         found += exchanged(m, process.bath, process.decision_instants[-1] * sample_s)
     found += [f"loop: {text}" for text in _loops(made, effect)]
+    found += _inverse_responses(made)
     found += [f"dead time: {text}" for text in _dead_times(made)]
     found += [f"single precision: {text}" for text in _coarse(process)]
     steady = m.A_tick - np.eye(len(m.A))

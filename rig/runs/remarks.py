@@ -4,6 +4,7 @@ from dataclasses import replace
 
 from coldloop.config import Configuration
 from coldloop.errors import UsageError
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import TICK_S
 from coldloop.session.settings import TimeMode
 from optimizer_plc.budget import PlcBudget
@@ -28,6 +29,8 @@ def remarks(effective: Configuration[Settings]) -> list[str]:
             " sooner: give a longer period, adaptive, or --enforce"
         )
     found, left_out = [too_slow(program)], effective.notes()
+    if not PROCESS.has_load and "plant.load" in effective.sources:
+        found.append(f"load {effective.settings.plant.load}: the {PROCESS.name} has no load; only the length is taken")
     if left_out:
         found.append(f"not applied of the preset: {', '.join(left_out)}; `coldloop config` says why")
     return [*filter(None, found)]

@@ -148,7 +148,7 @@ def simulate(
     Args:
         load: Named load such as `a`, or a CSV file with the columns time_s and load_w; by default `2h`.
         solver: `ode`, `qpoases`, `osqp`, `fast-gradient`, `interior-point`, `hybrid` or `daqp`; by default `ode`.
-        updating_period: Seconds from 0.5 to 5 in multiples of 0.25, or `adaptive`, the default.
+        updating_period: Seconds, from 2 ticks to a sampling period (0.5 to 5 s); `adaptive`, the default.
         duration_s: Plant time in seconds, multiples of 0.25, or a text such as `10min`; by default that of the load.
         seed: Seed of the sensors' noise; by default 1.
         config: TOML file with further settings, such as one that `coldloop config` has written. An argument that is

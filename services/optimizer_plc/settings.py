@@ -96,9 +96,9 @@ class ContractionSettings(BaseModel):
     q_max: Annotated[int, Field(ge=1)] = 5
     """Largest q, that of the first period and of one which begins with a load step."""
     band: Annotated[float, Field(ge=0)] = 10.0
-    """Dead band of |ln K|, over its usual size, the median."""
+    """Dead band of the size of ln K, over the usual size, its median."""
     least: Annotated[float, Field(gt=0)] = 5e-4
-    """Least usual size of |ln K|, and the first."""
+    """Least usual size of ln K, and the first."""
     change: Annotated[float, Field(ge=0, lt=1)] = 0.02
     """Share by which the usual size goes up or down in a period."""
 
@@ -121,8 +121,11 @@ class AdaptiveSettings(BaseModel):
     """q(t_0), the number of a period in the ladder: 1 is 0.5 s, 9 is 2.5 s at P = 1 and with an iteration of 0.25 s or
     less. The ladder has each period that holds more iterations than the one before (`coldloop budget`)."""
     q_min: Annotated[int, Field(ge=1)] = 2
+    """Shortest period, as a number in the ladder of periods."""
     q_max: Annotated[int, Field(ge=1)] = 19
+    """Longest period, likewise."""
     delta: Annotated[int, Field(ge=1)] = 2
+    """Step of q."""
     cost_floor: Annotated[float, Field(gt=0)] = 1.0
     """Constant added to J, so that it is bounded below by a positive number (Assumption 1 of the paper)."""
 
@@ -159,7 +162,8 @@ class ProgramSettings(BaseModel):
     """So does an estimated load this near the largest one that the linear model holds with the feed at its limit."""
     sequence_ticks: Annotated[int, Field(ge=2, le=SEQUENCE_ROWS)] = 18
     """Shortest sequence sent; 18 rows fit into one Modbus request with their header. It is never shorter than two
-    updating periods: one to be played, one in case the next sequence is late."""
+    updating periods: one to be played, one in case the next sequence is late; nor than the longest time until the next
+    sequence of adaptive periods can arrive (`scheme.shortest_sequence`)."""
     adaptive: AdaptiveSettings = AdaptiveSettings()
     design: ControlDesign = ControlDesign()
     cold_end: ColdEndSettings = ColdEndSettings()
@@ -309,6 +313,7 @@ class ControlEndpoint(Endpoint):
     """Where the control PLC is."""
 
     port: Annotated[int, Field(ge=1, le=0xFFFF)] = CONTROL_PORT
+    """TCP port."""
 
 
 class OptimizerSection(BaseModel):

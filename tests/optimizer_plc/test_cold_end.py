@@ -61,8 +61,8 @@ def test_all_knots_are_within_the_limit_or_within_the_rate_of_it(
 ) -> None:
     u0, scale, rate = float(tuned.estimator.u0[0]), float(tuned.input_scale[0]), LIMITS.rate[0] * share
     x, u_before = np.zeros(tuned.estimator.steps.A.shape[1]), np.array([before - u0, 0.0, 0.0])
-    free = problem_at(tuned, x, 0.0, u_before, share, np.zeros(3), math.inf)
-    limited = problem_at(tuned, x, 0.0, u_before, share, np.zeros(3), (most - u0) / scale)
+    free = problem_at(tuned, x, 0.0, u_before, share, np.zeros(3), math.inf, -1)
+    limited = problem_at(tuned, x, 0.0, u_before, share, np.zeros(3), (most - u0) / scale, -1)
     of_cv155 = np.zeros(free.high.size, bool)
     of_cv155[: tuned.n_inputs : 3] = True
     highest = u0 + scale * limited.high[of_cv155]

@@ -50,11 +50,11 @@ class Laws:
         y = MODEL.y0 + np.array([given["y"].get(name, 0.0) for name in OUTPUT_NAMES])
         limit = most_open(c, u, y)
         target = np.zeros(len(PROCESS.inputs))
-        find_target(c.target, x, w, given["mismatch"], limit, target)
-        low, high = bounds_at(c.target, x, limit)
+        find_target(c.target, x, w, given["mismatch"], limit, -1, 0.0, target)
+        low, high = bounds_at(c.target, x, limit, -1, 0.0)
         loads = [*loads_held(c.target, low, high), least_warm_load(c.target, low, high)]
-        loads += [shortage(c, x, w, MODEL.w0 + part * w, limit, 0.0) for part in (0.0, 1.0, 3.0)]
-        problem = problem_at(c, x, w, u, 1.0, target, limit)
+        loads += [shortage(c, x, w, MODEL.w0 + part * w, limit, -1, 0.0, 0.0) for part in (0.0, 1.0, 3.0)]
+        problem = problem_at(c, x, w, u, 1.0, target, limit, -1)
         return {
             "by input": [*target, *problem.high[: c.n_inputs]], "loads": loads, "limit": [limit],
             "rest": self.rest(MODEL.w0 + w, u, y).tolist(),

@@ -13,7 +13,7 @@ from control_plc.output_limits import GuardState
 from control_plc.program import ControlProgram
 from rig.cosim.compiled.records import GUARD, NOT, SCAN, Alarms, Array, Trace, empty_rows, record
 
-OF_PLANS = (AlarmKind.CAPACITY, AlarmKind.SENSOR_SUSPECT)
+OF_PLANS = (AlarmKind.CAPACITY, AlarmKind.SENSOR_SUSPECT, AlarmKind.INPUT_WITHOUT_EFFECT)
 """Alarms of what plans say."""
 LONGEST_SILENCE = TICKS_PER_SAMPLE + 2
 """Ticks between two signs of life of an optimiser that answers every update."""

@@ -318,6 +318,12 @@ class Process:
         """Whether there is a disturbance."""
         return self.load.name != NO_LOAD.name
 
+    @property
+    def disturbances(self) -> tuple[Output, ...]:
+        """Outputs of a process file that measure a disturbance beside the load: they have its name, and no band."""
+        states = set() if self.load.has_named_loads else {state.name for state in self.states}
+        return tuple(output for output in self.outputs if output.band is None and output.name in states)
+
     def share(self, of: str) -> float:
         """Return the time of a solver's iteration, or of a preparation, over that with the cold box's problem."""
         return self.iterations.get(of, 1.0)
