@@ -26,13 +26,14 @@ from rig.figures.plot import (
 )
 from rig.figures.run_plot import save_figure
 from rig.results.folders import writing
+from rig.results.indicators import EXCESS_KEYS
 from rig.results.run_folder import Curves, RunFolder
 from rig.text_tables import aligned
 
 FIGURES: Final = (
     "complete", "ticks", "updates", "J_BF", "J_open_mean", "J_dev", "J_cst", "c1", "c2", "tau_u_mean",
-    "tau_u_mean_per_update", "iterations_total", *(f"{name}_outside_band_pct" for name in BANDED), "deadline_misses",
-    "trace_sha256",
+    "tau_u_mean_per_update", "iterations_total", *(f"{name}_outside_band_pct" for name in BANDED), *EXCESS_KEYS,
+    "deadline_misses", "trace_sha256",
 )  # fmt: skip
 
 

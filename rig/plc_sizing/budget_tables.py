@@ -55,9 +55,10 @@ def budget_tables(settings: Settings, period_s: float | None, executed: Callable
         executed: Returns what an iteration as exported takes.
     """
     problem, prediction = problem_of(settings)
+    limited = settings.optimizer_plc.program.cold_end.approach_k > 0.0
     return "\n".join([
         _speed(reference_curve(), problem.size),
-        _operations(problem, prediction) + executed(problem),
+        _operations(problem, prediction, limited=limited) + executed(problem),
         _iterations(settings.optimizer_plc.program, problem, period_s),
         _memory(settings, problem, prediction, MEMORY_BYTES),
     ])  # fmt: skip
@@ -130,7 +131,7 @@ def _speed(curve: SpeedCurve, size: int) -> str:
     )
 
 
-def _operations(problem: PredictiveProblem, prediction: PredictionModel) -> str:
+def _operations(problem: PredictiveProblem, prediction: PredictionModel, *, limited: bool) -> str:
     dense, without_zeros = counted_sizes(problem)
     m, mean = dense.m, ACTIVE_ROWS.mean
     variants: dict[str, Callable[[QpSizes], Operations]] = {
@@ -152,7 +153,7 @@ def _operations(problem: PredictiveProblem, prediction: PredictionModel) -> str:
     sizes = operations.PreparationSizes(
         dense, m - 4 * len(problem.design.constraint_instants), problem.n_knots, prediction.n_states,
         prediction.D.shape[1], prediction.D.shape[0], segments=1, samples=1,
-        targets=problem.design.target is not Target.OPERATING_POINT,
+        targets=problem.design.target is not Target.OPERATING_POINT, limited=limited,
     )  # fmt: skip
     once = operations.preparation(sizes, mean)
     rows.append(("preparation, once an updating period", f"{once.flops:,.0f}", "", f"{once.bytes / 1e3:.1f}", ""))

@@ -26,18 +26,8 @@ TIMES: Final = {
 DATES, CLOCKS = {"date", "datum", "fecha"}, {"time", "zeit", "uhrzeit"}
 """Names of two columns that are one of time."""
 TAGS: Final = {
-    "tag",
-    "tagname",
-    "tag name",
-    "tag_name",
-    "name",
-    "point",
-    "signal",
-    "variable",
-    "item",
-    "itemid",
-    "sensor",
-}
+    "tag", "tagname", "tag name", "tag_name", "name", "point", "signal", "variable", "item", "itemid", "sensor",
+}  # fmt: skip
 VALUES: Final = {"value", "val", "wert", "valeur", "valor", "_value", "reading"}
 NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,31}")
 WITH_ZONE: Final = r":\d\d.*(?:Z|UTC|GMT|[+-]\d\d(?::?\d\d)?)$"
@@ -134,8 +124,10 @@ def _readings(table: Table, request: Request, said: list[str]) -> Frame:
         judges = _judges(keys, [k for k, name in own.items() if name is not None], quality)
         left = [table.names[k] for k, name in own.items() if name is None and keys[k]]
         free = [table.names[k] for k in quality if k not in judges.values()]
-        if free and not tags:
-            raise UsageError(f"{table.where}: {', '.join(free)}: of which column? name it so, as in h1.quality")
+        if free and called and not tags:
+            raise UsageError(
+                f"{table.where}: {', '.join(free)}: whose? name it as in h1.quality, or name the columns with --map"
+            )
         left += free
         found = pd.concat([readings("", times[0], None)[:0], *(readings(own[k], k, judges[k]) for k in judges)])
     said += [f"left out   {', '.join(left)}"] if left else []

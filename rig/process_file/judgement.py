@@ -1,6 +1,7 @@
 """What there is to know of a process before it is controlled, as text: rest, modes, gains, and what is wrong."""
 
 from collections.abc import Sequence
+from math import log
 from typing import Final
 
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from coldloop.number_text import ends_text, number_text
 from coldloop.process.declaration import Input, Output, Process
+from rig.plc_sizing.holding import NOTHING, digits_last_s, leaves_its_band, shortest_period_s, waiting
 from rig.process_file.bath import exchanged
 from rig.process_file.making import Made
 
@@ -21,8 +23,6 @@ SHARE: Final = 0.01
 """Of a rate or a band, that is still to be told apart."""
 INVERSE: Final = 0.1
 """Move to the other side, over the change in the end, from which on it is told."""
-NOTHING: Final = 1e-12
-"""What is smaller is rounding."""
 
 
 def described(made: Made) -> str:
@@ -72,6 +72,8 @@ def _modes(made: Made) -> list[str]:
     lines = [f"modes      {'  '.join(texts[i : i + 8])} /s" for i in range(0, len(texts), 8)]
     if made.linear.error:
         lines.append(f"derivatives within {made.linear.error:.1e} of those with steps twice as wide")
+    if values[0].real <= 0.0:
+        lines.append(f"late       no mode grows: no period loses the plant{leaves_its_band(made.model, made.process)}")
     return lines
 
 
@@ -168,6 +170,24 @@ def _inverse_responses(made: Made) -> list[str]:
     return found
 
 
+def _unstable(made: Made, growth: float) -> list[str]:
+    """Return how long a plant with a mode that grows can wait for an update, and what its horizon may be."""
+    process, limits = made.process, np.array([[one.low, one.high, one.rate] for one in made.process.inputs]).T
+    horizon_s = process.decision_instants[-1] * process.tick_s * process.ticks_per_sample
+    single, double = (digits_last_s(growth, real) for real in (np.float32, np.float64))
+    period_s = shortest_period_s(0.25 * (process.share("preparation") + process.share("ode")), process.tick_s)
+    needs = waiting(made.model, process, limits)
+    held = needs and needs.text(period_s, "the shortest one of the reference PLC")
+    found = [f"unstable: a mode grows with {growth:.3g} /s and doubles in {log(2.0) / growth:.3g} s; {held}"]
+    found += [f"fail-safe: {text}" for text in (unheld(process.banded, made.own_A),) if text]
+    if horizon_s > single:
+        found.append(
+            f"horizon: beyond {single:.3g} s the mode leaves the problem no digits in single precision, beyond "
+            f"{double:.3g} s none in double; it is {horizon_s:g} s: shorten prediction.decision_instants"
+        )
+    return found
+
+
 def _warnings(made: Made) -> list[str]:
     """Return what a control engineer would want to know, in words."""
     m, process, found = made.model, made.process, list[str]()
@@ -175,10 +195,11 @@ def _warnings(made: Made) -> list[str]:
     poles = np.linalg.eigvals(made.own_A)
     fastest, slowest = -poles.real.min(), -poles.real.max()
     if poles.real.max() > NOTHING:
-        found.append(f"unstable: a mode grows with {poles.real.max():.3g} /s; nothing may be late for longer")
-        found += [f"fail-safe: {text}" for text in (unheld(process.banded, made.own_A),) if text]
+        found += _unstable(made, float(poles.real.max()))
     elif slowest > NOTHING and process.decision_instants[-1] * sample_s * slowest < 1.0:
         found.append(f"horizon: it ends before the slowest mode, {1 / slowest:.3g} s, has moved much")
+    fast = poles[(poles.imag * sample_s > np.pi) & (-poles.real * sample_s < 3.0)].imag  # 5 % of them are left
+    found += [f"sampling: the oscillation of {2 * np.pi / w:.3g} s is faster than two sampling periods" for w in fast]
     if fastest * sample_s > 20.0:
         found.append(f"sampling: the fastest mode, {1 / fastest:.2g} s, is over within a sampling period")
     for band, output in zip(process.bands, process.banded, strict=True):

@@ -3,11 +3,14 @@
 from collections.abc import Collection, Sequence
 from typing import Final
 
+from coldloop.process.declaration import Range
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import CONTROLLED, INPUT_NAMES
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.safety import AlarmKind, CapacityCause
 from coldloop.service.journal import Journal
+from control_plc.alarm_settings import BANDS
 from control_plc.alarms import AlarmPanel
 from control_plc.ladder import Ladder
 
@@ -15,6 +18,16 @@ SENSORS: Final = {AlarmKind.SENSOR_BAD: 1, AlarmKind.SENSOR_SUSPECT: 2}
 """Alarms of sensors, and the cause of their events."""
 OPTIMIZER_DRIVES: Final = (Mode.MPC, Mode.REST)
 """Modes in which the optimiser's sequences are played."""
+
+
+def present_limits(bands: Sequence[Range], panel: AlarmPanel) -> list[Range]:
+    """Return the limits of each output with a band: its band while its alarm is raised, wider by the dead band else."""
+    level, further = (panel.rows[kind] for kind in BANDS)
+    raised = [level.active, *(further.active and further.cause == place for place in range(len(bands) - 1))]
+    return [
+        (low, high) if is_raised else (low - dead_band, high + dead_band)
+        for (low, high), dead_band, is_raised in zip(bands, PROCESS.dead_bands, raised, strict=True)
+    ]
 
 
 class ProcessAlarms:
@@ -60,8 +73,8 @@ class ProcessAlarms:
             suspects: Outputs that the optimiser does without: bit i is output i; then inputs that have no effect.
         """
         report = self._panel.report
-        bands = zip(CONTROLLED, self._bands, strict=True)
-        outside = [not (cooling or low <= y[output] <= high) for output, (low, high) in bands]
+        limits = zip(CONTROLLED, present_limits(self._bands, self._panel), strict=True)
+        outside = [not (cooling or low <= y[output] <= high) for output, (low, high) in limits]
         report(AlarmKind.LEVEL_BAND, condition=outside[0])
         further = [place for place, is_outside in enumerate(outside[1:]) if is_outside]
         report(AlarmKind.T5_BAND, condition=bool(further), cause=further[0] if further else 0)

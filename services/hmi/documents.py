@@ -223,7 +223,6 @@ def trend_document(model: Model, names: Sequence[str], start: int, end: int, poi
     gaps = model.trends.gaps(start, end)
     modes = model.trends.modes(start, end)
     in_force = model.trends.modes(start - BEFORE_TICKS, end)  # with the update that the window begins with
-    marks, marks_since_s = _marks(model, start, end)
     shown = [one for one in model.predictions if one.tick >= start]
     limits = model.limits
     return {
@@ -233,8 +232,7 @@ def trend_document(model: Model, names: Sequence[str], start: int, end: int, poi
         "updates": updates_document(model.updates, in_force, gaps, points),
         "modes": [{"from": one.start, "to": one.end, "mode": mode_name(one.mode)} for one in modes],
         "doubtful": {name: found for name, found in model.trends.doubtful(start, end).items() if name in names},
-        "marks": marks,
-        "marks_since_s": marks_since_s,
+        **_marks(model, start, end),
         "predictions": [prediction_document(one) for one in _some(shown)],
         "planned": model.is_planned,
         "gaps": [[max(gap.start, start) * TICK_S, min(gap.end, end) * TICK_S] for gap in gaps],
@@ -296,8 +294,8 @@ def _some(predictions: list[Prediction]) -> list[Prediction]:
     return predictions[::-1][::every][::-1]
 
 
-def _marks(model: Model, start: int, end: int) -> tuple[list[Document], float | None]:
-    """Return the marks between two ticks, and the time (s) before which there may be more; None if these are all."""
+def _marks(model: Model, start: int, end: int) -> Document:
+    """Return the marks between two ticks, and since when they are all, s; None if there are no earlier ones."""
     begun = max((e.utc for e in model.events if e.service == "plant" and e.text.kind == BEGUN), default="")
     known = [entry for entry in model.events if entry.utc >= begun]  # not of a session before
     marked = MARKED.keys() - ({word(EventKind.LOAD)} if not PROCESS.has_load else ())
@@ -308,4 +306,4 @@ def _marks(model: Model, start: int, end: int) -> tuple[list[Document], float | 
         {"time": entry.tick * TICK_S, "kind": MARKED[entry.text.kind], "text": entry.text.sentence}
         for entry in found[-MOST_MARKS:]
     ]
-    return marks, since_s
+    return {"marks": marks, "marks_since_s": since_s}

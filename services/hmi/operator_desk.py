@@ -40,14 +40,11 @@ TIMEOUT_S: Final = 3.0
 
 
 class Preview(NamedTuple):
-    """What an operator is shown before a confirmation."""
+    """What a command would do, what it would change as it is now, and the token that confirms it."""
 
     token: str
-    """Confirms the command."""
     text: str
-    """What it would do."""
     now: str
-    """What it would change, as it is."""
 
 
 class Prepared(NamedTuple):
@@ -99,8 +96,7 @@ class OperatorDesk:
         self._training = training
         self._prepared: OrderedDict[str, Prepared] = OrderedDict()
         self._turn = asyncio.Lock()
-        self._last = ""
-        """Whose the last command was, and what."""
+        self._last = ""  # whose the last command was, and what
 
     async def prepare(self, command: Command, user: str) -> Preview:
         """Take a command, and return what it would do, with the token that confirms it.

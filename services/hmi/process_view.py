@@ -37,8 +37,11 @@ def process_document() -> dict[str, Any]:
 
 
 def _output(one: Output) -> dict[str, Any]:
-    loop = one.band.loop.input if one.band and one.band.loop else None
-    return {"name": one.name, "unit": one.unit, "bar": one.bar or _output_bar(one), "loop": loop}
+    band = one.band
+    loop = band.loop.input if band and band.loop else None
+    dead_band = band.dead_band if band else 0.0
+    bar = one.bar or _output_bar(one)
+    return {"name": one.name, "unit": one.unit, "bar": bar, "loop": loop, "dead_band": dead_band}
 
 
 def _output_bar(one: Output) -> Range:

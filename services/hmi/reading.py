@@ -90,9 +90,9 @@ class Reading:
             web.get("/metrics", self.metrics),
         ]
 
-    async def page(self, _request: web.Request) -> web.StreamResponse:
+    async def page(self, request: web.Request) -> web.StreamResponse:
         """Answer with the page."""
-        return web.FileResponse(STATIC / "index.html")
+        return await _file(STATIC / "index.html", request)
 
     async def mimic(self, _request: web.Request) -> web.Response:
         """Answer with the drawing that the process brings; those of the cold box are static files."""
@@ -102,7 +102,9 @@ class Reading:
 
     async def catalog(self, _request: web.Request) -> web.Response:
         """Answer with what the page is made from."""
-        return json_answer(self._catalog)
+        answer = json_answer(self._catalog)
+        answer.enable_compression()
+        return answer
 
     async def state(self, _request: web.Request) -> web.Response:
         """Answer with the whole state."""
@@ -323,5 +325,8 @@ def static_files() -> list[web.RouteDef]:
     ]
 
 
-async def _file(file: Path, _request: web.Request) -> web.StreamResponse:
-    return web.FileResponse(file)
+async def _file(file: Path, request: web.Request) -> web.StreamResponse:
+    answer = web.FileResponse(file, headers={hdrs.CACHE_CONTROL: "no-cache"})  # asked for again, sent if it has changed
+    if hdrs.IF_NONE_MATCH not in request.headers:  # otherwise the answer may have no body to compress
+        answer.enable_compression()
+    return answer

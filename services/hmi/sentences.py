@@ -155,8 +155,7 @@ def _step(found: Explanation, *, shorter: bool) -> str:
 
 
 def _contraction(found: Explanation, rule: UpdatingRuleStatus) -> str:
-    q = found.q
-    K, gamma = number_text(found.update.contraction, 4), number_text(found.update.gamma, 3)
+    q, K, gamma = found.q, number_text(found.update.contraction, 4), number_text(found.update.gamma, 3)
     if found.q_before is not None and (q > found.q_before or q == found.q_before == rule.q_max > rule.q_min):
         why = f"K = {K} is beyond its noise and Gamma = {gamma} < 0 asks for a longer period"
     else:

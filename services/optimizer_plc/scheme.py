@@ -14,9 +14,9 @@ from coldloop.kernels.compiled import kernel
 from coldloop.process.signals import BATH, OUTPUT_NAMES
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
-from optimizer_plc.estimator import Estimator, begin_prediction, correct, predict
+from optimizer_plc.estimator import Belief, Estimator, begin_prediction, correct, predict
 from optimizer_plc.idle_input import ROOM, TurbineWatch, idle_valve, stands, turbine_watch
-from optimizer_plc.plausibility import are_finite, suspects_of
+from optimizer_plc.plausibility import USED, are_finite, suspects_of
 from optimizer_plc.qp.costs import OutputMaps, augmented_cost, output_maps, predicted_indicators
 from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
@@ -80,6 +80,8 @@ class Constants(NamedTuple):
     approach: float
     """How much warmer than the bath helium before the feed is at which that is opened no further, K; infinite is any.
     """
+    following_s: float
+    """Time constant with which the limit of the feed follows that."""
     level: int
     """Which output is the level of the bath, ..."""
     temperature: int
@@ -128,7 +130,7 @@ def constants_of(
         largest_load=real(settings.holdable_load_w[1] - estimator.w0),
         reserve=real(settings.capacity_reserve_w),
         least_load_error=real(BATH.least_load_error if BATH else 0.0),
-        approach=real(settings.cold_end.approach_k or np.inf),
+        approach=real(settings.cold_end.approach_k or np.inf), following_s=real(settings.cold_end.following_s),
         level=LEVEL, temperature=TEMPERATURE, feed_temperature=FEED_TEMPERATURE,
         opening_per_k=real(settings.cold_end.opening_per_k),
         opening_from=real(settings.cold_end.opening_from - estimator.u0[target.feed]),
@@ -319,36 +321,68 @@ def copy_delivery(source: Delivery, target: Delivery) -> None:
 
 @kernel
 def shortage(
-    c: Constants, x: Array, w: float, load: float, most_open: float, idle: int, at: float, none: float
+    c: Constants, x: Array, w: float, load: float, most_open: float, idle: int, at: float, before: float, none: float
 ) -> float:  # fmt: skip
     """Return what the load is above what can be held, W; negative: below what is needed; `none`, that is 0, otherwise.
 
     The estimate w (a deviation) has what the plant lacks beside its model, so it is compared with what the model holds
     at rest within the inputs' bounds and the limit of the feed, less a reserve, and with the least that it holds
     without the turbine's outlet getting too cold, by the constant error of that. The load itself (W), where it is
-    measured, is compared with what the plant holds that is as its model.
+    measured, is compared with what the plant holds that is as its model. A shortage of the sign that was `before` ends
+    where the estimate has twice the reserve: noise does not end it and begin it anew.
     """
     if not c.target.limited:
         return none
     measured = load - c.estimator.w0 if c.estimator.load_known else w
     low, high = bounds_at(c.target, x, most_open, idle, at)
     _, most = loads_held(c.target, low, high)
-    too_much = max(w + c.reserve - most, measured - c.largest_load)
+    more = c.reserve if before > none else none
+    less = c.reserve if before < none else none
+    too_much = max(w + c.reserve + more - most, measured - c.largest_load)
     warm = least_warm_load(c.target, low, high) - c.least_load_error
-    too_little = min(w - warm, min(w, measured) - c.least_load)
+    too_little = min(w - warm - less, min(w, measured) - c.least_load)
     return max(too_much, none) + min(too_little, none)
 
 
 @kernel
-def most_open(c: Constants, u: Array, y: Array) -> float:
-    """Return how far the feed may be opened, a scaled deviation, by inputs (3,), deviations, and outputs (22,)."""
-    if np.isinf(c.approach):
-        return c.approach
-    approach = y[c.feed_temperature] - y[c.temperature]
-    if math.isnan(approach):
-        approach = y.dtype.type(0.0)
+def believed(c: Constants, belief: Belief, u: Array, y: Array, output: int) -> float:
+    """Return an output by the estimate, for inputs u (3,), deviations; by its reading where no constant is estimated.
+
+    One without a constant is as the model has it while its reading is left out.
+    """
+    e, reading = c.estimator, belief.readings[output]
+    if e.plausible.constants[output] < 0 and reading.state == USED and np.isfinite(y[output]):
+        shown: float = y[output]
+        return shown
+    maps = e.outputs
+    value: float = e.y0[output] + maps.F[output, 0] * belief.numbers[0].w
+    for j in range(belief.x.shape[0]):
+        value += maps.A[output, j] * belief.x[j]
+    for j in range(u.shape[0]):
+        value += maps.B[output, j] * u[j]
+    return value
+
+
+@kernel
+def most_open(c: Constants, u: Array, approach: float) -> float:
+    """Return how far the feed may be opened, a scaled deviation, by inputs (3,), deviations, and an approach, K."""
     feed = c.target.feed
     limit: float = max(u[feed] + c.opening_per_k * (c.approach - approach), c.opening_from) / c.input_scale[feed]
+    return limit
+
+
+@kernel
+def limit_of_feed(c: Constants, m: OptimizerState, y: Array) -> float:
+    """Return `most_open` by the estimate, followed from that of the update before; y (22,) are the outputs."""
+    before, belief = m.numbers[0].most_open, m.belief
+    if np.isinf(c.approach):
+        return c.approach
+    warmer = believed(c, belief, m.u, y, c.feed_temperature) - believed(c, belief, m.u, y, c.temperature)
+    elapsed = y.dtype.type(belief.numbers[0].since) * c.estimator.tick_s
+    moved = (most_open(c, m.u, warmer) - before) * min(elapsed / c.following_s, y.dtype.type(1.0))
+    if not np.isfinite(moved):  # by an estimate that leads to no answer
+        moved = y.dtype.type(0.0)
+    limit: float = max(before + moved, c.opening_from / c.input_scale[c.target.feed])
     return limit
 
 
@@ -401,8 +435,8 @@ def judge_played(c: Constants, m: OptimizerState, load: float, y: Array) -> floa
         now.suspects += c.turbine.bit
     idle = idle_valve(c.turbine, now.suspects)
     at = m.u[max(idle, 0)] / c.input_scale[max(idle, 0)]
-    now.most_open = most_open(c, m.u, y)
-    now.shortage = shortage(c, m.belief.x, w, load, now.most_open, idle, at, real(0.0))
+    now.most_open = limit_of_feed(c, m, y)
+    now.shortage = shortage(c, m.belief.x, w, load, now.most_open, idle, at, now.shortage, real(0.0))
     if not abs(now.shortage) <= real(LARGEST):  # by an estimate that leads to no answer
         now.shortage = real(0.0)
     find_target(c.target, m.belief.x, w, m.belief.numbers[0].mismatch, now.most_open, idle, at, m.target)

@@ -156,8 +156,8 @@ class ProgramSettings(BaseModel):
     interrupting_load_step_w: Annotated[float, Field(ge=0)] = 0.0
     """A load step of more than this ends an updating period at once, whatever decides its length; 0 is never."""
     holdable_load_w: tuple[FiniteFloat, FiniteFloat] = (BATH and BATH.holdable_load) or LOAD_SPAN
-    """Loads that some inputs within their limits hold at rest within the bands, in the load's unit: of the cold box, by
-    steady states of its nonlinear plant. With a bath, a load outside raises the alarm `capacity`."""
+    """Loads that are held at rest within the bands, in the load's unit: of the cold box by runs of its nonlinear
+    plant. With a bath, a load outside raises the alarm `capacity`."""
     capacity_reserve_w: Annotated[float, Field(ge=0)] = BATH.load_reserve if BATH else 0.0
     """So does an estimated load this near the largest one that the linear model holds with the feed at its limit."""
     sequence_ticks: Annotated[int, Field(ge=2, le=SEQUENCE_ROWS)] = 18

@@ -94,11 +94,13 @@ class Table:
         return [self._numbers(place, name) for place, name in zip(places, wanted, strict=True) if place is not None]
 
     def qualities(self) -> list[int]:
-        """Return the columns that say how good readings are: of a short name if one reading is good by it."""
+        """Return the columns that say how good readings are: of a short name if it has words or whole numbers only."""
         named = [place for place, name in enumerate(self.names) if QUALITY.fullmatch(plain(name))]
+        cells = {place: {row[place] for _, row in self.rows} - {""} for place in named}
         return [
-            place for place in named
-            if "qual" in plain(self.names[place]) or any(row[place] and is_good(row[place]) for _, row in self.rows)
+            place for place, texts in cells.items()
+            if "qual" in plain(self.names[place])
+            or (any(map(is_good, texts)) and all(text.isdigit() or math.isnan(self.number(text)) for text in texts))
         ]  # fmt: skip
 
     def _check_quality(self, places: Collection[int]) -> None:

@@ -141,6 +141,9 @@ RECORDS: Final[dict[str, tuple[str | bytes, str]]] = {
         "".join(f"{line},{'192,ok' if k else 'quality,remark'}\n" for k, line in enumerate(SHORT.splitlines())),
         "not used: quality, remark",
     ),
+    "a flow that is called q": (
+        "".join(f"{line},{200.5 + k if k else 'q'}\n" for k, line in enumerate(SHORT.splitlines())), "not used: q",
+    ),
     "Latin-1": (SHORT.replace("h2\n", "h2 (\u00b5m)\n").encode("latin-1"), "read as Latin-1"),
 }  # fmt: skip
 

@@ -252,7 +252,7 @@ REFUSED: Final[dict[str, tuple[str, dict[str, Any], str]]] = {
     "no outputs": (text(CLEAN), {"inputs": tuple("abyz")}, "no readings of outputs beside the inputs"),
     "quality that belongs to none": (
         text([[*row, 192, 192] for row in CLEAN], header=[*HEADER, "p.Quality", "r.Quality"]), {},
-        "p.Quality, r.Quality: of which column?",
+        "p.Quality, r.Quality: whose?",
     ),
     "nothing that is good": (
         text([[*row, 0] for row in CLEAN], header=[*HEADER, "quality"]), {},

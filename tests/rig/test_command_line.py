@@ -121,6 +121,7 @@ def test_a_plain_installation_says_which_extra_a_command_needs(tmp_path: Path, p
     lacking = [
         ["report", f"{tmp_path}/r"], ["export", f"{tmp_path}/r", "--hdf5"], ["page", f"{tmp_path}/r"],
         ["study", "periods", "--quick"], ["reproduce", "--quick"], ["run", "--solver", "qpoases", "--in-process"],
+        ["import", f"{tmp_path}/export.csv", "--inputs", "a", "--out", f"{tmp_path}/record.csv"],
     ]  # fmt: skip
     done = python("-c", WITHOUT_EXTRAS, json.dumps(run + lacking))
     complaints = [line for line in done.err.splitlines() if line.startswith("coldloop")]

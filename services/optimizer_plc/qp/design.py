@@ -22,7 +22,7 @@ from pydantic import (
 from coldloop.process.declaration import FURTHEST_WEIGHT
 from coldloop.process.loaded import PROCESS
 from coldloop.process.per_signal import PerBand, PerInput, PositivePerBand
-from coldloop.process.signals import BATH
+from coldloop.process.signals import BATH, STRETCH
 
 N_INPUTS = len(PROCESS.inputs)
 N_SLACKS = 2 * len(PROCESS.bands)
@@ -139,6 +139,8 @@ class ColdEndSettings(BaseModel):
     at 36 %."""
     opening_per_k: PositiveFloat = 70.0
     """How far the feed may be from where it is, in % for each K that T2 - T1 is from it. Less slows load steps."""
+    following_s: PositiveFloat = 60.0 * STRETCH
+    """Time constant with which the limit follows T2 - T1, as it is estimated: noise of 0.03 K would move it by 2 %."""
     opening_from: FiniteFloat = 50.0
     """Opening, %, that is allowed in any case: should T1 or T2 be wrong."""
 

@@ -209,12 +209,12 @@ def control_station(c: StationLaw, integrals: RealArray, m: StationMeasurement) 
     given, openings = split(c, allowed, m)
     mode = mode_of(c, allowed, given, m)
     high, low = beyond(m.hp, c.overrides.hp, c.overrides.hp_full), beyond(m.lp, c.overrides.lp, c.overrides.lp_full)
-    if high > 0.0 or low > 0.0:
-        limited = shut_by(openings, high, low)
-        openings, mode = opened_by(limited, high, low), OVERRIDE
-        given = flows_through(c, limited, m)
+    limited = shut_by(openings, high, low)
+    moved = opened_by(limited, high, low)
+    if moved != openings:
+        given, mode = flows_through(c, limited, m), OVERRIDE
     follow(c, integrals, wanted, given, m)
-    return Commands(openings[0], openings[1], openings[2], feed), mode
+    return Commands(moved[0], moved[1], moved[2], feed), mode
 
 
 @kernel

@@ -69,6 +69,8 @@ class Band:
     """How far inside it the rows of the problem are: half of it where there is a setpoint, in its middle."""
     alarm: Range | None = None
     """Outside of it the alarm is raised; the band where it is not given."""
+    dead_band: float = 0.0
+    """Excess up to which the output does not count as outside, in its unit: for alarms, indicators and the page."""
     loop: Loop | None = None
     alarm_word: str = ""
     """What its alarm is called; `NAME outside its band` where this is empty."""
@@ -337,6 +339,11 @@ class Process:
     def bands(self) -> tuple[Band, ...]:
         """Their bands."""
         return tuple(output.band for output in self.outputs if output.band is not None)
+
+    @property
+    def dead_bands(self) -> tuple[float, ...]:
+        """Their dead bands."""
+        return tuple(band.dead_band for band in self.bands)
 
     def document(self) -> dict[str, Any]:
         """Return this as plain data, tuples as lists."""

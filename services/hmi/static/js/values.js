@@ -43,6 +43,9 @@ function ownBand(one, name) {
   return low === null && high === null ? null : [low === null ? Number(one.dataset.low) : low, high === null ? Number(one.dataset.high) : high];
 }
 
+// How far an output may be beyond its band until it is marked.
+const deadBand = (name) => (state.catalog.process.controlled.find((one) => name.endsWith(`.y.${one.name}`)) || { dead_band: 0 }).dead_band;
+
 function place(one, parts, width) {
   const name = one.dataset.signal, value = number(name);
   const own = ownBand(one, name), band = own || pair(one.dataset.band), bounds = pair(one.dataset.bounds);
@@ -55,7 +58,7 @@ function place(one, parts, width) {
   }
   parts.pointer.classList.toggle("unknown", !Number.isFinite(value));
   if (Number.isFinite(value)) parts.pointer.setAttribute("x", at(value) * width - 1.5);
-  const outside = known && (value < ends[0] || value > ends[1]);
+  const dead = own ? 0 : deadBand(name), outside = known && (value < ends[0] - dead || value > ends[1] + dead);
   one.classList.toggle("abnormal", Boolean(band) && outside);
   one.classList.toggle("at-limit", Boolean(bounds) && known && (value <= ends[0] || value >= ends[1]));
   return { value, from, to };
