@@ -96,9 +96,9 @@ class ContractionSettings(BaseModel):
     q_max: Annotated[int, Field(ge=1)] = 5
     """Largest q, that of the first period and of one which begins with a load step."""
     band: Annotated[float, Field(ge=0)] = 10.0
-    """Dead band of |ln K|, over its usual size, the median."""
+    """Dead band of the size of ln K, over the usual size, its median."""
     least: Annotated[float, Field(gt=0)] = 5e-4
-    """Least usual size of |ln K|, and the first."""
+    """Least usual size of ln K, and the first."""
     change: Annotated[float, Field(ge=0, lt=1)] = 0.02
     """Share by which the usual size goes up or down in a period."""
 
