@@ -172,6 +172,8 @@ class PreparationSizes(NamedTuple):
     """Sampling periods in a sequence."""
     targets: bool
     """Whether the cost is about a target that is sought."""
+    apart: int = 0
+    """Predictions without the watched reading, beside the filter's."""
 
 
 def preparation(sizes: PreparationSizes, active: float) -> Operations:
@@ -181,11 +183,12 @@ def preparation(sizes: PreparationSizes, active: float) -> Operations:
         product((states + 1) * sizes.outputs), Operations(states + sizes.inputs + 2 * sizes.outputs + 4)
     )
     predict = _response(states, sizes).times(sizes.segments)
+    apart = correct.plus(Operations(2 * sizes.outputs + 1), predict).times(sizes.apart)
     start = gradient(sizes.problem, active).plus(Operations(3 * n + 2))
     sequence = product(sizes.samples * sizes.inputs * sizes.knots).plus(Operations(4 * sizes.samples * sizes.inputs))
     costs = augmented_cost(sizes.problem, active).times(2)
     sought = target(sizes.inputs) if sizes.targets else Operations(0)
-    return correct.plus(predict, instance(sizes).times(2), product(n * n), costs, start, sequence, sought)
+    return correct.plus(predict, apart, instance(sizes).times(2), product(n * n), costs, start, sequence, sought)
 
 
 def instance(sizes: PreparationSizes) -> Operations:
