@@ -76,7 +76,7 @@ def report(ppm: float, factor: float, hours: float) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run each case, and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__)
     parser.add_argument("--ppm", type=float, action="append", help="may be repeated (default: 200, -200)")
     parser.add_argument("--factor", type=float, default=50.0)
     parser.add_argument("--hours", type=float, default=6.0, help="of plant time")

@@ -25,7 +25,7 @@ EVERY = 40
 
 def main() -> None:
     """Draw the figure."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("figure", type=Path)
     options = parser.parse_args()

@@ -112,9 +112,11 @@ def draw(figure_file: Path, folders: list[Path]) -> None:
 
 def main() -> None:
     """Write or draw."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     commands = parser.add_subparsers(dest="command", required=True)
-    writing, drawing = commands.add_parser("write"), commands.add_parser("draw")
+    writing, drawing = (commands.add_parser(name, allow_abbrev=False) for name in ("write", "draw"))
     writing.add_argument("folder", type=Path)
     writing.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES))
     drawing.add_argument("figure", type=Path)

@@ -294,7 +294,7 @@ async def main(options: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Sends seeded nonsense to the three services.")
+    parser = argparse.ArgumentParser(allow_abbrev=False, description="Sends seeded nonsense to the three services.")
     parser.add_argument("--frames", type=int, default=100_000, help="damaged requests for each (default: 100000)")
     parser.add_argument("--bytes", type=int, default=10_000_000, help="random bytes for each (default: 10000000)")
     parser.add_argument("--tls", action="store_true", help="over TLS")

@@ -91,7 +91,7 @@ def outcomes(out: Path) -> tuple[str, bool]:
 
 def main() -> int:
     """Interrupt each command at all instants, and print; return 1 when one did not end as it should."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__)
     parser.add_argument("--count", type=int, default=20, help="instants of each command")
     parser.add_argument("--only", choices=COMMANDS, nargs="+", default=list(COMMANDS))
     parser.add_argument("--signal", choices=("SIGINT", "SIGTERM"), default="SIGINT")

@@ -71,7 +71,7 @@ def patient(patience_s: float) -> Configuration[Settings]:
 
 def main() -> int:
     """Do all of it in one run, and print; return 1 when the run failed."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__)
     parser.add_argument("--service", choices=("optimizer", "control", "plant"), default="optimizer")
     parser.add_argument("--signal", choices=("kill", "stop"), default="kill")
     parser.add_argument("--count", type=int, default=200)

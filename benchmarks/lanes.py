@@ -98,7 +98,9 @@ def look_ups_us(count: int, repeat: int) -> tuple[float, float]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--ticks", type=int, default=2000, help="of each plant")
     parser.add_argument("--look-ups", type=int, default=100_000)
     parser.add_argument("--repeat", type=int, default=5, help="the medians are printed")

@@ -115,7 +115,9 @@ def measured(load_name: str, ticks: int, repeat: int, calls: int) -> dict[str, t
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--load", default="2h")
     parser.add_argument("--ticks", type=int, default=28_800)
     parser.add_argument("--repeat", type=int, default=5, help="the medians are printed")

@@ -64,7 +64,7 @@ async def measure(ticks: int, period_s: float) -> int:
 
 def main() -> None:
     """Read the options, and measure."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__)
     parser.add_argument("--ticks", type=int, default=14400)
     parser.add_argument("--updating-period", type=float, default=0.0, help="s; 0 is adaptive")
     options = parser.parse_args()

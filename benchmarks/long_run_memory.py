@@ -68,7 +68,7 @@ def write_load(file: Path, hours: int, mean_w: float) -> None:
 
 def main() -> None:
     """Run, and print memory over time."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__)
     parser.add_argument("--hours", type=int, default=1000)
     parser.add_argument("--out", type=Path, required=True, help="folder for the results; memory.csv grows in it")
     options = parser.parse_args()

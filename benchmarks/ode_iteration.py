@@ -63,7 +63,9 @@ def measured(problems: int, minutes: float, repeat: int) -> tuple[float, float, 
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--problems", type=int, default=300)
     parser.add_argument("--minutes", type=float, default=20.0, help="of load e that they are recorded from")
     parser.add_argument("--repeat", type=int, default=5, help="the medians are printed")

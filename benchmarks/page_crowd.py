@@ -112,7 +112,7 @@ async def main(options: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--browsers", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=90.0, help="of each of the three runs, 15 or more")
     parser.add_argument("--address", help="be the browsers, of the page at this address")

@@ -199,7 +199,9 @@ def compare_problem(coldloop: Path, repeat: int) -> None:
 
 def main() -> None:
     """Measure and print, or be one side of a measurement."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--exchanges", type=int, default=3000)
     parser.add_argument("--coldloop", type=Path, default=OWN_PYTHON, help="an interpreter that has Coldloop")
     parser.add_argument("--helics-control", choices=CORES, help=argparse.SUPPRESS)

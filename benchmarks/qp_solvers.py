@@ -161,7 +161,9 @@ def report_paths(name: str, problems: list[RecordedProblem], harsh: NDArray[np.b
 
 def main() -> None:
     """Record, solve and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--hours", default="ef", help="one-hour loads to record, a letter each")
     parser.add_argument("--minutes", type=float, default=60, help="of each")
     parser.add_argument("--period", type=float, default=5.0, help="updating period recorded, s")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 def main() -> None:
     """Run each case, and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__)
     parser.add_argument("--case", nargs=2, action="append", metavar=("FACTOR", "DURATION"),
                         help="may be repeated (default: 1 for 2min, 20 for 1h)")  # fmt: skip
     for factor, duration in parser.parse_args().case or [("1", "2min"), ("20", "1h")]:

@@ -19,7 +19,7 @@ def realtime_factor(*options: str) -> tuple[float, str]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__)
     parser.add_argument("--load", default="2h")
     parser.add_argument("--duration", default="2h")
     parser.add_argument("--repeat", type=int, default=3, help="runs of each kind; the median is printed")

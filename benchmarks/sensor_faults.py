@@ -159,7 +159,7 @@ def off(text: str) -> dict[str, float]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__)
     parser.add_argument("--loads", nargs="+", default=["a"], help="names of loads (default: a)")
     parser.add_argument(
         "--outputs", nargs="+", default=OUTPUT_NAMES, choices=OUTPUT_NAMES, help="sensors (default: all)"

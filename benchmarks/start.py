@@ -78,7 +78,9 @@ def on_processor(measure: Callable[[], float]) -> tuple[float, float]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--repeat", type=int, default=5, help="the medians are printed")
     parser.add_argument("--cold", action="store_true", help="the first start on a machine, too: takes a minute or more")
     options = parser.parse_args()

@@ -22,7 +22,7 @@ def seconds(workers: int, options: StudyOptions) -> float:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__)
     parser.add_argument("--duration", type=duration, help="plant time of each run (default: eight hours)")
     parser.add_argument("--seeds", type=int, default=1)
     arguments = parser.parse_args()

@@ -1,6 +1,7 @@
 """The command `coldloop`, and `python -m rig`: interrupts end it in good order also while its modules are imported."""
 
 import gc
+import io
 import os
 import sys
 from pathlib import Path
@@ -29,6 +30,8 @@ def _open_closed_streams() -> None:
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115 as long as the process
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a terminal may not have each character of a unit
 
 
 if __name__ == "__main__":

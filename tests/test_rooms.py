@@ -14,7 +14,7 @@ FLOORS = {
     "services/plant": [["helium"], ["components"], ["cold_box"], ["refrigerator", "rack"], ["own"]],
     "services/optimizer_plc": [["qp"], ["solvers", "rules"]],
     "rig": [
-        ["results"], ["figures", "cosim"], ["runs", "plc_sizing", "plc_export"], ["studies", "chaos", "process_file"],
+        ["results"], ["figures", "cosim"], ["plc_sizing"], ["runs", "plc_export"], ["studies", "chaos", "process_file"],
         ["live"], ["testing", "report"], ["cli"],
     ],
 }  # fmt: skip

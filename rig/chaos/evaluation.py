@@ -6,12 +6,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.signals import CONTROLLED, TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind
 from optimizer_plc.qp.design import ControlDesign
 from rig.chaos.trace import ChaosTrace
+from rig.results.indicators import DEAD_BANDS, excess_of
 from rig.results.recording import Recording
 
 PerInput = tuple[float, ...]
@@ -41,7 +42,7 @@ class Row(NamedTuple):
     largest_steps: PerInput
     """Largest change of each input from a tick to the next, as a share of its limit."""
     outside_s: PerBand
-    """Time in the window that each output with a band was outside."""
+    """Time in the window that each output with a band was outside, beyond its dead band."""
     undisturbed_s: PerBand
     """The same without faults."""
     back_s: float | None
@@ -140,8 +141,7 @@ def _largest(steps: NDArray[np.float64]) -> PerInput:
 
 def _outside(recording: Recording, design: ControlDesign) -> NDArray[np.bool_]:
     """Return for each tick whether outputs are outside their bands, (N, bands); False for unknown ticks."""
-    y = recording.y[:, CONTROLLED]
-    outside: NDArray[np.bool_] = (y < np.array(design.output_low)) | (y > np.array(design.output_high))
+    outside: NDArray[np.bool_] = excess_of(recording.y, design) > DEAD_BANDS
     return outside
 
 

@@ -34,7 +34,9 @@ class LinkPlan(BaseModel):
         if not isinstance(content, dict) or not isinstance(content.get("faults"), list):
             return content
         if "load" in content:
-            raise ValueError("this is a chaos plan; a proxy's plan has only `seed` and `faults` (docs/chaos.md)")
+            raise ValueError(
+                "this is a chaos plan; a proxy's plan has only `seed` and `faults` (`coldloop docs chaos`)"
+            )
         return {**content, "faults": [_completed(fault) for fault in content["faults"]]}
 
     def changes(self) -> list[FaultTransition]:

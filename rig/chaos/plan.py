@@ -14,6 +14,7 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import SAMPLING_PERIOD_S, TICK_S
 from coldloop.session.settings import TimeMode
+from coldloop.text_file import read_text
 from plant.load import concatenated, find_load, named_families, telegraph
 from plant.settings import PlantKind
 from rig.chaos.faults import AnyFault, BoundaryFault
@@ -194,12 +195,7 @@ def _text_of(name: str) -> str:
     path = Path(name)
     if path.exists() and not path.is_file():
         raise UsageError(f"{name}: not a regular file; name a readable TOML file")
-    try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise UsageError(f"{name}: not UTF-8 text; save it as UTF-8") from None
-    except OSError as error:
-        raise UsageError(f"{name}: {error.strerror}; name a readable TOML file") from None
+    return read_text(path, "name a readable TOML file")
 
 
 def parse_plan(text: str, source: str, changes: dict[str, Any]) -> ChaosPlan:
@@ -236,5 +232,5 @@ def _explained(error: ValidationError) -> str:
     where = ".".join(str(part) for part in first["loc"])
     message = " ".join(first["msg"].removeprefix("Value error, ").split())
     if first["type"] == "extra_forbidden":
-        message = "no such key; docs/chaos.md lists them"
+        message = "no such key; `coldloop docs chaos` lists them"
     return f"{where}: {message}" if where else message

@@ -15,6 +15,8 @@ HOST: Final = "127.0.0.1"
 CHUNK: Final = 4096
 MOST_FROZEN: Final = 64
 """Connections that are kept while nothing passes: those who try again and again would take up all files."""
+HALF_CLOSED_S: Final = 60.0
+"""How long one direction may stay open alone."""
 _LINGER_NOT: Final = struct.pack("ii", 1, 0)
 
 
@@ -113,7 +115,7 @@ class LinkProxy:
         near: tuple[asyncio.StreamReader, asyncio.StreamWriter],
         far: tuple[asyncio.StreamReader, asyncio.StreamWriter],
     ) -> None:
-        """Pass frames on until either end is closed."""
+        """Pass frames on until both ends are closed, or one is broken; what one end still says, the other is sent."""
         self._number += 1
         seed = f"{self._seed}/{self._number}"
         pumps = [
@@ -121,31 +123,37 @@ class LinkProxy:
             asyncio.create_task(self._pump(far[0], near[1], Mangler(Direction.ANSWERS, f"{seed}/answers"))),
         ]
         try:
-            await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
+            ended, left = await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
+            if left and all(pump.result() for pump in ended):
+                await asyncio.wait(left, timeout=HALF_CLOSED_S)
         finally:
             for pump in pumps:
                 pump.cancel()
             await asyncio.gather(*pumps, return_exceptions=True)
 
-    async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, mangler: Mangler) -> None:
+    async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, mangler: Mangler) -> bool:
+        """Pass one direction on until it ends; return whether its end was passed on, too."""
         buffer = bytearray()
-        with contextlib.suppress(ConnectionError):
+        with contextlib.suppress(OSError):
             while True:
                 try:
                     async with asyncio.timeout(mangler.hold_s):
                         data = await reader.read(CHUNK)
                 except TimeoutError:
                     if mangler.hold_s is None:  # the network's own: the connection has gone
-                        return
+                        return False
                     writer.write(mangler.release())
                     continue
                 await self._flowing.wait()
                 if not data:
-                    return
+                    writer.write(mangler.release())
+                    writer.write_eof()
+                    return True
                 buffer += data
                 for frame in take_frames(buffer):
                     if not await self._pass(frame, writer, mangler):
-                        return
+                        return False
+        return False
 
     async def _pass(self, frame: bytes, writer: asyncio.StreamWriter, mangler: Mangler) -> bool:
         """Forward a frame as decided; return whether the connection stays open."""

@@ -11,7 +11,7 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.signals import STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
 from optimizer_plc.qp.design import ControlDesign
-from plant.cold_box.capacity import held_loads
+from plant.cold_box.capacity import LOOP_MARGIN, held_loads
 from plant.cold_box.diagnosis import operating_point
 from plant.cold_box.equilibrium import Equilibrium
 from plant.cold_box.linearisation import linearisation_error
@@ -152,7 +152,7 @@ def _kink_line(error: float) -> list[str]:
 
 
 def held_line(box: ColdBox, level: float, design: ControlDesign, limits: InputLimits) -> str:
-    """Return which loads a plant holds with L1 as in its file and T5 within its band: some seconds of computing."""
+    """Return which loads are held with L1 as in its file and T5 within its band: some seconds of computing."""
     openings = [np.linspace(limits.low[k], limits.high[k], count) for k, count in zip((0, 2), GRID, strict=True)]
     heater, warmth = (limits.low[1], limits.high[1]), (design.output_low[1], design.output_high[1])
     try:
@@ -160,7 +160,7 @@ def held_line(box: ColdBox, level: float, design: ControlDesign, limits: InputLi
             held = held_loads(box, load_helium(), level, openings[0], heater, openings[1], warmth)
     except ValueError:
         return "holds      no load with T5 within its band\n"
-    loads = f"[{max(held.least.w, 0.0):.0f},{held.largest.w:.0f}]"
+    loads = f"[{max(held.least.w, 0.0):.0f},{max(held.largest.w - LOOP_MARGIN, 0.0):.0f}]"
     return f"holds      loads of {loads} W at least: --set optimizer_plc.program.holdable_load_w={loads}\n"
 
 

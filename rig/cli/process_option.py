@@ -9,10 +9,15 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import UsageError
-from coldloop.process.declaration import VARIABLE
+from coldloop.kernels.cache_folder import find_cache_folder
+from coldloop.parsing import parsed_json
+from coldloop.process.declaration import VARIABLE, Process
 from rig.interpreter import PYTHON
 
 OPTION: Final = "--process"
+TRUST: Final = "--trust"
+READING: Final = ("report", "compare", "plot", "page", "export", "identify")
+"""Commands that take names, units and bands of a process from the folder of a run, and execute nothing in it."""
 LOADED: Final = "coldloop.process.loaded"
 """The module that reads it, once."""
 
@@ -24,6 +29,8 @@ def load_named_process(arguments: Sequence[str]) -> list[str]:
         UsageError: There is no file, or it cannot be made into a model file: what was said then is on standard error.
     """
     left, named = _split(arguments)
+    if named is None and not os.environ.get(VARIABLE) and LOADED not in sys.modules:
+        named = _of_run(left)
     if named is not None:
         path = Path(named)
         if not path.is_file():
@@ -33,6 +40,19 @@ def load_named_process(arguments: Sequence[str]) -> list[str]:
             raise UsageError(f"{OPTION} {named}: this interpreter is loaded with another process; begin a new one")
         os.environ[VARIABLE] = model
     return left
+
+
+def _of_run(arguments: Sequence[str]) -> str | None:
+    """Return the model file in the first folder of a run that a command only reads, or trusts; None for a cold box."""
+    if not arguments or not (arguments[0] in READING or (arguments[0] == "rerun" and TRUST in arguments)):
+        return None
+    places = [Path(each).parent if Path(each).name == "manifest.json" else Path(each) for each in arguments[1:]]
+    model = next((place / "inputs" / "model.json" for place in places if (place / "manifest.json").is_file()), None)
+    try:
+        Process.of(parsed_json(model.read_bytes())["process"] if model is not None else {})
+    except (OSError, ValueError, TypeError, KeyError):  # the command itself says what is wrong
+        return None
+    return str(model)
 
 
 def _split(arguments: Sequence[str]) -> tuple[list[str], str | None]:
@@ -51,10 +71,8 @@ def _split(arguments: Sequence[str]) -> tuple[list[str], str | None]:
 
 def _made(path: Path) -> Path:
     """Return the model file of a process file, made by a process of its own: this one is loaded with no process yet."""
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "coldloop" / "processes"
-    root.mkdir(parents=True, exist_ok=True)
     place = hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
-    out = root / f"{path.stem}-{place}.json"
+    out = find_cache_folder("processes") / f"{path.stem}-{place}.json"
     environment = {name: value for name, value in os.environ.items() if name != VARIABLE}
     made = subprocess.run(  # noqa: S603 our own program
         [*PYTHON, "-m", "rig", "process", str(path), "--out", str(out)], env=environment, capture_output=True,

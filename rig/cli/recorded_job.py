@@ -63,7 +63,7 @@ def _failure(summary: dict[str, Any], job: Job) -> str:
     return "; ".join(filter(None, (
         f"{failed} of {failed + summary['updates']} updates have no answer: what the optimiser computed is not finite",
         unheld(PROCESS.banded, model.A),
-        "docs/fail-safe.md#no-answer",
+        "`coldloop docs fail-safe#no-answer`",
     )))  # fmt: skip
 
 
@@ -71,7 +71,7 @@ def _tell(out: Path, summary: dict[str, Any]) -> None:
     updates = "no updates"
     if summary["updates"]:
         updates = f"{summary['updates']} updates, tau_u {summary['tau_u_mean']:.2f} s on average over time"
-    outside = ", ".join(f"{one.name} {summary[f'{one.name}_outside_band_pct']:.2f} %" for one in PROCESS.banded)
+    outside = ", ".join(f"{one.name} {summary[f'{one.name}_outside_dead_band_pct']:.2f} %" for one in PROCESS.banded)
     sys.stdout.write(
         f"{summary['ticks']} ticks, {updates}, {summary['realtime_factor'] or 0:,.0f} x real time\n"
         f"outside the bands: {outside}; "

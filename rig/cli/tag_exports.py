@@ -9,6 +9,7 @@ import hashlib
 import io
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any, Final, NamedTuple
@@ -37,7 +38,14 @@ class Tag(NamedTuple):
 
 
 def exported(register_map: RegisterMap) -> Iterator[Tag]:
-    """Yield the tags of a service, in the order of their addresses."""
+    """Yield the tags of a service, in the order of their addresses; names that would be the same end with these."""
+    tags = list(_named(register_map))
+    count = Counter(tag.name.lower() for tag in tags)
+    for tag in tags:
+        yield tag._replace(name=f"{tag.name}_{tag.register.address}") if count[tag.name.lower()] > 1 else tag
+
+
+def _named(register_map: RegisterMap) -> Iterator[Tag]:
     for block in register_map.shown:
         if block.writer is not None and block.record is not Operator:
             continue
@@ -52,12 +60,7 @@ def _tags(block: Block, row: int, prefix: str) -> Iterator[Tag]:
     texts = {name for name, field in fields_of(block.record).items() if field.is_text}
     for register in block.registers(row):
         if register.name.partition(".")[0] not in texts:
-            yield Tag(tag_name(f"{prefix}_{register.name}"), block.name, register)
-
-
-def tag_name(text: str) -> str:
-    """Return a name of letters, digits and underscores."""
-    return _NOT_IN_NAMES.sub("_", text)
+            yield Tag(_NOT_IN_NAMES.sub("_", f"{prefix}_{register.name}"), block.name, register)
 
 
 def runs(tags: Sequence[Tag]) -> Iterator[list[Tag]]:

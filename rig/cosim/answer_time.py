@@ -5,7 +5,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Final
 
-from coldloop.errors import LinkError
+from coldloop.errors import PeerUnreachableError
 
 ANSWER_S: Final = 10.0
 """How long a rig may take to answer all that a command asks at once."""
@@ -18,10 +18,10 @@ async def answered_in_time(what: str) -> AsyncIterator[None]:
     """Give up what is done in this context after `ANSWER_S`.
 
     Raises:
-        LinkError: It took longer.
+        PeerUnreachableError: It took longer.
     """
     try:
         async with asyncio.timeout(ANSWER_S):
             yield
     except TimeoutError:
-        raise LinkError(f"{what} takes longer than {ANSWER_S:g} s: the rig answers too slowly") from None
+        raise PeerUnreachableError(f"{what} takes longer than {ANSWER_S:g} s: the rig answers too slowly") from None

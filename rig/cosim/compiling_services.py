@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from coldloop.kernels.first_use import Kernels, write_line
+from coldloop.kernels.first_use import Kernels, announce
 from coldloop.parsing import parsed_json
 from coldloop.service.start import COMPILING, SERVING
 
@@ -21,7 +21,7 @@ async def show_compiling(logs: Sequence[Path]) -> None:
             return
         await asyncio.sleep(LOOK_S)
     await asyncio.sleep(TOGETHER_S)
-    write_line(*_compiling(logs))
+    announce(*_compiling(logs))
 
 
 def _compiling(logs: Sequence[Path]) -> list[Kernels]:

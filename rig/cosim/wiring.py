@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from coldloop.modbus.endpoints import Endpoint
+from coldloop.modbus.endpoints import PLANT_PORT, Endpoint
 from coldloop.safety.retained import RetainSettings
 from rig.cosim.answer_time import QUIET_S
 from rig.cosim.endpoints import RigEndpoints
@@ -67,8 +67,12 @@ def wired(settings: Settings, endpoints: RigEndpoints, detours: Detours | None =
         return getattr(settings, section).server.model_copy(update={"host": endpoint.host, "port": endpoint.port})
 
     plant, control_plc = detours or (None, None)
+    telemetry, port = settings.telemetry, endpoints.plant.port
+    if port != PLANT_PORT and telemetry.prefix == type(telemetry)().prefix:  # another rig may have the same broker
+        telemetry = telemetry.model_copy(update={"prefix": f"{telemetry.prefix}/{port}"})
     return settings.model_copy(
         update={
+            "telemetry": telemetry,
             "session": settings.session.model_copy(update={"autostart": False}),
             "plant": settings.plant.model_copy(update={"server": server("plant", endpoints.plant)}),
             "control_plc": settings.control_plc.model_copy(

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from coldloop.number_text import ends_text, number_text
 from rig.figures.plot import (
     BANDED,
     COLOURS,
@@ -18,19 +19,21 @@ from rig.figures.plot import (
     STYLE,
     Bounds,
     draw_tau_u,
+    label_marks,
     legend_above,
     limit,
     time_unit,
 )
 from rig.figures.run_plot import save_figure
 from rig.results.folders import writing
+from rig.results.indicators import EXCESS_KEYS
 from rig.results.run_folder import Curves, RunFolder
 from rig.text_tables import aligned
 
 FIGURES: Final = (
     "complete", "ticks", "updates", "J_BF", "J_open_mean", "J_dev", "J_cst", "c1", "c2", "tau_u_mean",
-    "tau_u_mean_per_update", "iterations_total", *(f"{name}_outside_band_pct" for name in BANDED), "deadline_misses",
-    "trace_sha256",
+    "tau_u_mean_per_update", "iterations_total", *(f"{name}_outside_band_pct" for name in BANDED), *EXCESS_KEYS,
+    "deadline_misses", "trace_sha256",
 )  # fmt: skip
 
 
@@ -68,7 +71,7 @@ def _cell(value: Any) -> str:  # noqa: ANN401 a value of a JSON document
     if value is None:
         return "-"
     if isinstance(value, float):
-        return f"{value:.5g}"
+        return number_text(value, 5)
     return f"{value[:12]}" if isinstance(value, str) and len(value) == 64 else str(value)
 
 
@@ -91,6 +94,7 @@ def draw_comparison(runs: Sequence[RunFolder], labels: Sequence[str]) -> Figure:
         for name, label in LABELS.items():
             axes[name].set_ylabel(label)
             legend_above(axes[name])
+            label_marks(axes[name])
         axes["stage_cost"].set_xlabel(f"plant time ({unit})")
         axes["stage_cost"].set_xlim(0, max(float(one["time_s"][-1]) for one in curves) / scale_s)
         figure.align_ylabels(list(axes.values()))
@@ -106,7 +110,7 @@ def _scale(axes: dict[str, Axes], first: RunFolder, curves: Sequence[Curves]) ->
     bounds = Bounds.of(first.configuration)
     for name, edges in {**bounds.bands, **bounds.inputs}.items():
         values = np.concatenate([one[name] for one in curves])
-        limit(axes[name], values, edges, f"{'band' if name in bounds.bands else 'bounds'} {edges[0]:g} to {edges[1]:g}")
+        limit(axes[name], values, edges, f"{'band' if name in bounds.bands else 'bounds'} {ends_text(*edges)}")
     axes["tau_u_s"].set_ylim(0, LONGEST_TAU_U_S + 0.3)
     axes["stage_cost"].set_yscale("log")
     axes["stage_cost"].set_ylim(bottom=1e-6)

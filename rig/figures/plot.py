@@ -9,8 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from matplotlib.ticker import ScalarFormatter
 from numpy.typing import NDArray
 
+from coldloop.number_text import axis_labels, ends_text
 from coldloop.process.load_profile import LOAD_COLUMN, LOAD_WORD
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, SAMPLING_PERIOD_S
@@ -37,7 +39,8 @@ def with_unit(name: str, unit: str) -> str:
 
 
 LABELS: Final[Mapping[str, str]] = {
-    LOAD_COLUMN: with_unit(LOAD_WORD, PROCESS.load.unit),
+    **({LOAD_COLUMN: with_unit(LOAD_WORD, PROCESS.load.unit)} if PROCESS.has_load else {}),
+    **{one.name: with_unit(one.name, one.unit) for one in PROCESS.disturbances},
     **{name: with_unit(name, unit) for name, unit in {**BANDED, **MOVED}.items()},
     "tau_u_s": "tau_u (s)",
     "stage_cost": "stage cost (1)",
@@ -89,7 +92,7 @@ class RunCurves(NamedTuple):
 
 
 def draw_run(curves: RunCurves) -> Figure:
-    """Return load, outputs with their bands, inputs with their bounds, updating period, cost, modes and alarms."""
+    """Return load, disturbances, outputs with their bands, inputs with their bounds, tau_u, cost, modes and alarms."""
     scale_s, unit = time_unit(curves.series["time_s"])
     time = curves.series["time_s"] / scale_s
     heights = [1.0] * (len(DRAWN) + len(curves.pressures)) + ([0.45] if curves.events else [])
@@ -98,18 +101,20 @@ def draw_run(curves: RunCurves) -> Figure:
         axes: list[Axes] = list(
             figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, gridspec_kw=PANELS)
         )
-        _curve(axes[0], time, curves.series[LOAD_COLUMN], LABELS[LOAD_COLUMN], PROCESS.load.name)
-        first = 1 + len(BANDED)
-        for place, (name, band) in zip(axes[1:first], curves.bounds.bands.items(), strict=True):
+        outside = DRAWN[: DRAWN.index(next(iter(BANDED)))]  # load and disturbances
+        for place, name in zip(axes, outside, strict=False):
+            _curve(place, time, curves.series[name], LABELS[name], PROCESS.load.name if name == LOAD_COLUMN else name)
+        first = len(outside) + len(BANDED)
+        for place, (name, band) in zip(axes[len(outside) : first], curves.bounds.bands.items(), strict=True):
             _curve(place, time, curves.series[name], LABELS[name], name)
-            limit(place, curves.series[name], band, f"band {band[0]:g} to {band[1]:g} {BANDED[name]}".rstrip())
+            limit(place, curves.series[name], band, f"band {ends_text(*band)} {BANDED[name]}".rstrip())
         behind = first + len(MOVED)
         for place, (name, bound) in zip(axes[first:behind], curves.bounds.inputs.items(), strict=True):
             _curve(place, time, curves.series[name], LABELS[name], name)
-            limit(place, curves.series[name], bound, f"bounds {bound[0]:g} to {bound[1]:g} {MOVED[name]}".rstrip())
+            limit(place, curves.series[name], bound, f"bounds {ends_text(*bound)} {MOVED[name]}".rstrip())
         for place, (name, ends) in zip(axes[behind:], curves.pressures.items(), strict=False):
             _curve(place, time, curves.series[name], f"{name} (bar)", name)
-            limit(place, curves.series[name], ends, f"no alarm from {ends[0]:g} to {ends[1]:g} bar")
+            limit(place, curves.series[name], ends, f"no alarm from {ends_text(*ends)} bar")
         _updating_period(axes[behind + len(curves.pressures)], time, curves.series)
         _cost(axes[behind + len(curves.pressures) + 1], time, curves.series["stage_cost"])
         if curves.events:
@@ -118,11 +123,26 @@ def draw_run(curves: RunCurves) -> Figure:
             legend_above(place)
             place.text(LABEL_AT, 1.03, f"({letter})", transform=place.transAxes, fontsize=8, ha="center")
             place.yaxis.set_label_coords(LABEL_AT, 0.5)
+            label_marks(place)
         axes[-1].set_xlabel(f"plant time ({unit})")
         axes[-1].set_xlim(float(time[0]), float(time[-1]) if len(time) > 1 else float(time[0]) + 1)
         figure.suptitle(curves.title, y=0.99)
         figure.supxlabel(curves.identity, y=0.004, fontsize=6.5, color="#5a6672")
     return figure
+
+
+class MarkLabels(ScalarFormatter):
+    """Labels of a linear axis: as many digits as the step of its marks needs."""
+
+    def format_ticks(self, values: Sequence[float]) -> list[str]:
+        """Return the labels of the marks."""
+        return axis_labels(values)
+
+
+def label_marks(axes: Axes) -> None:
+    """Give the marks of the vertical axis their labels, if it is a linear one without words."""
+    if isinstance(axes.yaxis.get_major_formatter(), ScalarFormatter):
+        axes.yaxis.set_major_formatter(MarkLabels())
 
 
 def time_unit(time_s: Series) -> tuple[float, str]:
@@ -195,7 +215,8 @@ def draw_tau_u(axes: Axes, time: Series, tau_u: Series, time_s: Series, colour: 
               drawstyle="steps-post", label=label)  # fmt: skip
     if chatters:
         step = float(np.median(np.diff(time_s))) or 1.0
-        axes.plot(time, moving_mean(tau_u, max(1, round(SMOOTHING_S / step))), color=colour, linewidth=1.3,
+        mean = np.where(np.isfinite(tau_u), moving_mean(tau_u, max(1, round(SMOOTHING_S / step))), np.nan)
+        axes.plot(time, mean, color=colour, linewidth=1.3,
                   label=f"{label}, mean over {SMOOTHING_S:g} s")  # fmt: skip
 
 

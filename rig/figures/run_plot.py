@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES
 from coldloop.whole_file import whole_file
 from rig.figures.plot import BANDED, DRAWN, Bounds, RunCurves, draw_run
@@ -74,12 +75,14 @@ def pressure_limits(configuration: Mapping[str, Any]) -> dict[str, tuple[float, 
 
 def at_times(series: Curves, times_s: NDArray[np.float64]) -> Curves:
     """Return the curves of a file at the times of another one."""
-    return {name: np.interp(times_s, series["time_s"], curve) for name, curve in series.items() if name != "time_s"}
+    known = series["time_s"]
+    return {n: np.interp(times_s, known, curve, np.nan, np.nan) for n, curve in series.items() if n != "time_s"}
 
 
 def title_of(configuration: Mapping[str, Any], way: str = "") -> str:
     """Return what a run was, in a few words; of a session that was recorded, the load is not known by name."""
-    load = "session under way" if way == Way.RECORDED else f"load {Path(configuration['plant.load']).name}"
+    named = f"load {Path(configuration['plant.load']).name}" if PROCESS.has_load else PROCESS.name
+    load = "session under way" if way == Way.RECORDED else named
     if configuration["control_plc.driver"] == "classical":
         return f"{load}, classical loops"
     period = configuration["optimizer_plc.program.updating_period_s"]

@@ -32,7 +32,7 @@ def kill(process: ServiceProcess) -> None:
     _signal(process, signal.SIGKILL)
 
 
-async def freeze(process: ServiceProcess, seconds: float) -> bool:
+async def pause(process: ServiceProcess, seconds: float) -> bool:
     """Suspend a process for a while; it is resumed in any case. Return whether it runs."""
     _signal(process, signal.SIGSTOP)
     try:

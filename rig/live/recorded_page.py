@@ -1,6 +1,7 @@
 """A run folder as the operator's page replays it."""
 
 import math
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from functools import cache, cached_property
 from typing import Any, Final
@@ -11,13 +12,15 @@ from numpy.typing import NDArray
 from coldloop.config import load_configuration
 from coldloop.process.load_profile import LOAD_COLUMN
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
+from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Mode, Process
 from coldloop.registers.declaration import fields_of
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, UpdatingRuleStatus
-from coldloop.registers.plant import StationSample
+from coldloop.registers.plant import SensorFaultKind, StationSample
 from coldloop.registers.safety import Alarm
 from coldloop.service.event_text import EventText, word
 from hmi.process_image import JournalEntry
+from hmi.quality import Doubts
 from hmi.replay import ReplayFrame
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.rules import make_rule
@@ -110,8 +113,25 @@ class RecordedPage:
         u, y = tuple(values[: len(INPUT_NAMES)]), tuple(values[len(INPUT_NAMES) :])
         mode = _MODES.get(self._modes[tick], int(Mode.MPC))
         cause = _CAUSES.get(self._causes[tick], int(Cause.NONE))
-        bad, station = self._bad_sensors[tick], self._station_at(tick)
-        return ReplayFrame(Process(tick, load, u, y), mode, cause, self._since[tick], bad, station)
+        suspect, faulty = self._doubts[max(0, bisect_right(self._doubts, tick, key=lambda one: one[0]) - 1)][1:]
+        doubts = Doubts(suspect, bad=self._bad_sensors[tick], simulated=faulty)
+        return ReplayFrame(Process(tick, load, u, y), mode, cause, self._since[tick], doubts, self._station_at(tick))
+
+    @cached_property
+    def _doubts(self) -> list[tuple[int, int, int]]:
+        """Suspect and faulty sensors from a tick on, by the journals: tick, and a bit for each output of both."""
+        found = [(0, 0, 0)]
+        for entry in self.events:
+            kind, subject, cause = entry.text[:3]
+            if subject not in OUTPUT_NAMES:
+                continue
+            (_, suspect, faulty), bit = found[-1], 1 << OUTPUT_NAMES.index(subject)
+            if kind == word(EventKind.SENSOR):
+                suspect = suspect & ~bit | bit * (cause == "suspect")
+            elif kind == word(EventKind.SENSOR_FAULT):
+                faulty = faulty & ~bit | bit * (cause != word(SensorFaultKind.NONE))
+            found.append((entry.tick, suspect, faulty))
+        return found
 
     def alarms(self, events: Sequence[JournalEntry]) -> list[Alarm]:
         """Return the alarms after these events."""

@@ -1,10 +1,15 @@
 """What a rig that is up is doing, read over Modbus."""
 
-from typing import Final, NamedTuple
+import asyncio
+from collections.abc import Awaitable, Iterator
+from typing import Any, Final, NamedTuple
 
-from coldloop.operating.execution import Clients
+from coldloop.errors import LinkError, PeerUnreachableError
+from coldloop.number_text import value_text
+from coldloop.operating.execution import Clients, CommandClient
 from coldloop.operating.rings import last_update
 from coldloop.process.load_profile import LOAD_UNIT
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import CONTROLLED, OUTPUT_NAMES, OUTPUT_UNITS, TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode, Process
@@ -12,44 +17,86 @@ from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmState
 from coldloop.service.event_text import alarm_cause, alarm_word, word_of
+from rig.cosim.answer_time import answered_in_time
 
 QUIET: Final = (AlarmState.NORMAL, AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE)
+
+
+class PlantStatus(NamedTuple):
+    """One look at the plant."""
+
+    identity: Identity
+    pace: SessionPace
+    load: LoadStatus
+
+
+class ControlStatus(NamedTuple):
+    """One look at the control PLC."""
+
+    ladder: LadderStatus
+    operator: Operator
+    y: tuple[float, ...]
+    """Outputs of the last scan; all are 0 before the first."""
+    alarms: tuple[str, ...]
 
 
 class RigStatus(NamedTuple):
     """One look at the services of a rig."""
 
-    plant: Identity
-    pace: SessionPace
-    ladder: LadderStatus
-    operator: Operator
-    process: Process
-    load: LoadStatus
+    plant: PlantStatus | None
+    """None where it does not answer, as below."""
+    control: ControlStatus | None
     update: Optimization | None
-    """The last one that was done; None before the first, and of an optimiser that is not ours."""
-    alarms: tuple[str, ...]
+    """The last one that was done; None before the first as well, and of an optimiser that is not ours."""
+    silent: tuple[str, ...] = ()
+    """What is said of each service that does not answer."""
 
 
 async def read_status(clients: Clients) -> RigStatus:
-    """Return the state of a rig.
+    """Return the state of a rig, of which some services may be away.
 
     Raises:
-        LinkError: A service does not answer.
+        LinkError: Neither the plant nor the control PLC answers, or an answer is not possible.
     """
-    plant, control, optimizer = clients["plant"], clients["control_plc"], clients.get("optimizer_plc")
-    update = None if optimizer is None else await last_update(optimizer, await optimizer.read(Identity))
-    rows = await control.read_rows(Alarm, 0, len(AlarmKind))
+    readers = {"plant": _plant, "control_plc": _control, "optimizer_plc": _update}
+    names = [name for name in readers if name in clients]
+    answers = await asyncio.gather(*(_answer(readers[name](clients[name])) for name in names))
+    found: dict[str, Any] = dict(zip(names, answers, strict=True))
+    absent = [answer for answer in answers if isinstance(answer, LinkError)]
+    plant, control, update = (
+        None if isinstance(found.get(name), LinkError) else found.get(name) for name in readers
+    )  # fmt: skip
+    if plant is None and control is None:
+        raise absent[0]
+    return RigStatus(plant, control, update, tuple(map(str, absent)))
+
+
+async def _answer(reading: Awaitable[Any]) -> Any:  # noqa: ANN401 of any service
+    """Return what is read, or why a service does not answer."""
+    try:
+        async with answered_in_time("to read the status"):
+            return await reading
+    except PeerUnreachableError as error:
+        return error
+
+
+async def _plant(client: CommandClient) -> PlantStatus:
+    await client.connect(0.0)
+    return PlantStatus(await client.read(Identity), await client.read(SessionPace), await client.read(LoadStatus))
+
+
+async def _control(client: CommandClient) -> ControlStatus:
+    await client.connect(0.0)
+    rows = await client.read_rows(Alarm, 0, len(AlarmKind))
     alarms = tuple(_alarm(kind, row) for kind, row in zip(AlarmKind, rows, strict=True) if row.state not in QUIET)
-    return RigStatus(
-        plant=await plant.read(Identity),
-        pace=await plant.read(SessionPace),
-        ladder=await control.read(LadderStatus),
-        operator=await control.read(Operator),
-        process=await control.read(Process),
-        load=await plant.read(LoadStatus),
-        update=update,
-        alarms=alarms,
+    return ControlStatus(
+        await client.read(LadderStatus), await client.read(Operator), (await client.read(Process)).y, alarms
     )
+
+
+async def _update(client: CommandClient) -> Optimization | None:
+    await client.connect(0.0)
+    return await last_update(client, await client.read(Identity))
 
 
 def _alarm(kind: AlarmKind, row: Alarm) -> str:
@@ -58,13 +105,13 @@ def _alarm(kind: AlarmKind, row: Alarm) -> str:
     return f"{alarm_word(kind)}{f' ({cause})' if cause else ''}, {state}"
 
 
-def _pace(status: RigStatus) -> str:
-    pace = status.pace
-    if not status.plant.session:
+def _pace(plant: PlantStatus) -> str:
+    pace = plant.pace
+    if not plant.identity.session:
         return "no session"
     if not pace.realtime:
         return "lock-step"
-    return f"paused (factor {pace.factor:g})" if pace.paused else f"{pace.factor:g} x real time"
+    return f"paused (factor {value_text(pace.factor)})" if pace.paused else f"{value_text(pace.factor)} x real time"
 
 
 def _tau_u(status: RigStatus) -> str:
@@ -73,28 +120,41 @@ def _tau_u(status: RigStatus) -> str:
 
 def page(status: RigStatus) -> str:
     """Return the state as a page."""
-    ladder, load, y = status.ladder, status.load, status.process.y
-    known = any(y)  # a control PLC that was started again shows nothing before its first scan
-    following = f", {load.next_watts:g} {LOAD_UNIT} from {load.next_tick * TICK_S:g} s" if load.upcoming else ""
-    rows = [
-        ("session", f"{status.plant.session}, {_pace(status)}, {status.plant.tick * TICK_S:.2f} s"),
-        ("mode", f"{word_of(Mode, ladder.mode)} ({word_of(Cause, ladder.cause)}) since {ladder.since * TICK_S:g} s"),
-        ("operator", word_of(OperatorMode, status.operator.mode)),
-        ("load", f"{load.watts:g} {LOAD_UNIT}{following}"),
-        *((OUTPUT_NAMES[i], f"{y[i]:.3f} {OUTPUT_UNITS[i]}" if known else "-") for i in CONTROLLED),
-        ("tau_u", _tau_u(status)),
-        ("alarms", "; ".join(status.alarms) or "none"),
-    ]  # fmt: skip
-    return "".join(f"{name:8} {text}\n" for name, text in rows)
+    return "".join(f"{name:8} {text}\n" for name, text in _rows(status))
+
+
+def _rows(status: RigStatus) -> Iterator[tuple[str, str]]:
+    plant, control = status.plant, status.control
+    if plant is not None:
+        yield "session", f"{plant.identity.session}, {_pace(plant)}, {plant.identity.tick * TICK_S:.2f} s"
+    if control is not None:
+        mode, cause = word_of(Mode, control.ladder.mode), word_of(Cause, control.ladder.cause)
+        yield "mode", f"{mode} ({cause}) since {control.ladder.since * TICK_S:g} s"
+        yield "operator", word_of(OperatorMode, control.operator.mode)
+    if plant is not None and PROCESS.has_load:
+        load, then = plant.load, value_text(plant.load.next_watts, LOAD_UNIT)
+        following = f", {then} from {load.next_tick * TICK_S:g} s" if load.upcoming else ""
+        yield "load", f"{value_text(load.watts, LOAD_UNIT)}{following}"
+    if control is not None:
+        known = any(control.y)  # a control PLC that was started again shows nothing before its first scan
+        for i in CONTROLLED:
+            yield OUTPUT_NAMES[i], f"{control.y[i]:.3f} {OUTPUT_UNITS[i]}" if known else "-"
+    yield "tau_u", _tau_u(status)
+    if control is not None:
+        yield "alarms", "; ".join(control.alarms) or "none"
+    yield from (("absent", one) for one in status.silent)
 
 
 def line(status: RigStatus) -> str:
     """Return the state as one line."""
-    y = status.process.y
-    outputs = "  ".join(f"{OUTPUT_NAMES[i]} {y[i]:6.2f} {OUTPUT_UNITS[i]}" for i in CONTROLLED)
-    load = f"{status.load.watts:6.1f} {LOAD_UNIT}"
-    return (
-        f"{status.plant.tick * TICK_S:10.2f} s  {word_of(Mode, status.ladder.mode):9}  {load}  "
-        f"{outputs}  tau_u {_tau_u(status):>6}  "
-        f"{'; '.join(status.alarms) or 'no alarms'}"
-    )
+    plant, control = status.plant, status.control
+    parts = ["no plant  "] if plant is None else [f"{plant.identity.tick * TICK_S:10.2f} s"]
+    parts.append("no control PLC" if control is None else f"{word_of(Mode, control.ladder.mode):9}")
+    if plant is not None:
+        parts.append(f"{plant.load.watts:6.1f} {LOAD_UNIT}")
+    if control is not None:
+        parts += [f"{OUTPUT_NAMES[i]} {control.y[i]:6.2f} {OUTPUT_UNITS[i]}" for i in CONTROLLED]
+    parts.append(f"tau_u {_tau_u(status):>6}")
+    if control is not None:
+        parts.append("; ".join(control.alarms) or "no alarms")
+    return "  ".join((*parts, *status.silent))

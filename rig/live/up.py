@@ -180,14 +180,16 @@ def addresses(settings: Settings, ports: Sequence[int], folder: Path, services: 
     shown = PROCESS.banded[-1]
     measured = PLANT_MAP.block_of(Measurement).registers()
     address = next(one.address for one in measured if one.name == f"y.{shown.name}")
-    load = 420 if PROCESS_FILE is None else PROCESS.load.span[1]
+    load = f"load {420 if PROCESS_FILE is None else PROCESS.load.span[1]:g}" if PROCESS.has_load else "mode manual"
+    which = f"load {settings.plant.load}, " if PROCESS.has_load else ""
+    more = "load FILE.csv, mode, " if PROCESS.has_load else ""
     tls = any(getattr(settings, service).server.tls for service in services)
     places = {
         service: f"127.0.0.1:{port}" if service in services else "yours: a client of the control PLC"
         for service, port in zip(SERVICES, ports, strict=True)
     }
     lines = [
-        f"the rig is up: load {settings.plant.load}, {settings.session.factor:g} x real time",
+        f"the rig is up: {which}{settings.session.factor:g} x real time",
         *(f"  {service:14} {place}" for service, place in places.items()),
         f"  logs           {folder / 'logs'}",
     ]
@@ -200,6 +202,6 @@ def addresses(settings: Settings, ports: Sequence[int], folder: Path, services: 
         ]
     lines += [
         f"coldloop status{base} --follow    its status",
-        f"coldloop set{base} load {load:<10g}and load FILE.csv, mode, setpoint, factor, pause, resume, acknowledge",
+        f"coldloop set{base} {load:<15}and {more}setpoint, factor, pause, resume, acknowledge",
     ]
     return "\n".join(lines) + "\n"

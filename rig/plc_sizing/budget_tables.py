@@ -57,9 +57,10 @@ def budget_tables(settings: Settings, period_s: float | None, executed: Callable
     """
     problem, prediction = problem_of(settings)
     program = settings.optimizer_plc.program
+    limited, apart = program.cold_end.approach_k > 0.0, predicted_apart(program, prediction)
     return "\n".join([
         _speed(reference_curve(), problem.size),
-        _operations(problem, prediction, predicted_apart(program, prediction)) + executed(problem),
+        _operations(problem, prediction, apart, limited=limited) + executed(problem),
         _iterations(program, problem, period_s),
         _memory(settings, problem, prediction, MEMORY_BYTES),
     ])  # fmt: skip
@@ -139,7 +140,7 @@ def predicted_apart(program: ProgramSettings, prediction: PredictionModel) -> in
     return 2 * (kalman and watched_output(program.plausibility, prediction) >= 0)
 
 
-def _operations(problem: PredictiveProblem, prediction: PredictionModel, apart: int) -> str:
+def _operations(problem: PredictiveProblem, prediction: PredictionModel, apart: int, *, limited: bool) -> str:
     dense, without_zeros = counted_sizes(problem)
     m, mean = dense.m, ACTIVE_ROWS.mean
     variants: dict[str, Callable[[QpSizes], Operations]] = {
@@ -161,7 +162,7 @@ def _operations(problem: PredictiveProblem, prediction: PredictionModel, apart: 
     sizes = operations.PreparationSizes(
         dense, m - 4 * len(problem.design.constraint_instants), problem.n_knots, prediction.n_states,
         prediction.D.shape[1], prediction.D.shape[0], segments=1, samples=1,
-        targets=problem.design.target is not Target.OPERATING_POINT, apart=apart,
+        targets=problem.design.target is not Target.OPERATING_POINT, limited=limited, apart=apart,
     )  # fmt: skip
     once = operations.preparation(sizes, mean)
     rows.append(("preparation, once an updating period", f"{once.flops:,.0f}", "", f"{once.bytes / 1e3:.1f}", ""))

@@ -172,6 +172,8 @@ class PreparationSizes(NamedTuple):
     """Sampling periods in a sequence."""
     targets: bool
     """Whether the cost is about a target that is sought."""
+    limited: bool
+    """Whether there is a limit of the feed, by two outputs that are estimated."""
     apart: int = 0
     """Predictions without the watched reading, beside the filter's."""
 
@@ -188,7 +190,9 @@ def preparation(sizes: PreparationSizes, active: float) -> Operations:
     sequence = product(sizes.samples * sizes.inputs * sizes.knots).plus(Operations(4 * sizes.samples * sizes.inputs))
     costs = augmented_cost(sizes.problem, active).times(2)
     sought = target(sizes.inputs) if sizes.targets else Operations(0)
-    return correct.plus(predict, apart, instance(sizes).times(2), product(n * n), costs, start, sequence, sought)
+    limit = _response(2, sizes).plus(Operations(13)) if sizes.limited else Operations(0)
+    once = (product(n * n), costs, start, sequence, sought, limit)
+    return correct.plus(predict, apart, instance(sizes).times(2), *once)
 
 
 def instance(sizes: PreparationSizes) -> Operations:

@@ -43,7 +43,7 @@ def _operations(sizes: ProblemSizes) -> dict[str, float]:
     problem = dense_sizes(n_inputs + 2 * sizes.bands * sizes.knots, rows, n_inputs)
     once = PreparationSizes(
         problem=problem, rate_rows=rate_rows, knots=sizes.knots, states=sizes.states, inputs=sizes.inputs,
-        outputs=sizes.outputs, segments=1, samples=1, targets=False,
+        outputs=sizes.outputs, segments=1, samples=1, targets=False, limited=False,
     )  # fmt: skip
     counts = {str(name): SOLVERS[name].operations(problem).flops for name in COUNTED}
     return {**counts, "preparation": preparation(once, ACTIVE_ROWS.mean).flops}

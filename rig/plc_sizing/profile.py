@@ -11,17 +11,16 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from coldloop.config import load_configuration
 from coldloop.errors import ConfigurationError, UsageError
+from coldloop.table import read_table
 from rig.plc_sizing.reference_plc import Array, fitted
 
-LISTING: Final = "docs/keys.md lists the keys"
+LISTING: Final = "`coldloop docs keys` lists the keys"
 SHIPPED: Final = files("rig.plc_sizing") / "profiles"
 FEWEST_SIZES: Final = 3
 """Of a factorisation, for a curve of three coefficients."""
 TIMES_HEADER: Final = ("size", "plc_ms")
 """First columns of a file of factorisation times."""
 
-LARGEST_FILE: Final = 1_000_000
-"""Bytes of a file of times."""
 LARGEST_SIZE: Final = 10_000
 SHORTEST_MS, LONGEST_MS = 1e-6, 1e9
 
@@ -100,12 +99,14 @@ def _read(path: Path) -> PlcProfile:
 
 def _times(path: Path) -> tuple[Array, Array]:
     """Return sizes, in rising order, and times in seconds."""
-    rows = _rows(path)
-    if not rows or tuple(cell.strip() for cell in rows[0][1][:2]) != TIMES_HEADER:
-        raise ConfigurationError(f"{path}: the first line must be the header {','.join(TIMES_HEADER)}")
+    table = read_table(path, TIMES_HEADER, "name a CSV file with `factorisations`", ConfigurationError)
     found: dict[float, float] = {}
-    for number, cells in rows[1:]:
-        size, plc_ms = _pair(f"{path}: line {number}", cells)
+    for (number, _), size, plc_ms in zip(table.rows, *table.columns(TIMES_HEADER), strict=True):
+        if not (1.0 <= size <= LARGEST_SIZE and SHORTEST_MS <= plc_ms <= LONGEST_MS):
+            raise ConfigurationError(
+                f"{path}: line {number}: sizes are from 1 to {LARGEST_SIZE}, times from {SHORTEST_MS:g} to "
+                f"{LONGEST_MS:g} ms"
+            )
         if size in found:
             raise ConfigurationError(f"{path}: line {number}: the size {size:g} is there twice; leave one time of it")
         found[size] = plc_ms * 1e-3
@@ -115,31 +116,3 @@ def _times(path: Path) -> tuple[Array, Array]:
     if (np.diff(times) <= 0.0).any():
         raise ConfigurationError(f"{path}: a larger size takes no longer than a smaller one; times have to rise")
     return sizes, times
-
-
-def _rows(path: Path) -> list[tuple[int, list[str]]]:
-    """Return the lines that are no comments, with their numbers."""
-    try:
-        with path.open("rb") as file:  # a device has no end
-            content = file.read(LARGEST_FILE + 1)
-        if len(content) > LARGEST_FILE:
-            raise ConfigurationError(f"{path}: not a file of times: more than {LARGEST_FILE} bytes")
-        lines = content.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise ConfigurationError(f"{path}: not UTF-8 text; save it as UTF-8") from None
-    except OSError as error:
-        raise ConfigurationError(f"{path}: {error.strerror}; name a CSV file with `factorisations`") from None
-    return [(number, line.split(",")) for number, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
-
-
-def _pair(where: str, cells: list[str]) -> tuple[float, float]:
-    """Return a size and its time in milliseconds."""
-    try:
-        size, plc_ms = (float(cell) for cell in cells[:2])
-    except ValueError:
-        raise ConfigurationError(f"{where}: not a size and a time in milliseconds") from None
-    if not (1.0 <= size <= LARGEST_SIZE and SHORTEST_MS <= plc_ms <= LONGEST_MS):
-        raise ConfigurationError(
-            f"{where}: sizes are from 1 to {LARGEST_SIZE}, times from {SHORTEST_MS:g} to {LONGEST_MS:g} ms"
-        )
-    return size, plc_ms

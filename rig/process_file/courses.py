@@ -6,7 +6,7 @@ from typing import Any
 
 from coldloop.errors import UsageError
 from coldloop.process.declaration import Forecast
-from rig.process_file.csv_columns import TIME, columns
+from coldloop.table import TIME, read_table
 from rig.process_file.declaration import DisturbanceSection, LoadSection, ProcessFile
 
 
@@ -42,7 +42,8 @@ def _course(one: DisturbanceSection, folder: Path, tick_s: float) -> dict[str, A
 
 def _steps(one: LoadSection | DisturbanceSection, path: Path, tick_s: float) -> tuple[list[int], list[float]]:
     """Return ticks and values of a CSV file with time_s and the name of a signal."""
-    times, values = (column.tolist() for column in columns(path, [TIME, one.name]).T)
+    wanted = (TIME, one.name)
+    times, values = read_table(path, wanted, "name a CSV file beside the process file").columns(wanted)
     ticks = [round(time / tick_s) for time in times]
     if ticks[0] != 0:
         raise UsageError(f"{path}: {TIME} begins at {times[0]:g}; it begins at 0, which is when a session begins")

@@ -19,7 +19,7 @@ from coldloop.process.declaration import FURTHEST_WEIGHT, Bath
 
 MOST_SIGNALS: Final = 32
 """Outputs at most: registers have a bit for each."""
-LISTING: Final = "docs/keys.md lists all keys"
+LISTING: Final = "`coldloop docs keys` lists all keys"
 
 RESERVED: Final = frozenset((
     "tick", "session", "holder", "generation", "crc", "mode", "update", "u", "time_s", "load", "load_w", "cause",
@@ -122,6 +122,9 @@ class OutputSection(_Section):
     of the band, or of the tolerance."""
     alarm: Span | None = None
     """Outside of it the alarm is raised; the band, or the setpoint with its tolerance, if not given."""
+    dead_band: NonNegativeFloat | None = None
+    """Excess over the band up to which it does not count as outside, for alarms, indicators and the page; if not given
+    3 times `noise`, and 1 % of the band at least; a setpoint's is its tolerance."""
     weight: NonNegativeFloat = 0.0
     """In the cost, per square of its deviation from the operating point."""
     loop: LoopSection | None = None
@@ -152,6 +155,8 @@ class OutputSection(_Section):
 
     @model_validator(mode="after")
     def _weighed(self) -> Self:
+        if self.band is None and self.dead_band is not None:
+            raise ValueError(f"{self.name}: a dead_band needs a band; leave it out: a setpoint has its tolerance")
         if self.edges is not None:
             _near(self.penalty, self.usual_penalty(self.edges), f"{self.name}: penalty")
         return self
@@ -159,6 +164,11 @@ class OutputSection(_Section):
     def usual_penalty(self, edges: Span) -> float:
         """Return what `penalty` is if it is not given."""
         return 1.0 / ((edges[1] - edges[0]) / (20 if self.setpoint is None else 2)) ** 2
+
+    @property
+    def usual_dead_band(self) -> float:
+        """What `dead_band` is if it is not given."""
+        return max(3.0 * self.noise, 0.01 * (self.band[1] - self.band[0])) if self.band else 0.0
 
     @property
     def edges(self) -> Span | None:

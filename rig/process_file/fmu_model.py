@@ -1,5 +1,6 @@
 """The linear model of an FMU at rest: by its own derivatives, by differences, or from a step test of it."""
 
+import re
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
@@ -7,9 +8,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.errors import UsageError
+from coldloop.errors import ModelFileError, UsageError
 from plant.own.fmu import FmuSimulation, Wiring
-from plant.own.fmu_file import Fmu
+from plant.own.fmu_file import DOUBLE, Fmu
 from plant.own.maker import FMU, file_digest
 from rig.process_file.declaration import ProcessFile
 from rig.process_file.identified import Record, identified
@@ -26,8 +27,8 @@ STEP_SIZE: Final = 0.01
 """Of the step test, to both sides of the operating point, over the range of the input or the span of the load."""
 SAMPLES: Final = 400
 """Of the step test, at least; ten horizons if that is more."""
-NUMBERS: Final = ("Real", "Float", "Int", "UInt", "Boolean")
-"""Beginnings of the types of variables that a start value can be given for."""
+MOST_FINDINGS: Final = 5
+"""Of a description that breaks the standard, that are told."""
 
 
 def with_units(file: ProcessFile, folder: Path) -> ProcessFile:
@@ -42,8 +43,9 @@ def with_units(file: ProcessFile, folder: Path) -> ProcessFile:
 
     def unit(section: Any) -> Any:  # noqa: ANN401 of any signal
         variable = section.variable or section.name
-        fmu.reference(variable)
-        return section if section.unit else section.model_copy(update={"unit": fmu.variables[variable].unit or ""})
+        fmu.port(variable)
+        declared = fmu.variables.get(variable) or fmu.variables[variable.rpartition("[")[0]]  # an array has one unit
+        return section if section.unit else section.model_copy(update={"unit": declared.unit or ""})
 
     named = {name: tuple(map(unit, getattr(file, name))) for name in ("inputs", "outputs", "disturbances")}
     return file.model_copy(update={**named, "load": file.load and unit(file.load)})
@@ -59,7 +61,18 @@ def from_fmu(file: ProcessFile, folder: Path, name: str) -> Linearised:
     wiring = _wiring(file, fmu)
     simulation, wiring = _at_rest(file, fmu, wiring)
     y, x = simulation.outputs(), simulation.states()
-    found = _differentiated(file, fmu, wiring, simulation) if wiring.states else None
+    notes = [f"warning    FMU: {finding}" for finding in fmu.findings[:MOST_FINDINGS]]
+    notes += [
+        f"warning    FMU: {one} is of type {fmu.port(one).type}: what it is given is rounded"
+        for one in filter(None, [*wiring.inputs, wiring.load, *wiring.disturbances])
+        if fmu.port(one).is_discrete
+    ]
+    found = None
+    try:
+        found = _differentiated(file, fmu, wiring, simulation)
+    except ModelFileError as error:  # and the instance may be of no more use
+        notes.append(f"warning    FMU: {error}; a step test of it makes the model instead")
+        simulation, wiring = _at_rest(file, fmu, wiring)
     if found is None:
         tested = identified(_step_tested(file, simulation, str(fmu.path)))
         wiring = replace(wiring, states=())
@@ -75,18 +88,17 @@ def from_fmu(file: ProcessFile, folder: Path, name: str) -> Linearised:
         f"rest       after {wiring.rest_ticks * file.tick_s:g} s from the FMU's start, which each session begins with"
     )
     parameters = {"file": str(fmu.path.resolve()), "wiring": asdict(wiring)}
-    return model._replace(kind=FMU, parameters=parameters, digest=file_digest(fmu.path), notes=(rest, *model.notes))
+    return model._replace(
+        kind=FMU, parameters=parameters, digest=file_digest(fmu.path), notes=(rest, *model.notes, *notes)
+    )
 
 
 def _wiring(file: ProcessFile, fmu: Fmu) -> Wiring:
     for name in file.plant.start:
-        if name not in fmu.variables:
-            raise UsageError(f"plant.start: {fmu.path} has no variable {name}")
-        if not fmu.variables[name].type.startswith(NUMBERS):
-            raise UsageError(f"plant.start: {name} is no number in {fmu.path}")
+        fmu.port(name)
     for one in file.inputs:
-        variable = fmu.variables[one.variable or one.name]
-        if variable.causality != "input" and variable.variability != "tunable":
+        variable = fmu.variables.get(one.variable or one.name)
+        if variable is not None and variable.causality != "input" and variable.variability != "tunable":
             raise UsageError(f"inputs: {variable.name} is no input of {fmu.path} but its {variable.causality}")
     load = file.load
     return Wiring(
@@ -172,16 +184,23 @@ def _at_rest(file: ProcessFile, fmu: Fmu, wiring: Wiring) -> tuple[FmuSimulation
 def _differentiated(
     file: ProcessFile, fmu: Fmu, wiring: Wiring, simulation: FmuSimulation
 ) -> tuple[Array, Array, str] | None:
-    """Return derivatives of the states' rates and of the outputs by states, inputs and load; None if it has none."""
-    rates = [int(each.variable.valueReference) for each in fmu.description.derivatives]
-    outputs = [fmu.reference(name) for name in wiring.outputs]
+    """Return derivatives of the states' rates and of the outputs by states, inputs and load; None if it has none.
+
+    Raises:
+        ModelFileError: It says that it has, and fails.
+    """
+    names = [*wiring.states, *wiring.inputs, wiring.load, *wiring.disturbances]
+    outputs = [fmu.port(name) for name in wiring.outputs]
+    ports = [*outputs, *(fmu.port(name) for name in names if name is not None)]
+    if not wiring.states or not all(port.type in DOUBLE and port.size == 1 for port in ports):
+        return None
+    rates = [fmu.port(each.variable.name) for each in fmu.description.derivatives]
     if fmu.has_derivatives:
         return simulation.derivatives(rates), simulation.derivatives(outputs), "directional derivatives"
-    if any(fmu.variables[name].initial != "exact" for name in wiring.states):
+    if fmu.is_single or any(fmu.variables[name].initial != "exact" for name in wiring.states):
         return None
     u, w = operating_point(file)
     p = len(outputs)
-    names = [*wiring.states, *wiring.inputs, wiring.load, *wiring.disturbances]
 
     def evaluated(v: Array) -> Array:
         values = {name: value for name, value in zip(names, v.tolist(), strict=True) if name is not None}
@@ -199,8 +218,9 @@ def _differentiated(
 
 def _named(fmu: Fmu, wiring: Wiring) -> dict[str, str]:
     """Return names and units of the states, as names of signals are."""
-    names = ["".join(each if each.isalnum() else "_" for each in name).strip("_") for name in wiring.states]
-    unique = names if len(set(names)) == len(names) else [f"x{i}" for i in range(1, len(names) + 1)]
+    names = [re.sub(r"[^A-Za-z0-9]", "_", name).strip("_") for name in wiring.states]
+    told_apart = len({name.lower() for name in names}) == len(names) and all(name[:1].isalpha() for name in names)
+    unique = names if told_apart else [f"x{i}" for i in range(1, len(names) + 1)]
     return {name: fmu.variables[state].unit or "" for name, state in zip(unique, wiring.states, strict=True)}
 
 
@@ -216,7 +236,7 @@ def _step_tested(file: ProcessFile, simulation: FmuSimulation, where: str) -> Re
     signals += [(one.name, one.at, one.span) for one in file.outside]
     steps = np.empty((count, len(signals)))
     for j, (_, at, (low, high)) in enumerate(signals):
-        size = STEP_SIZE * (high - low)
+        size = max(STEP_SIZE * (high - low), float(simulation.inputs[j].is_discrete))
         levels, k = (max(low, at - size), min(high, at + size)), 0
         while k < count:
             hold = int(np.exp(generator.uniform(0.0, np.log(max(2.0, horizon / 2)))))

@@ -15,6 +15,7 @@ from coldloop.errors import UsageError
 from coldloop.process.lti_model import discretise
 
 Array = NDArray[np.float64]
+Places = NDArray[np.intp]
 
 MOST_STATES: Final = 8
 HELD_BACK: Final = 1 / 3
@@ -48,6 +49,8 @@ class Record(NamedTuple):
     input_names: tuple[str, ...]
     where: str
     """Names it in messages."""
+    pieces: tuple[slice, ...] = (slice(None),)
+    """Rows without a gap between them, in order."""
 
 
 class Identified(NamedTuple):
@@ -89,13 +92,14 @@ def identified(record: Record) -> Identified:
     _check_moves(record, u_scale)
     y_scale = np.maximum(y_scale, 1e-12 * np.maximum(1.0, np.abs(y_mean)))
     u, y = (record.inputs - record.operating) / u_scale, (record.outputs - y_mean) / y_scale
-    used = len(u) - round(len(u) * HELD_BACK)
-    past = _past(record, used)
-    seen = _states(u[:used], y[:used], past)
-    candidates = [_fitted(seen, u, y, used, order) for order in range(1, seen.rows.shape[1] + 1)]
+    pieces = [np.arange(len(u))[piece] for piece in record.pieces]
+    used = [piece[: len(piece) - round(len(piece) * HELD_BACK)] for piece in pieces]
+    past = _past(record, sum(map(len, used)))
+    seen = _states(u, y, used, past)
+    candidates = [_fitted(seen, u, y, pieces, used, order) for order in range(1, seen.rows.shape[1] + 1)]
     errors = [float(np.sqrt((each.error**2).mean())) for each in candidates]
     order = next(k for k, error in enumerate(errors, 1) if error <= max(WORTH * min(errors), EXACT))
-    whole = _fitted(_states(u, y, past), u, y, len(u), order)
+    whole = _fitted(_states(u, y, pieces, past), u, y, pieces, pieces, order)
     A, B = _continuous(whole.A, whole.B, record.period_s)
     rests = bool(np.linalg.eigvals(A).real.max() * record.period_s * len(u) < -1.0)
     return Identified(
@@ -112,9 +116,9 @@ def unexplained(A: Array, B: Array, C: Array, D: Array, record: Record) -> Array
     n, m = B.shape
     u, scale = record.inputs - record.operating, np.maximum(record.outputs.std(axis=0), 1e-12)
     at = discretise(A, B, np.zeros(n), record.period_s)
-    responses = _responses(at.A, C, u)
-    left = record.outputs - responses[:, :, n : n + n * m] @ at.B.ravel() - u @ D.T
-    free = np.delete(responses, np.s_[n : n + n * m], axis=2) / scale[:, np.newaxis]
+    responses, q = _responses(at.A, C, u, [np.arange(len(u))[piece] for piece in record.pieces]), n * len(record.pieces)
+    left = record.outputs - responses[:, :, q : q + n * m] @ at.B.ravel() - u @ D.T
+    free = np.delete(responses, np.s_[q : q + n * m], axis=2) / scale[:, np.newaxis]
     unknowns = np.linalg.lstsq(free.reshape(-1, free.shape[2]), (left / scale).ravel())[0]
     error: Array = np.sqrt(((left / scale - free @ unknowns) ** 2).mean(axis=0))
     return error
@@ -151,22 +155,25 @@ class _States(NamedTuple):
     u: Array
     """Inputs at the same times."""
     y: Array
+    followed: NDArray[np.bool_]
+    """Whether the next row is a sample later: shape (N - past - 1,)."""
 
 
-def _states(u: Array, y: Array, past: int) -> _States:
+def _states(u: Array, y: Array, pieces: list[Places], past: int) -> _States:
     """Return the state sequence of the predictor that the record gives."""
     z, p = np.hstack([u, y]), y.shape[1]
     width = z.shape[1]
-    behind = np.hstack([z[k : len(z) - past + k] for k in range(past)])  # oldest first
+    at = np.concatenate([piece[past:] for piece in pieces])
+    behind = np.hstack([z[at - past + k] for k in range(past)])  # oldest first
     one = np.ones((len(behind), 1))
-    predictor = np.linalg.lstsq(np.hstack([behind, one]), y[past:])[0][:-1].T  # shape (p, past width)
+    predictor = np.linalg.lstsq(np.hstack([behind, one]), y[at])[0][:-1].T  # shape (p, past width)
     ahead = np.zeros((past, p, past * width))
     for k in range(past):  # k samples later the oldest k are no longer in the window
         ahead[k, :, k * width :] = predictor[:, : (past - k) * width]
     left, sizes, _ = np.linalg.svd(ahead.reshape(past * p, -1) @ behind.T @ behind @ ahead.reshape(past * p, -1).T)
     most = min(MOST_STATES, int((sizes > NOTHING * sizes[0]).sum()))
     rows = behind @ ahead.reshape(past * p, -1).T @ left[:, :most]
-    return _States(rows / rows.std(axis=0), u[past:], y[past:])
+    return _States(rows / rows.std(axis=0), u[at], y[at], np.diff(at) == 1)
 
 
 def _matrices(states: _States, order: int) -> tuple[Array, Array]:
@@ -175,20 +182,20 @@ def _matrices(states: _States, order: int) -> tuple[Array, Array]:
     seen = np.hstack([x, one])
     C = np.asarray(np.linalg.lstsq(seen, states.y)[0].T, float)
     innovations = states.y - seen @ C.T
-    known = np.hstack([x, states.u, innovations, one])[:-1]
-    A = np.linalg.lstsq(known, x[1:])[0][:order].T
+    known = np.hstack([x, states.u, innovations, one])[:-1][states.followed]
+    A = np.linalg.lstsq(known, x[1:][states.followed])[0][:order].T
     return _admissible(A), C[:, :order]
 
 
-def _fitted(states: _States, u: Array, y: Array, used: int, order: int) -> _Fit:
-    """Return the model of an order that the first `used` rows give, and its errors on the others."""
+def _fitted(states: _States, u: Array, y: Array, pieces: list[Places], used: list[Places], order: int) -> _Fit:
+    """Return the model of an order that the rows used of each piece give, and its errors on the others."""
     A, C = _matrices(states, order)
-    responses = _responses(A, C, u)
-    unknowns = np.asarray(np.linalg.lstsq(responses[:used].reshape(-1, responses.shape[2]), y[:used].ravel())[0], float)
-    left, held = (y - responses @ unknowns)[used:], y[used:]
+    responses, of = _responses(A, C, u, pieces), np.concatenate(used)
+    unknowns = np.asarray(np.linalg.lstsq(responses[of].reshape(-1, responses.shape[2]), y[of].ravel())[0], float)
+    left, held = np.delete(y - responses @ unknowns, of, axis=0), np.delete(y, of, axis=0)
     error = np.sqrt((left**2).mean(axis=0)) / np.maximum(held.std(axis=0), 1e-9) if len(held) else np.zeros(y.shape[1])
-    n, m = order, u.shape[1]
-    return _Fit(A, unknowns[n : n + n * m].reshape(n, m), C, unknowns[n + n * m :], error)
+    n, m, q = order, u.shape[1], order * len(pieces)
+    return _Fit(A, unknowns[q : q + n * m].reshape(n, m), C, unknowns[q + n * m :], error)
 
 
 def _admissible(A: Array) -> Array:
@@ -203,16 +210,18 @@ def _admissible(A: Array) -> Array:
     return found
 
 
-def _responses(A: Array, C: Array, u: Array) -> Array:
-    """Return what initial state, entries of B and constants do to the outputs, shape (N, p, n + n m + p)."""
+def _responses(A: Array, C: Array, u: Array, pieces: list[Places]) -> Array:
+    """Return what the pieces' initial states, entries of B and constants do to the outputs: (N, p, q + n m + p)."""
     n, m, p = len(A), u.shape[1], len(C)
-    found = np.zeros((len(u), p, n + n * m + p))
-    found[:, :, n + n * m :] = np.eye(p)
-    free, forced, each = np.eye(n), np.zeros((n, n, m)), np.arange(n)
-    for k, row in enumerate(u):
-        found[k, :, :n], found[k, :, n : n + n * m] = C @ free, C @ forced.reshape(n, n * m)
-        free, forced = A @ free, (A @ forced.reshape(n, n * m)).reshape(n, n, m)
-        forced[each, each] += row
+    q, each = n * len(pieces), np.arange(n)
+    found = np.zeros((len(u), p, q + n * m + p))
+    found[:, :, q + n * m :] = np.eye(p)
+    for i, piece in enumerate(pieces):
+        free, forced = np.eye(n), np.zeros((n, n, m))
+        for k in piece:
+            found[k, :, i * n : (i + 1) * n], found[k, :, q : q + n * m] = C @ free, C @ forced.reshape(n, n * m)
+            free, forced = A @ free, (A @ forced.reshape(n, n * m)).reshape(n, n, m)
+            forced[each, each] += u[k]
     return found
 
 

@@ -1,12 +1,15 @@
 """What there is to know of a process before it is controlled, as text: rest, modes, gains, and what is wrong."""
 
 from collections.abc import Sequence
+from math import log
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from coldloop.number_text import ends_text, number_text
 from coldloop.process.declaration import Input, Output, Process
+from rig.plc_sizing.holding import NOTHING, digits_last_s, leaves_its_band, shortest_period_s, waiting
 from rig.process_file.bath import exchanged
 from rig.process_file.making import Made
 
@@ -18,8 +21,8 @@ SMALL: Final = 1e-6
 """Singular value, over the largest, below which a direction counts as none."""
 SHARE: Final = 0.01
 """Of a rate or a band, that is still to be told apart."""
-NOTHING: Final = 1e-12
-"""What is smaller is rounding."""
+INVERSE: Final = 0.1
+"""Move to the other side, over the change in the end, from which on it is told."""
 
 
 def described(made: Made) -> str:
@@ -37,14 +40,15 @@ def described(made: Made) -> str:
 
 def _values(names: tuple[str, ...], values: Array, units: tuple[str, ...]) -> str:
     triples = zip(names, values, units, strict=True)
-    return "  ".join(
-        f"{name} {value if abs(value) > NOTHING else 0.0:.5g} {unit}".rstrip() for name, value, unit in triples
-    )
+    shown = (f"{n} {number_text(value if abs(value) > NOTHING else 0.0, 5)} {unit}" for n, value, unit in triples)
+    return "  ".join(map(str.rstrip, shown))
 
 
 def _rest(made: Made) -> list[str]:
     m, process = made.model, made.process
-    load = "" if not m.F.any() and not m.G.any() else f"; load {m.load_name} {m.w0:.5g} {m.load_unit}".rstrip()
+    load = (
+        "" if not m.F.any() and not m.G.any() else f"; load {m.load_name} {number_text(m.w0, 5)} {m.load_unit}".rstrip()
+    )
     problem = len(process.decision_instants) * (len(process.inputs) + 2 * len(process.bands))
     named = ((m.input_names, "input"), (m.output_names, "output"), (m.state_names, "state"))
     counted = ", ".join(f"{len(names)} {noun}{'s' * (len(names) != 1)}" for names, noun in named)
@@ -68,6 +72,8 @@ def _modes(made: Made) -> list[str]:
     lines = [f"modes      {'  '.join(texts[i : i + 8])} /s" for i in range(0, len(texts), 8)]
     if made.linear.error:
         lines.append(f"derivatives within {made.linear.error:.1e} of those with steps twice as wide")
+    if values[0].real <= 0.0:
+        lines.append(f"late       no mode grows: no period loses the plant{leaves_its_band(made.model, made.process)}")
     return lines
 
 
@@ -138,6 +144,50 @@ def _dead_times(made: Made) -> list[str]:
     ]
 
 
+def _inverse_responses(made: Made) -> list[str]:
+    """Return which outputs with a band first move to the other side after a step of an input than where they end."""
+    m, process, n, quarters = made.model, made.process, len(made.own_A), 4
+    poles = np.linalg.eigvals(made.own_A)
+    delays = [lag["delay_s"] for lag in made.linear.parameters.get("lags", ())]  # approximated by what moves so
+    if any(delays) or poles.real.max() > NOTHING or (abs(poles.imag[poles.real > -NOTHING]) > NOTHING).any():
+        return []
+    part_s = process.tick_s * process.ticks_per_sample / quarters
+    times = part_s * np.arange(1, quarters * process.decision_instants[-1] + 1)
+    part, x = m.discretised(part_s), np.zeros_like(m.B)
+    moves = np.array([m.C @ (x := part.A @ x + part.B) + m.D for _ in times])
+    ends = moves[-1]
+    if (poles.real < -NOTHING).all():
+        ends = m.D - m.C[:, :n] @ np.linalg.solve(made.own_A, m.B[:n])
+    found = []
+    for i, j in ((m.output_names.index(one.name), j) for one in process.banded for j in range(len(m.input_names))):
+        share = moves[:, i, j] / (ends[i, j] or np.inf)
+        far = np.flatnonzero(np.abs(share) > INVERSE)
+        if far.size and share[far[0]] < 0.0:
+            back = np.flatnonzero(share[far[0] :] > 0.0)
+            until = f"until {times[far[0] + back[0]]:.3g} s" if back.size else "longer than the horizon"
+            step = f"after a step of {m.input_names[j]} {m.output_names[i]} first moves the other way"
+            found.append(f"inverse response: {step}, by {-share.min():.2g} of its change in the end, {until}")
+    return found
+
+
+def _unstable(made: Made, growth: float) -> list[str]:
+    """Return how long a plant with a mode that grows can wait for an update, and what its horizon may be."""
+    process, limits = made.process, np.array([[one.low, one.high, one.rate] for one in made.process.inputs]).T
+    horizon_s = process.decision_instants[-1] * process.tick_s * process.ticks_per_sample
+    single, double = (digits_last_s(growth, real) for real in (np.float32, np.float64))
+    period_s = shortest_period_s(0.25 * (process.share("preparation") + process.share("ode")), process.tick_s)
+    needs = waiting(made.model, process, limits)
+    held = needs and needs.text(period_s, "the shortest one of the reference PLC")
+    found = [f"unstable: a mode grows with {growth:.3g} /s and doubles in {log(2.0) / growth:.3g} s; {held}"]
+    found += [f"fail-safe: {text}" for text in (unheld(process.banded, made.own_A),) if text]
+    if horizon_s > single:
+        found.append(
+            f"horizon: beyond {single:.3g} s the mode leaves the problem no digits in single precision, beyond "
+            f"{double:.3g} s none in double; it is {horizon_s:g} s: shorten prediction.decision_instants"
+        )
+    return found
+
+
 def _warnings(made: Made) -> list[str]:
     """Return what a control engineer would want to know, in words."""
     m, process, found = made.model, made.process, list[str]()
@@ -145,16 +195,19 @@ def _warnings(made: Made) -> list[str]:
     poles = np.linalg.eigvals(made.own_A)
     fastest, slowest = -poles.real.min(), -poles.real.max()
     if poles.real.max() > NOTHING:
-        found.append(f"unstable: a mode grows with {poles.real.max():.3g} /s; nothing may be late for longer")
-        found += [f"fail-safe: {text}" for text in (unheld(process.banded, made.own_A),) if text]
+        found += _unstable(made, float(poles.real.max()))
     elif slowest > NOTHING and process.decision_instants[-1] * sample_s * slowest < 1.0:
         found.append(f"horizon: it ends before the slowest mode, {1 / slowest:.3g} s, has moved much")
+    fast = poles[(poles.imag * sample_s > np.pi) & (-poles.real * sample_s < 3.0)].imag  # 5 % of them are left
+    found += [f"sampling: the oscillation of {2 * np.pi / w:.3g} s is faster than two sampling periods" for w in fast]
     if fastest * sample_s > 20.0:
         found.append(f"sampling: the fastest mode, {1 / fastest:.2g} s, is over within a sampling period")
     for band, output in zip(process.bands, process.banded, strict=True):
         value = float(m.y0[m.output_names.index(output.name)])
         if not band.margin and not band.low <= value <= band.high:
-            found.append(f"band: {output.name} rests at {value:.5g}, its band is {band.low:g} to {band.high:g}")
+            found.append(
+                f"band: {output.name} rests at {number_text(value, 5)}, its band is {ends_text(band.low, band.high)}"
+            )
     rows = [m.output_names.index(output.name) for output in process.banded]
     reach = m.discretised(process.decision_instants[-1] * sample_s).B * [one.scale for one in process.inputs]
     effect = (m.C[rows] @ reach) / [[band.high - band.low] for band in process.bands]
@@ -165,6 +218,7 @@ def _warnings(made: Made) -> list[str]:
     if process.bath is not None:
         found += exchanged(m, process.bath, process.decision_instants[-1] * sample_s)
     found += [f"loop: {text}" for text in _loops(made, effect)]
+    found += _inverse_responses(made)
     found += [f"dead time: {text}" for text in _dead_times(made)]
     found += [f"single precision: {text}" for text in _coarse(process)]
     steady = m.A_tick - np.eye(len(m.A))

@@ -51,6 +51,10 @@ def linearised(file: ProcessFile, folder: Path) -> Linearised:
         found = from_fmu(file, folder, plant.fmu)
     else:
         found = _from_lags(file, plant)
+    if not len(found.A):
+        raise UsageError(
+            "plant: it has no states, so there is nothing to predict; give the dynamics of its actuators at least"
+        )
     if file.prediction.step_test is not None:
         found = _by_record(file, found, folder / file.prediction.step_test)
     for name in ("A", "B", "F", "C", "D", "G", "x0", "y0"):
@@ -92,7 +96,7 @@ def _from_equations(file: ProcessFile, place: str, source: str, name: str) -> Li
     equations = equations_of(source, name, place)
     u, w = operating_point(file)
     n, m = len(equations.states), len(u)
-    x = _rest(equations, u, w, place, file.tick_s * file.ticks_per_sample)
+    x = _rest(equations, u, w, place, file.tick_s * file.ticks_per_sample) if n else np.zeros(0)
     y = evaluated(equations.outputs, x, u, outside(w), size=len(file.outputs), where=place)
 
     def flow(v: Array) -> Array:

@@ -132,6 +132,7 @@ def _output(one: OutputSection, at_rest: float) -> Output:
         margin = 0.0 if one.setpoint is None else (high - low) / 2
         band = Band(
             low=low, high=high, weight=one.penalty or one.usual_penalty(one.edges), margin=margin, alarm=one.alarm,
+            dead_band=one.usual_dead_band if one.dead_band is None else one.dead_band,
             loop=None if loop is None else Loop(
                 input=loop.input, gain=loop.gain, integral_time_s=loop.integral_time_s,
                 setpoint_offset=0.0 if one.setpoint is None else one.setpoint - at_rest,

@@ -11,6 +11,7 @@ from typing import Final
 from xml.etree import ElementTree as ET
 
 from coldloop.errors import UsageError
+from coldloop.text_file import read_text
 
 SVG: Final = "{http://www.w3.org/2000/svg}"
 XLINK_HREF: Final = "{http://www.w3.org/1999/xlink}href"
@@ -68,12 +69,7 @@ def drawing_of(path: Path, signals: Collection[str]) -> str:
 
 
 def _parsed(path: Path) -> ET.Element:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise UsageError(f"{path}: not UTF-8 text (byte {error.start}); save it as plain SVG, not compressed") from None
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}; mimic names an SVG file beside the process file") from None
+    text = read_text(path, "mimic names an SVG file beside the process file")
     if len(text) > LONGEST:
         raise UsageError(f"{path}: {len(text)} characters; a drawing has {LONGEST} at most")
     if "<!ENTITY" in text:

@@ -1,11 +1,12 @@
 """The Python source of a plant: of a file beside the process file, or of a package that is installed."""
 
 from importlib.metadata import entry_points
-from importlib.util import find_spec
+from importlib.util import decode_source, find_spec
 from pathlib import Path
 from typing import Final
 
 from coldloop.errors import UsageError
+from coldloop.text_file import read_bytes
 
 GROUP: Final = "coldloop.plants"
 """Of entry points: classes with the equations of a plant."""
@@ -18,10 +19,11 @@ def source_of(folder: Path, place: str) -> tuple[str, str]:
         UsageError: It cannot be read.
     """
     file, _, name = place.partition(":")
+    data = read_bytes(folder / file, "a plant's file is looked for beside the process file")
     try:
-        return (folder / file).read_text(encoding="utf-8"), name
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{folder / file}: {error}; a plant's file is looked for beside the process file") from None
+        return decode_source(data), name  # as Python reads it: byte order mark, declared encoding
+    except (SyntaxError, UnicodeDecodeError) as error:
+        raise UsageError(f"{folder / file}: {error}; save it as UTF-8") from None
 
 
 def installed_source(name: str) -> tuple[str, str]:
@@ -39,7 +41,7 @@ def installed_source(name: str) -> tuple[str, str]:
         spec = find_spec(point.module)
         if spec is None or spec.origin is None:
             raise ImportError(f"no module {point.module}")  # noqa: TRY301 told as the others
-        return Path(spec.origin).read_text(encoding="utf-8"), point.attr
+        return decode_source(Path(spec.origin).read_bytes()), point.attr
     except Exception as error:
         said = " ".join(str(error).split())
         raise UsageError(

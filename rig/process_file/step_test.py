@@ -8,14 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
+from coldloop.table import TIME, Table, read_table
 from plant.own.maker import LINEAR
-from rig.process_file.csv_columns import TIME, columns, header
 from rig.process_file.declaration import DisturbanceSection, LoadSection, ProcessFile
-from rig.process_file.identified import Identified, Record, identified, unexplained
+from rig.process_file.identified import Identified, Places, Record, identified, unexplained
 from rig.process_file.linear_model import Linearised, operating_point
 
 Array = NDArray[np.float64]
 
+PIECE: Final = "piece"
+"""Column whose number changes where a record has a gap."""
 POOR: Final = 0.5
 """Share of an output's variation, explained of the data held back, below which a model is no good."""
 UNLIKE: Final = 0.3
@@ -32,9 +34,11 @@ def from_step_test(file: ProcessFile, path: Path) -> Linearised:
     Raises:
         UsageError: One line that names file, line and remedy.
     """
-    record, moved = _recorded(file, path)
+    table = _table(file, path)
+    record, moved = _recorded(file, table)
     found = identified(record)
-    notes = [
+    notes = [f"record     {path.name}: {note}" for note in (*table.notes, *_unused(table, record, file))]
+    notes += [
         f"unknown    {path.name} has no column {one.name}: the model does not know what it does"
         for one in file.outside
         if one not in moved
@@ -45,7 +49,7 @@ def from_step_test(file: ProcessFile, path: Path) -> Linearised:
 
 def record_compared(file: ProcessFile, path: Path, plant: Linearised, model: Linearised) -> list[str]:
     """Return which outputs of a record the plant that it is for explains by far worse than the model found in it."""
-    record, moved = _recorded(file, path)
+    record, moved = _recorded(file, _table(file, path))
     places = _places(file, moved)
     by_plant, by_model = (
         unexplained(one.A, np.hstack([one.B, one.F[:, places]]), one.C, np.hstack([one.D, one.G[:, places]]), record)
@@ -59,19 +63,34 @@ def record_compared(file: ProcessFile, path: Path, plant: Linearised, model: Lin
     ]
 
 
-def _recorded(file: ProcessFile, path: Path) -> tuple[Record, list[LoadSection | DisturbanceSection]]:
+def _table(file: ProcessFile, path: Path) -> Table:
+    named = (*file.inputs, *file.outside, *file.outputs)
+    return read_table(path, [TIME, *(one.name for one in named)], "name a CSV file beside the process file")
+
+
+def _unused(table: Table, record: Record, file: ProcessFile) -> list[str]:
+    used = {table.place(name) for name in (TIME, PIECE, *record.input_names, *(one.name for one in file.outputs))}
+    left = [name for place, name in enumerate(table.names) if name and place not in used]
+    return [f"not used: {', '.join(left)}"] if left else []
+
+
+def _recorded(file: ProcessFile, table: Table) -> tuple[Record, list[LoadSection | DisturbanceSection]]:
     """Return a record in samples of the model, and what moved in it beside the inputs."""
-    moved = [one for one in file.outside if one.name in header(path)]
+    moved = [one for one in file.outside if table.place(one.name) is not None]
     names = [one.name for one in (*file.inputs, *moved)]
-    rows = columns(path, [TIME, *names, *(one.name for one in file.outputs)])
-    period_s = _period(path, rows[:, 0])
-    _check_readings(file, path, rows[:, 1 + len(names) :])
+    rows = np.array(table.columns([TIME, *names, *(one.name for one in file.outputs)])).T
+    number = np.zeros(len(rows)) if table.place(PIECE) is None else np.array(table.columns([PIECE])[0])
+    pieces = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(number)) + 1)
+    period_s = _period(table, rows[:, 0], pieces)
+    _check_readings(file, table.where, rows[:, 1 + len(names) :])
     every = max(1, round(file.tick_s * file.ticks_per_sample / period_s))
-    inputs, outputs = rows[:, 1 : 1 + len(names)], rows[:, 1 + len(names) :]
-    count = len(rows) // every
-    held = inputs[: count * every].reshape(count, every, -1).mean(axis=1)
-    at = np.array([one.at for one in (*file.inputs, *moved)])
-    return Record(period_s * every, held, outputs[: count * every : every], at, tuple(names), str(path)), moved
+    counts = [len(piece) // every for piece in pieces if len(piece) >= every]
+    used = np.concatenate([piece[: len(piece) // every * every] for piece in pieces])
+    inputs, outputs = rows[used, 1 : 1 + len(names)], rows[used, 1 + len(names) :]
+    held = inputs.reshape(len(used) // every, every, -1).mean(axis=1)
+    at, ends = np.array([one.at for one in (*file.inputs, *moved)]), np.cumsum(counts)
+    cut = tuple(slice(end - count, end) for count, end in zip(counts, ends, strict=True))
+    return Record(period_s * every, held, outputs[::every], at, tuple(names), table.where, cut), moved
 
 
 def _places(file: ProcessFile, moved: Sequence[LoadSection | DisturbanceSection]) -> list[int]:
@@ -122,7 +141,7 @@ def _outputs(file: ProcessFile, found: Identified) -> Array:
     )
 
 
-def _check_readings(file: ProcessFile, path: Path, outputs: Array) -> None:
+def _check_readings(file: ProcessFile, path: str, outputs: Array) -> None:
     """Check that readings are such as the file's sensors give.
 
     Raises:
@@ -140,18 +159,19 @@ def _check_readings(file: ProcessFile, path: Path, outputs: Array) -> None:
             raise UsageError(f"{path}: {one.name} never moves; what acts on it cannot be told")
 
 
-def _period(path: Path, times: Array) -> float:
+def _period(table: Table, times: Array, pieces: Sequence[Places]) -> float:
     if len(times) < 2:
-        raise UsageError(f"{path}: one line of numbers is no record")
+        raise UsageError(f"{table.where}: one line of numbers is no record")
     intervals = np.diff(times)
     usual = float(np.median(intervals))
     if usual <= 0.0:
-        raise UsageError(f"{path}: {TIME} does not rise from line to line")
-    odd = np.flatnonzero(np.abs(intervals - usual) > EVEN * usual)
-    if odd.size:
-        line, interval = int(odd[0]) + 3, float(intervals[odd[0]])
+        raise UsageError(f"{table.where}: {TIME} does not rise from line to line")
+    uneven = np.abs(intervals - usual) > EVEN * usual
+    uneven[[piece[0] - 1 for piece in pieces[1:]]] = False
+    if uneven.any():
+        odd = int(uneven.argmax())
         raise UsageError(
-            f"{path}, line {line}: {interval:g} s after the line before, others are {usual:g} s apart; "
-            "export it with even times, and without gaps"
+            f"{table.where}, line {table.rows[odd + 1][0]}: {intervals[odd]:g} s after the line before, others are "
+            f"{usual:g} s apart; `coldloop import` makes times even and cuts at gaps"
         )
     return usual

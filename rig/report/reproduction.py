@@ -35,8 +35,8 @@ READING = (
 )
 
 
-def reproduce(options: StudyOptions, workers: Workers, out: Path) -> str:
-    """Do all studies and write the report; return what to print.
+def reproduce(options: StudyOptions, workers: Workers, out: Path) -> tuple[str, int]:
+    """Do all studies and write the report; return what to print, and in how many runs updates had no answer.
 
     Raises:
         ColdloopError: A study failed, or the report cannot be written.
@@ -54,7 +54,8 @@ def reproduce(options: StudyOptions, workers: Workers, out: Path) -> str:
         )  # fmt: skip
         whole_text(out / "report.md", text)
         whole_text(out / "report.html", as_page(TITLE, text, out))
-    return f"{verdict_counts(judged)}; {minutes:.1f} min\nreport in {out / 'report.html'}\n"
+    text = f"{verdict_counts(judged)}; {minutes:.1f} min\nreport in {out / 'report.html'}\n"
+    return text, sum(result.failed_runs for result in results.values())
 
 
 def _values(results: Mapping[str, StudyResult]) -> dict[str, list[float]]:

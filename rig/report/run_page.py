@@ -9,6 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from plotly.offline import get_plotlyjs
 from plotly.subplots import make_subplots
 
+from coldloop.number_text import number_text
 from coldloop.process.load_profile import LOAD_COLUMN
 from rig.figures.plot import (
     ACCENT,
@@ -65,7 +66,7 @@ def _shown(value: object) -> str:
         return "-"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    return number_text(value, 6) if isinstance(value, float) else str(value)
 
 
 def _plot(run: RunFolder) -> str:
@@ -81,6 +82,7 @@ def _plot(run: RunFolder) -> str:
         for begin, end in alarm_times(run.events(), scale_s, float(curves["time_s"][-1]) / scale_s):
             figure.add_vrect(x0=begin, x1=end, fillcolor="#b3261e", opacity=0.12, line_width=0)
     figure.update_xaxes(title_text=f"plant time ({unit})", row=len(LABELS), col=1)
+    figure.update_yaxes(exponentformat="e", minexponent=7)  # by itself it writes 150k
     figure.update_layout(
         height=190 * len(LABELS), template="plotly_white", hovermode="x", margin={"l": 70, "r": 20, "t": 20, "b": 50},
         showlegend=False,

@@ -3,7 +3,7 @@
 import hashlib
 import math
 from collections import namedtuple
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +63,29 @@ else:
     )
 
 
+DEAD_BANDS: Final = np.array(PROCESS.dead_bands)
+"""Shape (bands,)."""
+
+
+def excess_of(y: NDArray[Any], design: ControlDesign) -> NDArray[np.float64]:
+    """Return by how much outputs (N, outputs) are beyond their bands, shape (N, bands); NaN where one is unknown.
+
+    An output is outside where that is more than its dead band, of `DEAD_BANDS`.
+    """
+    constrained = y[:, CONTROLLED].astype(float)
+    beyond = np.maximum(constrained - design.output_high, design.output_low - constrained)
+    return np.maximum(beyond, 0.0)
+
+
+EXCESS_KEYS: Final = tuple(
+    f"{one.name}_{what}"
+    for one in PROCESS.banded
+    for what in ("outside_dead_band_pct", "largest_excess", "excess_integral")
+)
+"""Of each output with a band: share of the known ticks in which it was beyond by more than its dead band, %; largest
+excess over the band itself, in its unit; the time integral of that, in its unit times s."""
+
+
 class StageCost:
     """The stage cost of what was really reached: deviations from the operating point, and violations of the bands."""
 
@@ -79,12 +102,10 @@ class StageCost:
         design = self._design
         x = block.x.astype(float) - self._x0
         u = block.u.astype(float) - self._u0
-        constrained = block.y[:, CONTROLLED].astype(float)
-        violation = np.maximum(constrained - design.output_high, 0) + np.maximum(design.output_low - constrained, 0)
         cost: NDArray[np.float64] = (
             (x**2 * self._state_weights).sum(axis=1)
             + (u**2 * design.input_weight).sum(axis=1)
-            + (violation**2 * design.violation_weight).sum(axis=1)
+            + (excess_of(block.y, design) ** 2 * design.violation_weight).sum(axis=1)
         )
         if self._outputs_weigh:
             cost += ((block.y - self._y0) ** 2 * self._output_weights).sum(axis=1)
@@ -104,6 +125,7 @@ class RunEvaluation(Sink):
         self._design = design
         self._digest = hashlib.sha256()
         self._outside = np.zeros(len(CONTROLLED), dtype=int)
+        self._beyond, self._furthest, self._excess = np.zeros((3, len(CONTROLLED)))
         self._stage_costs = 0.0
         self._j_dev = self._j_cst = self._weighted = self._violations = self._largest = 0.0
         self._taus = self._squared_taus = self._delivered = self._known = 0
@@ -114,6 +136,10 @@ class RunEvaluation(Sink):
         constrained = block.y[:, CONTROLLED]
         outside = (constrained < self._design.output_low) | (constrained > self._design.output_high)
         self._outside += outside.sum(axis=0)
+        excess = excess_of(block.y, self._design)
+        self._beyond += (excess > DEAD_BANDS).sum(axis=0)
+        self._furthest = np.fmax(self._furthest, np.fmax.reduce(excess, axis=0, initial=0.0))
+        self._excess += np.nansum(excess, axis=0) * TICK_S
         self._known += int(np.isfinite(block.load).sum())
         self._stage_costs += float(np.nansum(self._cost.of(block)))
         self._digest.update(block.digested)
@@ -140,6 +166,14 @@ class RunEvaluation(Sink):
     def trace_sha256(self) -> str:
         """SHA-256 over load, inputs, outputs, states and station of all ticks, as little-endian single precision."""
         return self._digest.hexdigest()
+
+    @property
+    def excesses(self) -> dict[str, float]:
+        """How far each output with a band was beyond it, by `EXCESS_KEYS`; NaN where no tick is known."""
+        known = self._known or math.nan
+        exists = known / known
+        by_band = zip(100.0 * self._beyond / known, self._furthest * exists, self._excess * exists, strict=True)
+        return dict(zip(EXCESS_KEYS, [float(value) for values in by_band for value in values], strict=True))
 
     @property
     def indicators(self) -> Indicators:

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -18,6 +19,8 @@ from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
 from coldloop.process.loaded import PROCESS
 from coldloop.process.model_file import read_document
+from coldloop.registers.control_plc import Mode
+from coldloop.service.event_text import word
 from rig.results.arrow_arrays import numbers_of
 from rig.results.columns import FORMAT
 
@@ -31,6 +34,7 @@ OLDER: Final[dict[str, Any]] = {
     "optimizer_plc.program.plausibility.sigmas": 0.0,
 }
 """Configuration of runs that were recorded before there was a key: what the preset would decide now."""
+TAU_U: Final = "tau_u_s"
 DRAWN_TICKS: Final = 60_000
 """A longer trace is drawn by the least and the largest value of many ticks."""
 
@@ -131,13 +135,24 @@ class RunFolder:
     @property
     def remedy(self) -> str:
         """What to do where it is not the one that is loaded."""
-        return f"use --process {self.path / str(self._model)}" if self._process else "leave out --process"
+        if not self._process:
+            return "leave out --process"
+        return "name its file with --process; rerun --trust executes the plant that the folder holds"
+
+    @property
+    def model_digest(self) -> str | None:
+        """Digest of the copy of its model; None for the shipped one of the cold box."""
+        return self._document_of_model.get("digest")
 
     @property
     def _process(self) -> dict[str, Any]:
         """Declaration of the process, from the copy of its model; empty for the cold box."""
-        found: dict[str, Any] = {}
-        return read_document(self.path / self._model, "restore it").get("process", found) if self._model else found
+        found: dict[str, Any] = self._document_of_model.get("process", {})
+        return found
+
+    @property
+    def _document_of_model(self) -> dict[str, Any]:
+        return read_document(self.path / self._model, "restore it") if self._model else {}
 
     @property
     def _model(self) -> str | None:
@@ -168,13 +183,15 @@ class RunFolder:
 
         It takes constant memory.
 
+        The updating period is drawn while it was in force: in other modes than MPC it is NaN.
+
         A trace of more than `longest` ticks is reduced to two points for each of `longest / 2` intervals.
         """
         names = ["time_s", *columns]
         with self.reading(file_name) as file:
             every = max(1, math.ceil(file.metadata.num_rows / (longest / 2))) if file.metadata.num_rows > longest else 1
-            batches = file.iter_batches(batch_size=every * 4096, columns=names)
-            parts = [_reduced(batch_series(batch), every) for batch in batches]
+            batches = file.iter_batches(batch_size=every * 4096, columns=[*names, "mode"] if TAU_U in names else names)
+            parts = [_reduced(_in_force(batch, names), every) for batch in batches]
             return {name: np.concatenate([part[name] for part in parts] or [np.empty(0)]) for name in names}
 
     def events(self) -> list[dict[str, Any]]:
@@ -182,6 +199,15 @@ class RunFolder:
         with self.reading("events.parquet") as file:
             rows: list[dict[str, Any]] = file.read().to_pylist()
         return rows
+
+
+def _in_force(batch: pa.RecordBatch, names: Sequence[str]) -> Curves:
+    """Return columns as numbers; the updating period only where MPC was active, or the mode is not known."""
+    series = batch_series(batch.select(names))
+    if TAU_U in series:
+        is_mpc = pc.fill_null(pc.equal(batch["mode"], word(Mode.MPC)), fill_value=True)
+        series[TAU_U] = np.where(is_mpc.to_numpy(zero_copy_only=False), series[TAU_U], np.nan)
+    return series
 
 
 def batch_series(batch: pa.RecordBatch) -> Curves:

@@ -2,12 +2,18 @@
 
 from dataclasses import replace
 
+import numpy as np
+
 from coldloop.config import Configuration
 from coldloop.errors import UsageError
-from coldloop.process.signals import TICK_S
+from coldloop.process.loaded import PROCESS
+from coldloop.process.lti_model import load
+from coldloop.process.signals import SAMPLING_PERIOD_S, TICK_S
 from coldloop.session.settings import TimeMode
 from optimizer_plc.budget import PlcBudget
+from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.settings import ProgramSettings
+from rig.plc_sizing.holding import digits_last_s, shortest_period_s, waiting
 from rig.settings import Settings
 
 PERIOD = "optimizer_plc.program.updating_period_s"
@@ -27,7 +33,9 @@ def remarks(effective: Configuration[Settings]) -> list[str]:
             f" {budget.answer_after_s(1):.3g} s for an answer with {program.solver_name}, and in real time none comes"
             " sooner: give a longer period, adaptive, or --enforce"
         )
-    found, left_out = [too_slow(program)], effective.notes()
+    found, left_out = [too_slow(program), certificate(effective.settings)], effective.notes()
+    if not PROCESS.has_load and "plant.load" in effective.sources:
+        found.append(f"load {effective.settings.plant.load}: the {PROCESS.name} has no load; only the length is taken")
     if left_out:
         found.append(f"not applied of the preset: {', '.join(left_out)}; `coldloop config` says why")
     return [*filter(None, found)]
@@ -42,23 +50,53 @@ def too_slow(program: ProgramSettings) -> str:
     )
 
 
+def certificate(settings: Settings, *, only_lost: bool = False) -> str:
+    """Return what the fixed updating period means for a plant with a mode that grows; empty for another.
+
+    Where it is adaptive or too short for the PLC it is the PLC's shortest. With `only_lost` it is empty where held.
+    """
+    limits, program, more = settings.limits, settings.optimizer_plc.program, ""
+    reach, shortest_s = np.array([limits.low, limits.high, limits.rate]), _shortest_s(program)
+    needs, fixed_s = waiting(load(settings.model.file), PROCESS, reach, limits.rate_share), program.updating_period_s
+    period_s, longest_s = max(fixed_s, shortest_s), _budget(program).times.period(program.adaptive.q_max) * TICK_S
+    if not needs or (only_lost and period_s <= needs.limit_s):
+        return ""
+    if not fixed_s and longest_s > needs.longest_s >= shortest_s:
+        more += f"; adaptive ones go up to {longest_s:.3g} s: lower optimizer_plc.program.adaptive.q_max"
+    horizon_s = program.design.horizon * SAMPLING_PERIOD_S
+    if horizon_s > (most_s := digits_last_s(needs.growth, real_of(program.arithmetic))):
+        more += (
+            f"; the horizon of {horizon_s:.3g} s leaves the problem no digits, in {program.arithmetic} beyond "
+            f"{most_s:.3g} s: shorten optimizer_plc.program.design.decision_instants"
+        )
+    whose = "the PLC's shortest updating period" if period_s > fixed_s else "the updating period"
+    return f"a mode of the plant grows with {needs.growth:.3g} /s: {needs.text(period_s, whose)}{more}"
+
+
 def enforced(effective: Configuration[Settings]) -> Configuration[Settings]:
     """Return a configuration whose fixed updating period is as long as the PLC takes; an adaptive one always is.
 
     Raises:
-        UsageError: The longest updating period is too short for the PLC.
+        UsageError: The longest updating period is too short for the PLC, or the shortest too long for the plant.
     """
     program = effective.settings.optimizer_plc.program
-    shortest = _budget(program).shortest_ticks
-    if shortest is None:
+    shortest_s = _shortest_s(program)
+    if why := _budget(program).too_slow():
         raise UsageError(
-            f"--enforce: with {program.solver_name} {_budget(program).too_slow()}; take a faster PLC "
+            f"--enforce: with {program.solver_name} {why}; take a faster PLC "
             "(optimizer_plc.program.budget.power), another solver, or a longer sampling period"
         )
-    if not 0 < round(program.updating_period_s / TICK_S) < shortest:
+    if why := certificate(effective.settings, only_lost=True):
+        raise UsageError(f"--enforce: {why}; take a faster PLC, a shorter period, or inputs that reach further")
+    if not 0 < round(program.updating_period_s / TICK_S) < round(shortest_s / TICK_S):
         return effective
-    settings = effective.settings.with_program(updating_period_s=shortest * TICK_S)
+    settings = effective.settings.with_program(updating_period_s=shortest_s)
     return replace(effective, settings=settings, sources={**effective.sources, PERIOD: "--enforce"})
+
+
+def _shortest_s(program: ProgramSettings) -> float:
+    times = _budget(program).times
+    return shortest_period_s(times.slots + times.iteration, TICK_S)
 
 
 def _budget(program: ProgramSettings) -> PlcBudget:

@@ -11,8 +11,9 @@ from typing import Any
 from coldloop import __version__
 from coldloop.config import Configuration, load_configuration
 from coldloop.errors import UsageError
-from coldloop.process.loaded import PROCESS
+from coldloop.process.loaded import FILE, PROCESS
 from coldloop.process.lti_model import load as load_model
+from coldloop.process.model_file import read_document
 from rig.cosim.job import Job
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
@@ -50,8 +51,8 @@ def repeat(folder: Path, out: Path | None, *, force: bool) -> tuple[bool, str]:
     changed = changed_inputs(manifest, folder)
     if changed:
         raise UsageError("; ".join(changed))
-    if run.process != PROCESS:
-        raise UsageError(f"{folder}: a run of {run.process.name}, with another process file than now; {run.remedy}")
+    if run.process != PROCESS or (FILE is not None and read_document(FILE)["digest"] != run.model_digest):
+        raise UsageError(f"{folder}: a run of {run.process.name}, with another model than now; {run.remedy}")
     effective = _configuration(run)
     scenario = make_scenario(effective.settings, manifest["recorded_ticks"])
     if profile_digest(scenario.load) != manifest["inputs"]["load"]["profile_sha256"]:

@@ -36,7 +36,7 @@ from rig.results.indicators import RunEvaluation, StageCost
 from rig.results.recording import MemorySink, Recorder, Recording
 from rig.results.run_folder import batch_series
 from rig.results.tables import events_table, station_table, trace_table, updates_table
-from rig.runs.remarks import enforced, too_slow
+from rig.runs.remarks import certificate, enforced, too_slow
 from rig.runs.run_files import summary_of
 from rig.runs.running import make_scenario
 from rig.settings import Settings
@@ -148,12 +148,13 @@ def simulate(
     Args:
         load: Named load such as `a`, or a CSV file with the columns time_s and load_w; by default `2h`.
         solver: `ode`, `qpoases`, `osqp`, `fast-gradient`, `interior-point`, `hybrid` or `daqp`; by default `ode`.
-        updating_period: Seconds from 0.5 to 5 in multiples of 0.25, or `adaptive`, the default.
+        updating_period: Seconds, from 2 ticks to a sampling period (0.5 to 5 s); `adaptive`, the default.
         duration_s: Plant time in seconds, multiples of 0.25, or a text such as `10min`; by default that of the load.
         seed: Seed of the sensors' noise; by default 1.
         config: TOML file with further settings, such as one that `coldloop config` has written. An argument that is
             given comes before it.
-        enforce: Lengthen the updating period to what the PLC takes. Otherwise a warning says where it is too short.
+        enforce: Lengthen the updating period to what the PLC takes. Otherwise a warning says where it is too short,
+            or too long for a plant with a mode that grows.
         settings: Sections of the configuration, such as `plant={"sensors": {"level": 0.01}}`; they come before the
             file. The environment has no influence.
 
@@ -165,7 +166,8 @@ def simulate(
     )
     if enforce:
         effective = enforced(effective)
-    for line in filter(None, [too_slow(effective.settings.optimizer_plc.program)]):
+    slow, lost = too_slow(effective.settings.optimizer_plc.program), certificate(effective.settings, only_lost=True)
+    for line in filter(None, (slow, lost)):
         warnings.warn(line, stacklevel=2)
     return _run(effective, _ticks(duration_s))
 

@@ -17,7 +17,7 @@ from rig.studies.loop_cost import ADAPTIVE, loop_cost, require_costs
 
 FIXED_S: Final = tuple(
     ticks * TICK_S
-    for ticks in sorted({round(share * TICKS_PER_SAMPLE) for share in (0.2, 0.3, 0.4, 0.5, 0.7, 1.0)})
+    for ticks in sorted({round(share * TICKS_PER_SAMPLE) for share in (0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)})
     if ticks >= SHORTEST_TICKS
 )
 """Updating periods, s, that are compared, unless one is given."""

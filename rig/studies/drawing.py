@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Final
 
 import matplotlib as mpl
@@ -192,7 +193,7 @@ def hour_panels(
     with panels(rows, 2, (9.5, 3.1 * rows)) as (figure, axes):
         for name, place in zip(names, axes, strict=False):
             draw(name, place)
-            place.set_title(f"({name})", loc="left")
+            place.set_title(f"({Path(name).name})", loc="left")
             place.set_ylabel(label)
             place.set_yscale("log")
             place.set_yticks(ticks, map(str, ticks))

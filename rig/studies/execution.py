@@ -203,7 +203,7 @@ def perform_and_keep(request: RunRequest, folder: str, programs: str) -> None:
     store.keep(request, perform(request))
 
 
-_SHARED: Final = "name an --out that all machines share, or do shards and merge them (docs/studies.md)"
+_SHARED: Final = "name an --out that all machines share, or do shards and merge them (`coldloop docs studies`)"
 
 
 def _await_file(store: Store, request: RunRequest) -> None:

@@ -111,23 +111,33 @@ class LiveRig:
         While plant time is stopped, as without the plant, real time counts.
 
         Raises:
-            TimeoutError: It did not become true.
+            TimeoutError: It did not become true; with what it has read last.
         """
         start, deadline = self._tick_or_none(), time.monotonic() + within_s / self._scenario.factor + QUIET_S
-        while not condition():
+        while seen := self._unmet(condition):
             tick = self._tick_or_none()
             start = tick if start is None else start
             if tick is not None and start is not None and (tick - start) * TICK_S >= within_s:
-                raise TimeoutError(f"the condition was not met within {within_s:g} s of plant time")
+                raise TimeoutError(f"the condition was not met within {within_s:g} s of plant time: {seen}")
             if self._scenario.realtime or tick is None:
                 if time.monotonic() > deadline:
                     raise TimeoutError(
-                        f"the condition was not met within {within_s:g} s, and plant time does not advance"
+                        f"the condition was not met within {within_s:g} s, and plant time does not advance: {seen}"
                     )
                 time.sleep(LOOK_S)
             else:
                 self.advance(TICK_S)
         return self.time_s
+
+    def _unmet(self, condition: Callable[[], bool]) -> str:
+        """Return what a condition has read that is not met; nothing if it is."""
+        services = {service: getattr(self, service) for service in SERVICES}
+        for one in services.values():
+            one.latest.clear()
+        if condition():
+            return ""
+        read = (f"{service} {name} = {seen}" for service, one in services.items() for name, seen in one.latest.items())
+        return ", ".join(read) or "it has read no register by name"
 
     def _tick_or_none(self) -> int | None:
         try:
@@ -245,7 +255,7 @@ def up(
         mode: `lockstep`, the default: plant time passes only in `advance` and `wait_until`; `realtime`: by the clock.
         factor: In real time: seconds of plant time in a second; by default 1.
         solver: `ode`, `qpoases`, `osqp`, `fast-gradient`, `interior-point`, `hybrid` or `daqp`; by default `ode`.
-        updating_period: Seconds from 0.5 to 5 in multiples of 0.25, or `adaptive`, the default.
+        updating_period: Seconds, from 2 ticks to a sampling period (0.5 to 5 s); `adaptive`, the default.
         seed: Seed of the sensors' noise, and of which frames a fault hits; by default 1.
         config: TOML file with further settings. An argument that is given comes before it.
         folder: Takes the logs; a temporary one if not given.

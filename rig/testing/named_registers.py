@@ -39,16 +39,20 @@ class NamedRegisters:
         self._places = {name: place for block in register_map.blocks for name, place in _places_of(block)}
         self.endpoint = endpoint
         """Where the service listens, for clients of your own."""
+        self.latest: dict[str, Any] = {}
+        """What was read last, by name, since `clear`."""
 
     def read(self, name: str, *, row: int = 0) -> Any:  # noqa: ANN401 a number, or a tuple of an array
         """Return the value of a register; `row` counts from 0 in blocks that have several."""
         place = self._place(name)
         value = getattr(self._record(place.block, row), place.field)
-        return value if place.element is None else value[place.element]
+        self.latest[name] = value = value if place.element is None else value[place.element]
+        return value
 
     def read_block(self, block: str, *, row: int = 0) -> Any:  # noqa: ANN401 the record of that block
         """Return all registers of a block, read in one request, as a named tuple."""
-        return self._record(self._block(block), row)
+        self.latest[block] = found = self._record(self._block(block), row)
+        return found
 
     def write(self, name: str, value: float | Record, *, row: int = 0) -> None:
         """Write a register; the others of its block are written as they were read just before."""

@@ -14,7 +14,7 @@ from coldloop.registers.safety import AlarmKind, AlarmPriority
 PASSING: Final = (AlarmKind.SCAN_OVERRUN, AlarmKind.ACCESS_REFUSED, AlarmKind.SECOND_WRITER)
 """Alarms for something that happens at an instant: their off-delay is how long ago the last time must be."""
 BANDS: Final = (AlarmKind.LEVEL_BAND, AlarmKind.T5_BAND)
-OF_THE_PROCESS: Final = (*BANDS, AlarmKind.CAPACITY, AlarmKind.SENSOR_SUSPECT)
+OF_THE_PROCESS: Final = (*BANDS, AlarmKind.CAPACITY, AlarmKind.SENSOR_SUSPECT, AlarmKind.INPUT_WITHOUT_EFFECT)
 """Alarms that say nothing against PLCs, links and what the control PLC works with."""
 
 LOW, MEDIUM, HIGH, CRITICAL = AlarmPriority
@@ -57,6 +57,7 @@ DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
     AlarmKind.OPTIMIZER_LOST: AlarmRule(MEDIUM),  # no new sequence will come by itself
     AlarmKind.SENSOR_BAD: AlarmRule(MEDIUM),  # substituted; the ladder reacts to those that matter
     AlarmKind.SENSOR_SUSPECT: AlarmRule(MEDIUM),  # the optimiser does without it
+    AlarmKind.INPUT_WITHOUT_EFFECT: AlarmRule(MEDIUM),  # likewise: the turbine stands
     AlarmKind.MODEL_MISMATCH: AlarmRule(MEDIUM),  # no sequence is accepted until a configuration is changed
     AlarmKind.SECOND_WRITER: AlarmRule(MEDIUM, off_delay_s=60.0),  # refused, but wired or configured wrongly
     AlarmKind.CERTIFICATE: AlarmRule(MEDIUM),  # clients will not connect once it has expired

@@ -69,7 +69,7 @@ class Clients:
         self._waits = 0
         self._begun = 0
         """Sessions that have begun."""
-        self.lease = WriterLease("the optimiser's registers", self._silence_s, self._note_lease)
+        self.lease = WriterLease("the optimiser's registers", self._silence_s, self._note_lease, shared=True)
         self.changed = asyncio.Event()
         self.granted = 0
         """Lock-step scans every tick before this one."""
@@ -177,23 +177,32 @@ class Clients:
             self.granted = 0
             self._note(EventKind.SESSION, asked.realtime, caller.name, value=asked.factor)
         elif record is SessionPace:
-            self.pending_time_base = pace = self._bank.get(SessionPace).of(program.session)
-            self._bank.put(SessionPace.shown(program.session, pace))
-            self._note(EventKind.PACE, pace_subject(pace), caller.name, value=pace.factor)
+            self._ask_for_pace(caller.name)
         elif record is Operator:
             self._operate(self._bank.get(Operator), caller.name)
         elif record is AlarmCommand:
             program.alarms.command(self._bank.get(AlarmCommand), caller.name)
         elif record is WatchdogTime:
-            time = self._bank.get(WatchdogTime).time
-            self._note(EventKind.WATCHDOG_TIME, time, caller.name, cause=program.watchdog.time)
-            program.watchdog.set(time, program.tick)
+            self._set_watchdog(self._bank.get(WatchdogTime).time, caller.name)
         elif record is JournalQuery:
             self._publication.journal.answer(self._bank.get(JournalQuery))
             return
         self.changed.set()
         if record is not Grant:
             self._publication.safety()
+
+    def _ask_for_pace(self, who: str) -> None:
+        pace = self._bank.get(SessionPace).of(self._program.session)
+        self._bank.put(SessionPace.shown(self._program.session, pace))
+        if pace != (self.pending_time_base or self._sessions.pace):
+            self.pending_time_base = pace
+            self._note(EventKind.PACE, pace_subject(pace), who, value=pace.factor)
+
+    def _set_watchdog(self, time: int, who: str) -> None:
+        watchdog = self._program.watchdog
+        if time != watchdog.time:
+            self._note(EventKind.WATCHDOG_TIME, time, who, cause=watchdog.time)
+            watchdog.set(time, self._program.tick)
 
     def _operate(self, operator: Operator, who: str) -> None:
         before = self._program.operator

@@ -3,11 +3,14 @@
 from collections.abc import Collection, Sequence
 from typing import Final
 
-from coldloop.process.signals import CONTROLLED
+from coldloop.process.declaration import Range
+from coldloop.process.loaded import PROCESS
+from coldloop.process.signals import CONTROLLED, INPUT_NAMES
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.safety import AlarmKind, CapacityCause
 from coldloop.service.journal import Journal
+from control_plc.alarm_settings import BANDS
 from control_plc.alarms import AlarmPanel
 from control_plc.ladder import Ladder
 
@@ -15,6 +18,16 @@ SENSORS: Final = {AlarmKind.SENSOR_BAD: 1, AlarmKind.SENSOR_SUSPECT: 2}
 """Alarms of sensors, and the cause of their events."""
 OPTIMIZER_DRIVES: Final = (Mode.MPC, Mode.REST)
 """Modes in which the optimiser's sequences are played."""
+
+
+def present_limits(bands: Sequence[Range], panel: AlarmPanel) -> list[Range]:
+    """Return the limits of each output with a band: its band while its alarm is raised, wider by the dead band else."""
+    level, further = (panel.rows[kind] for kind in BANDS)
+    raised = [level.active, *(further.active and further.cause == place for place in range(len(bands) - 1))]
+    return [
+        (low, high) if is_raised else (low - dead_band, high + dead_band)
+        for (low, high), dead_band, is_raised in zip(bands, PROCESS.dead_bands, raised, strict=True)
+    ]
 
 
 class ProcessAlarms:
@@ -31,6 +44,7 @@ class ProcessAlarms:
         self._journal = journal
         self._bands = bands
         self._before: dict[AlarmKind, frozenset[int]] = dict.fromkeys(SENSORS, frozenset())
+        self._suspects = 0
 
     def watch(
         self,
@@ -56,11 +70,11 @@ class ProcessAlarms:
             optimizer: Its heartbeat is present.
             shortage: What the load is above what can be held, in W; negative: below what is needed.
             bad: Outputs that are substituted.
-            suspects: Outputs that the optimiser does without: bit i is output i.
+            suspects: Outputs that the optimiser does without: bit i is output i; then inputs that have no effect.
         """
         report = self._panel.report
-        bands = zip(CONTROLLED, self._bands, strict=True)
-        outside = [not (cooling or low <= y[output] <= high) for output, (low, high) in bands]
+        limits = zip(CONTROLLED, present_limits(self._bands, self._panel), strict=True)
+        outside = [not (cooling or low <= y[output] <= high) for output, (low, high) in limits]
         report(AlarmKind.LEVEL_BAND, condition=outside[0])
         further = [place for place, is_outside in enumerate(outside[1:]) if is_outside]
         report(AlarmKind.T5_BAND, condition=bool(further), cause=further[0] if further else 0)
@@ -74,8 +88,11 @@ class ProcessAlarms:
         short = CapacityCause.of(shortage if mode is Mode.MPC else 0.0)
         report(AlarmKind.CAPACITY, condition=bool(short), cause=short, value=abs(shortage))
         self._watch_sensors(tick, AlarmKind.SENSOR_BAD, frozenset(bad))
-        suspected = (output for output in range(len(y)) if mode in OPTIMIZER_DRIVES and suspects >> output & 1)
+        self._suspects = suspects if mode in OPTIMIZER_DRIVES else 0
+        suspected = (output for output in range(len(y)) if self._suspects >> output & 1)
         self._watch_sensors(tick, AlarmKind.SENSOR_SUSPECT, frozenset(suspected))
+        idle = [place for place in range(len(INPUT_NAMES)) if self._suspects >> len(y) + place & 1]
+        report(AlarmKind.INPUT_WITHOUT_EFFECT, condition=bool(idle), cause=idle[0] if idle else 0)
 
     def _watch_sensors(self, tick: int, kind: AlarmKind, found: frozenset[int]) -> None:
         """Note each sensor that became bad, suspect or good, and raise the alarm; its cause is the newest one."""
@@ -88,5 +105,5 @@ class ProcessAlarms:
             self._panel.returned(kind)
 
     def has_noted(self, suspects: int) -> bool:
-        """Return whether these suspects (bit i is output i) are those of the last scan, in a mode of the optimiser."""
-        return suspects == sum(1 << output for output in self._before[AlarmKind.SENSOR_SUSPECT])
+        """Return whether these suspects are those of the last scan, in a mode of the optimiser."""
+        return suspects == self._suspects

@@ -52,6 +52,8 @@ ANSWER_TICKS: Final = 8
 SHORTEST_PATIENCE_S: Final = 0.1
 LONGEST_SLEEP_S: Final = 0.25
 """In real time it is seen so often whether an operator has called meanwhile."""
+REPACED_S: Final = 0.5
+"""Between two changes of the time base in real time: each reads the rack before outputs are written again."""
 KEEP_ALIVE_S: Final = 1.0
 """While paused, the rack is asked something so often."""
 
@@ -92,6 +94,8 @@ class ControlPlc:
         self._watch = ScanWatch()
         self._lost_lines = 0
         self._awaiting_since: float | None = None
+        self._repaced = -REPACED_S
+        """When the time base was changed last, s."""
         self.bank.put(program.operator)
         self.bank.put(WatchdogTime(program.watchdog.time))
         program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None), int(self._store.refused))
@@ -114,7 +118,7 @@ class ControlPlc:
         while True:
             if self.clients.asked is not None:
                 self._start(self.clients.asked)
-            elif self.clients.pending_time_base is not None:
+            elif self.clients.pending_time_base is not None and self._may_change_pace:
                 self._change_pace(self.clients.pending_time_base)
             elif not self.sessions.expected:
                 await self._stand_by()
@@ -162,7 +166,17 @@ class ControlPlc:
     @property
     def _is_called(self) -> bool:
         """An operator has requested another session, or another time base."""
-        return self.clients.asked is not None or self.clients.pending_time_base is not None
+        changes = self.clients.pending_time_base is not None and self._may_change_pace
+        return self.clients.asked is not None or changes
+
+    @property
+    def _may_change_pace(self) -> bool:
+        """Whether outputs were written since the last change, so that many in a row do not starve the rack's watchdog.
+
+        In lock-step, and while paused, the watchdog does not run.
+        """
+        pace = self.sessions.pace
+        return not pace.realtime or pace.paused or time.monotonic() >= self._repaced + REPACED_S
 
     async def _while_paused(self) -> None:
         """Wait until an operator writes something; the connection to the rack is kept open meanwhile."""
@@ -334,7 +348,7 @@ class ControlPlc:
     def _change_pace(self, pace: TimeBase) -> None:
         """Switch to another time base; the rack is read before the next scan."""
         self.clients.pending_time_base = None
-        self.sessions.pace = pace
+        self.sessions.pace, self._repaced = pace, time.monotonic()
         self._set_clock()
         self._link.repaced()
         self._show_pace()

@@ -39,6 +39,7 @@ class PlantEndpoint(Endpoint):
     """Where the plant's rack is."""
 
     port: Annotated[int, Field(ge=1, le=0xFFFF)] = PLANT_PORT
+    """TCP port."""
 
 
 class ControlStrategy(StrEnum):

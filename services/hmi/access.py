@@ -14,6 +14,11 @@ MOST_SESSIONS: Final = 200
 MOST_ADDRESSES: Final = 1000
 LOGINS_A_MINUTE: Final = 6.0
 LOGIN_BURST: Final = 6.0
+"""Wrong passwords for one name from one address."""
+PASSWORDS_A_SECOND: Final = 4.0
+PASSWORD_BURST: Final = 12.0
+"""Passwords that are checked for all names of one address together, but for those that have logged in from there: each
+takes a twentieth of a second of a core."""
 REQUESTS_A_BROWSER: Final = 3.0
 """In a second. Behind a proxy all browsers have one address, and each asks for two trends a second."""
 REQUEST_BURST: Final = 150.0
@@ -127,6 +132,37 @@ class ClientLimit:
         if address in self._buckets:
             level, since = self._buckets[address]
             self._buckets[address] = (min(self._burst, level + 1.0), since)
+
+
+class LoginLimit:
+    """Which attempts to log in are looked at: by address and name, and by address.
+
+    Who has logged in from an address before comes first there: others who try from it, behind a proxy perhaps, do not
+    keep such users out. Nothing here depends on whether a name exists.
+
+    Args:
+        now: Monotonic clock, s.
+    """
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._of_names = ClientLimit(now, LOGINS_A_MINUTE / 60, LOGIN_BURST)
+        self._of_addresses = ClientLimit(now, PASSWORDS_A_SECOND, PASSWORD_BURST)
+        self._known: OrderedDict[str, None] = OrderedDict()
+
+    def allows(self, address: str, name: str) -> bool:
+        """Return whether a password is checked for this name from this address."""
+        both = f"{address} {name}"
+        return self._of_names.allows(both) and (both in self._known or self._of_addresses.allows(address))
+
+    def succeeded(self, address: str, name: str) -> None:
+        """Note that the password was right."""
+        both = f"{address} {name}"
+        self._of_names.give_back(both)
+        self._of_addresses.give_back(address)
+        self._known[both] = None
+        self._known.move_to_end(both)
+        while len(self._known) > MOST_ADDRESSES:
+            self._known.popitem(last=False)
 
 
 def host_of(header: str) -> str:

@@ -11,7 +11,7 @@ from hmi.access import LoginSession
 from hmi.audit import Audit
 from hmi.documents import encoded
 from hmi.guard import Guard, cookie_name, refusal
-from hmi.operator_desk import OperatorDesk
+from hmi.operator_desk import OperatorDesk, PremisesChangedError
 from hmi.reading import json_answer
 from hmi.settings import HmiSection
 from hmi.users import Users
@@ -70,7 +70,7 @@ class Commanding:
         if not isinstance(name, str) or not isinstance(password, str):
             return refusal(400, "user and password must be text")
         address = request.remote or ""
-        user = await self._guard.log_in(name, password, address)
+        user = await self._guard.log_in(name, password, address, self._guard.logins)
         if isinstance(user, web.Response):
             return user
         self._guard.sessions.end(request.cookies.get(cookie_name(request)))
@@ -84,8 +84,9 @@ class Commanding:
 
     async def logout(self, request: web.Request) -> web.Response:
         """End the session."""
-        if self._guard.who(request):
-            self._note(request, "logout", "done", "")
+        who = self._guard.who(request)
+        if who:
+            self._audit.note("logout", who=who, address=request.remote or "", outcome="done")
         self._guard.sessions.end(request.cookies.get(cookie_name(request)))
         answer = web.json_response({})
         answer.del_cookie(cookie_name(request), path="/")
@@ -105,11 +106,11 @@ class Commanding:
             return operator if isinstance(operator, web.Response) else refusal(409, "a recorded run takes no commands")
         try:
             command = read_command(await _document(request))
-            token, text = await self._desk.prepare(command, operator.user.name)
+            preview = await self._desk.prepare(command, operator.user.name)
         except (UsageError, LinkError) as error:
             self._refuse(request, str(error))
             return refusal(422, str(error))
-        return web.json_response({"token": token, "text": text})
+        return web.json_response(preview._asdict())
 
     async def confirm(self, request: web.Request) -> web.Response:
         """Carry out a prepared command; answer with the command and its result."""
@@ -118,9 +119,10 @@ class Commanding:
             return operator if isinstance(operator, web.Response) else refusal(409, "a recorded run takes no commands")
         try:
             outcome = await self._desk.confirm(request.match_info["token"], operator.user.name)
-        except UsageError as error:
+        except (UsageError, LinkError) as error:
             self._refuse(request, str(error))
-            return refusal(409, str(error))
+            preview = error.preview._asdict() if isinstance(error, PremisesChangedError) else {}
+            return web.json_response({"error": str(error), **preview}, status=409)
         word = "refused" if outcome.refused_because else "uncertain" if outcome.uncertain_because else "done"
         detail = f"{outcome.asked}: {' '.join(filter(None, outcome[1:]))}"
         self._audit.note(  # by name: the login may have ended meanwhile
@@ -142,10 +144,6 @@ class Commanding:
     def _refuse(self, request: web.Request, reason: str) -> None:
         who = self._guard.who(request)
         self._audit.refuse("command", who=who, address=request.remote or "", reason=reason, has_session=bool(who))
-
-    def _note(self, request: web.Request, what: str, outcome: str, detail: str) -> None:
-        who = self._guard.who(request)
-        self._audit.note(what, who=who, address=request.remote or "", outcome=outcome, detail=detail)
 
 
 async def _document(request: web.Request) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from coldloop.registers.plant import StationAlarm, StationMode, StationStatus
-from coldloop.service.event_text import word
+from coldloop.service.event_text import word_of
 from hmi.process_image import Model
 
 KIND: Final = "plant.kind"
@@ -26,10 +26,9 @@ def plant_document(model: Model) -> dict[str, Any]:
     if kind != REFRIGERATOR:
         return {"kind": kind}
     status = model.record("plant", StationStatus) or StationStatus()
-    known = status.mode in StationMode.__members__.values()
     return {
         "kind": kind,
-        "mode": word(StationMode(status.mode)) if known else str(status.mode),
+        "mode": word_of(StationMode, status.mode),
         "alarms": [str(one.name).lower().replace("_", " ") for one in StationAlarm if status.alarms & one],
         "bands": {f"{SIGNALS}{name}": _band(model, *keys) for name, keys in LIMITS.items()},
     }

@@ -2,16 +2,17 @@
 
 import json
 import math
-from bisect import bisect_right
-from collections.abc import Iterable, Sequence
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import Any, Final
 
 from coldloop import __version__
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S
 from coldloop.registers.audit import EventKind
-from coldloop.registers.control_plc import Mode, OperatorMode, Plan
+from coldloop.registers.control_plc import Mode
 from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import (
     BANDED_OUTPUTS,
@@ -23,14 +24,15 @@ from coldloop.registers.optimizer_plc import (
     outputs_of,
 )
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmKind, AlarmPriority, AlarmState
-from coldloop.service.event_text import alarm_cause, alarm_word, word
+from coldloop.service.event_text import alarm_cause, alarm_word, word, word_of
 from hmi.compression_station import plant_document
 from hmi.explanation import explain
 from hmi.process_image import JournalEntry, Model
 from hmi.process_view import process_document
+from hmi.quality import qualities
 from hmi.sentences import deviation, sentence
 from hmi.signals import signals_of
-from hmi.trends import NAMES, Gap, mode_name, rounded, thin
+from hmi.trends import NAMES, Gap, ModeInterval, mode_name, rounded, thin
 
 Document = dict[str, Any]
 
@@ -44,8 +46,9 @@ MARKED: Final = {
 }
 """Kinds of events that are marked on the trends, and what as."""
 BEGUN: Final = word(EventKind.SESSION)
-MOST_MARKS: Final = 200
+MOST_MARKS: Final = 1000
 EARLIER_PREDICTIONS: Final = 12
+BEFORE_TICKS: Final = round(2 * SAMPLING_PERIOD_S / TICK_S)
 
 
 def encoded(document: Document) -> bytes:
@@ -83,20 +86,13 @@ def catalog(*, training: bool, replay: bool) -> Document:
         "replay": replay,
         "services": list(MAPS),
         "signals": {
-            signal.name: {
-                "service": service, "block": signal.block, "label": signal.label, "unit": signal.unit,
-                "decimals": signal.decimals, "words": signal.words, "description": signal.description,
-                "address": signal.address, "writer": signal.writer,
-            }
+            signal.name: {"service": service, **signal._asdict()}
             for service in MAPS
             for signal in signals_of(service)
         },
-        "trended": list(NAMES),
+        "trended": [name for name in NAMES if name != "load" or PROCESS.has_load],
         "process": process_document(),
-        "inputs": list(INPUT_NAMES),
         "outputs": list(OUTPUT_NAMES),
-        "modes": [mode_name(mode) for mode in Mode],
-        "operator_modes": [word(mode) for mode in OperatorMode],
         "alarm_actions": {word(action): int(action) for action in AlarmAction},
         "tick_s": TICK_S,
     }  # fmt: skip
@@ -104,17 +100,14 @@ def catalog(*, training: bool, replay: bool) -> Document:
 
 def alarm_document(kind: AlarmKind, alarm: Alarm) -> Document:
     """Return one alarm in words."""
-    known = alarm.state in AlarmState.__members__.values()
     return {
         "number": int(kind),
         "name": alarm_word(kind),
-        "state": word(AlarmState(alarm.state)) if known else str(alarm.state),
+        "state": word_of(AlarmState, alarm.state),
         "active": bool(alarm.active),
         "cause": alarm_cause(kind, alarm.cause) if alarm.times else "",
         "priority": int(alarm.priority),
-        "priority_word": word(AlarmPriority(alarm.priority))
-        if alarm.priority in AlarmPriority.__members__.values()
-        else "",
+        "priority_word": word_of(AlarmPriority, alarm.priority),
         "times": alarm.times,
         "raised_s": alarm.raised * TICK_S,
         "returned_s": alarm.returned * TICK_S,
@@ -123,12 +116,9 @@ def alarm_document(kind: AlarmKind, alarm: Alarm) -> Document:
 
 
 def alarms_document(model: Model) -> list[Document]:
-    """Return all alarms, those that want an operator first, then by priority and age."""
-    rank: dict[int, int] = {AlarmState.UNACKNOWLEDGED: 0, AlarmState.RETURNED: 0, AlarmState.ACKNOWLEDGED: 1}
-    rows = sorted(
-        model.alarm_rows(),
-        key=lambda row: (rank.get(row[1].state, 2), -row[1].priority, not row[1].active, -row[1].raised),
-    )
+    """Return all alarms: those that are active first, of these the unacknowledged ones, then by priority and age."""
+    rank: dict[int, int] = {AlarmState.UNACKNOWLEDGED: 0, AlarmState.ACKNOWLEDGED: 1, AlarmState.RETURNED: 2}
+    rows = sorted(model.alarm_rows(), key=lambda row: (rank.get(row[1].state, 3), -row[1].priority, -row[1].raised))
     return [alarm_document(kind, alarm) for kind, alarm in rows]
 
 
@@ -159,17 +149,18 @@ def services_document(model: Model) -> Document:
 def state_document(model: Model, changed: Iterable[str] | None = None) -> Document:
     """Return the state of everything that is shown; of signals only those that have changed, if these are named."""
     names = model.values if changed is None else [name for name in changed if name in model.values]
-    plan = model.record("control_plc", Plan) if model.mode == Mode.MPC else None
+    stale, replaced = model.stale_prefixes(), model.doubts.held | model.doubts.bad
+    not_current = [f"control_plc.process.y.{name}" for i, name in enumerate(OUTPUT_NAMES) if replaced >> i & 1]
     document: Document = {
         "whole": changed is None,
         "tick": model.tick,
         "time_s": model.tick * TICK_S,
         "services": services_document(model),
         "plant": plant_document(model),
-        "deviation": deviation(
-            model.record("optimizer_plc", ModelDeviation) or ModelDeviation(), plan.suspects if plan else 0
-        ),
-        "stale": model.stale_prefixes(),
+        "deviation": deviation(model.record("optimizer_plc", ModelDeviation) or ModelDeviation(), model.doubts.suspect),
+        "commands": model.commands,
+        "stale": stale + not_current,
+        "quality": dict(qualities(model.doubts, stale)),
         "values": {name: finite(model.values[name]) for name in names},
     }
     if model.replay is not None:
@@ -230,38 +221,58 @@ def trend_document(model: Model, names: Sequence[str], start: int, end: int, poi
     """Return everything that is drawn between two ticks."""
     times, series = model.trends.thinned(names, start, end, points)
     gaps = model.trends.gaps(start, end)
-    updates = [update for update in model.updates if start <= update.tick <= end]
-    update_times, update_series = thin(
-        [update.tick * TICK_S for update in updates],
-        {
-            "tau_u": [update.tau_u * TICK_S for update in updates],
-            "q": [float(update.q) for update in updates],
-            "J": [update.j_effective for update in updates],
-            "J_predicted": [update.j_delivered for update in updates],
-        },
-        points,
-        _lost_updates(updates, gaps),
-    )
+    modes = model.trends.modes(start, end)
+    in_force = model.trends.modes(start - BEFORE_TICKS, end)  # with the update that the window begins with
     shown = [one for one in model.predictions if one.tick >= start]
     limits = model.limits
     return {
-        "from_s": start * TICK_S,
-        "to_s": end * TICK_S,
         "now_s": model.tick * TICK_S,
         "time": times,
         "series": series,
-        "updates": {"time": update_times, **update_series},
-        "modes": [
-            {"from": one.start, "to": one.end, "mode": mode_name(one.mode)} for one in model.trends.modes(start, end)
-        ],
-        "substituted": {name: found for name, found in model.trends.substituted(start, end).items() if name in names},
-        "marks": _marks(model, start, end),
+        "updates": updates_document(model.updates, in_force, gaps, points),
+        "modes": [{"from": one.start, "to": one.end, "mode": mode_name(one.mode)} for one in modes],
+        "doubtful": {name: found for name, found in model.trends.doubtful(start, end).items() if name in names},
+        **_marks(model, start, end),
         "predictions": [prediction_document(one) for one in _some(shown)],
         "planned": model.is_planned,
         "gaps": [[max(gap.start, start) * TICK_S, min(gap.end, end) * TICK_S] for gap in gaps],
         "bands": _ranges(BANDED_OUTPUTS, limits.output_low, limits.output_high),
         "bounds": _ranges(INPUT_NAMES, limits.input_low, limits.input_high),
     }
+
+
+def updates_document(
+    updates: Sequence[Optimization], modes: Sequence[ModeInterval], gaps: Sequence[Gap], points: int
+) -> Document:
+    """Return times, updating periods and costs of updates as far as they were in force: while MPC was active.
+
+    A period lasts until the next one, or until its stretch ends. A cost is of an instant. Elsewhere there is None, also
+    between updates of which some are missing because nothing could be read.
+    """
+    found: Document = {name: [] for name in ("time", *QUANTITIES)}
+    for stretch in modes:
+        if stretch.mode != Mode.MPC:
+            continue
+        first, last = (round(time / TICK_S) for time in (stretch.start, stretch.end))
+        start = bisect_left(updates, first, key=lambda one: one.tick)
+        inside = [*islice(updates, start, bisect_right(updates, last, key=lambda one: one.tick))]
+        if not inside:
+            continue
+        columns = {name: [quantity(one) for one in inside] for name, quantity in QUANTITIES.items()}
+        times, thinned = thin([one.tick * TICK_S for one in inside], columns, points, _lost_updates(inside, gaps))
+        found["time"] += [*times, last * TICK_S, (last + 1) * TICK_S]
+        for name, values in thinned.items():
+            found[name] += [*values, values[-1] if name in PERIODS else None, None]
+    return found
+
+
+PERIODS: Final = ("tau_u", "q")
+QUANTITIES: Final[Mapping[str, Callable[[Optimization], float]]] = {
+    "tau_u": lambda one: one.tau_u * TICK_S,
+    "q": lambda one: float(one.q),
+    "J": lambda one: one.j_effective,
+    "J_predicted": lambda one: one.j_delivered,
+}
 
 
 def _lost_updates(updates: Sequence[Optimization], gaps: Sequence[Gap]) -> list[float]:
@@ -283,14 +294,16 @@ def _some(predictions: list[Prediction]) -> list[Prediction]:
     return predictions[::-1][::every][::-1]
 
 
-def _marks(model: Model, start: int, end: int) -> list[Document]:
+def _marks(model: Model, start: int, end: int) -> Document:
+    """Return the marks between two ticks, and since when they are all, s; None if there are no earlier ones."""
     begun = max((e.utc for e in model.events if e.service == "plant" and e.text.kind == BEGUN), default="")
-    found = [
-        entry
-        for entry in model.events
-        if entry.text.kind in MARKED and start <= entry.tick <= end and entry.utc >= begun  # not of a session before
-    ]
-    return [
+    known = [entry for entry in model.events if entry.utc >= begun]  # not of a session before
+    marked = MARKED.keys() - ({word(EventKind.LOAD)} if not PROCESS.has_load else ())
+    found = [entry for entry in known if entry.text.kind in marked and start <= entry.tick <= end]
+    is_cut = len(found) > MOST_MARKS or (len(known) == model.events.maxlen and known[0].tick > start)
+    since_s = (found[-MOST_MARKS:] or known)[0].tick * TICK_S if is_cut else None
+    marks = [
         {"time": entry.tick * TICK_S, "kind": MARKED[entry.text.kind], "text": entry.text.sentence}
         for entry in found[-MOST_MARKS:]
     ]
+    return {"marks": marks, "marks_since_s": since_s}

@@ -1,20 +1,21 @@
 """What every request passes: whose it is, where it comes from, how often, and the headers of every answer."""
 
 import asyncio
+import logging
 import re
 import time
 from collections.abc import Awaitable, Callable
 from typing import Final
 
 from aiohttp import hdrs, web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from hmi.access import (
     LOCAL_NAMES,
-    LOGIN_BURST,
-    LOGINS_A_MINUTE,
     REQUEST_BURST,
     REQUESTS_A_BROWSER,
     ClientLimit,
+    LoginLimit,
     LoginSession,
     LoginSessions,
     Party,
@@ -54,6 +55,16 @@ PASSWORDS_AT_ONCE: Final = 2
 """Passwords that are checked at a time: each takes a core and 16 MB."""
 
 _RUN: Final = re.compile(r"\A/run/\d+/")
+
+
+def told_in_a_line(record: logging.LogRecord) -> bool:
+    """Take the traceback off what aiohttp logs of a malformed request (a filter of its logger)."""
+    error = record.exc_info[1] if record.exc_info else None
+    if isinstance(error, HttpProcessingError):
+        record.msg, record.exc_info = f"{record.getMessage()}: {error.message.splitlines()[0]}", None
+        record.args = ()
+    return True
+
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -96,7 +107,9 @@ class Guard:
         self._checking = asyncio.Semaphore(PASSWORDS_AT_ONCE)
         login = settings.login
         self.sessions = LoginSessions(time.monotonic, login.idle_minutes * 60, login.longest_minutes * 60)
-        self.logins = ClientLimit(time.monotonic, LOGINS_A_MINUTE / 60, LOGIN_BURST)
+        self.logins = LoginLimit(time.monotonic)
+        self.scrapes = LoginLimit(time.monotonic)
+        """Of `/metrics`: a scraper with an old password keeps nobody from logging in."""
         self._requests = ClientLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
         self._files = ClientLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
         self._hosts = LOCAL_NAMES | {settings.host, *map(str.lower, settings.allowed_hosts)}
@@ -117,9 +130,9 @@ class Guard:
         who = self.who(request)
         return Party(who, has_session=True) if who else Party(request.remote or "", has_session=False)
 
-    async def log_in(self, name: str, password: str, address: str) -> User | web.Response:
+    async def log_in(self, name: str, password: str, address: str, limit: LoginLimit) -> User | web.Response:
         """Return the user with this password, or the refusal; both take as long."""
-        if not self.logins.allows(address):
+        if not limit.allows(address, name):
             self._audit.refuse("login", who=name[:40], address=address, reason="too many attempts", has_session=False)
             return refusal(429, "too many attempts to log in: wait a minute")
         async with self._checking:
@@ -129,7 +142,7 @@ class Guard:
                 "login", who=name[:40], address=address, reason="wrong name or password", has_session=False
             )
             return refusal(401, "wrong name or password")
-        self.logins.give_back(address)
+        limit.succeeded(address, name)
         return user
 
     def _refused(self, request: web.Request, status: int, reason: str, message: str = "") -> web.Response:

@@ -23,7 +23,6 @@ from coldloop.operating.execution import (
     CommandClient,
     NotTakenError,
     check_bounds,
-    check_manual,
     clients_of,
     connected,
     reason_of,
@@ -32,11 +31,20 @@ from coldloop.process.signals import INPUT_NAMES, TICK_S
 from coldloop.registers.common import SessionPace
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import AlarmAction
+from hmi.premises import Premises, differences, read_premises
 from hmi.process_image import Model
 
 CONFIRM_WITHIN_S: Final = 60.0
 MOST_PREPARED: Final = 100
 TIMEOUT_S: Final = 3.0
+
+
+class Preview(NamedTuple):
+    """What a command would do, what it would change as it is now, and the token that confirms it."""
+
+    token: str
+    text: str
+    now: str
 
 
 class Prepared(NamedTuple):
@@ -46,6 +54,15 @@ class Prepared(NamedTuple):
     text: str
     user: str
     until: float
+    premises: Premises
+
+
+class PremisesChangedError(UsageError):
+    """What a command was prepared for has changed since."""
+
+    def __init__(self, reason: str, preview: Preview) -> None:
+        super().__init__(reason)
+        self.preview = preview
 
 
 class CommandResult(NamedTuple):
@@ -79,23 +96,30 @@ class OperatorDesk:
         self._training = training
         self._prepared: OrderedDict[str, Prepared] = OrderedDict()
         self._turn = asyncio.Lock()
+        self._last = ""  # whose the last command was, and what
 
-    async def prepare(self, command: Command, user: str) -> tuple[str, str]:
-        """Take a command, and return the token that confirms it, and what it would do.
+    async def prepare(self, command: Command, user: str) -> Preview:
+        """Take a command, and return what it would do, with the token that confirms it.
 
         Raises:
             UsageError: It is not possible now.
             LinkError: The service does not answer.
         """
-        await self._check(command)
+        self._check(command)
         token = secrets.token_urlsafe(16)
         text = f"{command.text}{self._consequences(command)}"
-        self._prepared[token] = Prepared(command, text, user, self._now() + CONFIRM_WITHIN_S)
+        premises = await self._premises(command)
+        self._prepared[token] = Prepared(command, text, user, self._now() + CONFIRM_WITHIN_S, premises)
         while len(self._prepared) > MOST_PREPARED:
             self._prepared.popitem(last=False)
-        return token, text
+        now = "; ".join(f"{name} {value}" for name, value in premises.items() if name != "session")
+        return Preview(token, text, now)
 
-    async def _check(self, command: Command) -> None:
+    async def _premises(self, command: Command) -> Premises:
+        async with connected(self._clients(WORK[type(command)][0])) as clients:
+            return await read_premises(clients, command)
+
+    def _check(self, command: Command) -> None:
         if isinstance(command, FaultSensor) and not self._training:
             raise UsageError("sensor faults are offered only where hmi.training is switched on")
         if isinstance(command, SetSetpoint):
@@ -103,8 +127,6 @@ class OperatorDesk:
             low, high = limits.input_low[place], limits.input_high[place]
             if high > low:  # they are known
                 check_bounds(command, low, high)
-            async with connected(self._clients(["control_plc"])) as clients:
-                await check_manual(clients["control_plc"])
 
     def _consequences(self, command: Command) -> str:
         """Return what a command means at present, beyond its own words."""
@@ -134,6 +156,7 @@ class OperatorDesk:
         """Carry out a command that was prepared, once.
 
         Raises:
+            PremisesChangedError: What it was prepared for has changed; it has a new preview.
             UsageError: There is none with this token, or it is another user's, or it was prepared too long ago.
         """
         prepared = self._prepared.get(token)
@@ -143,7 +166,18 @@ class OperatorDesk:
             )
         del self._prepared[token]
         async with self._turn:
-            return await self._carry_out(prepared.command, prepared.text)
+            try:
+                changes = differences(prepared.premises, await self._premises(prepared.command))
+            except LinkError as error:
+                return CommandResult(prepared.text, refused_because=reason_of(error))
+            if changes:
+                by = f"; the last command here was {self._last}" if self._last else ""
+                reason = f"not done, as it has changed since it was asked: {changes}{by}"
+                raise PremisesChangedError(reason, await self.prepare(prepared.command, user))
+            result = await self._carry_out(prepared.command, prepared.text)
+            self._last = f"{user}'s: {prepared.text}"
+            self._model.commands += 1
+            return result
 
     async def _carry_out(self, command: Command, asked: str) -> CommandResult:
         services, work = WORK[type(command)]

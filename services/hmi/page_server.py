@@ -8,6 +8,7 @@ from functools import partial
 from typing import Final, NamedTuple
 
 from aiohttp import web
+from aiohttp.log import server_logger
 
 from coldloop.errors import ConfigurationError, PortInUseError
 from coldloop.modbus.refusals import RefusalLog
@@ -17,7 +18,7 @@ from hmi.broadcast import Broadcast
 from hmi.commanding import LONGEST_REQUEST, Commanding
 from hmi.connections import Connections
 from hmi.documents import encoded, state_document
-from hmi.guard import Guard
+from hmi.guard import Guard, told_in_a_line
 from hmi.operator_desk import OperatorDesk
 from hmi.process_image import Model
 from hmi.reading import STATIC, Reading, static_files
@@ -63,6 +64,7 @@ class PageServer:
         self._connections = Connections(settings.connections, time.monotonic)
         self._guard = Guard(settings, self._audit, self._users, self._connections)
         self._streams: list[tuple[Model, Broadcast, asyncio.Event]] = []
+        server_logger.addFilter(told_in_a_line)
         app = web.Application(middlewares=[self._guard.middleware], client_max_size=LONGEST_REQUEST)
         if len(exhibits) == 1:
             app.add_routes(self._routes(exhibits[0]))

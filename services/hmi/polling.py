@@ -3,19 +3,21 @@
 import asyncio
 import logging
 import time
+from contextlib import suppress
 from typing import Any, Final
 
 from coldloop.errors import DamagedAnswerError, LinkError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.endpoints import Endpoint
 from coldloop.operating.rings import last_update, read_ring
+from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.audit import EVENT_ROWS, Event, JournalPage
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.configuration import ConfigurationDigest, ConfigurationLine, configuration_of, lines_of
 from coldloop.registers.control_plc import LadderStatus, Operator, PlantLinkStatus, Process, Status
 from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, ControlLinkStatus, Optimization, Prediction
-from coldloop.registers.plant import LoadStatus, StationStatus
+from coldloop.registers.plant import LoadStatus, SensorFault, StationStatus
 from coldloop.registers.safety import Alarm, AlarmKind
 from hmi.compression_station import KIND, REFRIGERATOR
 from hmi.process_image import JournalEntry, Model
@@ -126,6 +128,9 @@ class Poller:
                 continue
         if self._service == "plant":
             await self._read_configuration()
+            with suppress(RequestRefusedError):  # a plant without sensor faults
+                faults = await self._client.read_rows(SensorFault, 0, len(OUTPUT_NAMES))
+                self._model.faulty_sensors = sum(bool(fault.kind) << i for i, fault in enumerate(faults))
 
     async def _read_configuration(self) -> None:
         """Read what the service runs, when it is not what was read last."""

@@ -9,15 +9,16 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, TypeVar, cast
 
-from coldloop.process.signals import OUTPUT_NAMES, TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import Event
 from coldloop.registers.common import Identity, SessionPace
-from coldloop.registers.control_plc import LadderStatus, Mode, Process
+from coldloop.registers.control_plc import LadderStatus, Mode, Plan, Process
 from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Prediction, UpdatingRuleStatus
 from coldloop.registers.plant import StationStatus
 from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.service.event_text import EventText, describe, utc_text
+from hmi.quality import Doubts
 from hmi.signals import values_of
 from hmi.trends import NO_STATION, TrendStore, station_values
 
@@ -94,6 +95,12 @@ class Model:
         """The plant's configuration from its registers, by dotted key."""
         self._values: dict[str, float | int | str] = {}
         self._session = 0
+        self.faulty_sensors = 0
+        """Outputs that a fault was put into for training, a bit for each."""
+        self.recorded_doubts: Doubts | None = None
+        """Of a recorded run; None on a rig that is up."""
+        self.commands = 0
+        """Commands that were carried out here."""
         self.replay: dict[str, object] | None = None
         """State of the replay; None on a rig that is up."""
         self.on_change: Callable[[], None] = lambda: None
@@ -119,7 +126,7 @@ class Model:
             self._moved(source, record.tick)
             station = self.record("plant", StationStatus)
             values = station_values(station.signals) if station else NO_STATION
-            self.trends.add(record, self.mode, self.bad_sensors, values, is_after_gap=is_after_gap)
+            self.trends.add(record, self.mode, self.doubts, values, is_after_gap=is_after_gap)
         elif isinstance(record, Prediction):
             self._predicted(record)
         elif isinstance(record, SessionPace):  # from now on ticks follow another clock
@@ -205,10 +212,13 @@ class Model:
         return ladder.mode if ladder else 0
 
     @property
-    def bad_sensors(self) -> int:
-        """Outputs substituted by their last good value, a bit for each."""
-        ladder = self.record("control_plc", LadderStatus)
-        return ladder.bad_sensors if ladder else 0
+    def doubts(self) -> Doubts:
+        """Outputs whose readings are in doubt; those of a recorded run are set."""
+        if self.recorded_doubts is not None:
+            return self.recorded_doubts
+        ladder, plan = self.record("control_plc", LadderStatus), self.record("control_plc", Plan)
+        suspect = plan.suspects if plan and self.mode in {Mode.MPC, Mode.REST} else 0
+        return Doubts(suspect, held=ladder.bad_sensors if ladder else 0, simulated=self.faulty_sensors)
 
     @property
     def rule(self) -> UpdatingRuleStatus:
@@ -258,8 +268,7 @@ class Model:
             stale += ["plant.measurement.", "plant.station."]
         if self.mode != Mode.MPC and self.record("control_plc", LadderStatus) is not None:
             stale.append("update")
-        bad = [name for i, name in enumerate(OUTPUT_NAMES) if self.bad_sensors >> i & 1]
-        return stale + [f"control_plc.process.y.{name}" for name in bad]
+        return stale
 
     @property
     def is_planned(self) -> bool:

@@ -3,7 +3,7 @@
 import math
 from typing import Any, Final
 
-from coldloop.process.declaration import NO_LOAD, Input, Output, Range
+from coldloop.process.declaration import Input, Output, Range
 from coldloop.process.load_profile import LOAD_UNIT, LOAD_WORD
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import SAMPLING_PERIOD_S
@@ -31,12 +31,17 @@ def process_document() -> dict[str, Any]:
         ],
         "controlled": [_output(one) for one in PROCESS.banded],
         "measured": [_output(one) for one in PROCESS.outputs if one.band is None and one.range[0] < one.range[1]],
-        "load": None if PROCESS.load == NO_LOAD else load,
+        "load": load if PROCESS.has_load else None,
+        "disturbances": [_output(one) for one in PROCESS.disturbances],
     }  # fmt: skip
 
 
 def _output(one: Output) -> dict[str, Any]:
-    return {"name": one.name, "unit": one.unit, "bar": one.bar or _output_bar(one)}
+    band = one.band
+    loop = band.loop.input if band and band.loop else None
+    dead_band = band.dead_band if band else 0.0
+    bar = one.bar or _output_bar(one)
+    return {"name": one.name, "unit": one.unit, "bar": bar, "loop": loop, "dead_band": dead_band}
 
 
 def _output_bar(one: Output) -> Range:

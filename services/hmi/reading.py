@@ -3,6 +3,7 @@
 import asyncio
 import csv
 import io
+import math
 import time
 from collections.abc import Mapping
 from contextlib import AbstractAsyncContextManager, suppress
@@ -38,7 +39,7 @@ from hmi.trends import NAMES, STATION_NAMES
 STATIC: Final = Path(__file__).parent / "static"
 POINTS: Final = 800
 MOST_POINTS: Final = 4000
-MOST_NAMES: Final = 8 + 1 + len(INPUT_NAMES) + len(BANDED_OUTPUTS) + len(STATION_NAMES)
+MOST_NAMES: Final = 8 + 1 + len(PROCESS.disturbances) + len(INPUT_NAMES) + len(BANDED_OUTPUTS) + len(STATION_NAMES)
 """Signals of one trend: what the page draws without being asked, and eight pens."""
 ROWS_AT_ONCE: Final = 500
 """Rows of a table that are made and sent at a time."""
@@ -89,9 +90,9 @@ class Reading:
             web.get("/metrics", self.metrics),
         ]
 
-    async def page(self, _request: web.Request) -> web.StreamResponse:
+    async def page(self, request: web.Request) -> web.StreamResponse:
         """Answer with the page."""
-        return web.FileResponse(STATIC / "index.html")
+        return await _file(STATIC / "index.html", request)
 
     async def mimic(self, _request: web.Request) -> web.Response:
         """Answer with the drawing that the process brings; those of the cold box are static files."""
@@ -101,7 +102,9 @@ class Reading:
 
     async def catalog(self, _request: web.Request) -> web.Response:
         """Answer with what the page is made from."""
-        return json_answer(self._catalog)
+        answer = json_answer(self._catalog)
+        answer.enable_compression()
+        return answer
 
     async def state(self, _request: web.Request) -> web.Response:
         """Answer with the whole state."""
@@ -167,7 +170,7 @@ class Reading:
         answer = web.StreamResponse(headers=csv_headers("coldloop-trend.csv"))
         add_headers(answer)
         await answer.prepare(request)
-        await answer.write(",".join(["time_s", *names, "substituted"]).encode() + b"\n")
+        await answer.write(",".join(["time_s", *names, "quality"]).encode() + b"\n")
         with suppress(ConnectionError, TimeoutError):  # the client has gone
             while start <= end:
                 async with self._turn(request):
@@ -185,8 +188,9 @@ class Reading:
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         for row, *values in zip(rows, *(trends.column(name, rows) for name in names), strict=True):
-            bad = " ".join(name for name in trends.substituted_at(row) if name in names)
-            writer.writerow([trends.ticks[row] * TICK_S, *(f"{value:.7g}" for value in values), bad])
+            doubts = " ".join(f"{name}={one}" for name, one in trends.doubts_at(row).named.items() if name in names)
+            numbers = ("" if math.isnan(value) else f"{value:.7g}" for value in values)
+            writer.writerow([trends.ticks[row] * TICK_S, *numbers, doubts])
         return text.getvalue().encode(), following
 
     async def explanation(self, request: web.Request) -> web.Response:
@@ -207,20 +211,35 @@ class Reading:
         return json_answer(encoded({"alarms": alarms_document(self._model)}))
 
     def _events(self, query: Mapping[str, str]) -> list[JournalEntry]:
+        """Return the events that a search finds, the newest first.
+
+        Raises:
+            HTTPBadRequest: Its times are not numbers.
+        """
         wanted, service = query.get("search", "").lower(), query.get("service", "")
+        try:
+            first, last = (float(query.get(name) or end) for name, end in (("from", -math.inf), ("to", math.inf)))
+        except ValueError:
+            raise web.HTTPBadRequest(reason="from and to must be times in s") from None
         found = []
         for entry in reversed(self._model.events):
-            if service and entry.service != service:
+            if (service and entry.service != service) or not first <= entry.tick * TICK_S <= last:
                 continue
             if not wanted or wanted in f"{entry.text.sentence} {entry.utc} {entry.service}".lower():
                 found.append(entry)
         return found
 
     async def events(self, request: web.Request) -> web.Response:
-        """Answer with the newest events that a search finds."""
+        """Answer with a page of the events that a search finds; page 0 is the newest."""
+        try:
+            start = EVENTS_SHOWN * max(0, int(request.query.get("page") or 0))
+        except ValueError:
+            raise web.HTTPBadRequest(reason="page must be a whole number") from None
         async with self._turn(request):
             found = self._events(request.query)
-            document = encoded({"found": len(found), "events": [*map(event_document, found[:EVENTS_SHOWN])]})
+            shown = [*map(event_document, found[start : start + EVENTS_SHOWN])]
+            pages = -(-len(found) // EVENTS_SHOWN)
+            document = encoded({"found": len(found), "first": start + 1, "pages": pages, "events": shown})
         return json_answer(document)
 
     async def events_table(self, request: web.Request) -> web.Response:
@@ -231,19 +250,8 @@ class Reading:
     def _events_as_table(self, found: list[JournalEntry]) -> web.Response:
         text = io.StringIO()
         names = (
-            "service",
-            "number",
-            "boot",
-            "utc",
-            "tick",
-            "time_s",
-            "kind",
-            "subject",
-            "cause",
-            "value",
-            "unit",
-            "who",
-        )
+            "service", "number", "boot", "utc", "tick", "time_s", "kind", "subject", "cause", "value", "unit", "who",
+        )  # fmt: skip
         writer = csv.DictWriter(text, names, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         for entry in found:
@@ -266,7 +274,7 @@ class Reading:
                 auth = None
             if auth is None:
                 return refusal(401, "log in first, or send name and password (basic)")
-            user = await self._guard.log_in(auth.login, auth.password, request.remote or "")
+            user = await self._guard.log_in(auth.login, auth.password, request.remote or "", self._guard.scrapes)
             if isinstance(user, web.Response):
                 return user
         body = exposition(page_families(self._model, len(self._broadcast)))
@@ -317,5 +325,8 @@ def static_files() -> list[web.RouteDef]:
     ]
 
 
-async def _file(file: Path, _request: web.Request) -> web.StreamResponse:
-    return web.FileResponse(file)
+async def _file(file: Path, request: web.Request) -> web.StreamResponse:
+    answer = web.FileResponse(file, headers={hdrs.CACHE_CONTROL: "no-cache"})  # asked for again, sent if it has changed
+    if hdrs.IF_NONE_MATCH not in request.headers:  # otherwise the answer may have no body to compress
+        answer.enable_compression()
+    return answer

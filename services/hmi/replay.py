@@ -20,6 +20,7 @@ from coldloop.registers.safety import Alarm
 from hmi.guard import refusal
 from hmi.page_server import PageServer, PageSite
 from hmi.process_image import JournalEntry, Model
+from hmi.quality import SOUND, Doubts
 from hmi.settings import HmiSection
 from hmi.trends import NO_STATION, station_values
 
@@ -36,8 +37,8 @@ class ReplayFrame(NamedTuple):
     cause: int
     since: int
     """Tick at which the mode began."""
-    bad_sensors: int = 0
-    """A bit for each output that the control PLC substituted. The process has the true value."""
+    doubts: Doubts = SOUND
+    """Outputs whose readings were in doubt. The process has the true value."""
     station: StationSample | None = None
     """Of a whole refrigerator."""
 
@@ -189,9 +190,7 @@ class Replay:
         for each in (*range(before + 1, tick, every), tick):
             frame = run.frame(each)
             if frame is not None:
-                model.trends.add(
-                    frame.process, frame.mode, frame.bad_sensors, frame.pressures, is_after_gap=self._in_gap
-                )
+                model.trends.add(frame.process, frame.mode, frame.doubts, frame.pressures, is_after_gap=self._in_gap)
                 newest = frame
             self._in_gap = frame is None
         self._tick = tick
@@ -206,7 +205,8 @@ class Replay:
 
     def _put(self, frame: ReplayFrame) -> None:
         model, process = self._model, frame.process
-        model.put("control_plc", LadderStatus(frame.mode, frame.cause, frame.since, 1, frame.bad_sensors, 0))
+        model.put("control_plc", LadderStatus(frame.mode, frame.cause, frame.since, 1, frame.doubts.bad, 0))
+        model.recorded_doubts = frame.doubts
         model.put("control_plc", process)
         model.put("plant", LoadStatus(watts=process.load))
         if frame.station is not None:  # what its controller asked for is not recorded

@@ -3,11 +3,12 @@
 from collections.abc import Callable, Mapping
 from typing import Final
 
+from coldloop.number_text import number_text
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, TICK_S
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ModelDeviation, UpdatingRuleStatus
-from coldloop.service.event_text import word
+from coldloop.service.event_text import word_of
 from hmi.explanation import Branch, Explanation, is_rounded_to_one
 
 AT_REST: Final = 1e-9
@@ -36,14 +37,15 @@ def deviation(found: ModelDeviation, suspects: int = 0) -> str:
     """Return how the plant differs from its model, without the load, the most notable first; empty where it agrees.
 
     Last come the reading that is furthest from what is predicted, if it is surprising: the model, or its sensor, is
-    not what the filter takes it for; and those that are not used for that reason (bit i is output i).
+    not what the filter takes it for; and those that are not used for that reason (bit i is output i); and inputs
+    that have no effect (the bits after those).
     """
     parts = [
-        (value, f"needs {abs(value):.3g} {unit} {'less' if value > 0 else 'more'} of {name}")
+        (value, f"needs {number_text(abs(value), 3)} {unit} {'less' if value > 0 else 'more'} of {name}")
         for name, unit, value in zip(INPUT_NAMES, INPUT_UNITS, found.u, strict=True)
     ]
     parts += [
-        (value, f"{name} {value:+.3g} {unit}")
+        (value, f"{name} {'+' if value > 0 else ''}{number_text(value, 3)} {unit}")
         for name, unit, value in zip(OUTPUT_NAMES, OUTPUT_UNITS, found.y, strict=True)
     ]
     notable = [
@@ -54,10 +56,12 @@ def deviation(found: ModelDeviation, suspects: int = 0) -> str:
     texts = [text for _, text in sorted(notable, reverse=True)[:MOST_DEVIATIONS]]
     surprise, name = max(zip(found.surprise, OUTPUT_NAMES, strict=True))
     if surprise >= SURPRISING:
-        texts.append(f"{name} {surprise:.2g} times further from its prediction than expected")
+        texts.append(f"{name} {number_text(surprise, 2)} times further from its prediction than expected")
     texts += [
         f"{name} is not used: it contradicts the others" for i, name in enumerate(OUTPUT_NAMES) if suspects >> i & 1
     ]
+    inputs = enumerate(INPUT_NAMES, len(OUTPUT_NAMES))
+    texts += [f"{name} is left where it is: it has no effect" for i, name in inputs if suspects >> i & 1]
     return ", ".join(texts)
 
 
@@ -117,8 +121,7 @@ def _interrupted(found: Explanation, rule: UpdatingRuleStatus) -> str:
 
 
 def _late(found: Explanation, _rule: UpdatingRuleStatus) -> str:
-    verdict = found.before.verdict if found.before else Verdict.NONE
-    text = word(Verdict(verdict)) if verdict in Verdict.__members__.values() else str(verdict)
+    text = word_of(Verdict, found.before.verdict if found.before else Verdict.NONE)
     return (
         f"{_change(found)} because the sequence before did not take effect at its instant (verdict: {text}): there was "
         f"nothing to learn from, and q stays at {found.q}."
@@ -130,13 +133,14 @@ def _algorithm_1(found: Explanation, _rule: UpdatingRuleStatus) -> str:
     if is_rounded_to_one(found.update):
         looks = "K is 1 to the precision of the registers (the cost does not change), and Gamma"
     elif K >= 1.0:
-        looks = f"K = {K:.6g} is not below 1 (the cost does not fall), so K itself is to fall: dK/dn"
+        looks = f"K = {number_text(K, 6)} is not below 1 (the cost does not fall), so K itself is to fall: dK/dn"
     else:
-        looks = f"K = {K:.6g} is below 1 (the cost falls), so the response time is to fall: dt_r/dn"
+        looks = f"K = {number_text(K, 6)} is below 1 (the cost falls), so the response time is to fall: dt_r/dn"
     if found.branch is Branch.LEVEL:
         return f"{_change(found)} because {looks} = 0 says that the number of iterations makes no difference."
     shorter = found.branch is Branch.DOWN
-    asks = f"{looks} = {gamma:.3g} {'>' if shorter else '<'} 0 asks for a {'shorter' if shorter else 'longer'} period"
+    sign, wanted = (">", "shorter") if shorter else ("<", "longer")
+    asks = f"{looks} = {number_text(gamma)} {sign} 0 asks for a {wanted} period"
     rest = " (at rest: the cost is at its floor, and rounding decides)" if abs(gamma) < AT_REST else ""
     return f"{_change(found)} because {asks}{rest}; {_step(found, shorter=shorter)}."
 
@@ -151,17 +155,12 @@ def _step(found: Explanation, *, shorter: bool) -> str:
 
 
 def _contraction(found: Explanation, rule: UpdatingRuleStatus) -> str:
-    q, before = found.q, found.before
-    if q == rule.q_max and before is not None and found.update.j_effective > before.j_delivered:
-        ratio = found.update.j_effective / before.j_delivered
-        return (
-            f"{_change(found)} because the cost that was reached is {ratio:.3g} times the one predicted: a mismatch "
-            f"triggers one long solve of q = {q}."
-        )
-    return (
-        f"{_change(found)} because of how much successive profiles have improved lately: the contraction rule goes "
-        f"from q = {rule.q_min} while they do to more in quiet; here q = {q}."
-    )
+    q, K, gamma = found.q, number_text(found.update.contraction, 4), number_text(found.update.gamma, 3)
+    if found.q_before is not None and (q > found.q_before or q == found.q_before == rule.q_max > rule.q_min):
+        why = f"K = {K} is beyond its noise and Gamma = {gamma} < 0 asks for a longer period"
+    else:
+        why = f"K = {K} is within its noise, or Gamma = {gamma} asks for no longer period"
+    return f"{_change(found)} because {why}: the contraction rule has q = {q}, at rest {rule.q_min}."
 
 
 def _outside(found: Explanation, rule: UpdatingRuleStatus) -> str:  # noqa: ARG001 it says nothing of itself

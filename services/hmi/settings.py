@@ -19,6 +19,7 @@ class PolledPlant(Endpoint):
     """Where the plant is."""
 
     port: PortNumber = PLANT_PORT
+    """TCP port."""
     timeout_s: PositiveFloat = TIMEOUT_S
 
 
@@ -26,6 +27,7 @@ class PolledControl(Endpoint):
     """Where the control PLC is."""
 
     port: PortNumber = CONTROL_PORT
+    """TCP port."""
     timeout_s: PositiveFloat = TIMEOUT_S
 
 
@@ -33,6 +35,7 @@ class PolledOptimizer(Endpoint):
     """Where the optimiser PLC is."""
 
     port: PortNumber = OPTIMIZER_PORT
+    """TCP port."""
     timeout_s: PositiveFloat = TIMEOUT_S
 
 
@@ -42,7 +45,9 @@ class HttpsSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     certificate: Path
+    """Certificate, and those that lead to an authority."""
     key: Path
+    """Its key."""
 
 
 class LoginSettings(BaseModel):

@@ -16,6 +16,9 @@ DECIMALS: Final = {
     "%": 2, "K": 3, "bar": 3, "W": 1, "s": 3, "ms": 2, "ppm": 1, "Pa": 0, "m3": 5, "g/s": 2, "kg": 2, "kW": 1,
 } | decimals_by_unit()  # fmt: skip
 """Digits after the point: of PLCs, links, states and a refrigerator's station, and of the process, which come first."""
+DIGITS: Final = 7
+TICKS: Final = {"Tick": "time", "Ticks": "ticks"}
+"""What a register counts whose description begins with this word."""
 _WORD: Final = re.compile(r"(\d+) ([^,;:()]+?)(?: \([^)]*\))?(?=[,;:]|$)")
 
 
@@ -27,7 +30,11 @@ class Signal(NamedTuple):
     label: str
     unit: str
     decimals: int | None
-    """None for whole numbers."""
+    """Digits after the point; None for whole numbers, and for those with `digits`."""
+    digits: int | None
+    """Significant digits of a number that has no unit, or one without a scale."""
+    counts: str
+    """`time` of a tick, `ticks` of a number of ticks: shown as plant time; empty for other signals."""
     words: dict[int, str]
     """Meaning of the numbers of an enumeration; empty for other signals."""
     description: str
@@ -63,10 +70,13 @@ def signals_of(service: str) -> tuple[Signal, ...]:
                 continue
             seen.add(label)
             floating = register.kind is Kind.F32
+            has_scale = register.unit or label.startswith(("u.", "y."))  # others may be of any size
+            decimals = DECIMALS.get(register.unit) if floating and has_scale else None
             found.append(
                 Signal(
                     name=f"{service}.{block.name}.{label}", block=block.name, label=label, unit=register.unit,
-                    decimals=DECIMALS.get(register.unit, 4) if floating else None,
+                    decimals=decimals, digits=DIGITS if floating and decimals is None else None,
+                    counts=TICKS.get(register.description.partition(" ")[0], ""),
                     words={} if floating else words_in(register.description), description=register.description,
                     address=register.address, writer=register.writer.value if register.writer else "",
                 )

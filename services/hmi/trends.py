@@ -3,13 +3,14 @@
 import math
 from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Final, NamedTuple
 
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
 from coldloop.registers.control_plc import Mode, Process
+from hmi.quality import SOUND, Doubts, Quality
 
 STATION_NAMES: Final = ("P12", "P11") if PROCESS.has_station else ()
 """Signals of a refrigerator's station that are kept: high and low pressure."""
@@ -30,11 +31,12 @@ class ModeInterval(NamedTuple):
     mode: int
 
 
-class Substitution(NamedTuple):
-    """A stretch of plant time in which the value of a bad sensor is substituted."""
+class Doubtful(NamedTuple):
+    """A stretch of plant time in which the reading of an output is in doubt."""
 
     start: float
     end: float
+    quality: Quality
 
 
 class Gap(NamedTuple):
@@ -55,8 +57,7 @@ class TrendStore:
         self._kept_ticks = round(kept_s / TICK_S)
         self.ticks = array("q")
         self._columns: dict[str, array[float]] = {name: array("f") for name in NAMES}
-        self._bad = array("L")
-        """Sensors whose value is substituted, a bit for each output."""
+        self._doubts: list[Doubts] = []
         self._gaps: list[Gap] = []
 
     def __len__(self) -> int:
@@ -69,12 +70,12 @@ class TrendStore:
 
     def clear(self) -> None:
         """Forget everything."""
-        del self.ticks[:], self._bad[:], self._gaps[:]
+        del self.ticks[:], self._doubts[:], self._gaps[:]
         for column in self._columns.values():
             del column[:]
 
     def add(
-        self, process: Process, mode: int, bad_sensors: int = 0, station: tuple[float, ...] = NO_STATION, *,
+        self, process: Process, mode: int, doubts: Doubts = SOUND, station: tuple[float, ...] = NO_STATION, *,
         is_after_gap: bool = False,
     ) -> None:  # fmt: skip
         """Add a sample; one that is not newer than the last one is left out.
@@ -82,7 +83,7 @@ class TrendStore:
         Args:
             process: The sample.
             mode: Of the fail-safe ladder.
-            bad_sensors: A bit for each output whose value is substituted.
+            doubts: Outputs whose readings are in doubt.
             station: Values of the signals of `STATION_NAMES`.
             is_after_gap: Between the last sample and this one nothing could be read.
         """
@@ -91,7 +92,7 @@ class TrendStore:
         if is_after_gap and process.tick - self.last_tick > 1 and self.ticks:
             self._gaps.append(Gap(self.last_tick, process.tick))
         self.ticks.append(process.tick)
-        self._bad.append(bad_sensors)
+        self._doubts.append(doubts)
         values = (process.load, *process.u, *process.y, float(mode), *station)
         for name, value in zip(NAMES, values, strict=True):
             self._columns[name].append(value)
@@ -102,7 +103,7 @@ class TrendStore:
         oldest = bisect_left(self.ticks, self.ticks[-1] - self._kept_ticks)
         drop = max(excess, oldest)
         if drop >= SPARE_ROWS or (drop and 2 * drop >= len(self.ticks)):
-            del self.ticks[:drop], self._bad[:drop]
+            del self.ticks[:drop], self._doubts[:drop]
             for column in self._columns.values():
                 del column[:drop]
             self._gaps = [gap for gap in self._gaps if gap.start >= self.ticks[0]]
@@ -138,45 +139,39 @@ class TrendStore:
         found: list[ModeInterval] = []
         for tick, value in zip(self.ticks[rows.start : rows.stop], self.column("mode", rows), strict=True):
             time, mode = tick * TICK_S, int(value)
-            if found and found[-1].mode == mode and time not in after_gap:
+            if found and time not in after_gap:
                 found[-1] = found[-1]._replace(end=time)
-            else:
-                if found and time not in after_gap:
-                    found[-1] = found[-1]._replace(end=time)
+            if not found or found[-1].mode != mode or time in after_gap:
                 found.append(ModeInterval(time, time, mode))
         return found
 
-    def substituted(self, start: int, end: int) -> dict[str, list[Substitution]]:
-        """Return the intervals in which outputs were substituted between two ticks, by name."""
+    def doubtful(self, start: int, end: int) -> dict[str, list[Doubtful]]:
+        """Return the intervals in which readings of outputs are in doubt between two ticks, by name.
+
+        Each lasts until the first sample of another quality, or a gap.
+        """
         rows = self.between(start, end)
-        bad = self._bad[rows.start : rows.stop]
-        if not any(bad):
-            return {}
-        times = [tick * TICK_S for tick in self.ticks[rows.start : rows.stop]]
-        after_gap = {gap.end * TICK_S for gap in self.gaps(start, end)}
-        found = {name: list(_stretches(times, bad, 1 << bit, after_gap)) for bit, name in enumerate(OUTPUT_NAMES)}
-        return {name: stretches for name, stretches in found.items() if stretches}
+        after_gap = {gap.end for gap in self.gaps(start, end)}
+        found: dict[str, list[Doubtful]] = {}
+        before: dict[str, Quality] = {}
+        last = 0
+        for tick, doubts in zip(self.ticks[rows.start : rows.stop], self._doubts[rows.start : rows.stop], strict=True):
+            if doubts != SOUND or before:
+                reach, now = (last + 1 if tick in after_gap else tick) * TICK_S, doubts.named
+                for name in before:
+                    found[name][-1] = found[name][-1]._replace(end=reach)
+                for name, quality in now.items():
+                    if before.get(name) != quality or tick in after_gap:
+                        found.setdefault(name, []).append(Doubtful(tick * TICK_S, tick * TICK_S, quality))
+                before = now
+            last = tick
+        for name in before:
+            found[name][-1] = found[name][-1]._replace(end=(last + 1) * TICK_S)
+        return found
 
-    def substituted_at(self, row: int) -> list[str]:
-        """Return the substituted outputs."""
-        bad = self._bad[row]
-        return [name for bit, name in enumerate(OUTPUT_NAMES) if bad >> bit & 1]
-
-
-def _stretches(
-    times: Sequence[float], bad: Sequence[int], mask: int, after_gap: Container[float]
-) -> Iterator[Substitution]:
-    """Yield the stretches in which a bit is set; each lasts until the first sample in which it is not, or a gap."""
-    start, last = None, 0.0
-    for time, bits in zip(times, bad, strict=True):
-        if start is not None and (time in after_gap or not bits & mask):
-            yield Substitution(start, last + TICK_S if time in after_gap else time)
-            start = None
-        if bits & mask and start is None:
-            start = time
-        last = time
-    if start is not None:
-        yield Substitution(start, last + TICK_S)
+    def doubts_at(self, row: int) -> Doubts:
+        """Return the outputs whose readings are in doubt."""
+        return self._doubts[row]
 
 
 def station_values(signals: Sequence[float]) -> tuple[float, ...]:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from coldloop.errors import ColdloopError, ConfigurationError, UsageError
+from coldloop.text_file import read_text
 
 COST: Final = 2**14
 BLOCK_SIZE: Final = 8
@@ -24,6 +25,10 @@ DIGEST_BYTES: Final = 32
 SHORTEST_PASSWORD: Final = 8
 HASH_FIELDS: Final = 5
 MOST_MEMORY: Final = 64 * 1024 * 1024
+COSTS: Final = range(10, 17)
+BLOCK_SIZES: Final = range(1, 17)
+"""Of hashes: cost as a power of 2, and block size. The largest take the memory above and half a second."""
+COMMENT: Final = "#"
 
 
 class PageRole(StrEnum):
@@ -87,18 +92,20 @@ class Users:
         if file is None:
             return
         try:
-            lines = file.read_text(encoding="utf-8").splitlines()
-            mode = file.stat().st_mode
-        except (OSError, UnicodeDecodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-            raise ConfigurationError(
-                f"hmi.login.users: {file}: {reason}; `python -m hmi.users {file} NAME operate` writes it"
-            ) from None
-        if mode & stat.S_IWOTH:
-            raise ConfigurationError(f"hmi.login.users: {file}: everyone can write to it; `chmod o-w {file}`")
+            lines = _lines(file)
+            mode, folder = file.stat().st_mode, file.resolve().parent.stat().st_mode
+        except (OSError, UsageError) as error:
+            raise ConfigurationError(f"hmi.login.users: {error}") from None
+        for path, bits in ((file, mode), (file.parent, folder)):
+            if bits & (stat.S_IWOTH | stat.S_IWGRP) and not bits & stat.S_ISVTX:
+                raise ConfigurationError(f"hmi.login.users: {path}: others can write to it; `chmod go-w {path}`")
         for number, line in enumerate(lines, 1):
-            if line.strip() and not line.startswith("#"):
+            if line.strip() and not line.startswith(COMMENT):
                 user = _user(line, f"{file}:{number}")
+                if user.name in self._users:
+                    raise ConfigurationError(
+                        f"hmi.login.users: {file}:{number}: a second line of {user.name}; keep one"
+                    )
                 self._users[user.name] = user
 
     def __len__(self) -> int:
@@ -109,6 +116,10 @@ class Users:
         user = self._users.get(name)
         right = is_password(password, user.hash if user else NOBODYS_HASH)
         return user if right else None
+
+
+def _lines(file: Path) -> list[str]:
+    return read_text(file, f"`python -m hmi.users {file} NAME operate` writes it").splitlines()
 
 
 def _user(line: str, place: str) -> User:
@@ -123,16 +134,17 @@ def _user(line: str, place: str) -> User:
 
 
 def _is_hash(stored: str) -> bool:
-    """Return whether a password can be compared with this hash: it is whole, and scrypt takes its cost."""
+    """Return whether a password can be compared with this hash: it is whole, and of a usual cost."""
     fields = stored.split("$")
-    if len(fields) != HASH_FIELDS or fields[0] != "scrypt":
+    if len(fields) != HASH_FIELDS or fields[0] != "scrypt" or not (fields[1] + fields[2]).isdecimal():
         return False
     try:
-        digest = base64.b64decode(fields[4], validate=True)
-        is_password("", stored)
-    except (ValueError, OverflowError, MemoryError):
+        salt, digest = (base64.b64decode(field, validate=True) for field in fields[3:])
+        cost, block_size = int(fields[1]), int(fields[2])
+    except ValueError:
         return False
-    return len(digest) == DIGEST_BYTES
+    costs = [2**power for power in COSTS if 128 * 2**power * block_size < MOST_MEMORY]
+    return cost in costs and block_size in BLOCK_SIZES and len(salt) > 0 and len(digest) == DIGEST_BYTES
 
 
 def write_user(file: Path, name: str, role: PageRole, password: str) -> None:
@@ -141,12 +153,12 @@ def write_user(file: Path, name: str, role: PageRole, password: str) -> None:
     Raises:
         UsageError: The name or the password cannot be used, or the file cannot be written.
     """
-    if not name or any(character in ":\n\r" or not character.isprintable() for character in name):
-        raise UsageError(f"user '{name}': a name is printable text without a colon")
+    if not name or name.startswith(COMMENT) or ":" in name or not name.isprintable():
+        raise UsageError(f"user '{name}': a name is printable text without a colon, and does not begin with #")
     if len(password) < SHORTEST_PASSWORD:
         raise UsageError(f"user '{name}': a password has {SHORTEST_PASSWORD} characters or more")
     try:
-        lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+        lines = _lines(file) if file.exists() else []
         kept = [line for line in lines if line.partition(":")[0] != name]
         file.touch(mode=0o600)
         file.chmod(0o600)
@@ -157,7 +169,7 @@ def write_user(file: Path, name: str, role: PageRole, password: str) -> None:
 
 def main() -> int:
     """Write a user's line; return the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m hmi.users", description="Add a user of the operator's page.")
+    parser = argparse.ArgumentParser("python -m hmi.users", description="Add a user of the page.", allow_abbrev=False)
     parser.add_argument("file", type=Path)
     parser.add_argument("name")
     parser.add_argument("role", choices=[role.value for role in PageRole])
@@ -166,7 +178,7 @@ def main() -> int:
         if sys.stdin.isatty():
             password = getpass.getpass(f"password of {options.name}: ")
         else:
-            password = sys.stdin.readline().rstrip("\r\n")
+            password = sys.stdin.readline().removeprefix("\ufeff").rstrip("\r\n")
         write_user(options.file, options.name, PageRole(options.role), password)
     except ColdloopError as error:
         sys.stderr.write(f"hmi.users: {error}\n")

@@ -1,7 +1,7 @@
 """What the optimiser PLC can compute in an updating period, and when its answer is there.
 
 The reference PLC (P = 1) is the Schneider TSX P574634M of the paper: one ODE iteration in a slot of 0.25 s, and one
-slot for the preparation of the problem, hence 4 tau_u - 1 iterations (section VI; `docs/science.md`, ruling 7).
+slot for the preparation of the problem, hence 4 tau_u - 1 iterations (section VI; `rig/report/slips.md`, 7).
 """
 
 from bisect import bisect_right
@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import TICK_S
-from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS, ComputingTimes
+from coldloop.process.updating_periods import LONGEST_TICKS, ComputingTimes
 
 MAX_PERIOD_TICKS = LONGEST_TICKS
 SLOT_S = 0.25 * PROCESS.share("preparation")
@@ -55,11 +55,6 @@ class PlcBudget:
     def answer_after_s(self, iterations: int) -> float:
         """Return the plant time from an updating instant to the end of its computation, in seconds."""
         return self.times.preparation + iterations * self.times.iteration
-
-    @property
-    def shortest_ticks(self) -> int | None:
-        """Shortest updating period that holds the preparation's slots and an iteration; None: the longest does not."""
-        return next(filter(self.times.holds, range(SHORTEST_TICKS, MAX_PERIOD_TICKS + 1)), None)
 
     def too_slow(self, ticks: int = 0) -> str:
         """Return that an iteration does not fit into a fixed period, or into the longest (0); empty where it does."""

@@ -57,17 +57,25 @@ class EstimatorSettings(BaseModel):
     load_walk_w: PositiveFloat = PROCESS.load.walk
     """Random walk of the load mismatch, W; for a load that is not measured, of the size of its steps."""
     pressure_noise_pa: PositiveFloat = 50.0
+    """Process noise of states in Pa."""
     volume_noise_m3: PositiveFloat = 1e-5
+    """Process noise of states in m3."""
     temperature_noise_k: PositiveFloat = 0.05
+    """Process noise of states in K."""
     mass_noise_kg: PositiveFloat = 1e-4
     """Of a line of the compression station, where the model has it, as the next two."""
     flow_noise_kg_s: PositiveFloat = 1e-5
+    """Process noise of states in kg/s."""
     integral_noise_bar_s: PositiveFloat = 1e-5
+    """Process noise of states in bar s."""
     level_sensor: PositiveFloat = 0.01
     """Standard deviation of the sensors: %, Hz, K and bar."""
     speed_sensor: PositiveFloat = 1.0
+    """Noise of the sensors of speed, Hz."""
     temperature_sensor: PositiveFloat = 0.02
+    """Noise of the sensors of temperature, K."""
     pressure_sensor: PositiveFloat = 1e-3
+    """Noise of the sensors of pressure, bar."""
     noise_reference: NoiseReference = NoiseReference.MEASUREMENT
     """Of one measurement, whatever the updating period; or of a mean over a sampling period, so that measurements which
     follow each other sooner count for less: a model error is then not taken for more load the shorter the period is."""
@@ -125,8 +133,11 @@ class PlausibilitySettings(BaseModel):
     """What a plant that is not its model adds to a residual, %, Hz, K and bar: from the hours a to f of plants that are
     20 % off, whose residuals are below 5 sigmas and 0.02 %, 0 Hz, 0 K, 0.009 bar (`docs/fail-safe.md`)."""
     speed_allowance: Annotated[float, Field(ge=0)] = 5.0
+    """The same of a speed, Hz."""
     temperature_allowance: Annotated[float, Field(ge=0)] = 0.0
+    """The same of a temperature, K."""
     pressure_allowance: Annotated[float, Field(ge=0)] = 0.01
+    """The same of a pressure, bar."""
     settled_s: Annotated[float, Field(ge=0)] = 60.0 * STRETCH
     """A reading is judged when it has been used for so long: until then the filter learns how the plant differs."""
     agreeing_s: Annotated[float, Field(ge=0)] = 60.0 * STRETCH
@@ -196,6 +207,7 @@ class OdeSettings(BaseModel):
     """Whether variables pressed against a bound are held during a step, instead of being projected after it only. Not
     in the paper."""
     tau_1_s: PositiveFloat = 0.25 * PROCESS.share("ode")
+    """Time of an iteration at P = 1, s (paper, section IV-D)."""
 
 
 class QpoasesSettings(BaseModel):
@@ -231,6 +243,7 @@ class FastGradientSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     alpha: PositiveFloat = PENALTY_WEIGHT
+    """Weight of broken rows (paper, equation of the penalised cost)."""
     adaptive_restart: bool = True
     """Whether the momentum is dropped when it points uphill."""
     tau_1_s: PositiveFloat = 0.03 * PROCESS.share("fast-gradient")
@@ -245,6 +258,7 @@ class DaqpSettings(BaseModel):
     alpha: PositiveFloat = PENALTY_WEIGHT
     """Weight that its answers are judged with; DAQP itself knows no penalty."""
     primal_tolerance: PositiveFloat = 1e-9
+    """Violation of a row up to which it counts as kept."""
     tau_1_s: PositiveFloat = 4.75 * PROCESS.share("daqp")
     """One solve in an updating period of 5 s at P = 1: an oracle's time, not a measured one."""
 
@@ -277,6 +291,7 @@ class InteriorPointSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     alpha: PositiveFloat = PENALTY_WEIGHT
+    """Weight of broken rows, as that of the ODE-based solver."""
     first_mu: PositiveFloat = 3.0
     """mu that the guess is put on the central path for, as a share of its J over the number of rows and variables: a
     guess that costs much is far from the optimum, and needs a path that begins far from the bounds."""

@@ -12,7 +12,7 @@ from coldloop.kernels.compiled import kernel
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.estimator import begin_at_rest, forget
 from optimizer_plc.qp.profile import hold, shift, shifted
-from optimizer_plc.rules.interface import OF_PROBLEM, UpdatingRule
+from optimizer_plc.rules.interface import UpdatingRule
 from optimizer_plc.scheme import BY_THE_RULE, Constants, begin_sent, plan, predict_played
 from optimizer_plc.session_state import OptimizerState
 
@@ -102,7 +102,6 @@ def follow(c: Constants, m: OptimizerState, latched: Latched) -> int:
     if not now.planned:
         return FIRST
     if interrupted:
-        m.rule[OF_PROBLEM] = m.u.dtype.type(0.0)
         return AFTER_A_STEP
     return BY_THE_RULE if in_time else now.q
 

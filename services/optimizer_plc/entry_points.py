@@ -1,12 +1,12 @@
 """Somebody else's solver, rule or estimator, by an entry point: nothing is edited here to use it."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from enum import StrEnum
 from importlib.metadata import entry_points
 from typing import Any
 
 from coldloop.errors import ConfigurationError
+from coldloop.foreign import foreign
 
 
 class Part(StrEnum):
@@ -34,13 +34,7 @@ def made(part: Part, name: str, *given: object) -> Any:  # noqa: ANN401 the call
         return there[name].load()(*given)
 
 
-@contextmanager
-def in_its_name(part: Part, name: str, what: str = "") -> Iterator[None]:
+def in_its_name(part: Part, name: str, what: str = "") -> AbstractContextManager[None]:
     """Call what is not ours: what it raises is a `ConfigurationError` of one line, with its name unless it is one."""
-    try:
-        yield
-    except ConfigurationError:
-        raise
-    except Exception as error:
-        said = " ".join(str(error).split())
-        raise ConfigurationError(f"{part} {name}: {what}{type(error).__name__}: {said}") from error
+    called = f"{part} {name}: {what}".removesuffix(": ")
+    return foreign(called, "the optimiser ends here: mend it, or choose another", kind=ConfigurationError)

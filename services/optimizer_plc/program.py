@@ -29,6 +29,7 @@ from optimizer_plc import decisions, scheme
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.decisions import Latched, Starts
+from optimizer_plc.entry_points import Part, in_its_name
 from optimizer_plc.estimator import correct, estimator_of
 from optimizer_plc.forecasts import Forecasts
 from optimizer_plc.outside_estimator import OutsideEstimator
@@ -203,7 +204,9 @@ class OptimizerProgram:
             scheme.solve(self.constants, self.method, self.state)
         else:
             qp, guess = scheme.pose(self.constants, self.state)
-            scheme.deliver(self.constants, self.state, qp, self.solver.solve(qp, guess, (n - 1, n)))
+            with in_its_name(Part.SOLVER, self.settings.outside.solver or self.settings.solver):
+                answer = self.solver.solve(qp, guess, (n - 1, n))
+            scheme.deliver(self.constants, self.state, qp, answer)
         return self._sequence()
 
     def _sequence(self) -> InputSequence:

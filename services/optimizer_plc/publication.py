@@ -88,10 +88,13 @@ class OptimizerPublication:
         elif block.record is OptimizerSession:
             self._asked_by = caller.name
         elif block.record is SessionPace:
-            pace = self.pace = self.bank.get(SessionPace).of(self._session)
+            before, pace = self.pace, self.bank.get(SessionPace).of(self._session)
+            self.bank.put(SessionPace.shown(self._session, pace))
+            if pace == before:
+                return
+            self.pace = pace
             self._journal.note(self.link.tick, EventKind.PACE, pace_subject(pace), value=pace.factor, who=caller.name)
             self._shown.show()
-            self.bank.put(SessionPace.shown(self._session, pace))
 
     def asked_for(self, session: int) -> OptimizerSession | None:
         """Return the settings that an operator has written for a session."""

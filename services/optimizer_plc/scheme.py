@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from coldloop.process.signals import BATH, OUTPUT_NAMES
+from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
-from optimizer_plc.estimator import Estimator, begin_prediction, correct, predict
-from optimizer_plc.plausibility import are_finite, suspects_of
+from optimizer_plc.estimator import Belief, Estimator, begin_prediction, correct, predict
+from optimizer_plc.idle_input import ROOM, TurbineWatch, idle_valve, stands, turbine_watch
+from optimizer_plc.plausibility import USED, are_finite, suspects_of
 from optimizer_plc.qp.costs import OutputMaps, augmented_cost, output_maps, predicted_indicators
 from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
@@ -23,7 +25,7 @@ from optimizer_plc.qp.target import TargetSearch, bounds_at, find_target, least_
 from optimizer_plc.rules.assessment import Assessment, Observation, assessed
 from optimizer_plc.rules.interface import UpdatingRule, decide_by
 from optimizer_plc.session_state import Delivery, OptimizerState
-from optimizer_plc.settings import ProgramSettings
+from optimizer_plc.settings import ProgramSettings, RuleName
 from optimizer_plc.solvers.interface import Answer, Costs
 from optimizer_plc.solvers.kernel_solver import solve_by
 
@@ -78,6 +80,8 @@ class Constants(NamedTuple):
     approach: float
     """How much warmer than the bath helium before the feed is at which that is opened no further, K; infinite is any.
     """
+    following_s: float
+    """Time constant with which the limit of the feed follows that."""
     level: int
     """Which output is the level of the bath, ..."""
     temperature: int
@@ -87,6 +91,7 @@ class Constants(NamedTuple):
     opening_per_k: float
     opening_from: float
     """A deviation, %."""
+    turbine: TurbineWatch
     load_step: float
     """What the load may move by until an updating period is interrupted, W; 0 is never."""
     sequence_ticks: int
@@ -125,14 +130,33 @@ def constants_of(
         largest_load=real(settings.holdable_load_w[1] - estimator.w0),
         reserve=real(settings.capacity_reserve_w),
         least_load_error=real(BATH.least_load_error if BATH else 0.0),
-        approach=real(settings.cold_end.approach_k or np.inf),
+        approach=real(settings.cold_end.approach_k or np.inf), following_s=real(settings.cold_end.following_s),
         level=LEVEL, temperature=TEMPERATURE, feed_temperature=FEED_TEMPERATURE,
         opening_per_k=real(settings.cold_end.opening_per_k),
         opening_from=real(settings.cold_end.opening_from - estimator.u0[target.feed]),
-        load_step=real(settings.interrupting_load_step_w), sequence_ticks=settings.sequence_ticks,
+        turbine=turbine_watch(estimator.y0, real),
+        load_step=real(settings.interrupting_load_step_w), sequence_ticks=shortest_sequence(settings, budget),
         fixed_ticks=0, most=len(budget.ladder), periods=np.array([0, *budget.ladder]),
         fitting=np.array([budget.iterations(ticks) for ticks in range(MAX_PERIOD_TICKS + 1)]),
     )  # fmt: skip
+
+
+def shortest_sequence(settings: ProgramSettings, budget: PlcBudget) -> int:
+    """Return the rows that a sequence has at least, so that it lasts until the next one can arrive.
+
+    All sequences last for two updating periods. Where the rule may choose one more than twice as long as the one
+    before they last for that; where a load step may interrupt, in the last tick of a period, for another one after it.
+    """
+    if settings.interrupting_load_step_w:
+        return min(max(settings.sequence_ticks, 2 * MAX_PERIOD_TICKS - 1), SEQUENCE_ROWS)
+    ladder, adaptive = budget.ladder, settings.adaptive
+    leap, most = len(ladder), len(ladder)
+    if not settings.outside.rule:
+        own = adaptive.rule is RuleName.CONTRACTION
+        leap, most = (1, adaptive.contraction.q_max) if own else (adaptive.delta, adaptive.q_max)
+    last = min(most, len(ladder)) - 1
+    followed = ((ticks, ladder[min(place + leap, last)]) for place, ticks in enumerate(ladder[:last]))
+    return max(settings.sequence_ticks, *(longest for ticks, longest in followed if longest > 2 * ticks), 0)
 
 
 @kernel
@@ -143,16 +167,20 @@ def with_floor(cost: float, constant: float, floor: float) -> float:
 
 @kernel
 def problem_at(
-    c: Constants, x: Array, w: float, u_before: Array, share: float, target: Array, most_open: float
+    c: Constants, x: Array, w: float, u_before: Array, share: float, target: Array, most_open: float, idle: int
 ) -> QuadraticProblem:  # fmt: skip
     """Return the instance of the problem at a state, a load and the input before, about a target.
 
-    With a limit of the feed; all are deviations.
+    With a limit of the feed; all are deviations. The input that is `idle`, unless it is -1, stays where it is.
     """
     phi, gamma, low, high, constant = instance(c.maps, x, w, u_before, share, target)
     feed = c.target.feed
     for i in range(feed, c.n_inputs, u_before.shape[0]):
         high[i] = min(high[i], max(most_open, low[feed]))  # the first knot's low is as far as the rate lets it close
+    if idle >= 0:
+        held, real = u_before[idle] / c.input_scale[idle], x.dtype.type
+        for i in range(idle, c.n_inputs, u_before.shape[0]):
+            low[i], high[i] = max(held - real(ROOM), c.maps.low[i]), min(held + real(ROOM), c.maps.high[i])
     return QuadraticProblem(c.Phi, phi, c.Gamma, gamma, low, high, constant)
 
 
@@ -204,7 +232,8 @@ def pose(c: Constants, m: OptimizerState) -> tuple[QuadraticProblem, Array]:
     sent.x[:] = m.belief.predicted
     s = sent.numbers[0]
     s.w, s.share, s.ticks = m.belief.numbers[0].w, c.rate_shares[ticks], ticks
-    qp = problem_at(c, sent.x, s.w, sent.u_before, s.share, m.target, m.numbers[0].most_open)
+    idle = idle_valve(c.turbine, m.numbers[0].suspects)
+    qp = problem_at(c, sent.x, s.w, sent.u_before, s.share, m.target, m.numbers[0].most_open, idle)
     return qp, shifted(c.shifts[ticks], m.playing.z, c.n_inputs)
 
 
@@ -235,6 +264,10 @@ def deliver(c: Constants, m: OptimizerState, qp: QuadraticProblem, answer: Answe
     s.delivered = with_floor(answer.costs[1], qp.constant, c.floor)
     s.iterations = answer.iterations[1]
     sent.z[:] = answer.points[1]
+    idle = idle_valve(c.turbine, now.suspects)
+    if idle >= 0:
+        for i in range(idle, c.n_inputs, sent.u_before.shape[0]):
+            sent.z[i] = sent.u_before[idle] / c.input_scale[idle]
     keep_first_rate(c.maps, c.scaled_rate, sent.u_before, s.share, sent.z)
     s.j_dev, s.j_cst, s.violation = predicted_indicators(c.predicted, qp, sent.z, sent.x, s.w, c.n_inputs)
     s.number, s.first_tick = now.sequences + 1, now.tick + now.ticks
@@ -287,35 +320,69 @@ def copy_delivery(source: Delivery, target: Delivery) -> None:
 
 
 @kernel
-def shortage(c: Constants, x: Array, w: float, load: float, most_open: float, none: float) -> float:
+def shortage(
+    c: Constants, x: Array, w: float, load: float, most_open: float, idle: int, at: float, before: float, none: float
+) -> float:  # fmt: skip
     """Return what the load is above what can be held, W; negative: below what is needed; `none`, that is 0, otherwise.
 
     The estimate w (a deviation) has what the plant lacks beside its model, so it is compared with what the model holds
     at rest within the inputs' bounds and the limit of the feed, less a reserve, and with the least that it holds
     without the turbine's outlet getting too cold, by the constant error of that. The load itself (W), where it is
-    measured, is compared with what the plant holds that is as its model.
+    measured, is compared with what the plant holds that is as its model. A shortage of the sign that was `before` ends
+    where the estimate has twice the reserve: noise does not end it and begin it anew.
     """
     if not c.target.limited:
         return none
     measured = load - c.estimator.w0 if c.estimator.load_known else w
-    low, high = bounds_at(c.target, x, most_open)
+    low, high = bounds_at(c.target, x, most_open, idle, at)
     _, most = loads_held(c.target, low, high)
-    too_much = max(w + c.reserve - most, measured - c.largest_load)
+    more = c.reserve if before > none else none
+    less = c.reserve if before < none else none
+    too_much = max(w + c.reserve + more - most, measured - c.largest_load)
     warm = least_warm_load(c.target, low, high) - c.least_load_error
-    too_little = min(w - warm, min(w, measured) - c.least_load)
+    too_little = min(w - warm - less, min(w, measured) - c.least_load)
     return max(too_much, none) + min(too_little, none)
 
 
 @kernel
-def most_open(c: Constants, u: Array, y: Array) -> float:
-    """Return how far the feed may be opened, a scaled deviation, by inputs (3,), deviations, and outputs (22,)."""
-    if np.isinf(c.approach):
-        return c.approach
-    approach = y[c.feed_temperature] - y[c.temperature]
-    if math.isnan(approach):
-        approach = y.dtype.type(0.0)
+def believed(c: Constants, belief: Belief, u: Array, y: Array, output: int) -> float:
+    """Return an output by the estimate, for inputs u (3,), deviations; by its reading where no constant is estimated.
+
+    One without a constant is as the model has it while its reading is left out.
+    """
+    e, reading = c.estimator, belief.readings[output]
+    if e.plausible.constants[output] < 0 and reading.state == USED and np.isfinite(y[output]):
+        shown: float = y[output]
+        return shown
+    maps = e.outputs
+    value: float = e.y0[output] + maps.F[output, 0] * belief.numbers[0].w
+    for j in range(belief.x.shape[0]):
+        value += maps.A[output, j] * belief.x[j]
+    for j in range(u.shape[0]):
+        value += maps.B[output, j] * u[j]
+    return value
+
+
+@kernel
+def most_open(c: Constants, u: Array, approach: float) -> float:
+    """Return how far the feed may be opened, a scaled deviation, by inputs (3,), deviations, and an approach, K."""
     feed = c.target.feed
     limit: float = max(u[feed] + c.opening_per_k * (c.approach - approach), c.opening_from) / c.input_scale[feed]
+    return limit
+
+
+@kernel
+def limit_of_feed(c: Constants, m: OptimizerState, y: Array) -> float:
+    """Return `most_open` by the estimate, followed from that of the update before; y (22,) are the outputs."""
+    before, belief = m.numbers[0].most_open, m.belief
+    if np.isinf(c.approach):
+        return c.approach
+    warmer = believed(c, belief, m.u, y, c.feed_temperature) - believed(c, belief, m.u, y, c.temperature)
+    elapsed = y.dtype.type(belief.numbers[0].since) * c.estimator.tick_s
+    moved = (most_open(c, m.u, warmer) - before) * min(elapsed / c.following_s, y.dtype.type(1.0))
+    if not np.isfinite(moved):  # by an estimate that leads to no answer
+        moved = y.dtype.type(0.0)
+    limit: float = max(before + moved, c.opening_from / c.input_scale[c.target.feed])
     return limit
 
 
@@ -364,12 +431,16 @@ def judge_played(c: Constants, m: OptimizerState, load: float, y: Array) -> floa
     now, played, real = m.numbers[0], m.playing.numbers[0], m.belief.x.dtype.type
     w = m.belief.numbers[0].w
     now.suspects = suspects_of(m.belief.readings)
-    now.most_open = most_open(c, m.u, y)
-    now.shortage = shortage(c, m.belief.x, w, load, now.most_open, real(0.0))
+    if stands(c.turbine, y):
+        now.suspects += c.turbine.bit
+    idle = idle_valve(c.turbine, now.suspects)
+    at = m.u[max(idle, 0)] / c.input_scale[max(idle, 0)]
+    now.most_open = limit_of_feed(c, m, y)
+    now.shortage = shortage(c, m.belief.x, w, load, now.most_open, idle, at, now.shortage, real(0.0))
     if not abs(now.shortage) <= real(LARGEST):  # by an estimate that leads to no answer
         now.shortage = real(0.0)
-    find_target(c.target, m.belief.x, w, m.belief.numbers[0].mismatch, now.most_open, m.target)
-    qp = problem_at(c, m.belief.x, w, m.playing.u_before, played.share, m.target, now.most_open)
+    find_target(c.target, m.belief.x, w, m.belief.numbers[0].mismatch, now.most_open, idle, at, m.target)
+    qp = problem_at(c, m.belief.x, w, m.playing.u_before, played.share, m.target, now.most_open, idle)
     return with_floor(augmented_cost(qp, m.playing.z, c.alpha), qp.constant, c.floor)
 
 

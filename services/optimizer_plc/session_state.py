@@ -34,7 +34,8 @@ efficiency, mismatch, contraction, gamma: what q was decided by. sequences: numb
 ticks that adaptive periods are longer than the budget says. in_time: answers in a row that came in time. planned,
 solved: whether there is a period, and an answer to it. guessed_before, delivered_before: J+ and Jhat of the problem
 before, infinite where there was none. shortage: what the load is above what can be held (W); negative: below what is
-needed. most_open: limit of the feed, a scaled deviation. suspects: readings left out, bit i is output i."""
+needed. most_open: limit of the feed, a scaled deviation. suspects: readings left out, bit i is output i; after
+those of the outputs comes the bit of an input that has no effect."""
 
 
 class Delivery(NamedTuple):
@@ -67,7 +68,7 @@ class OptimizerState(NamedTuple):
     target: Array
     """Inputs that the plant should come to rest at, scaled deviations, shape (3,)."""
     rule: Array
-    """What the rule of the updating period remembers, shape (2,)."""
+    """What the rule of the updating period remembers, shape (1,)."""
 
 
 def empty_state(n_states: int, size: int, real: Real) -> OptimizerState:

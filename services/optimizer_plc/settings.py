@@ -14,7 +14,7 @@ from coldloop.process.declaration import FURTHEST_WEIGHT
 from coldloop.process.limits import InputLimits
 from coldloop.process.load_profile import LOAD_SPAN
 from coldloop.process.model_settings import ModelSettings
-from coldloop.process.signals import BATH, STRETCH, TICK_S
+from coldloop.process.signals import BATH, TICK_S
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.process.whole_ticks import TOLERANCE, whole_ticks
 from coldloop.registers.codec import WordOrder
@@ -87,24 +87,25 @@ class RuleName(StrEnum):
 
 
 class ContractionSettings(BaseModel):
-    """Parameters of the contraction rule, chosen on the draws 11 and 12 of the six families of hours."""
+    """Parameters of the contraction rule, chosen on the draws 101 to 103 of the six families of hours."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    q_busy: Annotated[int, Field(ge=1)] = 2
-    q_quiet: Annotated[int, Field(ge=1)] = 4
-    q_step: Annotated[int, Field(ge=1)] = 9
-    rate: Annotated[float, Field(gt=0)] = 0.02 / STRETCH
-    """Contraction of the delivered cost, 1/s, at which the period is shortest."""
-    memory: Annotated[float, Field(ge=0, le=1)] = 0.95 ** (1.0 / STRETCH)
-    """Share of a contraction that is still felt a second later."""
-    surprise: Annotated[float, Field(gt=1)] = 2.0
-    """Cost reached over cost predicted from which on the next solve is a long one."""
+    q_rest: Annotated[int, Field(ge=1)] = 2
+    """Least q, that of quiet."""
+    q_max: Annotated[int, Field(ge=1)] = 5
+    """Largest q, that of the first period and of one which begins with a load step."""
+    band: Annotated[float, Field(ge=0)] = 10.0
+    """Dead band of |ln K|, over its usual size, the median."""
+    least: Annotated[float, Field(gt=0)] = 5e-4
+    """Least usual size of |ln K|, and the first."""
+    change: Annotated[float, Field(ge=0, lt=1)] = 0.02
+    """Share by which the usual size goes up or down in a period."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        if not self.q_busy <= self.q_quiet <= self.q_step:
-            raise ValueError("q_busy <= q_quiet <= q_step does not hold")
+        if self.q_rest > self.q_max:
+            raise ValueError("q_rest is above q_max")
         return self
 
 
@@ -120,8 +121,11 @@ class AdaptiveSettings(BaseModel):
     """q(t_0), the number of a period in the ladder: 1 is 0.5 s, 9 is 2.5 s at P = 1 and with an iteration of 0.25 s or
     less. The ladder has each period that holds more iterations than the one before (`coldloop budget`)."""
     q_min: Annotated[int, Field(ge=1)] = 2
+    """Shortest period, as a number in the ladder of periods."""
     q_max: Annotated[int, Field(ge=1)] = 19
+    """Longest period, likewise."""
     delta: Annotated[int, Field(ge=1)] = 2
+    """Step of q."""
     cost_floor: Annotated[float, Field(gt=0)] = 1.0
     """Constant added to J, so that it is bounded below by a positive number (Assumption 1 of the paper)."""
 
@@ -152,13 +156,14 @@ class ProgramSettings(BaseModel):
     interrupting_load_step_w: Annotated[float, Field(ge=0)] = 0.0
     """A load step of more than this ends an updating period at once, whatever decides its length; 0 is never."""
     holdable_load_w: tuple[FiniteFloat, FiniteFloat] = (BATH and BATH.holdable_load) or LOAD_SPAN
-    """Loads that some inputs within their limits hold at rest within the bands, in the load's unit: of the cold box, by
-    steady states of its nonlinear plant. With a bath, a load outside raises the alarm `capacity`."""
+    """Loads that are held at rest within the bands, in the load's unit: of the cold box by runs of its nonlinear
+    plant. With a bath, a load outside raises the alarm `capacity`."""
     capacity_reserve_w: Annotated[float, Field(ge=0)] = BATH.load_reserve if BATH else 0.0
     """So does an estimated load this near the largest one that the linear model holds with the feed at its limit."""
     sequence_ticks: Annotated[int, Field(ge=2, le=SEQUENCE_ROWS)] = 18
     """Shortest sequence sent; 18 rows fit into one Modbus request with their header. It is never shorter than two
-    updating periods: one to be played, one in case the next sequence is late."""
+    updating periods: one to be played, one in case the next sequence is late; nor than the longest time until the next
+    sequence of adaptive periods can arrive (`scheme.shortest_sequence`)."""
     adaptive: AdaptiveSettings = AdaptiveSettings()
     design: ControlDesign = ControlDesign()
     cold_end: ColdEndSettings = ColdEndSettings()
@@ -308,6 +313,7 @@ class ControlEndpoint(Endpoint):
     """Where the control PLC is."""
 
     port: Annotated[int, Field(ge=1, le=0xFFFF)] = CONTROL_PORT
+    """TCP port."""
 
 
 class OptimizerSection(BaseModel):

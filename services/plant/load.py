@@ -1,8 +1,7 @@
 """Heat loads by name: hours of the paper's kind, and where the name is a file, its load.
 
 The paper does not print its load profiles. The six hours a to f are random telegraphs about the load of the operating
-point, each of another family; `docs/science.md` says how they were chosen. `a@2` is a second
-draw of the family of hour a.
+point, each of another family (below). `a@2` is a second draw of the family of hour a.
 
 For a process that has no named loads of its own these are stretched: in time as its tick is longer, in size so that
 200 W are the way from the operating point's load to the nearer end of its span.

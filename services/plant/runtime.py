@@ -43,12 +43,13 @@ class PlantRuntime:
 
     def on_write(self, block: Block, caller: Caller) -> None:
         """Take what a client has written, and see to it that the plant moves."""
+        before = self.registers.rack.session.pace
         self.registers.on_write(block, caller)
         rack = self.registers.rack
         if block.record is PlantSession:
             self._stop_clock()
             self._position = None
-        elif block.record is SessionPace:
+        elif block.record is SessionPace and rack.session.pace != before:
             self._change_pace()
         elif block.record is Actuators and rack.moving:
             if rack.session.pace.realtime:
@@ -125,7 +126,8 @@ class PlantRuntime:
     def _fail(self, error: BaseException) -> None:
         if self._failure is not None and not self._failure.done():
             tick = self.registers.rack.tick
-            self._failure.set_exception(ColdloopError(f"the plant has stopped at tick {tick}: {error!r}"))
+            said = str(error) if isinstance(error, ColdloopError) else repr(error)
+            self._failure.set_exception(ColdloopError(f"the plant has stopped at tick {tick}: {said}"))
 
     def _age(self) -> float:
         """Return how long ago the present tick began by the rack's clock, in ticks; 0 while no clock runs.

@@ -41,6 +41,7 @@ class MismatchSettings(BaseModel):
     heat_transfer: Factor = 1.0
     """UA of the three heat exchangers."""
     turbine_efficiency: Factor = 1.0
+    """Isentropic efficiency of the turbine over that of the model."""
     jt_valve: Factor = 1.0
     """Flow area of CV155."""
     turbine_valve: Factor = 1.0

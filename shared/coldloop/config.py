@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from math import inf, isfinite
+from math import inf, isfinite, isnan
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
@@ -21,6 +21,7 @@ from pydantic import BaseModel, ValidationError
 
 from coldloop.errors import ConfigurationError
 from coldloop.parsing import MOST_LEVELS, TOO_DEEP, parsed_toml
+from coldloop.text_file import read_text
 
 PREFIX = "COLDLOOP__"
 DEFAULT = "default"
@@ -241,15 +242,7 @@ def as_toml(value: object) -> str:
 
 def _read_toml(file: Path, option: str) -> dict[str, Any]:
     try:
-        with file.open("rb") as content:  # a pipe will do, a device without an end will not
-            data = content.read(MOST_BYTES + 1)
-        if len(data) > MOST_BYTES:
-            raise ConfigurationError(f"{file}: not a configuration: more than {MOST_BYTES} bytes")
-        return parsed_toml(data.decode("utf-8-sig"))
-    except OSError as error:
-        raise ConfigurationError(f"{file}: {error.strerror}; name a readable TOML file with {option}") from None
-    except UnicodeDecodeError:
-        raise ConfigurationError(f"{file}: not UTF-8 text; save it as UTF-8") from None
+        return parsed_toml(read_text(file, f"name a readable TOML file with {option}", ConfigurationError, MOST_BYTES))
     except ValueError as error:
         raise ConfigurationError(f"{file}: not TOML: {error}") from None
 
@@ -301,6 +294,8 @@ def explained(
     if first["type"] == "missing":
         return f"{where}: is missing; {listing}"
     message = first["msg"].removeprefix("Value error, ")
+    if isinstance(first["input"], float) and isnan(first["input"]):
+        message = "not a number (NaN); give one, or leave the key out"
     if isinstance(first["input"], Mapping):  # a section, of which the message says enough
         return f"{where}: {message[0].lower()}{message[1:]}"
     given = repr(first["input"])

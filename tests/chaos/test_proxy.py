@@ -163,6 +163,17 @@ async def test_half_a_frame_ends_the_connection() -> None:
         writer.close()
 
 
+async def test_a_client_that_sends_no_more_gets_its_answers() -> None:
+    async with line() as it:
+        fault = Delay(**COMMON, at_s=0.0, kind="delay", direction=Direction.ANSWERS, delay_ms=1.0)
+        it.proxy.begin(fault)
+        reader, writer = await raw(it.proxy)
+        writer.write(READ_THREE * 50)
+        writer.write_eof()
+        assert len(await reader.read()) == 50 * (9 + 6)
+        writer.close()
+
+
 async def test_pipelined_requests_are_delayed_and_stay_in_order() -> None:
     async with line() as it:
         it.proxy.begin(Delay(kind="delay", delay_ms=1.0, jitter_ms=1.0, **COMMON))

@@ -249,7 +249,7 @@ def test_a_file_that_is_no_toml_is_named_with_the_place(write: Write) -> None:
 def test_a_file_that_is_no_text_is_named(tmp_path: Path) -> None:
     file = tmp_path / "rig.toml"
     file.write_bytes(b"title = '\xff\xfe'\n")
-    assert refused(file) == f"{file}: not UTF-8 text; save it as UTF-8"
+    assert refused(file) == f"{file}: not UTF-8 text (byte 9); save it as UTF-8, not compressed"
 
 
 def refusal(assignment: str) -> str:

@@ -3,7 +3,8 @@
 import pytest
 
 from coldloop.registers.bank import ALL_ROLES, BusyError, Caller
-from coldloop.safety.lease import Lease
+from coldloop.registers.safety import LeaseState
+from coldloop.safety.lease import LINGER_S, Lease
 
 NUMBER = 7
 
@@ -59,3 +60,53 @@ def test_the_connection_that_was_left_counts_again_when_the_holder_has_been_sile
     lease.check(on(1), NUMBER)
     assert lease.take(on(1), NUMBER)
     lease.check(on(2), NUMBER)
+
+
+# -- a lease that is shared -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def shared(clock: Clock) -> Lease:
+    held = Lease("the optimiser's registers", lambda: 10.0, clock, shared=True)
+    for connection in (1, 2, 3):
+        held.check(on(connection), NUMBER)
+        assert held.take(on(connection), NUMBER) == (connection == 1)
+    return held
+
+
+def test_connections_of_a_holder_write_side_by_side_and_say_their_number_once(shared: Lease) -> None:
+    for connection in (1, 3, 2, 1):
+        shared.check(on(connection))
+        assert not shared.take(on(connection))
+    assert shared.holder == NUMBER
+    for stranger, number in ((on(4), None), (on(4), 0), (on(4), 8), (Caller("elsewhere:4", ALL_ROLES, 4), NUMBER)):
+        with pytest.raises(BusyError):
+            shared.check(stranger, number)
+    assert shared.refused == 4
+
+
+def test_a_shared_lease_ends_with_the_last_of_its_connections(shared: Lease, clock: Clock) -> None:
+    assert not shared.closed(on(3))
+    assert not shared.closed(on(1))
+    shared.check(on(2))
+    assert shared.state is LeaseState.HELD
+    assert shared.closed(on(2))
+    assert shared.state is LeaseState.LINGERING
+    clock.now = LINGER_S + 0.1
+    shared.check(on(4), 8)
+
+
+def test_another_number_over_one_of_them_leaves_the_others_out(shared: Lease) -> None:
+    shared.check(on(2), 9)
+    assert shared.take(on(2), 9)
+    for connection in (1, 3):
+        with pytest.raises(BusyError):
+            shared.check(on(connection))
+
+
+def test_simple_clients_share_nothing(clock: Clock) -> None:
+    lease = Lease("the optimiser's registers", lambda: 10.0, clock, shared=True)
+    lease.take(on(1), 0)
+    for number in (None, 0):
+        with pytest.raises(BusyError):
+            lease.check(on(2), number)

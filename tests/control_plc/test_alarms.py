@@ -261,7 +261,8 @@ def test_a_condition_that_does_not_last_as_long_as_its_delay_changes_nothing() -
 def test_the_alarms_of_the_process_have_delays_and_others_none() -> None:
     settings = AlarmSettings()
     assert {kind for kind in AlarmKind if settings.rule(kind).on_delay_s} == {*OF_THE_PROCESS} - {
-        AlarmKind.SENSOR_SUSPECT
+        AlarmKind.SENSOR_SUSPECT,
+        AlarmKind.INPUT_WITHOUT_EFFECT,
     }
     assert course(settings, [(tick, True) for tick in range(40)]) == [(EventKind.ALARM_RAISED, 20)]
 

@@ -9,7 +9,7 @@ import pytest
 
 from coldloop.process.cold_box import L1, T5
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import OUTPUT_NAMES
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES
 from coldloop.registers.audit import EventKind
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Cause, Heartbeat, Mode, Operator, OperatorMode, SequenceRow, Update, Verdict
@@ -244,6 +244,18 @@ def test_exact_sensors_of_one_kind_may_rest_while_noisy_ones_of_the_other_move(n
     bench.readings = dict.fromkeys(range(12, 22), 1.5)
     bench.scans(400)
     assert bench.program.bad_sensors == 0
+
+
+def test_an_input_without_effect_is_an_alarm_until_it_acts_again(rig: "Bench", at: At) -> None:
+    program, valve = rig.program, INPUT_NAMES.index("CV156")
+    for bits, state in ((1 << len(OUTPUT_NAMES) + valve, AlarmState.UNACKNOWLEDGED), (0, AlarmState.RETURNED)):
+        rig.suspects = bits
+        rig.play([at()] * 20, ticks=2)
+        rig.scan()
+        assert alarm(rig, AlarmKind.INPUT_WITHOUT_EFFECT) is state
+        assert alarm(rig, AlarmKind.SENSOR_SUSPECT) is AlarmState.NORMAL
+        assert program.has_noted_suspects
+    assert program.alarms.rows[AlarmKind.INPUT_WITHOUT_EFFECT].cause == valve
 
 
 def test_what_the_optimiser_does_without_is_an_alarm_while_it_drives(rig: "Bench", at: At) -> None:

@@ -11,10 +11,12 @@ from pydantic import BaseModel
 
 from coldloop.registers.maps import MAPS
 from rig.cli import make_parser
+from rig.cli.command_listing import command_listing
 from rig.cli.key_listing import key_listing
 from rig.cli.register_listing import FORMATS
 from rig.plc_sizing.profile import PlcProfile
 from rig.process_file.declaration import ProcessFile
+from rig.settings import Settings
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -25,11 +27,24 @@ def test_the_register_page_is_what_the_command_prints() -> None:
     assert page.endswith(FORMATS["markdown"](list(MAPS.values())))
 
 
-@pytest.mark.parametrize("model", [ProcessFile, PlcProfile])
-def test_the_page_of_keys_is_what_the_commands_print(model: type[BaseModel]) -> None:
+@pytest.mark.parametrize(
+    ("model", "page"), [(ProcessFile, "keys.md"), (PlcProfile, "keys.md"), (Settings, "configuration.md")]
+)
+def test_the_pages_of_keys_are_what_the_commands_print(model: type[BaseModel], page: str) -> None:
     tables = key_listing(model)
-    assert tables in (ROOT / "docs" / "keys.md").read_text(encoding="utf-8")
+    assert tables in (ROOT / "docs" / page).read_text(encoding="utf-8")
     assert "|  |\n" not in tables, "each key has a meaning"
+
+
+def test_the_page_of_commands_is_what_the_parsers_say() -> None:
+    assert (ROOT / "docs" / "commands.md").read_text(encoding="utf-8").endswith(command_listing())
+
+
+def test_the_map_from_the_paper_to_the_code_names_what_is_there() -> None:
+    rows = re.findall(r"^\| I{1,3}.*|^\| [IV]+-.*", (ROOT / "docs" / "science.md").read_text("utf-8"), re.MULTILINE)
+    named = [path for row in rows for path in re.findall(r"`((?:services|shared|rig|tests)/[^`]+)`", row)]
+    assert len(named) > 30
+    assert [path for path in named if not (ROOT / path).exists()] == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

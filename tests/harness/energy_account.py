@@ -10,7 +10,6 @@ from plant.components.passes import MASS
 from plant.components.phase_separator import start_account
 from plant.helium.properties import Helium, helium_of, supply_cell
 from plant.numeric import RealArray
-from plant.refrigerator.balance import refrigerator_energy_rates
 from plant.refrigerator.equipment import EquipmentLaw, act
 from plant.refrigerator.high_pressure import FIRST
 from plant.refrigerator.physics import (
@@ -21,6 +20,7 @@ from plant.refrigerator.physics import (
     evaluate_refrigerator,
     refrigerator_of,
 )
+from tests.harness.refrigerator_energy import refrigerator_energy_rates
 
 CROSSED, SIZE, TO_BATH, WORST = range(4)
 """What crossed the boundary inwards and its size (J), what the bath's rates brought it (J), and the largest difference

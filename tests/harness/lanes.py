@@ -5,6 +5,7 @@ A test is in the lane that the fixtures it requests say. A test of the fast lane
 """
 
 import multiprocessing.util
+import platform
 import selectors
 import sys
 import time
@@ -51,6 +52,7 @@ class Watch:
         self.waited_s = 0.0
         self.lane = Lane.FAST
         self._notes: list[str] = []
+        platform.platform()  # asks `uname` the first time that a manifest is written
         sys.addaudithook(self._audit)
         event.register("numba:compile", _Compilations(self._compile))  # type: ignore[no-untyped-call]
         _before(multiprocessing.util, "spawnv_passfds", lambda path, *_: self._notes.append(f"it starts {path!r}"))

@@ -2,7 +2,10 @@
 
 import asyncio
 import contextlib
+import io
 import json
+import logging
+from collections.abc import Callable
 from http import HTTPStatus
 from http.client import HTTPConnection
 from pathlib import Path
@@ -10,15 +13,28 @@ from pathlib import Path
 import aiohttp
 import pytest
 from aiohttp import web
+from aiohttp.http_exceptions import BadStatusLine
 from aiohttp.test_utils import make_mocked_request
 
 from coldloop.errors import ConfigurationError, UsageError
 from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.settings import TlsSettings
-from hmi.access import REQUEST_BURST, REQUESTS_A_BROWSER, ClientLimit, LoginSessions, host_of, is_own_origin, port_of
+from hmi.access import (
+    LOGIN_BURST,
+    LOGINS_A_MINUTE,
+    PASSWORD_BURST,
+    REQUEST_BURST,
+    REQUESTS_A_BROWSER,
+    ClientLimit,
+    LoginLimit,
+    LoginSessions,
+    host_of,
+    is_own_origin,
+    port_of,
+)
 from hmi.audit import Audit
 from hmi.connections import Connections
-from hmi.guard import Guard
+from hmi.guard import Guard, told_in_a_line
 from hmi.page_server import PageServer, PageSite
 from hmi.process_image import Model
 from hmi.settings import HmiSection, LoginSettings
@@ -254,6 +270,59 @@ def test_requests_of_one_address_are_limited_and_others_not() -> None:
     assert [limit.allows("here") for _ in range(4)] == [True, True, True, False], "no more than its capacity"
 
 
+def logins(limit: LoginLimit, clock: Clock, wrong: Callable[[int], str]) -> list[bool]:
+    """Whether anna gets in, once a second, beside two wrong attempts a second from her address."""
+    found = []
+    for second in range(15):
+        for half in range(2):
+            clock.time += 0.5
+            limit.allows("proxy", wrong(2 * second + half))
+        found.append(limit.allows("proxy", "anna"))
+        if found[-1]:
+            limit.succeeded("proxy", "anna")
+    return found
+
+
+def test_a_malformed_request_is_one_line_in_the_log() -> None:
+    stream = io.StringIO()
+    handler = logging.StreamHandler(stream)
+    handler.addFilter(told_in_a_line)
+    log = logging.Logger("aiohttp.server")  # noqa: LOG001 of this test alone
+    log.addHandler(handler)
+    for error in (BadStatusLine("GET / HTTP/9.9\n"), ValueError("ours")):
+        log.error("Error handling request from %s", "127.0.0.1", exc_info=error)
+    malformed, *ours = stream.getvalue().splitlines()
+    assert malformed.startswith("Error handling request from 127.0.0.1: ")
+    assert ours[-1] == "ValueError: ours"
+
+
+@pytest.mark.parametrize("wrong", [lambda _: "scraper", lambda i: f"guess {i}"], ids=["one name", "many names"])
+def test_wrong_passwords_of_others_at_an_address_keep_nobody_out(wrong: Callable[[int], str]) -> None:
+    clock = Clock()
+    assert all(logins(LoginLimit(clock), clock, wrong))
+
+
+def test_who_has_logged_in_from_an_address_comes_first_there() -> None:
+    limit = LoginLimit(Clock())
+    assert limit.allows("proxy", "anna")
+    limit.succeeded("proxy", "anna")
+    checked = sum(limit.allows("proxy", f"guess {i}") for i in range(100))
+    assert checked == PASSWORD_BURST, "the processor is not theirs"
+    assert limit.allows("proxy", "anna")
+    assert not limit.allows("proxy", "berta"), "who has not been there waits with the others"
+    assert limit.allows("elsewhere", "berta")
+
+
+def test_one_name_is_guessed_six_times_a_minute() -> None:
+    clock = Clock()
+    limit = LoginLimit(clock)
+    tried = 0
+    for tenth in range(600):
+        clock.time = tenth / 10
+        tried += limit.allows("here", "anna")
+    assert LOGIN_BURST <= tried <= LOGIN_BURST + LOGINS_A_MINUTE
+
+
 def test_own_origin_and_host() -> None:
     assert is_own_origin("http://127.0.0.1:8020", "127.0.0.1:8020")
     assert not is_own_origin(None, "127.0.0.1:8020")
@@ -284,8 +353,11 @@ def test_passwords_are_kept_as_hashes_in_a_file_of_their_owner(tmp_path: Path) -
         "anna", "anna:operate", "anna:root:scrypt$1$1$a$b", "anna:view:plain",
         f"anna:view:{WHOLE_HASH[:-5]}", f"anna:view:{WHOLE_HASH.replace('$16384$', '$16383$')}",
         f"anna:view:{WHOLE_HASH.replace('$16384$', '$much$')}", f"anna:view:{WHOLE_HASH.replace('$8$', '$80000$')}",
+        f"anna:view:{WHOLE_HASH.replace('$16384$', '$-1$')}", f"anna:view:{WHOLE_HASH.replace('$16384$', '$2$')}",
+        f"anna:view:{WHOLE_HASH.replace('$16384$', '$1048576$')}", f"anna:view:{WHOLE_HASH.replace('$16384$', '$²$')}",
     ],
-    ids=["name", "no hash", "no such role", "no hash but a word", "cut", "cost", "cost is a word", "block size"],
+    ids=["name", "no hash", "no such role", "no hash but a word", "cut", "cost", "cost is a word", "block size",
+         "negative", "cheap", "dear", "no digit"],
 )  # fmt: skip
 def test_a_line_that_is_no_user_is_named(tmp_path: Path, line: str) -> None:
     file = tmp_path / "users"
@@ -297,13 +369,25 @@ def test_a_line_that_is_no_user_is_named(tmp_path: Path, line: str) -> None:
 def test_a_file_that_everybody_may_write_to_makes_nobody_an_operator(tmp_path: Path) -> None:
     file = tmp_path / "users"
     write_user(file, "anna", PageRole.OPERATE, "a long password")
-    file.chmod(0o606)
-    with pytest.raises(ConfigurationError, match=r"everyone can write to it; `chmod o-w"):
+    for path, mode in ((file, 0o606), (file, 0o660), (tmp_path, 0o770)):
+        before = path.stat().st_mode
+        path.chmod(mode)
+        with pytest.raises(ConfigurationError, match=rf"{path}: others can write to it; `chmod go-w {path}`"):
+            Users(file)
+        path.chmod(before)
+    tmp_path.chmod(0o1777)  # as /tmp: others cannot take the file away
+    assert len(Users(file)) == 1
+
+
+def test_a_name_that_stands_twice_is_nobody(tmp_path: Path) -> None:
+    file = tmp_path / "users"
+    file.write_text(f"anna:view:{WHOLE_HASH}\nanna:operate:{WHOLE_HASH}\n", encoding="utf-8")
+    with pytest.raises(ConfigurationError, match="users:2: a second line of anna"):
         Users(file)
 
 
 def test_a_name_or_a_password_that_cannot_be_is_refused(tmp_path: Path) -> None:
-    for name, password in (("", "long enough"), ("a:b", "long enough"), ("anna", "short")):
+    for name, password in (("", "long enough"), ("a:b", "long enough"), ("#anna", "long enough"), ("anna", "short")):
         with pytest.raises(UsageError):
             write_user(tmp_path / "users", name, PageRole.VIEW, password)
 

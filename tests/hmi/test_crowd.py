@@ -194,5 +194,5 @@ async def test_a_table_has_each_signal_once_and_all_its_rows() -> None:
             async with browser.get(f"{page.address}static/{name}") as answer:
                 assert answer.status == HTTPStatus.NOT_FOUND, name
     await page.close()
-    assert lines[0] == "time_s,L1,T5,substituted"
+    assert lines[0] == "time_s,L1,T5,quality"
     assert [float(line.partition(",")[0]) for line in lines[1:]] == [tick * 0.25 for tick in range(rows)]

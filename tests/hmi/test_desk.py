@@ -12,6 +12,8 @@ from coldloop.operating.commands import (
     SetFactor,
     SetLoad,
     SetMode,
+    SetPaused,
+    SetSetpoint,
     TreatAlarm,
     clock_text,
     duration_text,
@@ -24,7 +26,7 @@ from coldloop.registers.plant import LoadAhead, LoadStatus
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
-from hmi.operator_desk import CONFIRM_WITHIN_S, CommandResult, OperatorDesk
+from hmi.operator_desk import CONFIRM_WITHIN_S, CommandResult, OperatorDesk, PremisesChangedError
 from hmi.process_image import Model
 from tests.hmi.conftest import Clock
 
@@ -88,10 +90,13 @@ class Desk:
         monkeypatch.setattr(self.desk, "_clients", lambda services: {service: peers[service] for service in services})
 
     async def asked(self, command: Command) -> str:
-        return (await self.desk.prepare(command, "anna"))[1]
+        return (await self.desk.prepare(command, "anna")).text
 
-    async def outcome(self, command: Command) -> CommandResult:
-        token, _ = await self.desk.prepare(command, "anna")
+    async def outcome(self, command: Command, missing: Peer | None = None) -> CommandResult:
+        """Prepare and confirm a command; in between a service may disappear."""
+        token, *_ = await self.desk.prepare(command, "anna")
+        if missing is not None:
+            missing.is_absent = True
         return await self.desk.confirm(token, "anna")
 
 
@@ -126,18 +131,14 @@ async def test_a_command_that_was_written_and_not_answered_is_neither_applied_no
 
 @pytest.mark.parametrize("how", ["absent", "refusing"])
 async def test_a_command_that_was_certainly_not_taken_is_refused(desk: Desk, how: str) -> None:
-    if how == "absent":
-        desk.plant.is_absent = True
-    else:
-        desk.plant.failures = [PAST]
-    outcome = await desk.outcome(SetLoad(kind="load", watts=431.0))
+    desk.plant.failures = [PAST]
+    outcome = await desk.outcome(LOAD, desk.plant if how == "absent" else None)
     assert outcome.refused_because
     assert (outcome.applied, outcome.uncertain_because) == ("", "")
 
 
 async def test_time_goes_as_before_when_a_service_that_follows_it_is_missing(desk: Desk) -> None:
-    desk.optimizer.is_absent = True
-    outcome = await desk.outcome(SetFactor(kind="factor", factor=2.0))
+    outcome = await desk.outcome(SetFactor(kind="factor", factor=2.0), desk.optimizer)
     assert outcome.refused_because == "nobody listens there"
     assert desk.plant.written == [], "what is told as refused has not been done at any service"
 
@@ -258,16 +259,66 @@ async def test_that_the_rest_of_a_load_is_dropped_is_said_before(desk: Desk, com
 
 async def test_a_confirmation_counts_once_in_time_and_from_who_asked(desk: Desk) -> None:
     command = SetMode(kind="mode", mode="auto")
-    token, _ = await desk.desk.prepare(command, "anna")
+    token, *_ = await desk.desk.prepare(command, "anna")
     with pytest.raises(UsageError, match="nothing to confirm"):
         await desk.desk.confirm(token, "lena")
     assert (await desk.desk.confirm(token, "anna")).applied, "somebody else's attempt has not used it up"
     with pytest.raises(UsageError, match="nothing to confirm"):
         await desk.desk.confirm(token, "anna")
-    token, _ = await desk.desk.prepare(command, "anna")
+    token, *_ = await desk.desk.prepare(command, "anna")
     desk.clock.time += CONFIRM_WITHIN_S + 1
     with pytest.raises(UsageError, match="within 60 s"):
         await desk.desk.confirm(token, "anna")
+
+
+SETPOINT = SetSetpoint(kind="setpoint", input="CV155", value=44.0)
+LOAD = SetLoad(kind="load", watts=431.0)
+SESSION = Identity(session=2, tick=0)
+
+
+@pytest.mark.parametrize(
+    ("command", "service", "change", "part"),
+    [
+        (SETPOINT, "control", Operator(OperatorMode.MANUAL, 46.0, 75.0, 36.0), "setpoint of CV155: 43 %, now 46 %"),
+        (SETPOINT, "control", SESSION, "session: 1, now 2"),
+        (
+            SetMode(kind="mode", mode="auto"),
+            "control",
+            Operator(OperatorMode.AUTO, 43.0, 75.0, 36.0),
+            "manual, now auto",
+        ),
+        (LOAD, "plant", LoadStatus(watts=410.0), "heat load: 400 W, now 410 W"),
+        (LOAD, "plant", LoadStatus(400.0, 1200, 500.0, 14_400, upcoming=7), "now changing until 1:00:00"),
+        (SetPaused(kind="pause", paused=True), "plant", SessionPace(1, 1, 9.0, 0), "factor 1, now factor 9"),
+    ],
+)
+async def test_a_confirmation_ends_when_its_premises_change(
+    desk: Desk, command: Command, service: str, change: tuple[Any, ...], part: str
+) -> None:
+    peer: Peer = getattr(desk, service)
+    desk.control.records[Operator] = Operator(OperatorMode.MANUAL, 43.0, 75.0, 36.0)
+    token, *_ = await desk.desk.prepare(command, "anna")
+    peer.records[type(change)] = change
+    with pytest.raises(PremisesChangedError, match=part) as changed:
+        await desk.desk.confirm(token, "anna")
+    assert peer.written == []
+    with pytest.raises(UsageError, match="nothing to confirm"):
+        await desk.desk.confirm(token, "anna")
+    if change is not SESSION:
+        assert (await desk.desk.confirm(changed.value.preview.token, "anna")).applied, "asked again as it is now"
+
+
+async def test_an_operator_learns_whose_command_came_between(desk: Desk) -> None:
+    asked = await desk.desk.prepare(LOAD, "anna")
+    assert asked.now == "heat load 400 W"
+    other, *_ = await desk.desk.prepare(SetLoad(kind="load", watts=420.0), "bob")
+    desk.plant.records[LoadStatus] = LoadStatus(watts=420.0)
+    with pytest.raises(PremisesChangedError):
+        await desk.desk.confirm(other, "bob")
+    other, *_ = await desk.desk.prepare(SetLoad(kind="load", watts=420.0), "bob")
+    assert (await desk.desk.confirm(other, "bob")).applied
+    with pytest.raises(PremisesChangedError, match="bob's: Change the heat load to 420 W"):
+        await desk.desk.confirm(asked.token, "anna")
 
 
 @pytest.mark.parametrize(

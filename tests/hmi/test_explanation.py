@@ -198,6 +198,17 @@ def test_periods_that_are_fixed() -> None:
     )
 
 
+def test_periods_of_the_contraction_rule() -> None:
+    own = RULE._replace(rule=UpdatingRuleKind.CONTRACTION, q_first=5, q_max=5, delta=0)
+    beyond, within = "K = 0.5 is beyond its noise and Gamma = -0.1 < 0", "K = 0.5 is within its noise, or Gamma = -0.1"
+    for before, q, says in ((2, 3, beyond), (5, 5, beyond), (3, 2, within), (2, 2, within)):
+        update = optimization(2, 101 + before, q, contraction=0.5, gamma=-0.1)
+        found = explain(update, optimization(1, 100, before), None, own)
+        assert found.branch is Branch.CONTRACTION
+        assert says in sentence(found, own)
+        assert f"has q = {q}, at rest 2" in sentence(found, own)
+
+
 def test_the_first_update_one_after_a_restart_and_one_whose_predecessor_is_unknown() -> None:
     assert explain(optimization(0, 0, 9), None, None, RULE).branch is Branch.FIRST
     again = explain(optimization(5, 300, 9), optimization(4, 100, 3), None, RULE)

@@ -13,14 +13,14 @@ from coldloop.modbus.endpoints import Endpoint
 from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind, JournalPage
 from coldloop.registers.common import Identity, SessionPace
-from coldloop.registers.control_plc import LadderStatus, Mode, Process
+from coldloop.registers.control_plc import LadderStatus, Mode, Plan, Process
 from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmPriority, AlarmState
 from coldloop.service.metrics import exposition
 from hmi.access import Party
 from hmi.broadcast import WAITING, Broadcast
-from hmi.documents import alarms_document, encoded, state_document, trend_document
+from hmi.documents import MOST_MARKS, alarms_document, encoded, state_document, trend_document
 from hmi.page_metrics import page_families
 from hmi.polling import Poller
 from hmi.process_image import STALE_S, JournalEntry, Model
@@ -236,7 +236,7 @@ def test_where_nothing_was_read_there_is_no_line_however_much_is_thinned(model: 
         assert {value for time, value in level.items() if time < 100} == {60.0}
         assert {value for time, value in level.items() if time > 100} == {61.0}
     assert [(one["from"], one["to"]) for one in trend["modes"]] == [(0.25, 399 * 0.25), (540 * 0.25, 899 * 0.25)]
-    assert trend["substituted"]["L1"] == [(540 * 0.25, 900 * 0.25)]
+    assert trend["doubtful"]["L1"] == [(540 * 0.25, 900 * 0.25, "held")]
 
 
 def test_the_updating_period_is_not_current_while_mpc_does_not_drive(model: Model) -> None:
@@ -246,24 +246,75 @@ def test_the_updating_period_is_not_current_while_mpc_does_not_drive(model: Mode
         assert model.is_planned is (mode == Mode.MPC)
 
 
-def test_a_value_that_is_substituted_is_told_stretch_by_stretch_and_no_other(model: Model) -> None:
-    t5, l1 = (OUTPUT_NAMES.index(name) for name in ("T5", "L1"))
-    for tick, bad in ((2, 0), (3, 1 << t5), (4, 1 << t5), (5, 0), (6, 1 << l1 | 1 << t5)):
+def test_doubtful_values_are_listed_by_stretch_with_the_worst_quality(model: Model) -> None:
+    t5, l1 = (1 << OUTPUT_NAMES.index(name) for name in ("T5", "L1"))
+    for tick, bad, suspect, faulty in ((2, 0, 0, 0), (3, t5, 0, 0), (4, t5, l1, 0), (5, 0, l1, l1), (6, l1 | t5, 0, 0)):
         model.put("control_plc", LadderStatus(1, 0, 0, 1, bad, 0))
+        model.put("control_plc", Plan(1, 9, suspects=suspect))
+        model.faulty_sensors = faulty
         model.put("control_plc", process(tick))
-    assert model.trends.substituted(0, 10) == {"T5": [(0.75, 1.25), (1.5, 1.75)], "L1": [(1.5, 1.75)]}
-    document = json.loads(encoded(trend_document(model, ["L1", "load"], 0, 10, 100)))
-    assert document["substituted"] == {"L1": [[1.5, 1.75]]}
-    assert model.trends.substituted(0, 2) == {}
+    document = json.loads(encoded(trend_document(model, ["L1", "T5", "load"], 0, 10, 100)))
+    assert document["doubtful"] == {
+        "T5": [[0.75, 1.25, "held"], [1.5, 1.75, "held"]],
+        "L1": [[1.0, 1.25, "suspect"], [1.25, 1.5, "simulated"], [1.5, 1.75, "held"]],
+    }
+    assert model.trends.doubtful(0, 2) == {}
 
 
-def test_alarms_that_wait_come_first_and_by_priority(model: Model) -> None:
+def test_each_value_has_the_worst_of_its_qualities(model: Model, clock: Clock) -> None:
+    def quality(name: str) -> str | None:
+        return dict(state_document(model)["quality"]).get(name)
+
+    assert quality("control_plc.process.y.T1") is None
+    assert quality("control_plc.update.x.") == "simulated", "no sensor has a state"
+    t1, l1 = (1 << OUTPUT_NAMES.index(name) for name in ("T1", "L1"))
+    model.put("control_plc", Plan(1, 9, suspects=t1 | l1))
+    model.put("control_plc", LadderStatus(1, 0, 0, 1, l1, 0))
+    assert [quality(f"control_plc.process.y.{name}") for name in ("T1", "L1")] == ["suspect", "held"]
+    assert quality("plant.measurement.y.L1") == "bad", "its reading itself"
+    model.faulty_sensors = l1
+    assert quality("control_plc.process.y.L1") == "simulated"
+    assert state_document(model)["stale"] == ["control_plc.process.y.L1"], "what is not current is crossed out"
+    model.put("control_plc", LadderStatus(Mode.MANUAL, 0, 0, 1, 0, 0))
+    assert quality("control_plc.process.y.T1") is None, "no optimiser doubts it in manual"
+    clock.time += STALE_S + 0.1
+    assert quality("control_plc.") == "stale"
+
+
+def test_updates_are_drawn_only_while_they_are_in_force(model: Model) -> None:
+    manual = range(40, 80)
+    for tick in range(2, 120):
+        model.put("control_plc", LadderStatus(Mode.MANUAL if tick in manual else Mode.MPC, 0, 0, 1, 0, 0))
+        model.put("control_plc", process(tick))
+    updates = [Optimization(i, tick, 8, 3, 3, 0, *(float(tick),) * 11) for i, tick in enumerate(range(8, 119, 8))]
+    model.put_updates(updates)
+    for end in (60, 119):
+        found = trend_document(model, ["L1"], 20, end, 400)["updates"]
+        shown = {time: values for time, *values in zip(*(found[name] for name in ("time", "tau_u", "J")), strict=True)}
+        assert found["time"] == sorted(found["time"])
+        drawn = {round(time / 0.25) for time, (tau_u, _) in shown.items() if tau_u is not None}
+        assert drawn == {8, 16, 24, 32, 40} | ({80, 88, 96, 104, 112, 119} if end == 119 else set())
+        assert shown[40 * 0.25] == [2.0, None], "the period reaches to its end, its cost is of an instant"
+        assert shown[41 * 0.25] == [None, None]
+
+
+@pytest.mark.parametrize("count", [MOST_MARKS, MOST_MARKS + 7])
+def test_marks_are_all_of_the_window_or_since_when_is_said(model: Model, count: int) -> None:
+    model.put("control_plc", process(2 * MOST_MARKS))
+    event = JournalEntry.of("control_plc", Event(kind=EventKind.ALARM_RAISED))
+    model.put_events(event._replace(tick=tick) for tick in range(count))
+    document = trend_document(model, ["L1"], 0, 2 * MOST_MARKS, 20)
+    assert len(document["marks"]) == MOST_MARKS
+    assert document["marks_since_s"] == (None if count == MOST_MARKS else document["marks"][0]["time"])
+
+
+def test_active_alarms_come_first_and_returned_ones_hide_none(model: Model) -> None:
     rows = [Alarm(priority=AlarmPriority.LOW) for _ in AlarmKind]
     rows[AlarmKind.MODE] = Alarm(AlarmState.ACKNOWLEDGED, 1, priority=AlarmPriority.CRITICAL)
     rows[AlarmKind.T5_BAND] = Alarm(AlarmState.RETURNED, 0, priority=AlarmPriority.HIGH)
     rows[AlarmKind.SCAN_OVERRUN] = Alarm(AlarmState.UNACKNOWLEDGED, 1, priority=AlarmPriority.LOW)
     model.put_alarms(rows)
-    assert [one["name"] for one in alarms_document(model)][:3] == ["t5 band", "scan overrun", "mode"]
+    assert [one["name"] for one in alarms_document(model)][:3] == ["scan overrun", "mode", "t5 band"]
 
 
 def test_a_message_has_only_what_changed_and_numbers_that_json_has(model: Model) -> None:
@@ -276,13 +327,6 @@ def test_a_message_has_only_what_changed_and_numbers_that_json_has(model: Model)
     assert "control_plc.process.load" not in document["values"]
     whole = json.loads(encoded(state_document(model)))
     assert whole["values"]["control_plc.process.y.L1"] is None
-
-
-def test_a_measurement_that_is_substituted_is_stale_and_no_other(model: Model) -> None:
-    assert model.stale_prefixes() == []
-    t1, l1 = OUTPUT_NAMES.index("T1"), OUTPUT_NAMES.index("L1")
-    model.put("control_plc", LadderStatus(1, 0, 0, 1, 1 << t1 | 1 << l1, 0))
-    assert sorted(model.stale_prefixes()) == ["control_plc.process.y.L1", "control_plc.process.y.T1"]
 
 
 def test_what_is_sent_is_json_even_when_numbers_or_words_are_none(model: Model) -> None:

@@ -13,8 +13,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from coldloop.process.signals import OUTPUT_NAMES
+from coldloop.registers.audit import Event, EventKind
 from hmi.explanation import Branch
-from hmi.process_image import Model
+from hmi.process_image import JournalEntry, Model
+from hmi.quality import SOUND
 from hmi.replay import Replay
 from rig.live.recorded_page import RecordedPage, _bits
 from rig.results.run_folder import RunFolder
@@ -114,7 +116,13 @@ def test_up_with_its_page_prints_where_it_is_and_a_password_that_operates(proces
         assert processes.coldloop("down", *words, more=more).popen.wait(END_S) == 0
 
 
-def test_a_recorded_run_says_which_sensors_were_bad(recorded_run: Path) -> None:
+def test_a_recorded_run_has_the_quality_of_its_sensors(recorded_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recorded = RecordedPage(RunFolder(recorded_run))
-    assert {recorded.frame(tick).bad_sensors for tick in range(recorded.ticks)} == {0}
+    t5, kinds = OUTPUT_NAMES.index("T5"), EventKind
+    noted = ((5, kinds.SENSOR, 2), (9, kinds.SENSOR_FAULT, 3), (12, kinds.SENSOR, 0), (15, kinds.SENSOR_FAULT, 0))
+    events = [JournalEntry.of("plant", Event(tick=at, kind=kind, subject=t5, cause=cause)) for at, kind, cause in noted]
+    monkeypatch.setattr(recorded, "events", events)
+    told = [recorded.frame(tick).doubts.named.get("T5") for tick in (4, 5, 8, 9, 13, 15)]
+    assert told == [None, "suspect", "suspect", "simulated", "simulated", None]
+    assert recorded.frame(recorded.ticks - 1).doubts == SOUND
     assert _bits("L1 T5") == 1 << OUTPUT_NAMES.index("L1") | 1 << OUTPUT_NAMES.index("T5")

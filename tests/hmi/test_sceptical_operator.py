@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.harness.waiting import eventually
-from tests.hmi.conftest import Site, log_in_by_clicks, opened
+from tests.hmi.conftest import OPERATOR, Site, log_in_by_clicks, opened
 from tests.hmi.test_operating import MPC, SENSOR_BAD, alarm_state, confirm, load, mode, view
 
 if TYPE_CHECKING:
@@ -137,6 +137,35 @@ def test_the_page_that_dies_between_the_two_steps_says_that_nobody_knows(operate
     assert load(site) == before
 
 
+def test_a_confirmation_is_asked_anew_when_somebody_else_came_between(
+    operated: "Page", second: "Page", site: Site
+) -> None:
+    asked_twice(operated, "444")
+    view(second, "commands")
+    asked_twice(second, "446")
+    assert "446 W" in confirm(second)
+    operated.click("#confirm-yes")
+    eventually(lambda: "now 446 W" in (operated.text_content("#confirm-changed") or ""), "it says what has changed")
+    assert operated.is_visible("#confirm")
+    assert load(site) == 446.0
+    assert operated.text_content("#confirm-now") == "Now: heat load 446 W."
+    operated.click("#confirm-no")
+    operated.reload()
+    eventually(lambda: "446 W" in operated.inner_text("#last-command"), "the log is the server's")
+    assert f"Last command: {OPERATOR[0]}" in operated.inner_text("#last-command")
+
+
+def test_enter_in_a_field_prepares_and_never_confirms(operated: "Page", site: Site) -> None:
+    before = load(site)
+    operated.fill("#load-number", "447")
+    operated.keyboard.press("Enter")
+    operated.wait_for_selector("#confirm[open]")
+    operated.keyboard.press("Enter")
+    operated.wait_for_selector("#confirm[open]", state="detached")
+    eventually(lambda: "not confirmed" in outcome(operated), "a second Enter cancels")
+    assert load(site) == before
+
+
 def test_manual_that_somebody_else_has_ended_takes_no_setpoint(operated: "Page", second: "Page", site: Site) -> None:
     operated.click("button:has-text('Manual')")
     assert "applied" in confirm(operated)
@@ -195,7 +224,7 @@ def test_a_load_file_at_a_high_factor_begins_in_time(operated: "Page", site: Sit
         content = "time_s,load_w\n0,401\n" + "".join(f"{600 + i},{402 + i % 2}\n" for i in range(60))
         operated.set_input_files("#load-file", {"name": "a.csv", "mimeType": "text/csv", "buffer": content.encode()})
         operated.click("#load-play")
-        assert "applied: load of 61 steps" in confirm(operated)
+        assert "last value is held: load of 61 steps" in confirm(operated)
         eventually(lambda: load(site) in {401.0, 402.0, 403.0}, "the load follows")
     finally:
         cookie = site.log_in()
@@ -269,8 +298,14 @@ def test_a_substituted_value_is_no_line_like_others(operated: "Page", site: Site
     confirm(operated)
     eventually(lambda: alarm_state(site, SENSOR_BAD) == 1, "the alarm is raised")
     try:
-        asked = "() => fetch('api/trend?names=T5&seconds=60').then((a) => a.json()).then((a) => a.substituted.T5 || [])"
+        asked = "() => fetch('api/trend?names=T5&seconds=60').then((a) => a.json()).then((a) => a.doubtful.T5 || [])"
         eventually(lambda: operated.evaluate(asked), "the trend says it")
+        view(operated, "overview")
+        for kind in ("tag", "bar"):
+            at = f"#overview .{kind}[data-name=T5]"
+            eventually(lambda: operated.locator(f"{at} .stale, {at}.stale").count(), f"{kind}: crossed out")  # noqa: B023
+            assert operated.locator(f"{at}[data-quality=simulated], {at} [data-quality=simulated]").count()
+        assert operated.text_content("#overview .tag[data-name=T5] .mark") == "S"
         view(operated, "trends")
         eventually(lambda: operated.evaluate(BLANK), "the line is interrupted")
     finally:
@@ -283,7 +318,7 @@ def test_a_substituted_value_is_no_line_like_others(operated: "Page", site: Site
     operated.click("#alarm-table tr[data-alarm='sensor bad'] button:has-text('Acknowledge')")
 
 
-BLANK = "document.querySelector('#chart-T5')?.dataset.substituted > 0"
+BLANK = "document.querySelector('#chart-T5')?.dataset.doubtful > 0"
 
 
 def test_shelving_says_that_it_counts_plant_time(operated: "Page") -> None:

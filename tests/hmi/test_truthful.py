@@ -50,6 +50,7 @@ def test_in_manual_nothing_of_mpc_looks_current_and_the_button_says_who_drives(o
     try:
         eventually(lambda: operated.evaluate(pressed) == ["manual"], "manual is pressed")
         eventually(lambda: operated.locator("#tau-u.stale").count() == 1, "the updating period is crossed out")
+        assert operated.title().endswith("MANUAL · Coldloop")
         assert not trend_of_level(site)["planned"]
         view(operated, "trends")
         eventually(lambda: "mode manual" in operated.inner_text("#trend-legend"), "its colour has a name")
@@ -60,6 +61,36 @@ def test_in_manual_nothing_of_mpc_looks_current_and_the_button_says_who_drives(o
         confirm(operated)
     eventually(lambda: mode(site) == MPC, "MPC drives again")
     eventually(lambda: operated.locator("#tau-u.stale").count() == 0, "it is current again")
+
+
+PLACES = """() => JSON.stringify([...document.querySelectorAll("#trends .toolbar, #charts .chart, #trend-legend")]
+  .map((one) => one.getBoundingClientRect()))"""
+
+
+def test_nothing_moves_by_hovering_and_a_click_finds_the_update(page: "Page", site: Site) -> None:
+    eventually(lambda: len(site.ask("/api/trend?names=L1").document["updates"]["time"]) > 2, "updates")
+    view(page, "trends")
+    page.click("#hold")
+    page.wait_for_selector("#chart-tau canvas")
+    before, box = page.evaluate(PLACES), page.locator("#chart-tau .u-over").bounding_box()
+    assert box is not None
+    for share in (0.2, 0.5, 0.79):
+        page.mouse.move(box["x"] + share * box["width"], box["y"] + box["height"] / 2)
+        eventually(lambda: page.inner_text("#readout"), "values at the cursor")
+        assert page.evaluate(PLACES) == before
+    page.mouse.click(box["x"] + 0.79 * box["width"], box["y"] + box["height"] / 2)
+    page.wait_for_selector("#why:visible")
+
+
+def test_a_value_of_the_drawing_opens_its_trend_with_what_belongs_to_it(page: "Page") -> None:
+    page.focus("#overview .tag[data-name=CV156]")
+    page.keyboard.press("Enter")
+    eventually(lambda: "operator's setpoint" in page.inner_text("#point-facts"), "setpoint and output")
+    page.wait_for_selector("#point-chart canvas")
+    page.click("#point-close")
+    page.click("#overview .bar[data-name=T5]")
+    eventually(lambda: "output of its loop, CV156" in page.inner_text("#point-facts"), "band and loop")
+    page.click("#point-close")
 
 
 def test_why_shows_the_trajectory_that_was_predicted_for_the_update(page: "Page", site: Site) -> None:

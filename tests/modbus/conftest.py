@@ -200,6 +200,7 @@ class Pki:
         certificate, key = self.folder / f"{name}.crt", self.folder / f"{name}.key"
         certificate.write_bytes(pair.certificate_pem)
         key.write_bytes(pair.key_pem)
+        key.chmod(0o600)
         return TlsSettings(certificate=certificate, key=key, ca=self.folder / "ca.crt", warn_days=0)
 
     def client(self, role: str | None) -> ssl.SSLContext:

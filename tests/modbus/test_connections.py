@@ -172,3 +172,30 @@ async def test_a_port_in_use_is_named_with_its_remedy(serve: "Serve") -> None:
 async def test_a_host_that_is_not_ours_is_named_with_its_remedy() -> None:
     with pytest.raises(PortInUseError, match=r"^plant cannot listen on 192.0.2.1:0: .*choose"):
         await plant_server(ServerSettings(host="192.0.2.1", port=0)).start()
+
+
+async def test_a_client_that_sends_no_more_is_answered_all_it_has_asked(serve: "Serve") -> None:
+    """Through more than one turn of the event loop; then the server closes its half, too."""
+    async with serve() as running:
+        wire = await running.connect()
+        wire.send(b"".join(framed(READ_MAGIC, number) for number in range(200)) + b"\0")
+        wire.writer.write_eof()
+        answer = bytes.fromhex("03 04 42f6e979")
+        assert await wire.closed() == b"".join(framed(answer, number) for number in range(200))
+
+
+async def test_a_request_that_waits_ends_with_the_half_of_its_client(serve: "Serve") -> None:
+    """Whether it has closed one half or is gone cannot be told, and a lease must not outlive its holder."""
+    waiting = asyncio.Event()
+
+    async def wait(_block: "Block", _caller: "Caller") -> None:
+        waiting.set()
+        await asyncio.Event().wait()
+
+    async with serve(on_write=wait) as running:
+        running.bank.put(SESSION)
+        wire = await running.connect()
+        wire.send(framed(bytes.fromhex("06 0192 0001")))
+        await waiting.wait()
+        wire.writer.write_eof()
+        assert await wire.closed() == b""

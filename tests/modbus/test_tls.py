@@ -229,6 +229,17 @@ async def test_bad_files_are_told_in_one_line(serve: "Serve", pki: "Pki", case: 
         RegisterClient.at(CONTROL_MAP, Endpoint(port=1, tls=files))
 
 
+async def test_a_key_that_everyone_can_read_is_told(
+    serve: "Serve", pki: "Pki", tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    key = tmp_path / "key.pem"
+    key.write_bytes(pki.server.key.read_bytes())
+    key.chmod(0o644)
+    async with serve(CONTROL_MAP, tls=pki.server.model_copy(update={"key": key})):
+        pass
+    assert [record for record in caplog.records if f"key {key}: everyone can read it" in record.getMessage()]
+
+
 def test_a_role_survives_its_encoding_and_nonsense_is_no_role() -> None:
     assert decoded_role(encoded_role("opérateur")) == "opérateur"
     for der in (b"", b"\x0c", b"\x0c\x05abc", b"\x13\x03abc", b"\x0c\x81\x80" + b"a" * 128):

@@ -12,7 +12,7 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.qp.penalties import Preset
-from optimizer_plc.scheme import Constants, most_open, problem_at
+from optimizer_plc.scheme import Constants, limit_of_feed, most_open, problem_at
 from optimizer_plc.settings import ProgramSettings
 
 LIMITS = InputLimits()
@@ -30,10 +30,8 @@ def tuned(model: LtiModel) -> Constants:
 
 def limit(c: Constants, cv155: float, approach: float) -> float:
     """Return the limit of CV155, %, at an opening of CV155 and T2 - T1."""
-    y = np.array(c.estimator.y0)
-    y[T2] = y[T1] + approach
     u0 = c.estimator.u0
-    return float(u0[0] + c.input_scale[0] * most_open(c, np.array([cv155, *u0[1:]]) - u0, y))
+    return float(u0[0] + c.input_scale[0] * most_open(c, np.array([cv155, *u0[1:]]) - u0, approach))
 
 
 @pytest.mark.parametrize(
@@ -46,8 +44,51 @@ def test_it_is_70_per_cent_for_each_kelvin_from_0_3_and_never_below_50_per_cent(
     assert limit(tuned, cv155, approach) == pytest.approx(most)
 
 
-def test_a_temperature_that_is_not_measured_says_nothing_against_opening(tuned: Constants) -> None:
-    assert limit(tuned, 55.0, math.nan) == pytest.approx(limit(tuned, 55.0, 0.0))
+def followed(program: OptimizerProgram, readings: dict[int, float], ticks: int, times: int = 1) -> float:
+    """Return the limit of CV155, %, with CV155 at 55 %, after so many updates with these readings over y0 (K)."""
+    c, m = program.constants, program.state
+    y = np.array(c.estimator.y0)
+    m.u[:] = np.array([55.0, *c.estimator.u0[1:]]) - c.estimator.u0
+    for output, reading in readings.items():
+        y[output] += reading
+    for _ in range(times):
+        m.belief.numbers["since"] = ticks
+        m.numbers["most_open"] = limit_of_feed(c, m, y)
+    return float(c.estimator.u0[0] + c.input_scale[0] * m.numbers["most_open"][0])
+
+
+def program_with(model: LtiModel, estimated: float, **settings: object) -> OptimizerProgram:
+    """Return a program whose limit was 55 %, and that believes T2 to be so much warmer than the model says (K)."""
+    program = OptimizerProgram(model, ProgramSettings.model_validate(settings), LIMITS)
+    c, m = program.constants, program.state
+    m.numbers["most_open"] = (55.0 - c.estimator.u0[0]) / c.input_scale[0]
+    m.belief.x[c.estimator.plausible.constants[T2]] = estimated
+    return program
+
+
+@pytest.mark.usefixtures("compiles")
+def test_the_limit_goes_by_the_estimate_whatever_the_readings_show(model: LtiModel) -> None:
+    approach = float(model.y0[T2] - model.y0[T1])
+    for reading in (0.0, 0.5, math.nan):
+        program = program_with(model, 0.33 - approach)
+        assert followed(program, {T2: reading}, 240) == pytest.approx(55.0 - 70.0 * 0.03), "after a time constant"
+
+
+@pytest.mark.usefixtures("compiles")
+def test_the_limit_follows_with_its_time_constant_so_that_noise_moves_it_little(model: LtiModel) -> None:
+    approach = float(model.y0[T2] - model.y0[T1])
+    program = program_with(model, 0.27 - approach)
+    assert followed(program, {}, 4) == pytest.approx(55.0 + 70.0 * 0.03 / 60.0)
+
+
+@pytest.mark.usefixtures("compiles")
+def test_readings_count_where_no_constant_is_estimated_and_the_model_where_they_are_left_out(model: LtiModel) -> None:
+    settings = {"kind": "state-feedback"}
+    program = OptimizerProgram(model, ProgramSettings.model_validate({"estimator": settings}), LIMITS)
+    approach = float(model.y0[T2] - model.y0[T1])
+    assert followed(program, {T2: 0.33 - approach}, 240) == pytest.approx(55.0 - 70.0 * 0.03)
+    assert followed(program, {T2: 0.25 - approach}, 240) == pytest.approx(55.0 + 70.0 * 0.05)
+    assert followed(program, {T2: math.nan}, 240) == pytest.approx(55.0 + 70.0 * (0.3 - approach))
 
 
 def test_the_paper_has_no_such_limit(model: LtiModel) -> None:
@@ -61,8 +102,8 @@ def test_all_knots_are_within_the_limit_or_within_the_rate_of_it(
 ) -> None:
     u0, scale, rate = float(tuned.estimator.u0[0]), float(tuned.input_scale[0]), LIMITS.rate[0] * share
     x, u_before = np.zeros(tuned.estimator.steps.A.shape[1]), np.array([before - u0, 0.0, 0.0])
-    free = problem_at(tuned, x, 0.0, u_before, share, np.zeros(3), math.inf)
-    limited = problem_at(tuned, x, 0.0, u_before, share, np.zeros(3), (most - u0) / scale)
+    free = problem_at(tuned, x, 0.0, u_before, share, np.zeros(3), math.inf, -1)
+    limited = problem_at(tuned, x, 0.0, u_before, share, np.zeros(3), (most - u0) / scale, -1)
     of_cv155 = np.zeros(free.high.size, bool)
     of_cv155[: tuned.n_inputs : 3] = True
     highest = u0 + scale * limited.high[of_cv155]

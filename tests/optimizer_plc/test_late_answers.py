@@ -1,5 +1,7 @@
 """Answers that come late by the clock: the PLC's budget is not what machine and link really take."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -7,9 +9,10 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import TICK_S
 from coldloop.registers.control_plc import Update, Verdict
-from optimizer_plc.budget import MAX_PERIOD_TICKS
+from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.decisions import PROVEN
 from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.scheme import shortest_sequence
 from optimizer_plc.settings import ProgramSettings
 
 
@@ -96,3 +99,19 @@ def test_while_others_drive_the_guess_is_where_they_have_led_the_inputs(
         np.testing.assert_allclose(program.state.playing.z, program.problem.hold(deviation), atol=1e-12)
         np.testing.assert_allclose(program.state.playing.u_before, deviation, atol=1e-12)
         program.solve()
+
+
+@pytest.mark.parametrize(
+    ("settings", "rows"),
+    [
+        ({}, 18),
+        ({"interrupting_load_step_w": 10.0}, 39),
+        ({"interrupting_load_step_w": 10.0, "sequence_ticks": 240}, 240),
+        ({"adaptive": {"rule": "contraction"}}, 18),
+        ({"adaptive": {"rule": "contraction"}, "budget": {"power": 0.5}}, 20),
+        ({"adaptive": {"delta": 10, "q_first": 1, "q_min": 1}, "budget": {"power": 0.5}}, 20),
+    ],
+)
+def test_a_sequence_lasts_until_the_next_one_can_arrive(settings: dict[str, Any], rows: int) -> None:
+    given = ProgramSettings.model_validate(settings)
+    assert shortest_sequence(given, PlcBudget(given.budget, 0.25)) == rows

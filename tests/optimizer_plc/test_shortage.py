@@ -27,13 +27,19 @@ def c(model: LtiModel) -> Constants:
 
 
 def short(
-    c: Constants, estimated: float, load: float, limit: float = 60.0, error: float = 0.0, colder: float = 0.0
+    c: Constants,
+    estimated: float,
+    load: float,
+    limit: float = 60.0,
+    error: float = 0.0,
+    colder: float = 0.0,
+    before: float = 0.0,
 ) -> float:
     """Return the shortage by an estimated and a measured load (W), the limit of CV155, its error (%) and T5's (K)."""
     x = np.zeros(c.estimator.steps.A.shape[-1])
     x[c.target.constants[CV155]], x[c.target.constants[-1]] = error, -colder
     most_open = (limit - c.estimator.u0[CV155]) / c.input_scale[CV155]
-    return float(shortage(c, x, estimated - c.estimator.w0, load, most_open, 0.0))
+    return float(shortage(c, x, estimated - c.estimator.w0, load, most_open, -1, 0.0, before, 0.0))
 
 
 def held(c: Constants, limit: float) -> float:
@@ -85,3 +91,14 @@ def test_a_turbine_that_is_colder_needs_more_load(c: Constants) -> None:
 def test_a_turbine_that_no_inputs_warm_enough_needs_the_load_with_which_it_is_warmest(c: Constants) -> None:
     warmest = c.estimator.w0 + 17.0 * PER_CENT_W[0] - 75.0 - 16.0 * PER_CENT_W[2] - 25.0
     assert short(c, 400.0, 400.0, colder=20.0) == pytest.approx(400.0 - warmest, abs=0.2)
+
+
+def test_a_shortage_ends_where_twice_the_reserve_is_left(c: Constants) -> None:
+    begins, cold = held(c, 55.0) - RESERVE_W, {"colder": 20.0}
+    assert short(c, begins - 0.5, 400.0, 55.0) == 0.0
+    assert short(c, begins - RESERVE_W + 0.5, 400.0, 55.0, before=3.0) > 0.0
+    assert short(c, begins - RESERVE_W - 0.5, 400.0, 55.0, before=3.0) == 0.0
+    assert short(c, begins - 0.5, 400.0, 55.0, before=-3.0) == 0.0, "the other shortage gives this one nothing"
+    assert short(c, LARGEST - 0.5, LARGEST - 0.5, 60.0, before=-3.0) == 0.0
+    assert short(c, 400.0, 400.0, **cold, before=-3.0) == pytest.approx(short(c, 400.0, 400.0, **cold) - RESERVE_W)
+    assert short(c, 400.0, LEAST + 0.5, colder=-1.0, before=-3.0) == 0.0, "a load that is measured has no noise"

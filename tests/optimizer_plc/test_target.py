@@ -50,7 +50,7 @@ def found(search: TargetSearch, x: Array, w: float, mismatch: float = 0.0, most_
     """Return the target, scaled."""
     real = search.low.dtype.type
     target = np.zeros(3, real)
-    find_target(search, x.astype(real), real(w), real(mismatch), real(most_open), target)
+    find_target(search, x.astype(real), real(w), real(mismatch), real(most_open), -1, real(0.0), target)
     return target
 
 

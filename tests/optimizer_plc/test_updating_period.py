@@ -19,7 +19,7 @@ from optimizer_plc.rules import (
     make_rule,
 )
 from optimizer_plc.rules.assessment import assessed
-from optimizer_plc.rules.interface import MEMORY, OF_PROBLEM, decide_by
+from optimizer_plc.rules.interface import MEMORY, decide_by
 from optimizer_plc.settings import ProgramSettings
 
 RULE = Algorithm1(q_first=9, q_min=2, q_max=19, delta=2)
@@ -34,10 +34,6 @@ class Deciding:
     def next(self, observation: Observation) -> tuple[int, Assessment]:
         a = assess(observation)
         return decide_by(self.rule, self.memory, observation, a), a
-
-    def after_interruption(self) -> int:
-        self.memory[OF_PROBLEM] = 0.0  # as `decisions.follow` does
-        return self.rule.after_interruption()
 
 
 costs = st.floats(1.0, 1e8)
@@ -203,48 +199,64 @@ def test_the_first_period_is_the_one_configured() -> None:
     assert RULE.first == 9
 
 
-def own_rule() -> Deciding:
-    return Deciding(ContractionRule(q_busy=2, q_quiet=9, q_step=13, rate=0.05, memory=0.9, surprise=2.0))
+OWN = ContractionRule(q_rest=2, q_max=5, band=10.0, least=5e-4, change=0.02)
 
 
-def delivered(cost: float, *, surprise: float = 1.0) -> Observation:
-    return contracting(period_s=2.0, delivered=cost, effective=cost * surprise)
+def following(cost: float, q: int, before: float = 100.0) -> Observation:
+    """From `before` to `cost`, with a last iteration that still gains: Gamma asks for a longer period where K < 1."""
+    return contracting(q=q, effective_before=before, hot_start=before, last_but_one=2.0 * cost, delivered=cost,
+                       effective=cost)  # fmt: skip
 
 
-def test_the_own_rule_keeps_long_periods_in_quiet() -> None:
-    rule = own_rule()
-    assert [rule.next(delivered(100.0))[0] for _ in range(5)] == [9] * 5
+def test_own_rule_goes_up_by_one_where_the_cost_contracts_beyond_its_noise() -> None:
+    """The dead band is 10 times 5e-4, the first usual size; -ln 0.99 is 0.01005 and -ln 0.996 is 0.00401."""
+    for cost, q, chosen in ((99.0, 2, 3), (99.0, 5, 5), (99.6, 2, 2), (99.6, 4, 3), (99.0, 9, 5)):
+        rule = Deciding(OWN)
+        assert rule.next(following(cost, q))[0] == chosen, (cost, q)
+    assert Deciding(OWN).next(contracting())[0] == 3, "Gamma asks for a shorter period"
 
 
-def test_the_own_rule_shortens_while_the_delivered_cost_contracts_and_then_forgets() -> None:
-    rule = own_rule()
-    contracting_costs = [1000.0, 500.0, 250.0, 125.0]
-    assert [rule.next(delivered(cost))[0] for cost in contracting_costs] == [9, 2, 2, 2]
-    after = [rule.next(delivered(125.0))[0] for _ in range(30)]
-    assert after == sorted(after)
-    assert after[-1] == 9
+def test_own_rule_follows_the_usual_size_by_steps() -> None:
+    rule = Deciding(OWN)
+    sizes = [rule.memory[0] for cost in (99.0, 99.0, 100.0) if rule.next(following(cost, 2))]
+    assert sizes == pytest.approx([5e-4 * share for share in (1.02, 1.02**2, 1.02**2 * 0.98)])
+    for _ in range(10):
+        rule.next(following(100.0, 2))
+    assert rule.memory[0] == pytest.approx(4.9e-4), "it does not fall below the least"
 
 
-def test_a_surprise_is_answered_by_one_long_solve() -> None:
-    rule = own_rule()
-    assert rule.next(delivered(100.0, surprise=2.1))[0] == 13
-    assert rule.next(delivered(100.0, surprise=1.9))[0] == 9
+@pytest.mark.parametrize("noise", [1e-4, 1e-3, 1e-2, 0.1])
+def test_own_rule_rests_while_the_cost_is_noise(noise: float) -> None:
+    """Whatever Gamma says; once the usual size, which begins at 5e-4, has been learnt."""
+    rule, random, q, before, chosen = Deciding(OWN), np.random.default_rng(3), 5, 100.0, []
+    for _ in range(1200):
+        cost = 100.0 * math.exp(noise * random.uniform(-1.0, 1.0))
+        q, _ = rule.next(following(cost, q, before))
+        chosen.append(q)
+        before = cost
+    assert set(chosen[400:]) == {2}
+
+
+@pytest.mark.parametrize("noise", [1e-3, 1e-2])
+def test_own_rule_leaves_its_rest_after_a_load_step(noise: float) -> None:
+    rule, random, q, before = Deciding(OWN), np.random.default_rng(4), 5, 100.0
+    for _ in range(400):
+        cost = 100.0 * math.exp(noise * random.uniform(-1.0, 1.0))
+        q, _ = rule.next(following(cost, q, before))
+        before = cost
+    chosen = []
+    for cost in (1000.0, 500.0, 250.0, 125.0, 100.0, 100.0, 100.0, 100.0):
+        q, _ = rule.next(following(cost, q, before))
+        chosen.append(q)
+        before = cost
+    assert chosen == [3, 4, 5, 5, 5, 4, 3, 2]
 
 
 @given(observed=st.lists(observations, max_size=20))
-def test_the_own_rule_stays_between_its_numbers(observed: list[Observation]) -> None:
-    rule = own_rule()
-    assert all(2 <= rule.next(one)[0] <= 13 for one in observed)
-    assert rule.after_interruption() == 13
-
-
-def test_after_a_load_step_nothing_contracts_at_first() -> None:
-    """Another load is another problem: a cost that is lower than before says nothing."""
-    rule = own_rule()
-    rule.next(delivered(1000.0))
-    rule.after_interruption()
-    assert rule.next(delivered(10.0))[0] == 9
-    assert rule.next(delivered(5.0))[0] == 2
+def test_own_rule_stays_between_its_numbers(observed: list[Observation]) -> None:
+    rule = Deciding(OWN)
+    assert all(2 <= rule.next(one)[0] <= 5 for one in observed)
+    assert OWN.first == OWN.after_interruption() == OWN.status.q_first == 5
 
 
 @pytest.mark.usefixtures("compiles")

@@ -15,7 +15,9 @@ from plant.refrigerator.equipment import (
     MOST_BLOCKED,
     act,
     further_drop,
+    loaded_compressors,
     resting_equipment,
+    start_compressors,
     throttled,
 )
 from plant.refrigerator.events import EventSchedule, RefrigeratorEvent
@@ -35,14 +37,17 @@ AT_REST = LoadProfile((0,), (FILE.w0,))
 
 
 def make(
-    events: Sequence[tuple[float, str, float]], load: LoadProfile = AT_REST, **turbine: float
+    events: Sequence[tuple[float, str, float]],
+    load: LoadProfile = AT_REST,
+    protection: dict[str, list[float]] | None = None,
+    **turbine: float,
 ) -> RefrigeratorProgram:
     listed = [RefrigeratorEvent.model_validate({"at_s": at, "target": what, "value": to}) for at, what, to in events]
     return RefrigeratorProgram(
         file=FILE,
         u0=FILE.u0,
         load=load,
-        station=StationSettings.model_validate({"turbine": turbine}),
+        station=StationSettings.model_validate({"turbine": turbine, "protection": protection or {}}),
         events=EventSchedule(listed, 300.0, 0.0),
     )
 
@@ -86,6 +91,31 @@ def test_compressors_start_one_after_the_other_idle_first_with_the_cold_box_isol
     run(program, 120.0)
     assert program.station.mode not in {StationMode.ONE_COMPRESSOR, StationMode.STARTING, StationMode.STOPPED}
     assert program.memory.x[NC2_SPEED] > 0.9
+
+
+def test_a_low_suction_pressure_stops_one_compressor_then_the_other_until_they_are_switched_off() -> None:
+    law = station_law(StationSettings(), FILE.reference, REFERENCE_REFRIGERATOR.station).equipment
+    memory = resting_equipment(np.array(FILE.u0))
+    for lp, state in ((0.81, (1.0, 1.0)), (0.79, (1.0, -1.0)), (0.74, (-1.0, -1.0)), (1.05, (-1.0, -1.0))):
+        d = given()
+        start_compressors(law, memory, d, lp, 0.9)
+        assert tuple(memory[:2]) == state
+        assert loaded_compressors(memory, given()) == state.count(1.0)
+        assert list(d[[GIVEN_NAMES.index("NC1"), GIVEN_NAMES.index("NC2")]]) == [max(one, 0.0) for one in state]
+    start_compressors(law, memory, given(NC1=0.0), 1.05, 0.9)
+    start_compressors(law, memory, given(), 1.05, 0.9)
+    assert 0.0 < memory[0] < 1.0
+    assert memory[1] == -1.0
+
+
+def test_a_suction_trip_is_alarmed_and_ends_when_it_is_switched_off() -> None:
+    protection = {"trip_lp_bar": [0.0, 0.94], "lp_bar": [0.96, 0.95]}
+    program = make([(5, "turbine", 0), (10, "turbine", 1), (60, "nc2", 0), (61, "nc2", 1)], protection=protection)
+    run(program, 20)
+    tripped = StationAlarm.SUCTION_TRIP | StationAlarm.NC2_TRIPPED
+    assert program.station.alarms & (tripped | StationAlarm.NC1_TRIPPED) == tripped
+    run(program, 120)
+    assert not program.station.alarms & tripped
 
 
 def test_a_turbine_that_trips_stops_at_once_and_runs_up_in_a_minute() -> None:

@@ -199,9 +199,9 @@ def test_closing_the_turbine_s_valve_takes_work_from_the_turbine_smoothly() -> N
 # -- cases that were seen to make or swallow helium or heat ------------------------------------------------------------
 
 
-def program(load: LoadProfile, *events: tuple[float, str, float]) -> RefrigeratorProgram:
+def program(load: LoadProfile, *events: tuple[float, str, float], control: str = "lq") -> RefrigeratorProgram:
     listed = [{"at_s": at, "target": target, "value": value} for at, target, value in events]
-    section = {"kind": "refrigerator", "refrigerator": {"events": listed}}
+    section = {"kind": "refrigerator", "refrigerator": {"events": listed}, "station": {"control": control}}
     plant = plant_maker(HEADER, PlantSettings.model_validate({"plant": section}).plant)(load, 1)
     assert isinstance(plant, RefrigeratorProgram)
     return plant
@@ -279,6 +279,23 @@ def test_after_a_total_trip_the_compressors_take_over_again() -> None:
     assert not plant.station.alarms & StationAlarm.TOTAL_TRIP
     assert signal(plant, "P11") == pytest.approx(1.05, abs=0.02)
     assert signal(plant, "P12") > 12.0
+
+
+@pytest.mark.parametrize("control", ["lq", "pi"])
+def test_a_turbine_that_trips_costs_no_helium(control: str) -> None:
+    """Its 57 g/s go round by the buffer; LQ blew 8.6 kg off in twelve minutes."""
+    plant = program(LoadProfile((0,), (HEADER.w0,)), (10.0, "turbine", 0.0), control=control)
+    before, buffer, mode = total(plant), signal(plant, "P13"), 0
+    for _ in range(4 * 730):
+        plant.advance()
+        assert plant.station is not None
+        mode = max(mode, plant.station.mode)
+    assert mode == StationMode.OVERRIDE
+    assert signal(plant, "lost") == 0.0
+    assert signal(plant, "P12") < 17.6
+    assert signal(plant, "P11") > 0.89
+    assert signal(plant, "P13") > buffer - 0.5
+    assert total(plant) == pytest.approx(before, rel=1e-9)
 
 
 TRIP = ((10.0, "nc1", 0.0), (10.0, "nc2", 0.0), (130.0, "nc1", 1.0), (160.0, "nc2", 1.0))

@@ -9,14 +9,12 @@ from coldloop.kernels.compiled import kernel
 from coldloop.process.model_range import model_range
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.process.signals import OUTPUT_NAMES
-from plant.cold_box.balance import energy_gained, energy_rates
 from plant.cold_box.physics import REFERENCE, cold_box_of, derivative
 from plant.components.phase_separator import content
 from plant.helium.properties import helium_of, load_helium, supply_enthalpy_and_density
 from plant.integrator import advance, plain_tuples
 from plant.numeric import RealArray
 from plant.own_model import own_header
-from plant.refrigerator.balance import stored_energy
 from plant.refrigerator.equipment import ACTING, DEVIATING, EquipmentLaw, resting_equipment
 from plant.refrigerator.file import SHIPPED, read_refrigerator_file
 from plant.refrigerator.high_pressure import FIRST
@@ -32,7 +30,9 @@ from plant.refrigerator.physics import (
 )
 from plant.refrigerator.station_control import station_law
 from plant.refrigerator.station_settings import StationSettings
+from tests.harness.box_energy import energy_gained, energy_rates
 from tests.harness.energy_account import AHEAD, CROSSED, SIZE, TO_BATH, WEIGHTS, WORST, accounted_tick
+from tests.harness.refrigerator_energy import stored_energy
 
 pytestmark = pytest.mark.usefixtures("compiles")
 

@@ -17,7 +17,7 @@ from plant.refrigerator.file import SHIPPED, read_refrigerator_file
 from plant.refrigerator.physics import REFERENCE_REFRIGERATOR
 from plant.refrigerator.program import RefrigeratorProgram
 from plant.refrigerator.station_control import StationControl
-from plant.refrigerator.station_law import SHUT, StationMeasurement
+from plant.refrigerator.station_law import SHUT, StationMeasurement, beyond, opened_by, shut_by
 from plant.refrigerator.station_settings import StationSettings
 from plant.settings import PlantSection
 
@@ -26,7 +26,7 @@ HP, LP, LEVEL, LOST = (STATION_SIGNAL_NAMES.index(name) for name in ("P12", "P11
 BOTH = pytest.mark.parametrize("control", ["lq", "pi"])
 AT_REST = StationMeasurement(
     16.0, 1.05, 6.0, FILE.v0[0], 0.0, 0.0, 60.0, 0.0, 1.23, nc1=True, nc2=True,
-    loaded=2, turbine=True, overspeed=False, deviating=False,
+    loaded=2, turbine=True, overspeed=False, deviating=False, suction=False,
 )  # fmt: skip
 
 
@@ -204,6 +204,53 @@ def test_charging_stops_when_the_low_pressure_is_too_high() -> None:
     for _ in range(40):
         commands = controller.step(AT_REST._replace(hp=9.0, lp=1.05 + 0.081))
     assert commands.cv953 == 0.0
+
+
+@pytest.mark.parametrize(
+    ("pressure", "limit", "full", "share"),
+    [(17.0, 17.0, 17.6, 0.0), (17.3, 17.0, 17.6, 0.5), (18.0, 17.0, 17.6, 1.0), (0.94, 0.99, 0.89, 0.5)],
+)
+def test_a_limit_acts_in_proportion(pressure: float, limit: float, full: float, share: float) -> None:
+    assert beyond(pressure, limit, full) == pytest.approx(share)
+
+
+@pytest.mark.parametrize(
+    ("asked", "high", "low", "moved"),
+    [
+        ((5.0, 40.0), 0.25, 0.0, (50.0, 40.0)),
+        ((5.0, 40.0), 0.9, 0.0, (100.0, 20.0)),
+        ((60.0, 0.0), 0.0, 0.25, (60.0, 50.0)),
+        ((60.0, 0.0), 0.0, 1.0, (0.0, 100.0)),
+        ((0.0, 70.0), 0.25, 0.25, (50.0, 70.0)),
+        ((5.0, 40.0), 1.0, 1.0, (100.0, 100.0)),
+    ],
+)
+def test_a_pressure_beyond_its_limit_first_opens_a_valve_then_shuts_the_other(
+    asked: tuple[float, float], high: float, low: float, moved: tuple[float, float]
+) -> None:
+    assert opened_by(shut_by((30.0, *asked), high, low), high, low) == pytest.approx((30.0, *moved))
+
+
+@BOTH
+@pytest.mark.usefixtures("compiles")
+def test_both_limits_at_once_make_the_buffer_a_bypass(control: str) -> None:
+    controller = StationControl(
+        StationSettings.model_validate({"control": control}), FILE.reference, REFERENCE_REFRIGERATOR.station
+    )
+    commands = controller.step(AT_REST._replace(hp=17.7, lp=0.85))
+    assert (commands.cv952, commands.cv953, controller.mode) == (100.0, 100.0, StationMode.OVERRIDE)
+    controller.step(AT_REST)
+    assert controller.mode != StationMode.OVERRIDE
+
+
+def test_limits_that_cannot_be_are_refused() -> None:
+    for bad, says in (
+        ({"protection": {"hp_bar": [17.0, 17.0]}}, "then a higher one"),
+        ({"protection": {"lp_bar": [0.99, 0.8]}}, "above both of trip_lp_bar"),
+        ({"hp_bar": 17.1}, "hp_bar below 17 bar"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            StationSettings.model_validate(bad)
 
 
 def test_a_program_that_is_resumed_goes_on_to_the_bit() -> None:

@@ -23,7 +23,7 @@ from optimizer_plc.decisions import Latched, begin_again
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.qp.prediction import state_weights
 from optimizer_plc.qp.target import bounds_at, find_target, least_warm_load, loads_held
-from optimizer_plc.scheme import most_open, problem_at, shortage
+from optimizer_plc.scheme import FEED_TEMPERATURE, TEMPERATURE, most_open, problem_at, shortage
 from optimizer_plc.settings import ProgramSettings
 
 Array = NDArray[np.float64]
@@ -48,13 +48,13 @@ class Laws:
         x = np.array([*given["states"], *(given["constants"][SIGNALS[place]] for place in self.program.disturbances)])
         u, w = np.array([given["u"][name] for name in INPUT_NAMES]), given["w"]
         y = MODEL.y0 + np.array([given["y"].get(name, 0.0) for name in OUTPUT_NAMES])
-        limit = most_open(c, u, y)
+        limit = most_open(c, u, y[FEED_TEMPERATURE] - y[TEMPERATURE])
         target = np.zeros(len(PROCESS.inputs))
-        find_target(c.target, x, w, given["mismatch"], limit, target)
-        low, high = bounds_at(c.target, x, limit)
+        find_target(c.target, x, w, given["mismatch"], limit, -1, 0.0, target)
+        low, high = bounds_at(c.target, x, limit, -1, 0.0)
         loads = [*loads_held(c.target, low, high), least_warm_load(c.target, low, high)]
-        loads += [shortage(c, x, w, MODEL.w0 + part * w, limit, 0.0) for part in (0.0, 1.0, 3.0)]
-        problem = problem_at(c, x, w, u, 1.0, target, limit)
+        loads += [shortage(c, x, w, MODEL.w0 + part * w, limit, -1, 0.0, 0.0, 0.0) for part in (0.0, 1.0, 3.0)]
+        problem = problem_at(c, x, w, u, 1.0, target, limit, -1)
         return {
             "by input": [*target, *problem.high[: c.n_inputs]], "loads": loads, "limit": [limit],
             "rest": self.rest(MODEL.w0 + w, u, y).tolist(),

@@ -85,9 +85,10 @@ class Service:
 
     def write(self, name: str, *values: float) -> None:
         """Write a block that ends with a CRC."""
-        _answered(self.client.write_registers(self.blocks[name].address, self._sealed(name, *values)))
+        _answered(self.client.write_registers(self.blocks[name].address, self.sealed(name, *values)))
 
-    def _sealed(self, name: str, *values: float) -> list[int]:
+    def sealed(self, name: str, *values: float) -> list[int]:
+        """Return the words of a block with its CRC."""
         raw = struct.pack(f">{self.blocks[name].letters[:-1]}", *values)
         return _words(raw + struct.pack(">I", zlib.crc32(raw) or 1))
 
@@ -160,7 +161,7 @@ class Optimiser(Service):
         asked, update = self.blocks["await update"], self.blocks["update"]
         words = self.client.readwrite_registers(
             read_address=update.address, read_count=update.row_words,
-            write_address=asked.address, values=self._sealed("await update", session, number),
+            write_address=asked.address, values=self.sealed("await update", session, number),
         )  # fmt: skip
         return self._values(update, _answered(words))
 
@@ -218,6 +219,46 @@ class Optimiser(Service):
         body = struct.pack(">BBHHB", 1, 16, self.blocks["sequence header"].address, len(words), len(values)) + values
         frame = struct.pack(">HHH", 99, 0, len(body)) + body
         self.client.send(frame[: len(frame) // 2])
+
+
+class SideBySide(Optimiser):
+    """The same as a master that has a connection for each block, and neither FC23 nor a request of two blocks."""
+
+    def __init__(self, *arguments: Any) -> None:  # noqa: ANN401 of `Optimiser`
+        super().__init__(*arguments)
+        self._port, self.clients = arguments[1], dict[str, ModbusTcpClient]()
+
+    def __exit__(self, *_: object) -> None:
+        for client in (self.client, *self.clients.values()):
+            client.close()  # type: ignore[no-untyped-call]
+
+    def over(self, name: str) -> ModbusTcpClient:
+        """Return the connection for a block; each introduces itself when it is made."""
+        if name not in self.clients:
+            self.clients[name] = made = ModbusTcpClient(HOST, port=self._port, timeout=10.0, retries=0)
+            assert made.connect()  # type: ignore[no-untyped-call]
+            beat = self.sealed("heartbeat", 0, self._model, HOLDER)
+            _answered(made.write_registers(self.blocks["heartbeat"].address, beat))
+        return self.clients[name]
+
+    def write(self, name: str, *values: float) -> None:
+        _answered(self.over(name).write_registers(self.blocks[name].address, self.sealed(name, *values)))
+
+    def _awaited(self, session: int, number: int) -> Values:
+        self.write("await update", session, number)
+        return self.read("update")
+
+    def send_rows(self, row: Sequence[float]) -> bytes:
+        own, self.client = self.client, self.over("sequence")
+        try:
+            return super().send_rows(row)
+        finally:
+            self.client = own
+
+    def _commit(self, update: Values, rows: bytes) -> int:
+        block = self.blocks["sequence header"]
+        _answered(self.over("sequence header").write_registers(block.address, self.header(update, rows)))
+        return int(self.read("acknowledgement")["verdict"])
 
 
 class Plant(Service):

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 from coldloop.registers.control_plc import Mode
 from tests.harness.processes import Process, Processes
@@ -18,6 +18,9 @@ PERIOD: Final = 20
 """The updating period, ticks."""
 ROUNDING: Final = 1e-5
 """Of single precision, share of the range."""
+
+
+Kind = TypeVar("Kind", bound=Optimiser)
 
 
 class Case(NamedTuple):
@@ -54,8 +57,8 @@ class Site(NamedTuple):
     control: Service
     rig: Process
 
-    def optimiser(self) -> Optimiser:
-        return Optimiser(self.control_blocks, self.port, self.case.loops, self.case.tick_s, PERIOD)
+    def optimiser(self, kind: type[Kind] = Optimiser) -> Kind:  # type: ignore[assignment] # the default is one
+        return kind(self.control_blocks, self.port, self.case.loops, self.case.tick_s, PERIOD)
 
     def drives(self, optimiser: Optimiser, sequences: int) -> None:
         """Answer updates until so many sequences have been accepted and one is being played; on time is expected."""

@@ -265,10 +265,10 @@ def test_what_cannot_be_gets_one_line(case: str, tmp_path: Path) -> None:
     [
         ("time_s,rain,draw\n5,0,0\n", "begins at 0"),
         ("time_s,rain,draw\n0,0,0\n60,1,0\n60,2,0\n", "time_s = 60: it rises by at least a tick"),
-        ("time_s;rain;draw\n0;0;0\n", "its first line is 'time_s;rain;draw', and should name time_s, rain with commas"),
+        ("time_s;rayn;draw\n0;0;0\n", "no column rain; its header is 'time_s,rayn,draw', and should name time_s,rain"),
         ("time_s,rain,draw,rain\n0,0,0,1\n", "two columns are named rain"),
         ("time_s,rain,draw\n0,4,0\n", "rain = 4 is outside its span"),
-        ("time_s,rain,draw\n0,wet,0\n", "'wet' is no number"),
+        ("time_s,rain,draw\n0,wet,0\n", "'wet' is no finite number"),
         ("time_s,rain,draw\n", "no line of numbers"),
     ],
 )

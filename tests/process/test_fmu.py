@@ -109,7 +109,7 @@ def foreign(folder: Path) -> None:
 
 
 @pytest.fixture(autouse=True)
-def unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def unpacked_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let FMUs of this test be unpacked where those of no other are."""
     folder = tmp_path / "unpacked"
     folder.mkdir()
@@ -207,6 +207,46 @@ class Lag(Fmi3Slave):
 """
 
 
+@pytest.mark.usefixtures("programs")
+def test_elements_of_arrays_and_whole_numbers_are_inputs(tmp_path: Path) -> None:
+    """dx/dt = (u[2] + n - x) / 20 where the pump is on: a gain of 1 of both."""
+    text = LAG.replace("Lag", "Pumped").replace("import", "import Boolean, Dimension, Int32,", 1)
+    text = text.replace('Float64("u", causality=Fmi3Causality.input, variability=continuous, start=0.0)',
+                        'Float64("u", causality=Fmi3Causality.input, variability=continuous, start=[0.0, 0.0], '
+                        'dimensions=[Dimension(start="2")], getter=lambda: self.u, '
+                        'setter=lambda given: self.u.__setitem__(slice(2), given))')  # fmt: skip
+    discrete = "causality=Fmi3Causality.input, variability=Fmi3Variability.discrete"
+    more = f'        self.register_variable(Int32("n", {discrete}, start=0))\n'
+    more += f'        self.register_variable(Boolean("on", {discrete}, start=False))\n'
+    text = text.replace(
+        "self.u, self.y = 0.0, 0.0, 0.0", "self.u, self.n, self.on, self.y = 0.0, [0.0, 0.0], 0, False, 0.0"
+    )
+    text = text.replace("(self.u - self.y)", "(self.on * (self.u[1] + self.n) - self.y)")
+    text = text.replace("\n    def do_step", f"{more}\n    def do_step")
+    (tmp_path / "pumped.py").write_text(text, encoding="utf-8")
+    command = [sys.executable, "-m", "pythonfmu3", "build", "-f", "pumped.py"]
+    subprocess.run(command, check=True, cwd=tmp_path, capture_output=True)
+    toml = TANKS.replace("two_tanks.fmu", "Pumped.fmu").split("[load]")[0].replace("[5.0, 8.0]", "[3.5, 4.5]")
+    toml = toml.replace('"u"', '"u[2]"').replace("[[outputs]]", NUMBER_OF_PUMPS + "[[outputs]]")
+    found = made(tmp_path, toml.replace("[[inputs", "start = { on = 1.0 }\n[[inputs", 1))
+    model = found.model
+    assert (model.C @ np.linalg.solve(-model.A, model.B))[0] == pytest.approx([1.0, 1.0], rel=1e-3)
+    assert model.y0 == pytest.approx([4.0], rel=1e-4)
+    assert "n is of type Int32: what it is given is rounded" in described(found)
+    with pytest.raises(ColdloopError, match=r"u\[3\] is no single number: elements are u\[1\] to u\[2\]"):
+        made(tmp_path, toml.replace("u[2]", "u[3]"))
+
+
+NUMBER_OF_PUMPS: Final = """
+[[inputs]]
+name = "n"
+at = 3.0
+low = 0.0
+high = 6.0
+rate = 1.0
+"""
+
+
 # -- the simulated plant ----------------------------------------------------------------------------------------------
 
 
@@ -275,6 +315,80 @@ def test_what_an_fmu_meets_may_be_forecast(
     assert known["J_BF"] < 0.5 * unknown["J_BF"]
 
 
+# -- what breaks the standard, or fails -------------------------------------------------------------------------------
+
+
+def test_what_breaks_the_standard_is_a_warning(compiled: Path, tmp_path: Path) -> None:
+    """A unit that is not declared, and a parameter without start: both are refused by FMPy's validation."""
+    text = (HERE / "two_tanks.xml").read_text(encoding="utf-8").replace('<Unit name="m3/s"/>', "")
+    text = text.replace('causality="input" variability="continuous"><Real start="0"/>',
+                        'causality="parameter" variability="tunable"><Real/>')  # fmt: skip
+    tanks(tmp_path, compiled, text)
+    found = made(tmp_path, TANKS)
+    warnings = [line for line in described(found).splitlines() if line.startswith("warning    FMU: ")]
+    assert any("m3/s" in line for line in warnings)
+    assert any('"w"' in line for line in warnings)
+    assert found.model.input_units == ("m3/s",)
+
+
+def test_derivatives_that_fail_are_replaced_by_a_step_test(
+    compiled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("not\nimplemented")
+
+    monkeypatch.setattr(fmpy.fmi2.FMU2Slave, "getDirectionalDerivative", fail)
+    tanks(tmp_path, compiled)
+    found = made(tmp_path, TANKS)
+    told = "directional derivatives fail: RuntimeError: not implemented; a step test of it makes the model instead"
+    assert told in described(found)
+    model = found.model
+    assert (model.C @ np.linalg.solve(-model.A, model.B))[0] == pytest.approx([1.25], rel=1e-3)
+
+
+def test_an_fmu_that_allows_one_instance_has_a_new_one_for_each_session(compiled: Path, tmp_path: Path) -> None:
+    tanks(tmp_path, compiled, changed('canBeInstantiatedOnlyOncePerProcess="true"'))
+    assert np.array_equal(made(tmp_path, TANKS).model.A, [[-0.1, 0.0], [0.05, -0.2]])
+    fmu = Fmu(tmp_path / "two_tanks.fmu")
+    wiring = Wiring(["u"], ["y"], "w", [], [], {"tank.x[1]": 2.0}, 1)
+    first = FmuSimulation(fmu, wiring, 0.25)
+    second = FmuSimulation(fmu, wiring, 0.25)
+    second.tick()
+    assert second.outputs()[0] == pytest.approx(0.025, rel=0.05)
+    with pytest.raises(ColdloopError, match="allows one instance at a time"):
+        first.tick()
+
+
+@pytest.mark.parametrize("place", ["binaries", "modelDescription"])
+def test_a_damaged_member_gets_one_line(place: str, compiled: Path, tmp_path: Path) -> None:
+    file = tanks(tmp_path, compiled)
+    with zipfile.ZipFile(file) as packed:
+        first = next(one.header_offset for one in packed.infolist() if one.filename.startswith(place))
+    content = bytearray(file.read_bytes())
+    content[first + 200] ^= 0xFF
+    file.write_bytes(content)
+    with pytest.raises(ColdloopError, match="not a readable FMU: BadZipFile: Bad CRC-32"):
+        made(tmp_path, TANKS)
+    assert not left_behind()
+
+
+def test_no_archive_is_unpacked_without_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its directory; where the directory lies, no more comes out, and the checksum is wrong."""
+    monkeypatch.setattr("plant.own.fmu_file.MOST_UNPACKED", 2 << 20)
+    file = tmp_path / "two_tanks.fmu"
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("zeros", bytes(3 << 20))
+    with pytest.raises(ColdloopError, match="unpacks to more than 2 MiB"):
+        Fmu(file)
+    assert max(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file()) < 1 << 20
+    file.write_bytes(file.read_bytes().replace((3 << 20).to_bytes(4, "little"), (1 << 20).to_bytes(4, "little")))
+    with pytest.raises(ColdloopError, match="not a readable FMU: BadZipFile: Bad CRC-32"):
+        Fmu(file)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
+    with pytest.raises(ColdloopError, match=r"cannot be unpacked into .*nowhere: No such file.*; free space there"):
+        Fmu(file)
+
+
 # -- what is refused --------------------------------------------------------------------------------------------------
 
 BAD: Final = {
@@ -284,7 +398,6 @@ BAD: Final = {
     "no rest": (TANKS.replace("[[inputs", "rest_s = 20.0\n[[inputs") + "[prediction]\ndecision_instants = [1, 2, 4]\n"
                 "constraint_instants = [1, 2]\n", "", "does not come to rest"),
     "another version": (TANKS, 'fmiVersion="1.0"', "FMU"),
-    "one instance only": (TANKS, 'canBeInstantiatedOnlyOncePerProcess="true"', "one instance"),
     "a fixed step": (TANKS, 'canHandleVariableCommunicationStepSize="false"', "does steps of 0.1 s only"),
     "no co-simulation": (TANKS, "ModelExchange", "has no co-simulation"),
     "variable without an FMU": (TANKS.replace('fmu = "two_tanks.fmu"', 'matrices = "m.npz"'), "", "is for an FMU"),
@@ -348,3 +461,4 @@ def test_an_fmu_that_does_not_start_says_why_in_its_own_words(tmp_path: Path, pr
     assert len(complaints.splitlines()) == 1
     assert "cannot be started" in complaints
     assert "No module named" in complaints
+    assert not list(Path(tempfile.gettempdir()).iterdir()), "nothing is left of it, unpacked or otherwise"

@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Final
 
 import pytest
+from pymodbus.client import ModbusTcpClient
 
 from coldloop.registers.control_plc import Mode
 from tests.harness.processes import Processes
-from tests.process.outside_client import Optimiser
+from tests.process.outside_client import HOLDER, HOST, Optimiser, SideBySide
 from tests.process.site import COLUMN, TANK, Case, up
 
 WITHOUT: Final = ("--without", "optimizer")
@@ -66,4 +67,29 @@ def test_one_that_breaks_off_in_a_sequence_leaves_the_ladder_to_act_without_a_st
         with site.optimiser() as second:
             second.introduce()
             site.drives(second, 2)
+        site.assert_no_step()
+
+
+@pytest.mark.usefixtures("realtime")
+def test_a_connection_per_block_drives_a_process_and_a_copied_number_does_not(
+    processes: Processes, tmp_path: Path
+) -> None:
+    with up(COLUMN, processes, tmp_path, *WITHOUT) as site, ExitStack() as held:
+        optimiser = held.enter_context(site.optimiser(SideBySide))
+        optimiser.introduce()
+        site.drives(optimiser, 2)
+        assert len(optimiser.clients) == 5
+        stranger = ModbusTcpClient(HOST, port=site.port, source_address=("127.0.0.2", 0), retries=0)
+        assert stranger.connect()  # type: ignore[no-untyped-call]
+        words = optimiser.sealed("heartbeat", 0, 0, HOLDER)
+        refused = stranger.write_registers(site.control_blocks["heartbeat"].address, words)
+        stranger.close()  # type: ignore[no-untyped-call]
+        assert (refused.exception_code, site.control.read("optimiser lease")["holder"]) == (6, HOLDER)
+        assert site.control.read("statistics")["second_writer"] == 1
+        optimiser.clients.pop("plan").close()  # type: ignore[no-untyped-call]
+        site.drives(optimiser, 2)
+        optimiser.plan(optimiser.next_update())
+        optimiser.send_rows([loop.high for loop in COLUMN.loops])
+        held.close()
+        assert site.modes_until(Mode.CLASSICAL) == [Mode.MPC, Mode.REST, Mode.HOLD, Mode.CLASSICAL]
         site.assert_no_step()

@@ -4,10 +4,12 @@ import json
 from dataclasses import replace
 from math import sqrt
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from coldloop.errors import ColdloopError
 from coldloop.process.cold_box import COLD_BOX
@@ -16,6 +18,7 @@ from rig.process_file.declaration import LagSection
 from rig.process_file.judgement import described
 from rig.process_file.linearised import lag_model
 from rig.process_file.making import Made, made_from
+from rig.process_file.matrices import realised
 from tests.harness.installed import installed
 from tests.harness.unstable_plants import pendulum, stirred_tank
 
@@ -258,7 +261,7 @@ def test_more_signals_than_a_request_carries_are_refused(tmp_path: Path) -> None
         ("m.json", '{"A":' + "[" * 5000 + "]" * 5000 + "}", "nested too deeply"),
         ("m.json", '{"A": [["x"]], "B": [[1.0]], "C": [[1.0]]}', "not a readable NPZ or JSON file"),
         ("m.json", '{"A": [[-1.0]], "B": [[1.0, 2.0]], "C": [[1.0]]}', r"B has shape (1, 2), and not (1, 1)"),
-        ("m.json", '{"A": [[NaN]], "B": [[1.0]], "C": [[1.0]]}', "A of the linear model is not finite"),
+        ("m.json", '{"A": [[NaN]], "B": [[1.0]], "C": [[1.0]]}', "A holds a number that is not finite"),
         ("m.json", "7", "not a readable NPZ or JSON file"),
         ("m.npz", "PK nothing", "not a readable NPZ or JSON file"),
         ("m.py:plant", "plant = 3", "no state space with A, B, C and D"),
@@ -276,6 +279,73 @@ def test_matrices_that_are_none_get_one_line(name: str, content: str, said: str,
     assert said in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("content", "A", "C"),
+    [
+        ('{"A": -0.02, "B": 0.01, "C": 1, "F": 0.5, "D": 0, "G": [0]}', [[-0.02]], [[1.0]]),
+        ('{"A": [[-0.02, 0], [1, -1]], "B": [0.01, 0], "C": [0, 1]}', [[-0.02, 0.0], [1.0, -1.0]], [[0.0, 1.0]]),
+    ],
+)
+def test_a_number_is_a_matrix_of_one_and_a_list_a_row_or_a_column(
+    content: str, A: list[list[float]], C: list[list[float]], tmp_path: Path
+) -> None:
+    (tmp_path / "m.json").write_text(content, encoding="utf-8")
+    model = made(tmp_path, BY_MATRICES.replace("GIVEN", "m.json")).model
+    assert (model.A.tolist(), model.C.tolist()) == (A, C)
+    assert model.B.tolist() == [[0.01], [0.0]][: len(A)]
+
+
+def test_transfer_functions_of_other_tools_are_realised() -> None:
+    """As SciPy has them, and as python-control has them, at a complex frequency."""
+    at = 0.3 + 0.7j
+    whole = SimpleNamespace(
+        num=[[[1.0], [2.0, 1.0], [3.0]], [[0.0], [3.0, 0.0, 1.0], [1.0]]],
+        den=[[[1.0, 1.0], [2.0, 2.0], [1.0, 4.0]], [[1.0], [1.0, 3.0, 2.0], [0.0, 1.0, 0.5]]],
+    )
+    for given in (whole, signal.TransferFunction([[1.0, 0.0], [0.0, 3.0]], [2.0, 2.0, 1.0])):
+        M = realised(given)
+        value = M["C"] @ np.linalg.solve(at * np.eye(len(M["A"])) - M["A"], M["B"]) + M["D"]
+        for i, row in enumerate(value):
+            for j, found in enumerate(row):
+                num, den = (given.num[i], given.den) if given is not whole else (given.num[i][j], given.den[i][j])
+                assert found == pytest.approx(np.polyval(num, at) / np.polyval(den, at), rel=1e-12)
+    assert len(realised(whole)["A"]) == 1 + 1 + 2 + 1  # the first two inputs of the first output share a state
+    with pytest.raises(ValueError, match="output 1 by input 1 is not proper"):
+        realised(SimpleNamespace(num=[[[1.0, 0.0, 0.0]]], den=[[[1.0, 1.0]]]))
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("from scipy.signal import TransferFunction\nplant = TransferFunction([0.5], [50.0, 1.0])", ""),
+        ("from scipy.signal import ZerosPolesGain\nplant = ZerosPolesGain([], [-0.02], 0.01)", ""),
+        ("from scipy.signal import TransferFunction\nplant = TransferFunction([1, 0, 0], [1.0, 1.0])", "is not proper"),
+        ("from scipy.signal import TransferFunction\nplant = TransferFunction([2.0], [4.0])", "it has no states"),
+    ],
+)
+def test_objects_with_transfer_functions_are_plants(content: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "m.py").write_text(content, encoding="utf-8")
+    text = BY_MATRICES.replace("GIVEN", "m.py:plant")
+    if said:
+        with pytest.raises(ColdloopError, match=said):
+            made(tmp_path, text)
+        return
+    model = made(tmp_path, text).model
+    assert model.A[0, 0] == pytest.approx(-0.02)
+    assert (model.C @ model.B)[0, 0] == pytest.approx(0.01)
+
+
+def test_an_inverse_response_is_said_with_its_numbers(tmp_path: Path) -> None:
+    """Of (1 - 20 s) / (10 s + 1)^2: 1 - (1 + 3 T) exp(-T) with T = t / 10 s is -0.54 at 6.7 s and 0 at 19 s."""
+    (tmp_path / "m.json").write_text('{"A": [[-0.1, 0], [0.1, -0.1]], "B": [0.3, -0.2], "C": [0, 1]}', encoding="utf-8")
+    text = described(made(tmp_path, BY_MATRICES.replace("GIVEN", "m.json")))
+    assert "power temperature first moves the other way, by 0.54 of its change in the end, until 20 s" in text
+    (tmp_path / "m.json").write_text('{"A": [[-0.1, 0], [0.1, -0.1]], "B": [0.1, 0], "C": [0, 1]}', encoding="utf-8")
+    assert "inverse response" not in described(made(tmp_path, BY_MATRICES.replace("GIVEN", "m.json")))
+    assert "inverse response" not in described(made_from(EXAMPLES / "wood_berry.toml"))
+
+
+@pytest.mark.usefixtures("programs")
 def test_the_command_prints_it_and_writes_nothing_that_is_half_made(tmp_path: Path, coldloop: "Coldloop") -> None:
     made(tmp_path)
     done = coldloop("process", tmp_path / "process.toml", "--out", tmp_path / "model.json")
@@ -287,6 +357,26 @@ def test_the_command_prints_it_and_writes_nothing_that_is_half_made(tmp_path: Pa
     assert failed.code != 0
     assert len(failed.complaints) == 1
     assert not (tmp_path / "other.json").exists()
+
+
+@pytest.mark.usefixtures("programs")
+@pytest.mark.parametrize(
+    ("begins", "said"),
+    [
+        ("while True: pass", "has not come to an end within 1 s"),
+        ("import os; os.kill(os.getpid(), 9)", "has ended the process that it ran in (SIGKILL)"),
+        ("import sys; sys.exit(0)", "Heater cannot be made: SystemExit: 0"),
+    ],
+)
+def test_a_plant_that_does_not_return_gets_one_line(
+    begins: str, said: str, tmp_path: Path, coldloop: "Coldloop"
+) -> None:
+    (tmp_path / "process.toml").write_text(ONE_BY_ONE, encoding="utf-8")
+    (tmp_path / "heater.py").write_text(f"{begins}\n{HEATER}", encoding="utf-8")
+    failed = coldloop("process", tmp_path / "process.toml", "--limit", "1")
+    assert failed.code != 0
+    assert len(failed.complaints) == 1
+    assert said in failed.complaints[0]
 
 
 def test_an_integrator_and_a_load_leave_out_the_constants_that_nothing_tells_from_them(tmp_path: Path) -> None:

@@ -45,6 +45,8 @@ def test_the_column_has_other_time_and_dead_times_that_its_model_approximates(
     assert here["trace_sha256"] == there["trace_sha256"]
     assert here["ticks"] == 2 * 3600 / 3
     assert 6.0 <= here["tau_u_mean"] <= 60.0
+    of_12_s = run(processes, COLUMN, tmp_path / "fixed", "--in-process", *options, "--updating-period", "12")
+    assert of_12_s["tau_u_mean"] == 12.0
 
 
 @pytest.mark.parametrize(
@@ -86,26 +88,32 @@ def test_a_model_of_another_process_is_refused_in_one_line(processes: Processes,
 
 
 def test_a_run_is_repeated_with_its_process_as_it_was_then(processes: Processes, tmp_path: Path) -> None:
-    """A process file that says something else since, or none, is not taken for it; nor when the run is drawn."""
-    folder = tmp_path / "run"
-    run(processes, TANK, folder, "--in-process", "--load", "a", "--duration", "60s")
-    for name in ("quadruple_tank.py", "quadruple_tank.svg"):
+    """A process file that says something else since, or none, is not taken for it; reading takes the folder's."""
+    folder, mark = tmp_path / "run", tmp_path / "executed"
+    changed, same, source = (tmp_path / name for name in ("tank.toml", "quadruple_tank.toml", "quadruple_tank.py"))
+    for name in (same.name, source.name, "quadruple_tank.svg"):
         (tmp_path / name).write_text((TANK.parent / name).read_text(encoding="utf-8"), encoding="utf-8")
-    changed, remedy = tmp_path / "tank.toml", f"use --process {folder / 'inputs' / 'model.json'}"
-    changed.write_text(TANK.read_text(encoding="utf-8").replace("[12.0, 12.6]", "[11.0, 12.6]"), encoding="utf-8")
-    for words in (("--process", changed, "rerun"), ("rerun",), ("plot",)):
+    source.write_text(f"{source.read_text(encoding='utf-8')}\nopen({str(mark)!r}, 'w').close()\n", encoding="utf-8")
+    changed.write_text(same.read_text(encoding="utf-8").replace("[12.0, 12.6]", "[11.0, 12.6]"), encoding="utf-8")
+    run(processes, same, folder, "--in-process", "--load", "a", "--duration", "60s")
+    mark.unlink()
+    for words in (("plot", folder), ("compare", folder, folder, "--out", tmp_path / "compare.png"), ("report", folder)):
+        assert started(processes, *words)[0] == 0
+    for words in (("rerun",), ("--process", changed, "rerun")):
+        assert not mark.exists()
         code, _, complaints = started(processes, *words, folder)
         assert code != 0
         assert "a run of quadruple-tank" in complaints
-        assert complaints.endswith(f"{remedy}\n")
+        assert complaints.endswith("rerun --trust executes the plant that the folder holds\n")
+    for words in (("--process", same, "rerun", folder), ("rerun", folder / "manifest.json", "--trust")):
+        code, told, complaints = started(processes, *words)
+        assert code == 0, complaints
+        assert "the same trace" in told
     model = folder / "inputs" / "model.json"
-    code, told, _ = started(processes, "--process", model, "rerun", folder)
-    assert code == 0, told
-    assert "the same trace" in told
     declared = read_document(model, "")
     declared["process"]["has_pond"] = True
     write_document(model, declared)
-    for words in (("report",), ("plot",), ("compare", folder)):
+    for words in (("report", "--force"), ("plot",), ("compare", folder)):
         code, _, complaints = started(processes, *words, folder)
         assert code != 0
         assert complaints.count("\n") == 1

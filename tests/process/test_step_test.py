@@ -221,9 +221,9 @@ def edited(lines: list[str], case: str) -> list[str]:
 REFUSED: Final = {
     "too short": "39 samples of 5 s are too short a record",
     "a gap": "line 51: 55 s after the line before, others are 5 s apart",
-    "no column": "no column y; its first line is 'time_s,a,b,yy,z'",
-    "an empty cell": "line 31, b: '' is no number",
-    "text": "line 31, z: 'Bad Input' is no number",
+    "no column": "no column y; its header is 'time_s,a,b,yy,z'",
+    "an empty cell": "line 31, b: '' is no finite number",
+    "text": "line 31, z: 'Bad Input' is no finite number",
     "an input that never moves": "b never moves",
     "inputs that move together": "a and b move together",
     "an output that never moves": "y never moves",

@@ -1,8 +1,10 @@
 """Whatever is asked for wrongly: one line on standard error, the right exit code, no results half written."""
 
 import asyncio
+import io
 import socket
 import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +15,7 @@ import pytest
 import rig.cosim.networked_run
 from coldloop.process.model_file import read_document, write_document
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from rig.__main__ import _open_closed_streams
 from tests.harness.processes import Processes
 
 if TYPE_CHECKING:
@@ -101,7 +104,8 @@ def test_a_wrong_key_in_the_environment_is_named(coldloop: "Coldloop") -> None:
         (["run", "--factor", "nan"], ["--factor", "nan"]),
         (["run", "--attach", "a:1", "b:2", "c:70000"], ["--attach", "HOST:PORT"]),
         (["run", "--in-process", "--mode", "realtime"], ["--in-process", "--mode realtime"]),
-        (["run", "--nonsense"], ["--nonsense"]),
+        (["run", "--nonsense"], ["--nonsense", "coldloop run --help"]),
+        (["config", "--set", "telemetry.broker=broker:1884"], ["telemetry.broker", "telemetry.port"]),
         (["fly"], ["fly", "run"]),
         (["registers", "--format", "xml"], ["--format", "xml", "markdown"]),
     ],
@@ -110,6 +114,29 @@ def test_a_wrong_option_is_told_with_what_would_be_right(
     arguments: list[str], parts: list[str], coldloop: "Coldloop"
 ) -> None:
     assert_refused(coldloop(*arguments), USAGE, *parts)
+
+
+@pytest.mark.parametrize("command", ["run", "up", "chaos kill"])
+def test_a_place_that_a_command_has_itself_is_refused_wherever_it_was_set(
+    command: str, coldloop: "Coldloop", tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The default may be repeated: `coldloop config` writes it."""
+    file = tmp_path / "config.toml"
+    file.write_text('[plant.server]\nhost = "0.0.0.0"\n')
+    assert_refused(coldloop(*command.split(), "--config", file), USAGE, str(file), "plant.server.host: has no effect")
+    file.write_text('[plant.server]\nhost = "127.0.0.1"\n')
+    monkeypatch.setenv("COLDLOOP__CONTROL_PLC__PLANT__PORT", "7000")
+    refused = coldloop(*command.split(), "--config", file)
+    assert_refused(refused, USAGE, "COLDLOOP__CONTROL_PLC__PLANT__PORT: has no effect")
+
+
+def test_output_that_cannot_show_a_character_shows_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", stream)
+    _open_closed_streams()
+    stream.write("°C")
+    stream.flush()
+    assert stream.buffer.getvalue() == b"?C"
 
 
 def test_a_bad_load_is_told_before_anything_is_made(coldloop: "Coldloop", results: Path, tmp_path: Path) -> None:
@@ -122,7 +149,7 @@ def test_a_bad_load_is_told_before_anything_is_made(coldloop: "Coldloop", result
 @pytest.mark.parametrize(
     ("command", "part"),
     [
-        ("fault melt plant", "melt"), ("fault kill boiler", "optimizer_plc"), ("fault freeze plant nan", "nan"),
+        ("fault melt plant", "melt"), ("fault kill boiler", "optimizer_plc"), ("fault pause plant nan", "nan"),
         ("fault cut broker 1", "broker"), ("fault cut plant 1e9", "3600"), ("fault sensor T99 stuck", "T10"),
         ("fault kill plant --rig far:1 far:2 far:3", "their own machine"), ("record --duration 0", "not positive"),
         ("record --figures bmp", "png"), ("set load nan", "finite"), ("set load 1e9", "10000"),

@@ -12,8 +12,10 @@ from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
 from coldloop.process.signals import TICKS_PER_SAMPLE
-from coldloop.registers.control_plc import Verdict
+from coldloop.registers.audit import EventKind
+from coldloop.registers.control_plc import Cause, Verdict
 from optimizer_plc.qp.design import ControlDesign
+from optimizer_plc.settings import OptimizerSection, ProgramSettings
 from plant.kinds import make_program
 from plant.settings import SensorSettings
 from rig.cosim.scenario import Scenario
@@ -127,3 +129,12 @@ def test_the_adaptive_period_roams_within_2_to_19_iterations_by_steps_of_2(half_
     assert len(set(q.tolist())) > 5
     assert (np.abs(np.diff(q)) <= 2).all()
     assert [row.tau_u for row in half_hour.updates] == (q + 1).tolist()
+
+
+def test_a_load_step_late_in_a_period_does_not_exhaust_the_sequence(simulate: "Simulate") -> None:
+    """The sequence that begins at tick 174 had 18 rows; its period is interrupted at 183: the next begins at 193."""
+    load = LoadProfile((0, 32, 47, 99, 120, 130, 183), (385.0, 360.0, 420.0, 445.0, 385.0, 325.0, 365.0))
+    section = OptimizerSection(program=ProgramSettings(interrupting_load_step_w=10.0))
+    events = simulate(Scenario(240, load, 0.0, seed=1), optimizer_plc=section).events
+    modes = [event for _, event in events if event.kind == EventKind.MODE]
+    assert [event.cause for event in modes] == [Cause.SESSION_STARTED, Cause.SEQUENCE_BEGAN]

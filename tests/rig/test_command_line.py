@@ -1,20 +1,25 @@
 """The command line: it starts at once, completes, and writes no control sequences where nobody sees them."""
 
+import errno
 import json
 import subprocess
+import tomllib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
+from coldloop.process.declaration import NO_LOAD
+from coldloop.process.loaded import PROCESS
 from coldloop.registers.maps import MAPS
 from coldloop.session.settings import TimeMode
 from optimizer_plc.qp.penalties import Preset
 from optimizer_plc.settings import SolverName
 from plant.load import NAMED
 from rig.chaos.plan import shipped_plans
-from rig.cli import COMMANDS, make_parser
+from rig.cli import COMMANDS, EXTRAS, make_parser
 from rig.cli.commands import choices
 from rig.cli.register_listing import FORMATS
 from rig.cli.tag_exports import EXPORTS
@@ -91,6 +96,39 @@ def test_a_typo_is_told_before_anything_that_takes_time_is_imported(python: Pyth
         assert not HEAVY & set(names.split()), words
 
 
+PROJECT = tomllib.loads(Path("pyproject.toml").read_text(encoding="utf-8"))
+DISTRIBUTIONS = {"markdown_it": "markdown-it-py"}
+"""Of packages whose name is another one."""
+
+
+def test_each_extra_that_a_command_names_brings_what_it_lacks() -> None:
+    extras = PROJECT["project"]["optional-dependencies"]
+    for package, extra in EXTRAS.items():
+        assert [one for one in extras[extra] if one.startswith(f"{DISTRIBUTIONS.get(package, package)}>=")], package
+
+
+def test_the_images_install_what_the_project_asks_for() -> None:
+    project, groups = PROJECT["project"], PROJECT["dependency-groups"]
+    asked = {*project["dependencies"], *(one for extra in project["optional-dependencies"].values() for one in extra)}
+    assert all(one in asked for group in groups.values() for one in group if isinstance(one, str))
+
+
+WITHOUT_EXTRAS = f"import sys; sys.modules.update(dict.fromkeys({list(EXTRAS)}))" + ONE_AFTER_THE_OTHER
+
+
+def test_a_plain_installation_says_which_extra_a_command_needs(tmp_path: Path, python: Python) -> None:
+    run = [["run", "--in-process", "--load", "a", "--duration", "30s", "--out", f"{tmp_path}/r", "--figures", "svg"]]
+    lacking = [
+        ["report", f"{tmp_path}/r"], ["export", f"{tmp_path}/r", "--hdf5"], ["page", f"{tmp_path}/r"],
+        ["study", "periods", "--quick"], ["reproduce", "--quick"], ["run", "--solver", "qpoases", "--in-process"],
+        ["import", f"{tmp_path}/export.csv", "--inputs", "a", "--out", f"{tmp_path}/record.csv"],
+    ]  # fmt: skip
+    done = python("-c", WITHOUT_EXTRAS, json.dumps(run + lacking))
+    complaints = [line for line in done.err.splitlines() if line.startswith("coldloop")]
+    assert (done.out.count("ended 0"), done.out.count("ended 2")) == (1, len(lacking)), done.err
+    assert [line.count("coldloop[") for line in complaints] == [1] * len(lacking), complaints
+
+
 def test_commands_to_a_rig_import_nothing_that_takes_time(free_port: int, python: Python) -> None:
     base = ["--port-base", str(free_port)]
     commands = [["status", *base], ["set", "load", "400", *base], ["set", "mode", "manual", *base], ["down", *base]]
@@ -114,6 +152,27 @@ def test_options_are_taken_before_and_behind_what_is_to_be_done() -> None:
     behind = parser.parse_args(["set", "load", "-1", "--port-base", "6020"])
     assert before.port_base == behind.port_base == 6020
     assert (before.new_load, before.assignments) == ("-1", ["a=1"])
+
+
+@pytest.mark.parametrize(
+    ("words", "cut"),
+    [
+        (("page", "--port", "3"), "--port"),
+        (("run", "--dur", "1h"), "--dur"),
+        (("set", "load", "400", "--a", "3"), "--a"),
+        (("fault", "sensor", "T5", "stuck", "--port-b", "6020"), "--port-b"),
+    ],
+)
+def test_an_abbreviation_of_an_option_is_none(words: tuple[str, ...], cut: str, coldloop: "Coldloop") -> None:
+    outcome = coldloop(*words)
+    assert outcome.code == 2
+    assert cut in outcome.complaints[-1]
+
+
+def test_a_load_of_a_process_that_has_none_is_refused(monkeypatch: pytest.MonkeyPatch, coldloop: "Coldloop") -> None:
+    monkeypatch.setattr("rig.cli.commands.options.PROCESS", replace(PROCESS, load=NO_LOAD, bath=None))
+    outcome = coldloop("run", "--load", "a")
+    assert (outcome.code, outcome.complaints) == (2, ["coldloop: load 'a': cold-box has no load; leave it out"])
 
 
 def test_version_is_an_option_and_a_command(coldloop: "Coldloop") -> None:
@@ -161,6 +220,16 @@ def test_a_full_standard_output_is_one_line(processes: Processes) -> None:
         done = processes.coldloop("registers", stdout=full.fileno(), stderr=subprocess.PIPE).ended()
     assert done.code == 1
     assert done.err == "coldloop: standard output: No space left on device\n"
+
+
+def test_an_error_that_is_not_the_outputs_is_not_called_so(
+    coldloop: "Coldloop", monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(_: object) -> int:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr("rig.cli.commands.down.execute", refused)
+    assert coldloop("down").complaints == ["coldloop: down: Operation not permitted"]
 
 
 @pytest.mark.parametrize(

@@ -14,12 +14,12 @@ from plant.kinds import plant_maker
 from plant.load import find_load
 from plant.numeric import RealArray
 from plant.own_model import own_header
-from plant.refrigerator.balance import stored_energy
 from plant.refrigerator.program import RefrigeratorProgram
 from plant.settings import PlantSettings
 from rig import Simulation, simulate
 from rig.cosim.one_process import load_table
 from tests.harness.energy_account import CROSSED, SIZE, WORST, accounted_program_tick
+from tests.harness.refrigerator_energy import stored_energy
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 LOAD = EXAMPLES / "cool_down.csv"

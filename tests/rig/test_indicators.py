@@ -162,3 +162,24 @@ def test_what_does_not_exist_is_not_a_number(model: LtiModel) -> None:
     assert all(map(math.isnan, of_updates))
     nothing = RunEvaluation(model, DESIGN).indicators
     assert all(map(math.isnan, (nothing.J_BF, nothing.L1_outside_band_pct, nothing.T5_outside_band_pct)))
+
+
+def test_an_excess_within_the_dead_band_is_no_time_outside(model: LtiModel) -> None:
+    block = at_rest(model, 8)
+    block.y[:, L1] = [60.0, 61.0, np.nextafter(np.float32(61.0), np.float32(62.0)), 61.03, 61.5, 58.97, 58.5, np.nan]
+    evaluation = RunEvaluation(model, DESIGN)
+    evaluation.block(block)
+    found = evaluation.excesses
+    assert evaluation.indicators.L1_outside_band_pct == pytest.approx(100.0 * 5 / 8)
+    assert found["L1_outside_dead_band_pct"] == pytest.approx(100.0 * 2 / 8)
+    assert found["L1_largest_excess"] == pytest.approx(0.5)
+    assert found["L1_excess_integral"] == pytest.approx(0.25 * (0.03 + 0.5 + 0.03 + 0.5), abs=1e-4)
+    assert [found[name] for name in found if name.startswith("T5")] == [0.0, 0.0, 0.0]
+
+
+def test_without_a_known_tick_there_is_no_excess(model: LtiModel) -> None:
+    block = at_rest(model, 2)
+    block.load[:] = np.nan
+    evaluation = RunEvaluation(model, DESIGN)
+    evaluation.block(block)
+    assert all(math.isnan(value) for value in evaluation.excesses.values())

@@ -1,5 +1,7 @@
 """Keys of a file as a table, compared with one that was written by hand."""
 
+from enum import StrEnum
+from pathlib import Path
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
@@ -62,10 +64,40 @@ A valve.
 
 ### `[main]`
 
-A valve.
-
-| key | value | if not given | meaning |
-|---|---|---|---|
-| `span` | two numbers, [low, high] | `[0.0, 100.0]` | Of its opening. |
+As `[[valves]]`.
 """
     )
+
+
+class Kind(StrEnum):
+    """What it is."""
+
+    WATER = "water"
+    HELIUM = "helium"
+
+
+class Tank(BaseModel):
+    """A tank.
+
+    Args:
+        level: Where it stands,
+            in the middle.
+    """
+
+    level: float = 0.5
+    kind: Kind = Kind.HELIUM
+    open: bool = False
+    map: Path = Path("/somewhere/map.json")
+    spans: tuple[float, float, float] = (1.0, 2.0, 3.0)
+    """Its sides."""
+
+
+def test_what_is_said_of_a_key_is_found_below_it_among_arguments_or_at_what_it_holds() -> None:
+    rows = key_listing(Tank).splitlines()[2:]
+    assert rows == [
+        "| `level` | number | `0.5` | Where it stands, in the middle. |",
+        '| `kind` | `water`, `helium` | `"helium"` | What it is. |',
+        "| `open` | true or false | `false` |  |",
+        "| `map` | file | `map.json`, shipped |  |",
+        "| `spans` | three numbers, one for each input | `[1.0, 2.0, 3.0]` | Its sides. |",
+    ]

@@ -4,6 +4,7 @@ import asyncio
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from itertools import cycle
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,7 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
 from coldloop.registers.plant import PLANT_MAP, LiveLoad, LoadAhead, LoadStatus, LoadStep, PlantSession
-from coldloop.registers.safety import AlarmKind
+from coldloop.registers.safety import AlarmKind, WatchdogStatus
 from coldloop.registers.seal import sealed
 from rig.cosim.journal_reader import JournalReader
 from rig.cosim.local_services import LocalServices
@@ -191,5 +192,22 @@ def test_a_pace_that_is_not_for_the_session_is_refused(tmp_path: Path) -> None:
                 for wrong in (SessionPace(9, 1, 1.0, 0), SessionPace(0, 0, 1.0, 1)):
                     with pytest.raises(RequestRefusedError):
                         await client.write(wrong)
+
+    asyncio.run(check())
+
+
+@pytest.mark.parametrize("factors", [(FACTOR, FACTOR), (FACTOR, 2 * FACTOR)], ids=["the same", "another each time"])
+def test_the_pace_written_fifty_times_a_second_starves_no_watchdog(
+    factors: tuple[float, float], tmp_path: Path
+) -> None:
+    async def check() -> None:
+        async with running(tmp_path) as rig:
+            await rig.until(rig.in_mpc)
+            paces = cycle(factors)
+            for _ in range(150):
+                await asyncio.gather(rig.pace(next(paces)), asyncio.sleep(0.02))
+            status = await rig.plant.read(WatchdogStatus)
+            assert (status.trips, status.lowest > status.time / 2) == (0, True), status
+            await rig.until(rig.in_mpc)
 
     asyncio.run(check())

@@ -4,6 +4,7 @@ import asyncio
 import hashlib
 import os
 import random
+import socket
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -245,6 +246,19 @@ def test_a_mode_that_there_is_not_is_one_line(fake: FakeRig, ask: "Callable[...,
     control = fake.banks["control_plc"]
     control.put(control.get(LadderStatus)._replace(mode=77, cause=78))
     assert_one_line(ask("status"), "block 'ladder'", "mode = 77")
+
+
+@pytest.mark.parametrize("absent", ["plant", "control_plc", "optimizer_plc"])
+def test_status_shows_what_answers_and_names_what_does_not(absent: str, fake: FakeRig, coldloop: "Coldloop") -> None:
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))  # not listening: whoever asks is refused
+        place = f"127.0.0.1:{nobody.getsockname()[1]}"
+        ends = [place if service == absent else end for service, end in zip(fake.banks, fake.ends, strict=True)]
+        code, out, complaints = coldloop("status", "--rig", *ends)
+    rows = dict(line.split(maxsplit=1) for line in out.splitlines())
+    assert code == 0, complaints
+    assert place in rows["absent"]
+    assert ("load" in rows, "mode" in rows) == (absent != "plant", absent != "control_plc")
 
 
 def test_what_a_command_would_write_back_is_within_its_range(fake: FakeRig, ask: "Callable[..., Outcome]") -> None:

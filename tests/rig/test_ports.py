@@ -7,7 +7,11 @@ import sys
 import pytest
 import uvloop
 
+from coldloop.service.telemetry_settings import TelemetrySettings
 from rig.cosim.ports import HOST, ReservedPorts
+from rig.cosim.wiring import endpoints_on, wired
+from rig.live.started_rigs import DEFAULT_PORTS
+from rig.settings import Settings
 from tests.harness.processes import Processes
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="two sockets share a port in this way on Linux alone")
@@ -55,3 +59,12 @@ def test_ports_in_a_row_are_reserved_where_none_is_taken(processes: Processes) -
             socket.create_connection((HOST, port)).close()
         with pytest.raises(OSError, match="in use"):
             ReservedPorts(1, port)
+
+
+def test_a_rig_at_other_ports_publishes_under_topics_of_its_own() -> None:
+    """Else the end of one rig would be read as that of the other."""
+    usual, other = (endpoints_on(ports, Settings()) for ports in (DEFAULT_PORTS, (6000, 6001, 6002)))
+    assert wired(Settings(), usual).telemetry.prefix == "coldloop"
+    assert wired(Settings(), other).telemetry.prefix == "coldloop/6000"
+    mine = Settings(telemetry=TelemetrySettings(prefix="site"))
+    assert wired(mine, other).telemetry.prefix == "site"

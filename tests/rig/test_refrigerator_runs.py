@@ -4,11 +4,12 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from coldloop.process.cold_box import L1
-from coldloop.process.signals import STATION_SIGNAL_NAMES
+from coldloop.process.signals import INPUT_NAMES, STATION_SIGNAL_NAMES
 from rig import simulate
 
 if TYPE_CHECKING:
@@ -81,6 +82,21 @@ def test_a_compressor_trip_makes_no_good_sensor_suspect_and_the_level_comes_back
     level = run.recording.y[:, L1]
     assert 55.0 < level.min() < 59.0
     assert level[-400:].min() > 59.0
+
+
+def test_a_turbine_trip_costs_no_helium_and_its_valve_is_left_until_it_turns() -> None:
+    """LQ blew 1.7 kg off in two minutes, and MPC opened CV156 to 54 %."""
+    events = [{"at_s": 300, "target": "turbine", "value": 0}, {"at_s": 420, "target": "turbine", "value": 1}]
+    run = simulate("a", duration_s=600, plant={"kind": "refrigerator", "refrigerator": {"events": events}})
+    station = run.recording.station
+    assert station[-1, STATION_SIGNAL_NAMES.index("lost")] < 0.01
+    assert station[:, STATION_SIGNAL_NAMES.index("P12")].max() < 17.6
+    valve = run.recording.u[:, INPUT_NAMES.index("CV156")]
+    assert np.ptp(valve[1220:1680]) < 1e-3
+    assert valve[-400:].max() > valve[1680] + 0.5, "it moves again"
+    heard = [(row["kind"], row["subject"]) for row in run.events.arrow.to_pylist()]
+    assert ("alarm raised", "input without effect") in heard
+    assert ("alarm returned", "input without effect") in heard
 
 
 def test_a_stuck_valve_that_nobody_sees_does_not_take_the_level_sensor_with_it() -> None:

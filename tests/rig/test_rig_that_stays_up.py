@@ -377,7 +377,7 @@ def test_a_service_that_stands_still_runs_again_when_the_terminal_is_closed(
     rig = running_rig(int(up))
     assert rig is not None
     state = Path(f"/proc/{rig.services['optimizer_plc'].pid}/stat")
-    freezing = processes.coldloop("fault", "--port-base", up, "freeze", "optimizer_plc", "3600")
+    freezing = processes.coldloop("fault", "--port-base", up, "pause", "optimizer_plc", "3600")
     eventually(lambda: state.read_text().rpartition(")")[2].split()[0] == "T", "it is stopped")
     assert freezing.interrupt(signal.SIGHUP) == 130
     assert state.read_text().rpartition(")")[2].split()[0] != "T"

@@ -3,13 +3,14 @@
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from matplotlib.figure import Figure
 
 from coldloop.process.signals import INPUT_NAMES
-from rig.figures.plot import DRAWN, Bounds, RunCurves, draw_run
+from rig.figures.plot import DRAWN, Bounds, RunCurves, draw_run, label_marks
 from rig.figures.run_plot import curves_of
-from rig.results.run_folder import RunFolder
+from rig.results.run_folder import RunFolder, _in_force
 from tests.conftest import Coldloop
 
 TICKS = 4000
@@ -63,3 +64,21 @@ def test_the_run_of_a_refrigerator_is_drawn_with_what_its_station_recorded(tmp_p
     assert found.pressures == {"P12": (14.5, 16.8), "P11": (0.97, 1.15)}
     assert found.series["P12"] == pytest.approx(np.full(60, 16.0), abs=0.1)
     assert (folder / "run.png").is_file()
+
+
+def test_the_updating_period_is_drawn_only_while_it_was_in_force() -> None:
+    modes = ["mpc", "manual", None, "mpc", "rest"]
+    batch = pa.record_batch({"time_s": [0.0, 0.25, 0.5, 0.75, 1.0], "tau_u_s": [1.0] * 5, "mode": modes})
+    drawn = _in_force(batch, ["time_s", "tau_u_s"])
+    assert list(np.isfinite(drawn["tau_u_s"])) == [True, False, True, True, False]
+    assert "mode" not in drawn
+
+
+def test_marks_of_a_figure_in_pascal_are_not_alike() -> None:
+    axes = Figure().subplots()
+    axes.plot([0, 1], [150_000.0, 150_008.0])
+    label_marks(axes)
+    axes.figure.canvas.draw()
+    labels = [label.get_text() for label in axes.get_yticklabels()]
+    assert len(set(labels)) == len(labels) > 2
+    assert [float(label) for label in labels] == pytest.approx(list(axes.get_yticks()))

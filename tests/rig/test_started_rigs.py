@@ -18,7 +18,7 @@ import pytest
 from coldloop.errors import UsageError
 from rig.cosim.endpoints import RigEndpoints
 from rig.live.private_folder import base_folder, make_private, new_own, read_own, write_own
-from rig.live.process_faults import freeze
+from rig.live.process_faults import pause
 from rig.live.process_identity import identity_of
 from rig.live.started_rigs import (
     LOCK_FILE,
@@ -150,7 +150,7 @@ def test_a_service_is_killed(coldloop: "Coldloop", other: Process) -> None:
 def test_no_fault_is_put_into_another_program_that_has_the_number(coldloop: "Coldloop", other: Process) -> None:
     services = dict.fromkeys(RigEndpoints._fields, ServiceProcess(other.pid, "of a process before it"))
     keep(FIRST, state_of(other, services=services))
-    for words in (("kill", "plant"), ("freeze", "plant", "1")):
+    for words in (("kill", "plant"), ("pause", "plant", "1")):
         outcome = coldloop("fault", *words)
         assert (outcome.code, len(outcome.complaints)) == (2, 1)
         assert "the plant service does not run" in outcome.complaints[0]
@@ -165,7 +165,7 @@ async def test_a_service_that_was_frozen_runs_again_when_the_command_is_ended(ot
             assert time.monotonic() < deadline
             time.sleep(0.005)
 
-    task = asyncio.create_task(freeze(ServiceProcess.of(other.pid), 600.0))
+    task = asyncio.create_task(pause(ServiceProcess.of(other.pid), 600.0))
     await asyncio.to_thread(until, os.WSTOPPED)
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
@@ -175,7 +175,7 @@ async def test_a_service_that_was_frozen_runs_again_when_the_command_is_ended(ot
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        (("freeze", "plant", "0"), "not a number of seconds"), (("freeze", "plant", "1e9"), "not a number of seconds"),
+        (("pause", "plant", "0"), "not a number of seconds"), (("pause", "plant", "1e9"), "not a number of seconds"),
         (("sensor", "T99", "dead"), "unknown output 'T99'"), (("sensor", "T5", "broken"), "a sensor shows"),
         (("sensor", "T5", "nan"), "finite number"), (("sensor", "T5"), "required"), ((), "required"),
     ],
@@ -324,7 +324,7 @@ def test_a_second_rig_that_is_started_at_the_same_time_is_refused(coldloop: "Col
 @pytest.mark.usefixtures("realtime")
 def test_ctrl_c_while_a_detached_rig_starts_ends_that(processes: "Processes") -> None:
     base = str(processes.three_ports())
-    starting = processes.coldloop("up", "--det", "--port-base", base, "--load", "e")  # an abbreviation is taken, too
+    starting = processes.coldloop("up", "--detach", "--port-base", base, "--load", "e")
     lock, deadline = state_folder(int(base)) / LOCK_FILE, time.monotonic() + 120.0
     number = 0
     while number in (0, starting.popen.pid):  # it is locked by the command, and then by the process of the rig

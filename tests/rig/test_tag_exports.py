@@ -7,13 +7,15 @@ import re
 import struct
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
 
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.codec import WordOrder
+from coldloop.registers.common import IDENTITY_BLOCK
 from coldloop.registers.control_plc import CONTROL_MAP
+from coldloop.registers.declaration import Block, RegisterMap, f32, record
 from coldloop.registers.declaration import fields_of as fields_of_record
 from coldloop.registers.maps import MAPS
 from coldloop.registers.plant import PLANT_MAP, Measurement
@@ -48,6 +50,16 @@ def test_telegraf_is_given_every_tag_with_its_address_and_type(coldloop: Coldloo
 
 def fields_of(one: dict[str, Any]) -> dict[str, Any]:
     return {field["name"]: field for request in one["request"] for field in request["fields"]}
+
+
+def test_names_that_would_be_the_same_end_with_their_addresses() -> None:
+    """Letters of other alphabets, and capitals, which some of these programs do not tell apart."""
+
+    fields = {name: Annotated[float, f32("a state")] for name in ("\u03b1", "\u03b2", "level", "Level", "T")}
+    States = record("States", __name__, "states", fields)
+    tags = exported(RegisterMap("plant", 1, (IDENTITY_BLOCK, Block("x", 100, States, ""))))
+    names = [tag.name for tag in tags if tag.block == "x"]
+    assert names == ["x___100", "x___102", "x_level_104", "x_Level_106", "x_T"]
 
 
 def test_fuxa_counts_addresses_from_one(coldloop: Coldloop) -> None:

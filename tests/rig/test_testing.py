@@ -131,8 +131,8 @@ def test_a_service_that_ends_by_itself_is_named_with_its_log(tmp_path: Path) -> 
 
 def test_waiting_for_what_does_not_come_ends_after_plant_time(rig: LiveRig) -> None:
     before = rig.time_s
-    with pytest.raises(TimeoutError, match="within 2 s of plant time"):
-        rig.wait_until(lambda: False, within_s=2)
+    with pytest.raises(TimeoutError, match=r"within 2 s of plant time: control_plc ladder\.mode = \d$"):
+        rig.wait_until(lambda: rig.control_plc.read("ladder.mode") == 77, within_s=2)
     assert rig.time_s == before + 2
 
 

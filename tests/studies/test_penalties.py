@@ -93,7 +93,7 @@ def test_a_best_period_at_an_end_is_not_inside() -> None:
 def test_hours_that_rules_were_tuned_on_are_not_fresh() -> None:
     loads = [Load(f"a@{draw}", draw, LoadProfile((0,), (1.0,)), 60) for draw in (1, 2, 11)]
     assert {title: [one.draw for one in some] for title, some in first_and_fresh(loads, FIRST).items()} == {
-        "hours a to f": [1],
+        "hours of the first draw": [1],
         "fresh hours": [2],
     }
 

@@ -77,7 +77,7 @@ def test_what_being_off_costs_is_over_the_same_controller_on_its_model() -> None
     *_, costs, ratios = controllers_remarks(HOURS, hours)
     assert "| sensor bias | 4 [0.000599 to 2.67e+04] (8: c) | 1 [1 to 1] (1: a) | 0.141 " in ratios
     assert f"| {NOMINAL} | 1 [1 to 1] (1: a) | 1 [1 to 1] (1: a) | 1 [1 to 1] (1: a) |" in ratios
-    (row,) = (line for line in costs.splitlines() if line.startswith("| sensor bias"))
+    (row,) = (line for line in costs.splitlines() if line.startswith("| sensor bias |"))
     assert row.startswith("| sensor bias | 900 [")
     assert "]; 1.5 / 0.2 | 150 [" in row
 

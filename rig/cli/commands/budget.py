@@ -127,6 +127,7 @@ def _certified(options: argparse.Namespace) -> str:
 def _tables(options: argparse.Namespace) -> str:
     from rig.plc_sizing.budget_tables import budget_tables, plc_tables, with_power
     from rig.plc_sizing.profile import find_profile
+    from rig.runs.remarks import certificate
 
     if len(set(options.loads)) < len(options.loads):
         raise UsageError("--load: a load is named twice; two of the same are no evidence")
@@ -135,11 +136,13 @@ def _tables(options: argparse.Namespace) -> str:
     profile = None if options.plc is None else find_profile(options.plc)
     settings = configuration(options).settings
     if profile is not None:
-        return plc_tables(settings, options.period, profile, lambda there: _costs(there, options))
+        return plc_tables(settings, options.period, profile,
+                          lambda there: f"{certificate(there)}\n{_costs(there, options)}".strip())  # fmt: skip
     if options.power is not None:
         settings = with_power(settings, options.power)
     program = settings.optimizer_plc.program
-    return budget_tables(settings, options.period, lambda problem: _executed(problem, program))
+    held, tables = certificate(settings), budget_tables(settings, options.period, lambda one: _executed(one, program))
+    return f"{held}\n\n{tables}" if held else tables
 
 
 def _executed(problem: "PredictiveProblem", program: "ProgramSettings") -> str:

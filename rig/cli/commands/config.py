@@ -10,12 +10,19 @@ from rig.cli.commands.options import configuration
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
+    parser.add_argument("--keys", action="store_true", help="list all keys and what they mean, as Markdown")
 
 
 def execute(options: argparse.Namespace) -> int:
     """Print one line a value, as TOML with its source behind it."""
     from coldloop.config import as_toml
 
+    if options.keys:
+        from rig.cli.key_listing import key_listing
+        from rig.settings import Settings
+
+        sys.stdout.write(key_listing(Settings))
+        return 0
     rows = configuration(options).effective()
     texts = [
         f"# {key} = not set" if value is None else f"{key} = {as_toml(value)}"  # TOML has no word for what is not set

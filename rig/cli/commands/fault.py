@@ -32,10 +32,10 @@ def declare(parser: argparse.ArgumentParser) -> None:
     kill = what.add_parser("kill", help="kill a service (SIGKILL); `coldloop up` restarts it")
     kill.add_argument("service", choices=SERVICES, metavar="|".join(SERVICES))
     kill.set_defaults(fault=_kill)
-    freeze = what.add_parser("freeze", help="suspend a service for a while")
-    freeze.add_argument("service", choices=SERVICES, metavar="|".join(SERVICES))
-    freeze.add_argument("seconds", type=_seconds, help="duration in real time")
-    freeze.set_defaults(fault=_freeze)
+    pause = what.add_parser("pause", help="suspend a service for a while")
+    pause.add_argument("service", choices=SERVICES, metavar="|".join(SERVICES))
+    pause.add_argument("seconds", type=_seconds, help="duration in real time")
+    pause.set_defaults(fault=_pause)
     cut = what.add_parser("cut", help="cut a link for a while; needs a rig started with `up --cuttable`")
     cut.add_argument("link", choices=LINKS, metavar="|".join(LINKS), help="control PLC to plant, or optimiser to it")
     cut.add_argument("seconds", type=_seconds, help="duration in real time")
@@ -72,12 +72,12 @@ async def _kill(options: argparse.Namespace) -> None:
     sys.stdout.write(f"killed the {options.service} service; `coldloop up` restarts it\n")
 
 
-async def _freeze(options: argparse.Namespace) -> None:
-    from rig.live.process_faults import freeze, process_of
+async def _pause(options: argparse.Namespace) -> None:
+    from rig.live.process_faults import pause, process_of
 
     process = process_of(first_port_here(options), options.service)
     tell(f"the {options.service} service is suspended for {options.seconds:g} s (Ctrl-C resumes it)")
-    runs = await freeze(process, options.seconds)
+    runs = await pause(process, options.seconds)
     sys.stdout.write(f"the {options.service} service {'runs again' if runs else 'has ended meanwhile'}\n")
 
 

@@ -42,15 +42,16 @@ def execute(options: argparse.Namespace) -> int:
     except NoEquilibriumError as error:
         raise UsageError(f"{options.plant or 'the reference plant'}: {error}") from None
     sys.stdout.write(text)
-    if options.plant is not None:
-        sys.stdout.write(
-            held_line(box, plant.operating_point.level_pct, settings.optimizer_plc.program.design, settings.limits)
-        )
     if options.out is not None:
         try:
             model.save(options.out)
         except OSError as error:
             raise UsageError(f"{options.out}: {error.strerror}; name a file that can be written with --out") from None
         sys.stdout.write(f"written to {options.out}\n")
+    sys.stdout.flush()
+    if options.plant is not None:  # a long search
+        sys.stdout.write(
+            held_line(box, plant.operating_point.level_pct, settings.optimizer_plc.program.design, settings.limits)
+        )
     load(in_use)
     return 0

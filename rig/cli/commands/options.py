@@ -8,7 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from coldloop.errors import UsageError
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import TICK_S
+from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS
+from coldloop.process.whole_ticks import whole_ticks
 from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.choices import FIGURE_FORMATS, LOADS, PRESETS, SOLVERS
 
@@ -42,27 +45,30 @@ class HostPort(NamedTuple):
     port: int
 
 
+SHORTEST_S: Final = SHORTEST_TICKS * TICK_S
+LONGEST_S: Final = LONGEST_TICKS * TICK_S
+
+
 def updating_period(text: str) -> float:
     """Return an updating period in seconds, 0 for `adaptive`."""
-    return 0.0 if text == "adaptive" else _period(text, "neither 'adaptive' nor seconds from 0.5 to 5")
+    return 0.0 if text == "adaptive" else _period(text, "neither 'adaptive' nor a")
 
 
 def fixed_updating_period(text: str) -> float:
     """Return an updating period in seconds."""
-    value = _period(text, "not seconds from 0.5 to 5")
-    if value < 2 * TICK_S or value % TICK_S:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a multiple of {TICK_S} s from 0.5 to 5 s")
-    return value
+    return _period(text, "not a")
 
 
 def _period(text: str, what: str) -> float:
     try:
-        value = float(text)
+        ticks = whole_ticks(float(text))
     except ValueError:
-        value = -1.0
-    if not 0 < value <= 5:
-        raise argparse.ArgumentTypeError(f"'{text}' is {what}")
-    return value
+        ticks = None
+    if ticks is None or not SHORTEST_TICKS <= ticks <= LONGEST_TICKS:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is {what} multiple of {TICK_S:g} s, a tick, from {SHORTEST_S:g} to {LONGEST_S:g} s"
+        )
+    return float(text)
 
 
 def positive_count(text: str) -> int:
@@ -76,8 +82,10 @@ def check_load(name: str | None) -> None:
     """Refuse a load that is neither a name nor a file, before anything that takes time; the file is read later.
 
     Raises:
-        UsageError: There is no such load.
+        UsageError: There is no such load, or the process has none.
     """
+    if name is not None and not PROCESS.has_load:
+        raise UsageError(f"load '{name}': {PROCESS.name} has no load; leave it out")
     if name is not None and name.partition("@")[0] not in LOADS and not (name and Path(name).exists()):
         raise UsageError(f"load '{name}': neither a file nor one of {', '.join(LOADS)}")
 
@@ -122,7 +130,7 @@ def add_loop_options(parser: argparse.ArgumentParser, loads: str) -> None:
     parser.add_argument("--solver", choices=SOLVERS, help="default: ode")
     parser.add_argument("--outside-solver", metavar="NAME",
                         help="clarabel, piqp, qpalm (each an extra of this name), or a solver that is installed"
-                        " beside, by its entry point (`docs/extending.md`)")  # fmt: skip
+                        " beside, by its entry point (`coldloop docs extending`)")  # fmt: skip
     parser.add_argument("--preset", choices=PRESETS, help="of solver and estimator (default: tuned)")
     parser.add_argument("--updating-period", type=updating_period, metavar="adaptive|SECONDS",
                         help="default: adaptive")  # fmt: skip
@@ -227,13 +235,14 @@ def _tls_site(folder: Path) -> dict[str, tuple[object, str]]:
     """Return the settings of a folder of `coldloop certificates`, and where they come from."""
     from coldloop.config import flattened
     from coldloop.parsing import parsed_toml
+    from coldloop.text_file import read_text
 
     file = folder / "tls.toml"
+    remedy = f"make it with `coldloop certificates --out {folder}`"
     try:
-        content = parsed_toml(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise UsageError(f"{file}: {reason}; make it with `coldloop certificates --out {folder}`") from None
+        content = parsed_toml(read_text(file, remedy))
+    except ValueError as error:
+        raise UsageError(f"{file}: {error}; {remedy}") from None
     return {key: (value, "--tls") for key, value in flattened(content).items()}
 
 
@@ -278,7 +287,7 @@ def operator_settings(options: argparse.Namespace) -> "OperatorSettings":
 
 
 def refuse_ineffective(effective: "Configuration[Settings]", keys: Mapping[str, str]) -> None:
-    """Refuse values from the command line that the command replaces by its own.
+    """Refuse values that the command replaces by its own; a file and the environment may repeat the default.
 
     Args:
         effective: The configuration.
@@ -287,10 +296,13 @@ def refuse_ineffective(effective: "Configuration[Settings]", keys: Mapping[str, 
     Raises:
         UsageError: One of them was set.
     """
-    for key, remedy in keys.items():
-        source = effective.sources.get(key, "")
-        if source.startswith("--"):
-            raise UsageError(f"{source}: has no effect on this command: {remedy}")
+    from coldloop.config import DEFAULT, flattened
+
+    usual = flattened(type(effective.settings)().model_dump(mode="json"))
+    for key, value, source in effective.effective():
+        if key in keys and (source.startswith("--") or (source != DEFAULT and value != usual.get(key))):
+            where = source if key in source.lower().replace("__", ".") else f"{source}: {key}"
+            raise UsageError(f"{where}: has no effect on this command: {keys[key]}")
 
 
 OWN_PORTS = "its services get free ports; `coldloop up --port-base` has fixed ones"

@@ -4,6 +4,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from rig.cli.commands.options import positive_count
+
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
@@ -12,12 +14,17 @@ def declare(parser: argparse.ArgumentParser) -> None:
     what.add_argument("--keys", action="store_true", help="list the keys of process files, as Markdown")
     parser.add_argument("--out", type=Path, metavar="MODEL",
                         help="write the model file; then --process MODEL, or COLDLOOP_PROCESS=MODEL")  # fmt: skip
+    parser.add_argument("--limit", type=positive_count, default=300, metavar="SECONDS",
+                        help="how long its plant may take, in a process of its own (default: 300)")  # fmt: skip
 
 
 def execute(options: argparse.Namespace) -> int:
     """Make, print; write the model file when there is --out."""
     from coldloop.errors import UsageError
     from coldloop.whole_file import require_regular_file
+    from rig.cli.key_listing import key_listing
+    from rig.process_file.declaration import ProcessFile
+    from rig.process_file.in_child import text_of_child
     from rig.process_file.judgement import described
     from rig.process_file.making import made_from
 
@@ -25,25 +32,22 @@ def execute(options: argparse.Namespace) -> int:
     if options.keys:
         if out is not None:
             raise UsageError("--out: writes the model of a process file; name that file, and leave out --keys")
-        return _list_keys()
+        sys.stdout.write(key_listing(ProcessFile))
+        return 0
     if out is not None:
         require_regular_file(out)
         if out.resolve() == options.file.resolve():
             raise UsageError(f"{out}: is the process file; name another one with --out")
-    made = made_from(options.file)
-    sys.stdout.write(described(made))
-    if out is not None:
+
+    def work() -> str:
+        made = made_from(options.file)
+        if out is None:
+            return described(made)
         try:
             made.model.save(out)
         except OSError as error:
             raise UsageError(f"{out}: {error.strerror}; name a file that can be written with --out") from None
-        sys.stdout.write(f"written to {out}\n")
-    return 0
+        return f"{described(made)}written to {out}\n"
 
-
-def _list_keys() -> int:
-    from rig.cli.key_listing import key_listing
-    from rig.process_file.declaration import ProcessFile
-
-    sys.stdout.write(key_listing(ProcessFile))
+    sys.stdout.write(text_of_child(options.file, work, options.limit))
     return 0

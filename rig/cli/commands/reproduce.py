@@ -3,7 +3,7 @@
 import argparse
 import sys
 
-from rig.cli.commands.study import add_scale_options, study_options, workers
+from rig.cli.commands.study import add_scale_options, ending, study_options, workers
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -15,5 +15,6 @@ def execute(options: argparse.Namespace) -> int:
     """Do all studies and write the report."""
     from rig.report.reproduction import reproduce
 
-    sys.stdout.write(reproduce(study_options(options), workers(options), options.out))
-    return 0
+    text, failed_runs = reproduce(study_options(options), workers(options), options.out)
+    sys.stdout.write(text)
+    return ending(failed_runs)

@@ -3,7 +3,6 @@
 import argparse
 import asyncio
 import sys
-from contextlib import AsyncExitStack
 from typing import Final
 
 from rig.cli.commands.options import add_rig_options, operator_settings, rig_endpoints, rig_services
@@ -26,19 +25,18 @@ def execute(options: argparse.Namespace) -> int:
 
 
 async def _show(options: argparse.Namespace) -> None:
-    from coldloop.operating.execution import clients_of, connected
-    from rig.cosim.answer_time import answered_in_time
+    from coldloop.operating.execution import clients_of
     from rig.live.status import line, page, read_status
 
     endpoints = rig_endpoints(options, operator_settings(options))
     clients = clients_of({service: getattr(endpoints, service) for service in rig_services(options)})
-    async with AsyncExitStack() as stack:
-        async with answered_in_time("to read the status"):
-            await stack.enter_async_context(connected(clients))
-            status = await read_status(clients)
+    try:
+        status = await read_status(clients)
         sys.stdout.write(f"{line(status)}\n" if options.follow else page(status))
         while options.follow:
             sys.stdout.flush()
             await asyncio.sleep(LOOK_S)
-            async with answered_in_time("to read the status"):
-                sys.stdout.write(f"{line(await read_status(clients))}\n")
+            sys.stdout.write(f"{line(await read_status(clients))}\n")
+    finally:
+        for client in clients.values():
+            client.close()

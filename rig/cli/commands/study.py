@@ -107,9 +107,14 @@ def _do(study: "Study", options: argparse.Namespace) -> int:
     for what, values in result.values.items():
         sys.stdout.write(f"{what}: {', '.join(f'{value:.4g}' for value in values)}\n")
     sys.stdout.write(f"results in {options.out / study.name}\n")
-    if not result.failed_runs:
+    return ending(result.failed_runs)
+
+
+def ending(failed_runs: int) -> int:
+    """Return the exit code of studies, and say in how many of their runs updates had no answer."""
+    if not failed_runs:
         return 0
     sys.stderr.write(
-        f"coldloop: in {result.failed_runs} runs updates have no answer: what the optimiser computed is not finite\n"
+        f"coldloop: in {failed_runs} runs updates have no answer: what the optimiser computed is not finite\n"
     )
     return NOT_FINITE

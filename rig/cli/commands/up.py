@@ -22,9 +22,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--page-port", type=int, metavar="PORT", help="its port (default: 8020); implies --page")
     other = parser.add_mutually_exclusive_group()
     other.add_argument("--without", choices=WITHOUT, metavar="|".join(WITHOUT),
-                       help="leave its place to a client of your own (docs/your-optimiser.md)")  # fmt: skip
+                       help="leave its place to a client of your own (`coldloop docs your-optimiser`)")  # fmt: skip
     other.add_argument("--optimizer", metavar="export:FOLDER",
-                       help="the exported optimiser in the place of ours (docs/plc-export.md)")  # fmt: skip
+                       help="the exported optimiser in the place of ours (`coldloop docs plc-export`)")  # fmt: skip
     parser.add_argument("--cuttable", action="store_true",
                         help="put a proxy into each link, for `coldloop fault cut`")  # fmt: skip
     parser.add_argument("--detach", action="store_true", help="return when it is up; `coldloop down` ends it")

@@ -10,10 +10,11 @@ from coldloop.registers.safety import AlarmKind, CapacityCause
 from coldloop.safety.sequence import InputSequence, with_checksum
 from control_plc.alarm_settings import BANDS
 from control_plc.output_limits import GuardState
+from control_plc.process_alarms import present_limits
 from control_plc.program import ControlProgram
 from rig.cosim.compiled.records import GUARD, NOT, SCAN, Alarms, Array, Trace, empty_rows, record
 
-OF_PLANS = (AlarmKind.CAPACITY, AlarmKind.SENSOR_SUSPECT)
+OF_PLANS = (AlarmKind.CAPACITY, AlarmKind.SENSOR_SUSPECT, AlarmKind.INPUT_WITHOUT_EFFECT)
 """Alarms of what plans say."""
 LONGEST_SILENCE = TICKS_PER_SAMPLE + 2
 """Ticks between two signs of life of an optimiser that answers every update."""
@@ -43,8 +44,8 @@ def due(program: ControlProgram) -> float:
 
 
 def alarms_of(program: ControlProgram) -> Alarms:
-    """Return the band alarms as they are."""
-    low, high = np.array(program.alarm_settings.bands, dtype=np.float64).T
+    """Return the band alarms as they are, with their present limits."""
+    low, high = np.array(present_limits(program.alarm_settings.bands, program.alarms), dtype=np.float64).T
     rows, delays = (program.alarms.rows[kind] for kind in BANDS), map(program.alarms.delay, BANDS)
     causes = [row.cause if row.active else NOT for row in rows]
     return Alarms(low.copy(), high.copy(), np.array(CONTROLLED), np.array(causes), np.array(list(delays)))

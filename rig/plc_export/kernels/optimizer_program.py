@@ -25,7 +25,7 @@ GENERIC: Final = {
     for of, kernels in ((solve_by, KERNELS), (decide_by, DECISIONS))
 }
 PLATFORM: Final = frozenset({"power", "log"})
-"""The cube root of a step size, and the logarithms and the power of the rules of the updating period."""
+"""The cube root of a step size, and the logarithms of the rules of the updating period."""
 
 
 class OptimizerKernels:

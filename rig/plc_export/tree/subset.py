@@ -45,7 +45,7 @@ class Source:
         """Return the error for a node, in one line."""
         line = getattr(node, "lineno", self.definition.lineno)
         raise UnfitKernelError(
-            f"{self.file}:{line}: {why}; an exported kernel has a smaller Python (docs/plc-export.md)"
+            f"{self.file}:{line}: {why}; an exported kernel has a smaller Python (`coldloop docs plc-export`)"
         )
 
     def _assigned(self) -> tuple[set[str], set[str]]:

@@ -1,5 +1,6 @@
 """What it costs the predictive controller that pressures and inlet temperature move, constant in its model."""
 
+from pathlib import Path
 from typing import Final
 
 from rig.studies.drawing import cost_bars, over_time
@@ -47,7 +48,7 @@ class CouplingStudy:
                 result.note(f"J_BF on the {label}, over the cold box alone", ratio)
             if "pressures" not in result.figures:
                 labelled = list(zip(CASES, runs, strict=True))
-                result.figures["pressures"] = over_time(f"hour {load.name}", labelled, SHOWN, 8.0)
+                result.figures["pressures"] = over_time(f"hour {Path(load.name).name}", labelled, SHOWN, 8.0)
         result.figures["closed-loop cost"] = cost_bars(result, CASES, 0.19)
         return result
 

@@ -32,11 +32,12 @@ OF_COLD_BOX: Final = {
 }
 """What differs; with exchangers 10 % worse the plant holds 513 W, and the hours d to f have up to 585 W."""
 DEFAULT: Final = f"{PROGRAM}preset=tuned"
+OWN: Final = "contraction rule"
 REGIMES: Final[dict[str, tuple[str, ...]]] = {NOMINAL: (), **(OF_COLD_BOX if PROCESS is COLD_BOX else {})}
 COLUMNS: Final = (
     "regime", "load", "tau_u (s)", "mean tau_u (s)", "J_BF", *(f"{one.name} outside (%)" for one in PROCESS.banded),
 )  # fmt: skip
-SUMMARY: Final = ("regime", "mean of adaptive (s)", "best fixed (s)", "adaptive over it", "in words")
+SUMMARY: Final = ("regime", "mean of adaptive (s)", "best fixed (s)", "adaptive over it", "in words", f"{OWN} over it")
 
 
 class PeriodsStudy:
@@ -46,8 +47,9 @@ class PeriodsStudy:
     title = "Cost against updating period of the process that is loaded, fixed and adaptive"
 
     def requests(self, options: StudyOptions) -> list[RunRequest]:
-        """Return every period under every draw, in each regime."""
-        return [run for regime in REGIMES for load in loads(options, *"abcdef") for run in _runs(load, regime)]
+        """Return every period under every draw, in each regime, and the rule that is not the default."""
+        drawn = loads(options, *"abcdef")
+        return [run for regime in REGIMES for load in drawn for run in (*_runs(load, regime), _own(load, regime))]
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Compare the adaptive period, in each regime, with the best fixed one of other draws, if there are any."""
@@ -57,11 +59,15 @@ class PeriodsStudy:
             found = [[outcomes[run] for run in _runs(load, regime)] for load in drawn]
             for load, some in zip(drawn, found, strict=True):
                 result.rows += [_row(regime, load.name, *one) for one in zip(PERIODS_S, some, strict=True)]
+            own = [outcomes[_own(load, regime)] for load in drawn]
+            result.rows += [_row(regime, load.name, OWN, run) for load, run in zip(drawn, own, strict=True)]
             costs[regime] = np.array([[one.indicators.J_BF for one in some] for some in found]).T
             means[regime] = float(np.mean([some[0].indicators.tau_u_mean for some in found]))
             best, ratio = judged(costs[regime], training)
+            of_own = judged(np.vstack(([run.indicators.J_BF for run in own], costs[regime][1:])), training)[1]
             result.note(f"{regime}: J_BF of the adaptive period over fixed {PERIODS_S[best]:g} s", ratio.value)
-            summary.append((regime, f"{means[regime]:.2f}", f"{PERIODS_S[best]:g}", ratio.text(), pays(ratio)))
+            cells = f"{means[regime]:.2f}", f"{PERIODS_S[best]:g}", ratio.text(), pays(ratio), of_own.text()
+            summary.append((regime, *cells))
         fresh = _has_others(training)
         chosen = "on the first draws, judged on the others" if fresh else "on the same, which favours it"
         title = f"J_BF of the adaptive period over the best fixed one, chosen {chosen}"
@@ -96,7 +102,11 @@ def _runs(load: Load, regime: str) -> list[RunRequest]:
     return [load.request(period, DEFAULT, *REGIMES[regime]) for period in PERIODS_S]
 
 
-def _row(regime: str, name: str, period_s: float, outcome: Outcome) -> tuple[str | float, ...]:
+def _own(load: Load, regime: str) -> RunRequest:
+    return load.request(ADAPTIVE, DEFAULT, f"{PROGRAM}adaptive.rule=contraction", *REGIMES[regime])
+
+
+def _row(regime: str, name: str, period_s: float | str, outcome: Outcome) -> tuple[str | float, ...]:
     run = outcome.indicators
     outside = (getattr(run, f"{one.name}_outside_band_pct") for one in PROCESS.banded)
     return (regime, name, "adaptive" if period_s == ADAPTIVE else period_s, run.tau_u_mean, run.J_BF, *outside)

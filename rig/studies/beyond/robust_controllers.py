@@ -16,7 +16,7 @@ from rig.studies.request import Procedure, RunRequest, Series
 from rig.studies.study import PROGRAM, Load, StudyOptions, loads
 from rig.text_tables import markdown_table
 
-CONDITIONS: Final = {**conditions.CONDITIONS, **conditions.BESIDE_THE_BOX, **LINEAR}
+CONDITIONS: Final = {**conditions.CONDITIONS, **conditions.BESIDE_THE_BOX, **conditions.UNKNOWN_LOADS, **LINEAR}
 TUNED: Final = f"{PROGRAM}preset=tuned"
 DEFAULT: Final = "tuned, Algorithm 1"
 CONTROLLERS: Final = {

@@ -17,7 +17,7 @@ from rig.studies.request import Series
 from rig.studies.study import Load, first_and_fresh
 from rig.text_tables import Cell, markdown_table
 
-FIRST: Final = "hours a to f"
+FIRST: Final = "hours of the first draw"
 COSTS: Final = {"J_open_mean": "open loop", "J_BF": "J_BF"}
 PeriodCosts = dict[Load, Mapping[str, Series]]
 """By hour: costs of the periods, by kind of cost."""
@@ -57,7 +57,7 @@ def period_remarks(timed: Mapping[PenaltyVariant, PeriodCosts], periods: Sequenc
             for title, some in first_and_fresh(costs, FIRST).items():
                 rows.append((setting.label, title, *_row(table_of(costs, some, cost), periods)))
         if cost == "J_open_mean" and theirs.shape[1] == len(periods):
-            rows.insert(0, ("the paper's points", FIRST, *_row(theirs, periods)))
+            rows.insert(0, ("the paper's points", "hours a to f", *_row(theirs, periods)))
         caption = (
             f"**Best of the fixed periods, {name}**: in how many hours it is neither the shortest nor the longest, "
             "which it is in each (s), and what the shortest and the longest cost over it, geometric mean of the hours; "

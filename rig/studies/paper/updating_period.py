@@ -120,7 +120,7 @@ class UpdatingPeriodStudy:
         for policy in (LITERAL, OWN_INTERRUPT):
             found = response(responses[policy.label], policy.label)
             result.values |= {name: [value] for name, value in found.items()}
-        result.remarks += [_table("Hours a to f", first), *([_table("Fresh hours", fresh)] if fresh else [])]
+        result.remarks += [_table("Hours of the first draw", first), *([_table("Fresh hours", fresh)] if fresh else [])]
         result.remarks += [response_table(responses), _variant_table(result)]
         return result
 

@@ -1,6 +1,6 @@
 """What the constrained predictive controller is asked to do: weights, bands and instants (paper, section IV).
 
-The paper leaves weights and scaling open; `docs/science.md` says why these were chosen.
+The paper leaves weights and scaling open; `docs/science.md` lists those of this project.
 """
 
 from enum import StrEnum
@@ -22,7 +22,7 @@ from pydantic import (
 from coldloop.process.declaration import FURTHEST_WEIGHT
 from coldloop.process.loaded import PROCESS
 from coldloop.process.per_signal import PerBand, PerInput, PositivePerBand
-from coldloop.process.signals import BATH
+from coldloop.process.signals import BATH, STRETCH
 
 N_INPUTS = len(PROCESS.inputs)
 N_SLACKS = 2 * len(PROCESS.bands)
@@ -68,20 +68,27 @@ class ControlDesign(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     decision_instants: Instants = PROCESS.decision_instants
+    """Sampling periods at which inputs are free; the last one is the horizon."""
     constraint_instants: Instants = PROCESS.constraint_instants
+    """Sampling periods at which bands count."""
     output_low: PerBand = tuple(band.low for band in PROCESS.bands)
     """Bands: of the cold box those of L1 (%) and T5 (K)."""
     output_high: PerBand = tuple(band.high for band in PROCESS.bands)
+    """Upper ends of the bands."""
     band_margin: PerBand = tuple(band.margin for band in PROCESS.bands)
     """How far inside the bands the rows of the problem are: soft rows let an output rest beyond them."""
     input_scale: PerInput = tuple(one.scale for one in PROCESS.inputs)
+    """Size of each input in the problem."""
     input_weight: PerInput = tuple(one.weight for one in PROCESS.inputs)
     """Diagonal of R, on deviations from the operating point."""
     pressure_scale: PositiveFloat = 2000.0
+    """Size of a pressure in the cost, Pa."""
     level_scale: PositiveFloat = 1.0
     """In % of the vessel."""
     temperature_scale: PositiveFloat = 1.0
+    """Size of a temperature in the cost, K."""
     state_weight: PositiveFloat = 0.1
+    """Weight of the states in the cost."""
     violation_weight: PositivePerBand = tuple(band.weight for band in PROCESS.bands)
     """rho, per sample and square of what a band is missed by: of the cold box per %^2 of L1 and K^2 of T5."""
     target: Target = Target.OPERATING_POINT
@@ -132,6 +139,8 @@ class ColdEndSettings(BaseModel):
     at 36 %."""
     opening_per_k: PositiveFloat = 70.0
     """How far the feed may be from where it is, in % for each K that T2 - T1 is from it. Less slows load steps."""
+    following_s: PositiveFloat = 60.0 * STRETCH
+    """Time constant with which the limit follows T2 - T1, as it is estimated: noise of 0.03 K would move it by 2 %."""
     opening_from: FiniteFloat = 50.0
     """Opening, %, that is allowed in any case: should T1 or T2 be wrong."""
 

@@ -138,11 +138,16 @@ def no_target_search(real: Real) -> TargetSearch:
 
 
 @kernel
-def find_target(c: TargetSearch, x: Array, w: float, mismatch: float, most_open: float, target: Array) -> None:
-    """Write the target (3,) for estimated states (n_x,), load and its mismatch, and a limit of the feed."""
+def find_target(
+    c: TargetSearch, x: Array, w: float, mismatch: float, most_open: float, idle: int, at: float, target: Array
+) -> None:  # fmt: skip
+    """Write the target (3,) for estimated states (n_x,), load and its mismatch, and a limit of the feed.
+
+    The input that is `idle`, unless it is -1, stays `at` a scaled deviation.
+    """
     if not c.followed:
         return
-    low, high = bounds_at(c, x, most_open)
+    low, high = bounds_at(c, x, most_open, idle, at)
     least, most = loads_held(c, low, high)
     load = min(max(mismatch + c.of_load * (w - mismatch), least), most)
     bounds, last = np.empty((low.shape[0], 2), x.dtype), target.shape[0]
@@ -159,10 +164,15 @@ def find_target(c: TargetSearch, x: Array, w: float, mismatch: float, most_open:
 
 
 @kernel
-def bounds_at(c: TargetSearch, x: Array, most_open: float) -> tuple[Array, Array]:
-    """Return bounds (4,), (4,) of inputs that act, with a limit of the feed, and of the outlet less its constant."""
+def bounds_at(c: TargetSearch, x: Array, most_open: float, idle: int, at: float) -> tuple[Array, Array]:
+    """Return bounds (4,), (4,) of inputs that act, with a limit of the feed, and of the outlet less its constant.
+
+    Those of an input that is `idle` (-1: none is) collapse to where it is, within its range.
+    """
     low, high = c.low.copy(), c.high.copy()
     high[c.feed] = max(min(high[c.feed], most_open), low[c.feed])
+    if idle >= 0:
+        low[idle] = high[idle] = min(max(at, low[idle]), high[idle])
     one = x.dtype.type(1.0)
     for i in range(low.shape[0]):
         if c.constants[i] >= 0:

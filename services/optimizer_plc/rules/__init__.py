@@ -89,5 +89,5 @@ def make_rule(settings: ProgramSettings, budget: PlcBudget, fixed_ticks: int, re
         FIXED_PERIOD if fixed_ticks else int(UpdatingRuleKind[adaptive.rule.name]),  # one type, compiled once
         FixedPeriod(budget.q(fixed_ticks)),
         Algorithm1(adaptive.q_first, adaptive.q_min, adaptive.q_max, adaptive.delta),
-        ContractionRule(own.q_busy, own.q_quiet, own.q_step, real(own.rate), real(own.memory), real(own.surprise)),
+        ContractionRule(own.q_rest, own.q_max, real(own.band), real(own.least), real(own.change)),
     )

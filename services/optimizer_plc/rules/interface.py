@@ -18,10 +18,8 @@ from optimizer_plc.rules.assessment import Assessment, Observation
 
 Array = NDArray[np.float64]
 
-MEMORY = 2
+MEMORY: Final = 1
 """Numbers that a rule may remember from one period to the next, in an array that begins with zeros."""
-OF_PROBLEM: Final = 1
-"""Place of the one that is of the problem: 0 again at a load step, as another load is another problem."""
 
 
 class UpdatingRule(Protocol):
@@ -57,7 +55,7 @@ def decides_by(rule: type) -> Callable[[D], D]:
 
 
 def decide_by(rule: Any, memory: Array, observation: Observation, assessment: Assessment) -> int:  # noqa: ANN401
-    """Return q(t_{k+1}) by the kernel that is registered for a rule, which may overwrite its memory (2,)."""
+    """Return q(t_{k+1}) by the kernel that is registered for a rule, which may overwrite its memory (1,)."""
     return DECISIONS[type(rule)](rule, memory, observation, assessment)
 
 

@@ -16,7 +16,7 @@ from plant.components.return_line import ReturnLine
 from plant.components.turbine import Turbine
 from plant.components.valve import Valve
 
-LISTING: Final = "docs/your-refrigerator.md lists the keys"
+LISTING: Final = "`coldloop docs your-refrigerator` lists the keys"
 MM2_PER_M2, G_PER_KG, L_PER_M3 = 1e6, 1e3, 1e3
 NOZZLE_UNITS: Final = 1e8
 """g sqrt(K)/(s bar) in a kg sqrt(K)/(s Pa)."""

@@ -1,11 +1,14 @@
 """Disturbances beside the load: what of them the simulated plant meets, and how its equations are given them."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
 import numpy as np
 
+from coldloop.errors import ColdloopError
+from coldloop.foreign import foreign
 from coldloop.process.load_profile import LoadProfile
 from plant.numeric import RealArray
 from plant.program import PlantProgram
@@ -53,6 +56,9 @@ class DisturbedPlant(PlantProgram):
         arguments: Of `PlantProgram`.
     """
 
+    whose = "the plant"
+    """What is told where equations that are not ours fail."""
+
     def __init__(self, disturbances: Disturbances, **arguments: Any) -> None:  # noqa: ANN401 of the base
         self.disturbances = disturbances
         super().__init__(**arguments)
@@ -70,13 +76,38 @@ class DisturbedPlant(PlantProgram):
         """Return states and outputs one tick ahead, without the disturbances."""
         raise NotImplementedError
 
+    def _calling(self) -> AbstractContextManager[None]:
+        return foreign(f"{self.whose} fails at tick {self.tick}", "the simulated plant ends there", kind=ColdloopError)
+
     def _outside(self, w: float) -> RealArray:
         return np.append(w, self.disturbances.at(self.tick))
 
     def _read(self, w: float) -> RealArray:
-        return np.append(self._own_outputs(self._outside(w)), self.disturbances.shown(self.tick))
+        with self._calling():
+            own = self._own_outputs(self._outside(w))
+        return np.append(own, self.disturbances.shown(self.tick))
 
     def _step(self, w: float) -> tuple[RealArray, RealArray]:
-        x, y = self._own_step(self._outside(w))
+        with self._calling():
+            x, y = self._own_step(self._outside(w))
         met, next_tick = self.disturbances, self.tick + 1
         return np.append(x, met.at(next_tick)), np.append(y, met.shown(next_tick))
+
+    def _saved(self) -> dict[str, Any] | None:
+        """Return what the plant hides beside its states, as plain data; None if nothing, or if it cannot be saved."""
+        return None
+
+    def _return_to(self, saved: Mapping[str, Any] | None) -> None:
+        """Return to what `_saved` returned (ValueError or KeyError if it is not of this plant)."""
+        if saved is not None:
+            raise ValueError("the retained state is that of another plant")
+
+    def retained(self) -> dict[str, Any]:
+        """Return what `resume` needs, as plain data."""
+        saved = self._saved()
+        return super().retained() | ({} if saved is None else {"own": saved})
+
+    def resume(self, *retained: Any, own: Mapping[str, Any] | None = None, **named: Any) -> None:  # noqa: ANN401
+        """Resume from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
+        self._return_to(own)
+        super().resume(*retained, **named)

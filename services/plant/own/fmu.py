@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from coldloop.errors import ModelFileError
 from coldloop.process.signals import STATE_NAMES, TICK_S
 from plant.numeric import RealArray
 from plant.own.disturbances import NO_DISTURBANCES, Disturbances, DisturbedPlant
-from plant.own.fmu_file import Fmu
+from plant.own.fmu_file import Fmu, Port
 from plant.program import HeatLoad, MeasurementNoise
 
 log = logging.getLogger("coldloop.plant")
@@ -46,9 +47,9 @@ class FmuSimulation:
 
     def __init__(self, fmu: Fmu, wiring: Wiring, tick_s: float) -> None:
         names = [*wiring.inputs, *([wiring.load] if wiring.load else []), *wiring.disturbances]
-        self._inputs = [fmu.reference(name) for name in names]
-        self._outputs = [fmu.reference(name) for name in wiring.outputs]
-        self._states = [fmu.reference(name) for name in wiring.states]
+        self.inputs = [fmu.port(name) for name in names]
+        self._outputs = [fmu.port(name) for name in wiring.outputs]
+        self._states = [fmu.port(name) for name in wiring.states]
         self._instance = fmu.instance(wiring.start)
         self._wiring = wiring
         self._step_s = tick_s / wiring.steps_per_tick
@@ -56,7 +57,7 @@ class FmuSimulation:
 
     def put(self, u: RealArray, w: RealArray) -> None:
         """Set inputs, load (which may be none) and other disturbances."""
-        self._instance.put(self._inputs, [*u.tolist(), *w[0 if self._wiring.load else 1 :].tolist()])
+        self._instance.put(self.inputs, [*u.tolist(), *w[0 if self._wiring.load else 1 :].tolist()])
 
     def outputs(self) -> RealArray:
         """Return the outputs."""
@@ -66,9 +67,9 @@ class FmuSimulation:
         """Return the states that it shows."""
         return self._instance.read(self._states)
 
-    def read(self, references: Sequence[int]) -> RealArray:
-        """Return other real variables."""
-        return self._instance.read(references)
+    def read(self, ports: Sequence[Port]) -> RealArray:
+        """Return other variables."""
+        return self._instance.read(ports)
 
     def tick(self) -> None:
         """Go one tick forward.
@@ -86,9 +87,9 @@ class FmuSimulation:
         for _ in range(self._wiring.rest_ticks):
             self.tick()
 
-    def derivatives(self, of: Sequence[int]) -> RealArray:
+    def derivatives(self, of: Sequence[Port]) -> RealArray:
         """Return partial derivatives by states, inputs, load and k other disturbances, shape (of, n + m + 1 + k)."""
-        by = [*self._states, *self._inputs]
+        by = [*self._states, *self.inputs]
         found = self._instance.derivatives(of, by)
         no_load = len(self._states) + len(self._wiring.inputs)
         return found if self._wiring.load else np.insert(found, no_load, 0.0, axis=1)
@@ -148,24 +149,16 @@ class FmuPlant(DisturbedPlant):
         self._simulation.tick()
         return self._shown(), self._simulation.outputs()
 
-    def retained(self) -> dict[str, Any]:
-        """Return what `resume` needs, as plain data."""
-        return {**super().retained(), **({"own": self._simulation.saved()} if self._keeps_state else {})}
+    def _saved(self) -> dict[str, Any] | None:
+        return self._simulation.saved() if self._keeps_state else None
 
-    def resume(
-        self,
-        tick: int,
-        x: Sequence[float],
-        u: Sequence[float],
-        y: Sequence[float],
-        noise_state: Mapping[str, Any],
-        own: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Resume from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
-        if own is None or not self._keeps_state:
+    def _return_to(self, saved: Mapping[str, Any] | None) -> None:
+        if saved is None or not self._keeps_state:
             raise ValueError("the FMU cannot return to a state")
-        super().resume(tick, x, u, y, noise_state)
-        self._simulation.return_to(own)
+        try:
+            self._simulation.return_to(saved)
+        except ModelFileError as error:
+            raise ValueError(str(error)) from error
 
 
 def fmu_maker(fmu: Fmu, wiring: Wiring, u0: Sequence[float], w0: Sequence[float]) -> Callable[[], FmuSimulation]:

@@ -39,11 +39,18 @@ def check_signals(header: ModelHeader) -> None:
             f"{header.file}: a model of another process than COLDLOOP_PROCESS names; name the same for both"
         )
     if header.plant == FMU:
-        source = Path(header.plant_parameters["file"])
-        if not source.is_file() or file_digest(source) != header.parameters_digest:
-            raise ModelFileError(
-                f"{header.file}: made from another {source} than is there; make it again, `coldloop process`"
-            )
+        _fmu_of(header)
+
+
+def _fmu_of(header: ModelHeader) -> Path:
+    """Return the FMU that a model was made from: where it was then, or beside the model file."""
+    source = Path(header.plant_parameters["file"])
+    for place in (source, header.file.parent / source.name):
+        if place.is_file() and file_digest(place) == header.parameters_digest:
+            return place
+    raise ModelFileError(
+        f"{header.file}: made from another {source} than is there or beside it; make it again, `coldloop process`"
+    )
 
 
 def file_digest(path: Path) -> str:
@@ -102,7 +109,7 @@ def _fmu_plant_maker(
     from plant.own.fmu import FmuPlant, Wiring, fmu_maker  # noqa: PLC0415 few plants are FMUs
     from plant.own.fmu_file import Fmu  # noqa: PLC0415
 
-    fmu = Fmu(Path(header.plant_parameters["file"]))
+    fmu = Fmu(_fmu_of(header))
     at_rest = fmu_maker(fmu, Wiring(**header.plant_parameters["wiring"]), header.u0, w0)
 
     def make(load: HeatLoad, seed: int) -> PlantProgram:

@@ -9,6 +9,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from coldloop.errors import ModelFileError
+from coldloop.foreign import foreign
 from coldloop.process.signals import TICK_S
 from plant.numeric import RealArray
 from plant.own.disturbances import NO_DISTURBANCES, Disturbances, DisturbedPlant, outside
@@ -43,11 +44,9 @@ def made_by(source: str, name: str, where: str) -> Any:  # noqa: ANN401 whatever
     """
     module = ModuleType(f"coldloop_plant_{name}")
     sys.modules[module.__name__] = module  # dataclasses look there
-    try:
+    with foreign(f"{where}: {name} cannot be made"):
         exec(compile(source, where, "exec"), vars(module))  # noqa: S102 it is what the user has written
         return getattr(module, name)
-    except Exception as error:
-        raise ModelFileError(f"{where}: {name} cannot be made: {_said(error)}") from error
 
 
 def equations_of(source: str, name: str, where: str) -> Equations:
@@ -57,15 +56,15 @@ def equations_of(source: str, name: str, where: str) -> Equations:
         ModelFileError: The source does not run, or the class lacks something: one line.
     """
     kind = made_by(source, name, where)
-    try:
+    with foreign(f"{where}: {name} cannot be made"):
         made: Any = kind()
         made.steps_per_tick = int(getattr(made, "steps_per_tick", 1))
         states, guess = dict(made.states), np.array(made.guess, dtype=np.float64)
-    except Exception as error:
-        raise ModelFileError(f"{where}: {name} cannot be made: {_said(error)}") from error
     for needed in ("derivatives", "outputs"):
         if not callable(getattr(made, needed, None)):
-            raise ModelFileError(f"{where}: {name} has no {needed}(x, u, w); docs/your-plant.md says what it needs")
+            raise ModelFileError(
+                f"{where}: {name} has no {needed}(x, u, w); `coldloop docs your-plant` says what it needs"
+            )
     if not isinstance(made.states, Mapping) or not all(re.fullmatch(NAME, str(each)) for each in states):
         raise ModelFileError(f'{where}: states of {name} are a dict of names and units, such as {{"T": "K"}}')
     if guess.shape != (len(states),):
@@ -76,10 +75,6 @@ def equations_of(source: str, name: str, where: str) -> Equations:
     return found
 
 
-def _said(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}".replace("\n", " ")
-
-
 def evaluated(function: Callable[..., Any], *at: Any, size: int, where: str) -> RealArray:  # noqa: ANN401
     """Return what derivatives() or outputs() give at a point, shape (size,).
 
@@ -87,10 +82,8 @@ def evaluated(function: Callable[..., Any], *at: Any, size: int, where: str) -> 
         ModelFileError: It fails there, or returns something else: one line.
     """
     name = getattr(function, "__name__", "it")
-    try:
+    with foreign(f"{where}: {name}() fails"):
         found = np.asarray(function(*at), dtype=np.float64)
-    except Exception as error:
-        raise ModelFileError(f"{where}: {name}() fails: {_said(error)}") from error
     if found.shape != (size,):
         raise ModelFileError(f"{where}: {name}() returns {found.size} numbers, not {size}")
     return found
@@ -135,6 +128,7 @@ class PythonPlant(DisturbedPlant):
         noise: MeasurementNoise | None = None,
     ) -> None:
         self._equations = equations
+        self.whose = f"the plant's class {type(equations).__name__}"
         super().__init__(disturbances, x0=x0, u0=u0, load=load, noise=noise)
 
     def _seen(self, x: RealArray, w: RealArray) -> RealArray:
@@ -171,21 +165,10 @@ class HiddenPythonPlant(PythonPlant):
         self._hidden = runge_kutta(self._equations, self._hidden, self._u, outside(w), TICK_S)
         return self._own, self._seen(self._hidden, w)
 
-    def retained(self) -> dict[str, Any]:
-        """Return what `resume` needs, as plain data."""
-        return {**super().retained(), "own": {"hidden": self._hidden.tolist()}}
+    def _saved(self) -> dict[str, Any]:
+        return {"hidden": self._hidden.tolist()}
 
-    def resume(
-        self,
-        tick: int,
-        x: Sequence[float],
-        u: Sequence[float],
-        y: Sequence[float],
-        noise_state: Mapping[str, Any],
-        own: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Resume from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
-        if own is None or len(own["hidden"]) != len(self._hidden):
+    def _return_to(self, saved: Mapping[str, Any] | None) -> None:
+        if saved is None or len(saved["hidden"]) != len(self._hidden):
             raise ValueError("the retained state is that of another plant")
-        super().resume(tick, x, u, y, noise_state)
-        self._hidden = np.array(own["hidden"], dtype=np.float64)
+        self._hidden = np.array(saved["hidden"], dtype=np.float64)

@@ -142,22 +142,11 @@ class TransferFunctionPlant(DisturbedPlant):
         advance_lags(self.constants, self.memory, self.tick, self._u, w, y)
         return self._own, y
 
-    def retained(self) -> dict[str, Any]:
-        """Return what `resume` needs, as plain data."""
-        return {**super().retained(), "own": {name: part.tolist() for name, part in self.memory._asdict().items()}}
+    def _saved(self) -> dict[str, Any]:
+        return {name: part.tolist() for name, part in self.memory._asdict().items()}
 
-    def resume(
-        self,
-        tick: int,
-        x: Sequence[float],
-        u: Sequence[float],
-        y: Sequence[float],
-        noise_state: Mapping[str, Any],
-        own: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Resume from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
-        kept = LagMemory(**{name: np.array((own or {})[name], dtype=np.float64) for name in LagMemory._fields})
+    def _return_to(self, saved: Mapping[str, Any] | None) -> None:
+        kept = LagMemory(**{name: np.array((saved or {})[name], dtype=np.float64) for name in LagMemory._fields})
         if any(part.shape != ours.shape for part, ours in zip(kept, self.memory, strict=True)):
             raise ValueError("the retained state is that of another plant")
-        super().resume(tick, x, u, y, noise_state)
         self.memory = kept

@@ -252,7 +252,9 @@ class Rack:
     # -- what operators change -----------------------------------------------------------------------------------------
 
     def set_watchdog(self, time: int, who: str) -> None:
-        """Change the time-out of the watchdog (ticks, 0 is off), and restart it."""
+        """Change the time-out of the watchdog (ticks, 0 is off), and restart it; the same one does nothing."""
+        if time == self.watchdog.time:
+            return
         self.journal.note(self.tick, EventKind.WATCHDOG_TIME, time, self.watchdog.time, who=who)
         self.watchdog.set(time, self.tick)
 
@@ -281,7 +283,9 @@ class Rack:
         self._load_by = who if ahead else ""
 
     def set_pace(self, pace: TimeBase, who: str) -> None:
-        """Change the time base from the present tick on."""
+        """Change the time base from the present tick on; the same one does nothing."""
+        if pace == self.session.pace:
+            return
         self.session = self.session._replace(pace=pace)
         self.moving = pace.realtime and (self.moving or self.tick > 0)
         self.journal.note(self.tick, EventKind.PACE, pace_subject(pace), value=pace.factor, who=who)

@@ -113,13 +113,14 @@ def _why_restless(cold: Equilibrium, file: RefrigeratorPlantFile, helium: Helium
         return obstacle
     for section, key in (("nef5", "cv167_area_mm2"), ("station", "cv956_area_mm2")):
         part = getattr(file, section)
-        wide = part.model_copy(update={key: WIDER * getattr(part, key)})
-        wider = file.model_copy(update={section: wide}).refrigerator
+        wider = WIDER * max(1.0, type(part).model_fields[key].default / getattr(part, key))
+        wide = part.model_copy(update={key: wider * getattr(part, key)})
         try:
-            rest = find_refrigerator_equilibrium(cold, wider, helium, P_buffer)
+            plant = file.model_copy(update={section: wide}).refrigerator
+            rest = find_refrigerator_equilibrium(cold, plant, helium, P_buffer)
         except (NoEquilibriumError, np.linalg.LinAlgError):
             continue
-        for obstacle in _too_narrow(WIDER * rest.v):
+        for obstacle in _too_narrow(wider * rest.v):
             if obstacle.startswith(section):
                 return obstacle
     return (

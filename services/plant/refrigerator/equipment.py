@@ -29,8 +29,11 @@ NC1, NC2, HP_NOISE, LP_NOISE, TURBINE, CV155_MOVES, CV156_MOVES, HEATER, BLOCKIN
 HEATER_OFF, HEATER_FOLLOWS, HEATER_ON = range(3)
 
 START, ADMISSION, TRIPPED, CV155, CV156, BLOCKED, ACTING, DEVIATING = 0, 2, 3, 4, 5, 6, 10, 13
+LOW_SUCTION: Final = -1.0
+"""In the place of a start: the low pressure has tripped the compressor."""
 EQUIPMENT_SIZE: Final = 14
-"""The equipment's memory: how far each compressor's start has come (2, 1 is loaded), the share of CV156's opening that
+"""The equipment's memory: how far each compressor's start has come (2, 1 is loaded, -1 tripped by
+the low pressure), the share of CV156's opening that
 the turbine's governor allows, 1 after an overspeed trip, positions of CV155 and CV156 (%), the blocked share of NEF1,
 NEF2, NEF34 and NEF6 (4), the inputs that act on the cold box (3), and 1 where one is not as it is asked."""
 
@@ -69,6 +72,8 @@ class EquipmentLaw(NamedTuple):
     """Speed to which the governor limits the turbine by CV156."""
     overspeed_hz: float
     """Speed at which it is tripped."""
+    trip_lp: tuple[float, float]
+    """Low pressure (bar) that stops each compressor; held until it is switched off."""
 
 
 class Acting(NamedTuple):
@@ -157,13 +162,18 @@ def start_compressors(law: EquipmentLaw, memory: RealArray, d: RealArray, lp: fl
     """Bring starts forward, and write into `d` the shares that both compressors are to run at.
 
     One starts at a time, NC1 first, and the other when the cold box takes enough for two: the bypass of a warm one
-    could not pass the rest. It idles, and is loaded in a ramp; one that is switched off stops at once.
+    could not pass the rest. It idles, and is loaded in a ramp; one that is switched off, or tripped by the low
+    pressure, stops at once.
     """
     for i in range(2):
         other = memory[START + 1 - i]
         if d[NC1 + i] == 0.0:
             memory[START + i] = 0.0
-        elif memory[START + i] > 0.0 or (lp > law.least_lp and (other == 0.0 or (other == 1.0 and taken > law.second))):
+        elif memory[START + i] > 0.0 and lp < law.trip_lp[i]:
+            memory[START + i] = LOW_SUCTION
+        elif memory[START + i] > 0.0 or (
+            memory[START + i] == 0.0 and lp > law.least_lp and (other <= 0.0 or (other == 1.0 and taken > law.second))
+        ):
             memory[START + i] = min(memory[START + i] + TICK_S / (law.idle_s + law.load_s), 1.0)
         come = memory[START + i]
         if come < 1.0:

@@ -63,6 +63,7 @@ class RefrigeratorEvent(BaseModel):
     """Plant time, in multiples of 0.25 s."""
     target: EventTarget
     value: float
+    """What it is from then on, in the unit of the target."""
 
     @model_validator(mode="after")
     def _is_possible(self) -> "RefrigeratorEvent":

@@ -57,7 +57,7 @@ def make_refrigerator_file(
 
 def main() -> None:
     """Write the file that the command line asks for."""
-    parser = argparse.ArgumentParser(description="Make the file of the refrigerator.")
+    parser = argparse.ArgumentParser(allow_abbrev=False, description="Make the file of the refrigerator.")
     add_configuration_options(parser)
     parser.add_argument("file", type=Path, help="what to write")
     options = parser.parse_args()

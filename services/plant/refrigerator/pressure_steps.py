@@ -125,6 +125,7 @@ def _measured(x: RealArray, signals: RealArray) -> StationMeasurement:
         turbine=True,
         overspeed=False,
         deviating=False,
+        suction=False,
     )
 
 
@@ -154,7 +155,7 @@ def _cells(response: Response) -> str:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description="Steps of valves and load, and what both pressures do.")
+    parser = argparse.ArgumentParser(allow_abbrev=False, description="Steps of valves and load: both pressures.")
     parser.add_argument("--seconds", type=float, default=900.0, help="plant time after each step (default: 900)")
     print("\n".join(table(parser.parse_args().seconds)))  # noqa: T201 a program for the terminal
 

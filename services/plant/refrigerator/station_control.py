@@ -17,6 +17,7 @@ from plant.refrigerator.station_law import (
     AlarmLimits,
     Commands,
     Loop,
+    Overrides,
     StationLaw,
     StationMeasurement,
     control_station,
@@ -82,7 +83,9 @@ def station_law(settings: StationSettings, reference: StationReference, station:
         equipment=EquipmentLaw(
             settings.start.idle, settings.start.idle_s, settings.start.load_s, settings.start.second, limits.lp_low_bar,
             settings.turbine.run_up_s, settings.turbine.governed_hz, settings.turbine.overspeed_hz,
+            settings.protection.trip_lp_bar,
         ),
+        overrides=Overrides(*settings.protection.hp_bar, *settings.protection.lp_bar),
     )  # fmt: skip
 
 

@@ -42,7 +42,7 @@ MEMORY_SIZE: Final = 5
 COMPRESSORS: Final = 2
 LEAST_PRESSURE: Final = 0.5
 """bar, taken for the valves' flows when a line is emptier."""
-AUTOMATIC, LIMITED, CHARGE_STOPPED, ONE_COMPRESSOR, STOPPED, STARTING = map(int, StationMode)
+AUTOMATIC, LIMITED, CHARGE_STOPPED, ONE_COMPRESSOR, STOPPED, STARTING, OVERRIDE = map(int, StationMode)
 
 
 class StationMeasurement(NamedTuple):
@@ -67,7 +67,7 @@ class StationMeasurement(NamedTuple):
     bath: float
     """Pressure of the bath, bar."""
     nc1: bool
-    """Whether the compressor is switched on."""
+    """Whether the compressor is switched on, and not tripped by the low pressure."""
     nc2: bool
     loaded: int
     """Compressors that are switched on and loaded."""
@@ -77,6 +77,8 @@ class StationMeasurement(NamedTuple):
     """Whether its protection has tripped it."""
     deviating: bool
     """Whether a valve or the heater of the cold box is not as it is asked."""
+    suction: bool
+    """Whether the low pressure has tripped a compressor."""
 
 
 class Commands(NamedTuple):
@@ -105,6 +107,15 @@ class AlarmLimits(NamedTuple):
     nitrogen_low: float
     helium_lost: float
     bath_relief: float
+
+
+class Overrides(NamedTuple):
+    """Pressures (bar) at which a limit begins to move the buffer's valves, and those at which it has them to itself."""
+
+    hp: float
+    hp_full: float
+    lp: float
+    lp_full: float
 
 
 class StationLaw(NamedTuple):
@@ -140,6 +151,7 @@ class StationLaw(NamedTuple):
     """Opening of CV167 at the operating point, %."""
     alarms: AlarmLimits
     equipment: EquipmentLaw
+    overrides: Overrides
 
 
 @kernel
@@ -164,6 +176,7 @@ def law_of(fields: Any) -> StationLaw:  # noqa: ANN401 - any nesting of tuples
         fields[15],
         AlarmLimits(*fields[16]),
         EquipmentLaw(*fields[17]),
+        Overrides(*fields[18]),
     )
 
 
@@ -194,8 +207,47 @@ def control_station(c: StationLaw, integrals: RealArray, m: StationMeasurement) 
     wanted = flows_of_lq(c, integrals, m) if c.is_lq else flows_of_pi(c, integrals, m)
     allowed = outside_dead_band(c, integrals, wanted, m) if c.dead_band > 0.0 else wanted
     given, openings = split(c, allowed, m)
+    mode = mode_of(c, allowed, given, m)
+    high, low = beyond(m.hp, c.overrides.hp, c.overrides.hp_full), beyond(m.lp, c.overrides.lp, c.overrides.lp_full)
+    limited = shut_by(openings, high, low)
+    moved = opened_by(limited, high, low)
+    if moved != openings:
+        given, mode = flows_through(c, limited, m), OVERRIDE
     follow(c, integrals, wanted, given, m)
-    return Commands(openings[0], openings[1], openings[2], feed), mode_of(c, allowed, given, m)
+    return Commands(moved[0], moved[1], moved[2], feed), mode
+
+
+@kernel
+def beyond(pressure: float, limit: float, full: float) -> float:
+    """Return how far a pressure is beyond a limit, as a share of the way to where that acts fully, 0 to 1."""
+    return min(max((pressure - limit) / (full - limit), 0.0), 1.0)
+
+
+@kernel
+def shut_by(openings: tuple[float, float, float], high: float, low: float) -> tuple[float, float, float]:
+    """Return the openings (%) of bypass, discharge and charge valve that a high and a low pressure leave of them.
+
+    In the second half of its way a pressure shuts the valve that makes it worse. The integrals know of this.
+    """
+    return openings[0], min(openings[1], 200.0 * (1.0 - low)), min(openings[2], 200.0 * (1.0 - high))
+
+
+@kernel
+def opened_by(openings: tuple[float, float, float], high: float, low: float) -> tuple[float, float, float]:
+    """Return the openings (%) with which each pressure beyond its limit is relieved: fully after half of its way.
+
+    The integrals do not know of this. With both beyond their limits, as when the turbine trips, the buffer is a second
+    bypass.
+    """
+    return openings[0], max(openings[1], min(200.0 * high, 100.0)), max(openings[2], min(200.0 * low, 100.0))
+
+
+@kernel
+def flows_through(c: StationLaw, openings: tuple[float, float, float], m: StationMeasurement) -> Flows:
+    """Return what the valves pass at these openings (%), as the flows that `split` says it gives."""
+    discharge = openings[1] * per_percent(c.discharge, m.hp)
+    bypass = openings[0] * per_percent(c.bypass, m.hp) + (discharge if c.is_lq else 0.0)
+    return Flows(bypass, openings[2] * per_percent(c.charge, m.buffer) - discharge)
 
 
 @kernel
@@ -320,7 +372,7 @@ def raised_alarms(limits: AlarmLimits, m: StationMeasurement) -> int:
     conditions = (
         m.hp > limits.hp_high, m.hp < limits.hp_low, m.lp > limits.lp_high, m.lp < limits.lp_low,
         not m.nc1, not m.nc2, m.nitrogen < limits.nitrogen_low, m.lost > limits.helium_lost,
-        not (m.nc1 or m.nc2), m.bath > limits.bath_relief, not m.turbine, m.overspeed, m.deviating,
+        not (m.nc1 or m.nc2), m.bath > limits.bath_relief, not m.turbine, m.overspeed, m.deviating, m.suction,
     )  # fmt: skip
     raised = 0
     for bit in range(len(conditions)):

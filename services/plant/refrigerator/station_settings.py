@@ -45,6 +45,7 @@ class PiTuning(BaseModel):
     gain: PositiveFloat
     """kg/s per bar, or % per % for the nitrogen."""
     integral_s: PositiveFloat
+    """Integral time, s."""
 
 
 class StationAlarmSettings(BaseModel):
@@ -53,12 +54,17 @@ class StationAlarmSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     hp_high_bar: Bar = 16.8
+    """High pressure, bar, above."""
     hp_low_bar: Bar = 14.5
+    """High pressure, bar, below."""
     lp_high_bar: Bar = 1.15
+    """Low pressure, bar, above."""
     lp_low_bar: Bar = 0.97
+    """Low pressure, bar, below."""
     nitrogen_low: Percent = 25.0
     """%."""
     helium_lost_kg: PositiveFloat = 0.5
+    """Helium that is gone from the circuit, kg."""
     bath_relief_bar: Bar = 1.8
     """Of the bath; its relief valve opens at 1.8 bar."""
 
@@ -77,9 +83,33 @@ class CompressorStart(BaseModel):
     idle: Annotated[float, Field(gt=0, lt=1)] = 0.25
     """Share of its flow while it idles."""
     idle_s: Annotated[float, Field(ge=0, le=600)] = 10.0
+    """How long it idles, s."""
     load_s: Annotated[float, Field(gt=0, le=3600)] = 50.0
+    """How long the ramp takes, s."""
     second: Annotated[float, Field(ge=0, le=1)] = 0.7
     """Share of what the first one gives that the cold box takes when the second one is started."""
+
+
+class PressureProtection(BaseModel):
+    """Pressures that override the controller, fully from the second one on, and those that stop a compressor."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    hp_bar: tuple[Bar, Bar] = (17.0, 17.6)
+    """Above it the charge valve shuts and the discharge valve opens; the line's relief valve opens at 18 bar."""
+    lp_bar: tuple[Bar, Bar] = (0.99, 0.89)
+    """Below it the discharge valve shuts and the charge valve opens."""
+    trip_lp_bar: tuple[Annotated[float, Field(ge=0, le=1)], Annotated[float, Field(ge=0, le=1)]] = (0.75, 0.8)
+    """Low pressures that stop NC1 and NC2: the one stops first, so that the other may go on; 0 is never."""
+
+    @model_validator(mode="after")
+    def _bands_have_a_width(self) -> "PressureProtection":
+        if not self.hp_bar[0] < self.hp_bar[1]:
+            raise ValueError("hp_bar: write the high pressure at which it begins to act, then a higher one")
+        if not self.lp_bar[0] > self.lp_bar[1] > max(self.trip_lp_bar):
+            raise ValueError("lp_bar: write the low pressure at which it begins to act, then a lower one that is above "
+                             "both of trip_lp_bar")  # fmt: skip
+        return self
 
 
 class TurbineProtection(BaseModel):
@@ -129,4 +159,13 @@ class StationSettings(BaseModel):
     """So far above its set point does the low pressure close the charge valve, whatever the high pressure asks for."""
     start: CompressorStart = CompressorStart()
     turbine: TurbineProtection = TurbineProtection()
+    protection: PressureProtection = PressureProtection()
     alarms: StationAlarmSettings = StationAlarmSettings()
+
+    @model_validator(mode="after")
+    def _limits_are_beyond_set_points(self) -> "StationSettings":
+        high, low = self.protection.hp_bar[0], self.protection.lp_bar[0]
+        if not (self.hp_bar < high and low < self.lp_bar):
+            raise ValueError(f"set points are to be within the limits of protection: hp_bar below {high:g} bar, lp_bar "
+                             f"above {low:g} bar")  # fmt: skip
+        return self

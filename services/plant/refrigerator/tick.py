@@ -19,6 +19,7 @@ from plant.refrigerator.equipment import (
     LP_NOISE,
     NC1,
     NC2,
+    START,
     TRIPPED,
     TURBINE,
     Acting,
@@ -97,9 +98,10 @@ def control_tick(m: RefrigeratorMemory, d: RealArray, law: StationLaw) -> None:
     x, signals, equipment = m.x, m.signals, m.equipment
     measured = StationMeasurement(
         signals[HP] + d[HP_NOISE], signals[LP] + d[LP_NOISE], signals[BUFFER], x[CV956], x[CV952], x[CV953],
-        signals[NITROGEN], signals[LOST], m.y[P1], d[NC1] != 0.0, d[NC2] != 0.0,
+        signals[NITROGEN], signals[LOST], m.y[P1], d[NC1] != 0.0 and equipment[START] >= 0.0,
+        d[NC2] != 0.0 and equipment[START + 1] >= 0.0,
         loaded_compressors(equipment, d), d[TURBINE] != 0.0 and equipment[TRIPPED] == 0.0, equipment[TRIPPED] != 0.0,
-        equipment[DEVIATING] != 0.0,
+        equipment[DEVIATING] != 0.0, min(equipment[START], equipment[START + 1]) < 0.0,
     )  # fmt: skip
     m.status[ALARMS] = raised_alarms(law.alarms, measured)
     commands, m.status[MODE] = control_station(law, m.integrals, measured)

@@ -104,15 +104,18 @@ def _split(content: bytes) -> tuple[int, bytes]:
     return int.from_bytes(content[:CHECKSUM_BYTES], "big"), content[CHECKSUM_BYTES:]
 
 
-def find_cache_folder() -> Path:
-    """Return a folder for the cache that only this user can write to: its files are loaded as code.
+def find_cache_folder(name: str = NAME) -> Path:
+    """Return a folder for a cache that only this user can write to: its files are loaded as code.
+
+    Args:
+        name: Of the cache: kernels, or processes, which are model files.
 
     Raises:
         ConfigurationError: Others can write to the one that the environment names.
     """
     chosen = os.environ.get("COLDLOOP_CACHE_DIR")
     for root in [Path(chosen)] if chosen else _usual_roots():
-        folder = root / NAME
+        folder = root / name
         try:
             root.mkdir(mode=0o755, parents=True, exist_ok=True)
             folder.mkdir(mode=0o755, exist_ok=True)
@@ -123,17 +126,17 @@ def find_cache_folder() -> Path:
         except OSError as error:
             if chosen:
                 sys.stderr.write(
-                    f"COLDLOOP_CACHE_DIR={chosen}: {error.strerror}; kernels are compiled for this process alone\n"
+                    f"COLDLOOP_CACHE_DIR={chosen}: {error.strerror}; {name} are made for this process alone\n"
                 )
             continue
         if closed:
             return folder
         if chosen:
             raise ConfigurationError(
-                f"COLDLOOP_CACHE_DIR={chosen}: others can write to {folder}, and kernels are loaded as code: name a "
+                f"COLDLOOP_CACHE_DIR={chosen}: others can write to {folder}, and {name} are loaded as code: name a "
                 "folder of your own, or take the permission away (chmod -R go-w)"
             )
-    return Path(tempfile.mkdtemp(prefix="coldloop-kernels-"))
+    return Path(tempfile.mkdtemp(prefix=f"coldloop-{name}-"))
 
 
 def _usual_roots() -> list[Path]:

@@ -21,7 +21,7 @@ class Kernels:
     """Seconds that compiling all of them takes."""
 
 
-Announce = Callable[[Kernels], None]
+Announce = Callable[..., None]
 
 
 def write_line(*kernels: Kernels) -> None:
@@ -40,6 +40,11 @@ _needed: list[Kernels] = []
 """The kernels that are needed at present; the first are what the user has asked for, the others are parts of it."""
 _announced: set[str] = set()
 _announce: Announce = write_line
+
+
+def announce(*kernels: Kernels) -> None:
+    """Announce what is compiled now, in the way that was chosen."""
+    _announce(*kernels)
 
 
 def announce_with(announce: Announce) -> None:

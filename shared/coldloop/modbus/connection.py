@@ -66,6 +66,8 @@ class Connection(asyncio.Protocol):
         self._output_blocked = False
         self._reading_paused = False
         self._queued = False
+        self._secure = False
+        self._ended = False  # the client sends no more
         self._rate: RateLimit | None = None
         self._held: asyncio.TimerHandle | None = None
         self.requests = 0
@@ -99,6 +101,7 @@ class Connection(asyncio.Protocol):
             return
         self.peer = f"{address[0]}:{address[1]}"
         secure = transport.get_extra_info("ssl_object")
+        self._secure = secure is not None
         if secure is None:
             self._welcome(caller_at(address[0], self.peer, self._settings.access))
         else:
@@ -131,6 +134,12 @@ class Connection(asyncio.Protocol):
             return
         self._buffer += data
         self._serve()
+
+    def eof_received(self) -> bool:
+        """Answer the requests that are there, and close then; a request that waits is dropped (event loop callback)."""
+        self._ended = not self._secure  # TLS has no half of a connection
+        self._regulate_reading()
+        return self._ended
 
     def pause_writing(self) -> None:
         """Stop serving a client that does not read its answers (event loop callback)."""
@@ -167,6 +176,10 @@ class Connection(asyncio.Protocol):
         return self._queued
 
     def _regulate_reading(self) -> None:
+        if self._ended:
+            if self._wait is not None or not (self._queued or self._held or self._output_blocked):
+                self._transport.close()
+            return
         pause = self._output_blocked or self._held is not None or len(self._buffer) > INPUT_LIMIT
         if pause is self._reading_paused or self._transport.is_closing():
             return

@@ -18,7 +18,9 @@ class Endpoint(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     host: str = "127.0.0.1"
+    """Name or address."""
     port: Annotated[int, Field(ge=1, le=65535)]
+    """TCP port."""
     word_order: WordOrder = WordOrder.HIGH_FIRST
     timeout_s: PositiveFloat = 3.0
     """How long an answer may take."""

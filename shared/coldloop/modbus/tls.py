@@ -2,6 +2,7 @@
 
 import logging
 import ssl
+import stat
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -84,6 +85,8 @@ def certificate_days_left(settings: TlsSettings, now: datetime | None = None) ->
 
 def _context(protocol: int, settings: TlsSettings, name: str) -> ssl.SSLContext:
     authorities = _check_files(settings, name)
+    if settings.key.stat().st_mode & stat.S_IROTH:
+        _logger.warning("%s: key %s: everyone can read it; `chmod o-r` it", name, settings.key)
     _warn_of_time(settings, name)
     context = ssl.SSLContext(protocol)
     context.minimum_version = ssl.TLSVersion.TLSv1_3

@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
 
 from coldloop.errors import LoadFileError, UsageError
+from coldloop.number_text import value_text
 from coldloop.process.load_profile import LOAD_SPAN, LOAD_UNIT, LOAD_WORD, LoadProfile, load_profile_of
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, LAST_TICK, OUTPUT_NAMES, TICK_S
 from coldloop.registers.plant import SensorFaultKind
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmKind
@@ -67,7 +69,9 @@ class SetSetpoint(_Command):
     @property
     def text(self) -> str:
         """The command in words."""
-        return f"Move the setpoint of {self.input} to {self.value:g} {INPUT_UNITS[INPUT_NAMES.index(self.input)]}"
+        return (
+            f"Move the setpoint of {self.input} to {value_text(self.value, INPUT_UNITS[INPUT_NAMES.index(self.input)])}"
+        )
 
 
 class SetLoad(_Command):
@@ -82,7 +86,7 @@ class SetLoad(_Command):
     def text(self) -> str:
         """The command in words."""
         begin = clock_text(self.tick * TICK_S) if self.tick else "the next tick"
-        return f"Change the {LOAD_WORD} to {self.watts:g} {LOAD_UNIT} from {begin} on"
+        return f"Change the {LOAD_WORD} to {value_text(self.watts, LOAD_UNIT)} from {begin} on"
 
 
 class PlayLoad(_Command):
@@ -126,7 +130,7 @@ class SetFactor(_Command):
     @property
     def text(self) -> str:
         """The command in words."""
-        return f"Run plant time {self.factor:g} times as fast as real time"
+        return f"Run plant time {value_text(self.factor)} times as fast as real time"
 
 
 class SetPaused(_Command):
@@ -186,7 +190,7 @@ class FaultSensor(_Command):
     @property
     def text(self) -> str:
         """The command in words."""
-        value = f" ({self.value:g})" if self.fault == SensorFaultKind.VALUE else ""
+        value = f" ({value_text(self.value)})" if self.fault == SensorFaultKind.VALUE else ""
         return f"Training: sensor of {self.output}: {word(SensorFaultKind(self.fault))}{value}"
 
 
@@ -200,6 +204,8 @@ def read_command(document: object) -> Command:
     Raises:
         UsageError: It is none; one line that says what is wrong with it.
     """
+    if not PROCESS.has_load and isinstance(document, dict) and document.get("kind") in {"load", "load_file"}:
+        raise UsageError(f"{PROCESS.name} has no load")
     try:
         return _COMMAND.validate_python(document)
     except ValidationError as error:

@@ -9,6 +9,7 @@ from typing import Any, Final
 from coldloop.errors import BUSY, LinkError, RequestRefusedError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.endpoints import Endpoint
+from coldloop.number_text import value_text
 from coldloop.operating.commands import (
     Command,
     FaultSensor,
@@ -128,7 +129,8 @@ def check_bounds(command: SetSetpoint, low: float, high: float) -> None:
     """
     unit = INPUT_UNITS[INPUT_NAMES.index(command.input)]
     if not low <= command.value <= high:
-        raise UsageError(f"{command.input} = {command.value:g} {unit} is not from {low:g} to {high:g} {unit}")
+        span = f"{value_text(low)} to {value_text(high, unit)}"
+        raise UsageError(f"{command.input} = {value_text(command.value, unit)} is not from {span}")
 
 
 async def check_manual(client: RegisterClient) -> Operator:
@@ -150,8 +152,9 @@ async def set_setpoint(clients: Clients, command: SetSetpoint) -> str:
     values = [command.value if i == place else present for i, present in enumerate(operator[1:])]
     await client.write(Operator(operator.mode, *values))
     back, unit = await client.read(Operator), INPUT_UNITS[place]
-    was = f"was {operator[1 + place]:g} {unit}"
-    return f"setpoint of {command.input} {back[1 + place]:g} {unit} ({was}); approached within the rate limit"
+    was = f"was {value_text(operator[1 + place], unit)}"
+    now = f"setpoint of {command.input} {value_text(back[1 + place], unit)}"
+    return f"{now} ({was}); approached within the rate limit"
 
 
 async def set_load(clients: Clients, command: SetLoad) -> str:
@@ -171,7 +174,7 @@ async def set_load(clients: Clients, command: SetLoad) -> str:
             break
         await asyncio.sleep(LOOK_S)
         status = await client.read(LoadStatus)
-    return f"{_load_text(command, status)} (was {before.watts:g} {LOAD_UNIT})"
+    return f"{_load_text(command, status)} (was {value_text(before.watts, LOAD_UNIT)})"
 
 
 def _load_text(command: SetLoad, status: LoadStatus) -> str:
@@ -181,13 +184,13 @@ def _load_text(command: SetLoad, status: LoadStatus) -> str:
         LinkError: It knows another one.
     """
     if not status.upcoming:
-        return f"load {status.watts:g} {LOAD_UNIT} now"
+        return f"load {value_text(status.watts, LOAD_UNIT)} now"
     if command.tick and status.last_tick != command.tick:
         raise LinkError(f"the load from {command.tick * TICK_S:g} s on is different: another client has overwritten it")
-    text = f"load {command.watts:g} {LOAD_UNIT} from {status.last_tick * TICK_S:g} s on"
+    text = f"load {value_text(command.watts, LOAD_UNIT)} from {status.last_tick * TICK_S:g} s on"
     if status.next_tick == status.last_tick:
         return text
-    return f"{text}, before it {status.next_watts:g} {LOAD_UNIT} from {status.next_tick * TICK_S:g} s on"
+    return f"{text}, before it {value_text(status.next_watts, LOAD_UNIT)} from {status.next_tick * TICK_S:g} s on"
 
 
 async def play_load(clients: Clients, command: PlayLoad) -> str:
@@ -364,7 +367,7 @@ async def _set_pace(clients: Clients, change: Callable[[SessionPace], SessionPac
         raise UsageError("the session is in lock-step: time advances as it is granted")
     await write_pace(clients, pace)
     back, tick = await plant.read(SessionPace), (await plant.read(Identity)).tick
-    return f"{'paused' if back.paused else 'running'} at {tick * TICK_S:g} s, factor {back.factor:g}"
+    return f"{'paused' if back.paused else 'running'} at {tick * TICK_S:g} s, factor {value_text(back.factor)}"
 
 
 async def write_pace(clients: Mapping[str, RegisterClient], pace: SessionPace) -> None:

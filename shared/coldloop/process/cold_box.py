@@ -8,6 +8,8 @@ LEVEL_BAND: Final = (59.0, 61.0)
 """Band of L1, % (paper, section IV)."""
 T5_BAND: Final = (9.0, 16.0)
 """Band of T5, K (paper, section IV)."""
+DEAD_BAND: Final = 0.02
+"""Of a band, over its width: 0.04 % and 0.14 K. L1 and T5 rest at an end of it where that is the optimum."""
 LEVEL_LOOP: Final = Loop(input="NCR22_A", gain=-100.0, integral_time_s=300.0)
 T5_LOOP: Final = Loop(input="CV156", gain=-5.0, integral_time_s=240.0)
 """How they were tuned is in `docs/science.md`."""
@@ -35,12 +37,17 @@ _HEAT_LOAD: Final = Load(
     has_named_loads=True,
 )  # fmt: skip
 _BANDED: Final = {
-    "L1": (
-        Band(low=LEVEL_BAND[0], high=LEVEL_BAND[1], weight=100.0, alarm_word="level band", loop=LEVEL_LOOP),
-        (56.0, 64.0),
-    ),
-    "T5": (Band(low=T5_BAND[0], high=T5_BAND[1], weight=100.0, alarm_word="t5 band", loop=T5_LOOP), (6.0, 20.0)),
-}
+    name: (
+        Band(
+            low=low, high=high, weight=100.0, dead_band=DEAD_BAND * (high - low), alarm_word=alarm_word, loop=loop
+        ),
+        bar,
+    )
+    for name, (low, high), alarm_word, loop, bar in (
+        ("L1", LEVEL_BAND, "level band", LEVEL_LOOP, (56.0, 64.0)),
+        ("T5", T5_BAND, "t5 band", T5_LOOP, (6.0, 20.0)),
+    )
+}  # fmt: skip
 
 
 def _output(name: str, unit: str, quantity: str) -> Output:
@@ -87,8 +94,8 @@ COLD_BOX: Final = Process(
         pressure_state="P1",
         level_state="V_l",
         temperature_states=tuple(state.name for state in _TEMPERATURES),
-        holdable_load=(128.0, 553.0),
-        load_reserve=25.0,
+        holdable_load=(128.0, 515.0),
+        load_reserve=20.0,
         least_load_error=25.0,
     ),
     moves_as_one=True,

@@ -69,6 +69,8 @@ class Band:
     """How far inside it the rows of the problem are: half of it where there is a setpoint, in its middle."""
     alarm: Range | None = None
     """Outside of it the alarm is raised; the band where it is not given."""
+    dead_band: float = 0.0
+    """Excess up to which the output does not count as outside, in its unit: for alarms, indicators and the page."""
     loop: Loop | None = None
     alarm_word: str = ""
     """What its alarm is called; `NAME outside its band` where this is empty."""
@@ -318,6 +320,12 @@ class Process:
         """Whether there is a disturbance."""
         return self.load.name != NO_LOAD.name
 
+    @property
+    def disturbances(self) -> tuple[Output, ...]:
+        """Outputs of a process file that measure a disturbance beside the load: they have its name, and no band."""
+        states = set() if self.load.has_named_loads else {state.name for state in self.states}
+        return tuple(output for output in self.outputs if output.band is None and output.name in states)
+
     def share(self, of: str) -> float:
         """Return the time of a solver's iteration, or of a preparation, over that with the cold box's problem."""
         return self.iterations.get(of, 1.0)
@@ -331,6 +339,11 @@ class Process:
     def bands(self) -> tuple[Band, ...]:
         """Their bands."""
         return tuple(output.band for output in self.outputs if output.band is not None)
+
+    @property
+    def dead_bands(self) -> tuple[float, ...]:
+        """Their dead bands."""
+        return tuple(band.dead_band for band in self.bands)
 
     def document(self) -> dict[str, Any]:
         """Return this as plain data, tuples as lists."""

@@ -14,7 +14,7 @@ LARGEST: Final = 1e38
 
 
 class RateReference(StrEnum):
-    """What the rate limit of an update is measured against; the paper leaves it open (`docs/science.md`, ruling 15)."""
+    """What the rate limit of an update is measured against; the paper leaves it open (`rig/report/slips.md`, 15)."""
 
     PER_UPDATE = "per-update"
     """The full limit of a sampling period of 5 s at each update, however soon the next one follows."""
@@ -28,7 +28,9 @@ class InputLimits(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     low: PerInput = tuple(one.low for one in PROCESS.inputs)
+    """Least value."""
     high: PerInput = tuple(one.high for one in PROCESS.inputs)
+    """Largest value."""
     rate: PerInput = tuple(one.rate for one in PROCESS.inputs)
     """Largest change in one sampling period, up or down."""
     rate_reference: RateReference = RateReference.PER_UPDATE

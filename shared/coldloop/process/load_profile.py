@@ -1,6 +1,5 @@
 """The load over time, and the CSV files that hold it."""
 
-import csv
 import math
 import struct
 from bisect import bisect_right
@@ -11,6 +10,7 @@ from typing import Final
 from coldloop.errors import LoadFileError
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import LAST_TICK, TICK_S
+from coldloop.table import TIME, Table, read_table, table_of
 
 LOAD_SPAN: Final[tuple[float, float]] = struct.unpack("2f", struct.pack("2f", *PROCESS.load.span))
 """Lowest and highest load, as registers have them."""
@@ -57,13 +57,7 @@ def read_load_file(path: Path) -> LoadProfile:
     Raises:
         LoadFileError: One line that names file, line and remedy.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise LoadFileError(f"{path}: not UTF-8 text (byte {error.start}); save it as UTF-8") from None
-    except OSError as error:
-        raise LoadFileError(f"{path}: {error.strerror}; name a readable CSV file") from None
-    return load_profile_of(text, str(path))
+    return _profile(read_table(path, (TIME, LOAD_COLUMN, IN_WATTS), "name a readable CSV file", LoadFileError))
 
 
 def load_profile_of(text: str, where: str) -> LoadProfile:
@@ -72,31 +66,20 @@ def load_profile_of(text: str, where: str) -> LoadProfile:
     Raises:
         LoadFileError: One line that names place, line and remedy.
     """
-    reader = csv.DictReader(text.splitlines())
-    try:
-        found = reader.fieldnames or ()
-        columns = ("time_s", LOAD_COLUMN if LOAD_COLUMN in found else IN_WATTS)
-        if not set(columns) <= set(found):
-            missing = " and ".join(sorted({"time_s", LOAD_COLUMN} - set(found)))
-            raise LoadFileError(f"{where}: no column {missing}; the first line is time_s,{LOAD_COLUMN}")
-        times: list[int] = []
-        watts: list[float] = []
-        for row in reader:
-            tick, load = _step(row, columns, times, f"{where}, line {reader.line_num}")
-            times.append(tick)
-            watts.append(load)
-    except csv.Error as error:
-        raise LoadFileError(f"{where}, line {reader.line_num + 1}: {error}; write two numbers a line") from None
-    if not times:
-        raise LoadFileError(f"{where}: no steps; add a line such as 0,385")
-    return LoadProfile(tuple(times), tuple(watts))
+    return _profile(table_of(text, where, (TIME, LOAD_COLUMN, IN_WATTS), LoadFileError))
 
 
-def _step(
-    row: dict[str, str | None], columns: tuple[str, str], before: list[int], where: str
-) -> tuple[int, float]:  # fmt: skip
-    """Return the step (tick, W) in a line, if it may follow those before."""
-    time, load = (_number(row[column], f"{where}, {column}") for column in columns)
+def _profile(table: Table) -> LoadProfile:
+    column = LOAD_COLUMN if table.place(LOAD_COLUMN) is not None or table.place(IN_WATTS) is None else IN_WATTS
+    ticks: list[int] = []
+    loads = table.columns([TIME, column])
+    for (line, _), time, load in zip(table.rows, *loads, strict=True):
+        ticks.append(_step(time, load, ticks, f"{table.where}, line {line}"))
+    return LoadProfile(tuple(ticks), tuple(loads[1]))
+
+
+def _step(time: float, load: float, before: list[int], where: str) -> int:
+    """Return the tick of a step, if it may follow those before."""
     if not 0 <= time < LAST_TICK * TICK_S:
         raise LoadFileError(f"{where}: {time:g} s is outside 0 to {LAST_TICK * TICK_S:g} s")
     low, high = LOAD_SPAN
@@ -110,14 +93,4 @@ def _step(
         raise LoadFileError(f"{where}: the first step is at {time:g} s; begin at 0 s")
     if before and tick <= before[-1]:
         raise LoadFileError(f"{where}: {time:g} s does not come after {before[-1] * TICK_S:g} s; sort by time_s")
-    return tick, load
-
-
-def _number(text: str | None, where: str) -> float:
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise LoadFileError(f"{where}: {text!r} is not a finite number")
-    return value
+    return tick

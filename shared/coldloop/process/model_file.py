@@ -104,7 +104,7 @@ def read_document(path: Path, remedy: str = REMEDY) -> dict[str, Any]:
         ModelFileError: the file is missing, unreadable, not JSON, not finite, of another version or damaged.
     """
     try:
-        document = parsed_json(path.read_text(encoding="utf-8"), parse_constant=_refuse)
+        document = parsed_json(path.read_bytes(), parse_constant=_refuse)
     except FileNotFoundError as error:
         raise ModelFileError(f"{path}: no such model file; {remedy}") from error
     except (OSError, ValueError) as error:

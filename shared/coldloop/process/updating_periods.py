@@ -11,8 +11,8 @@ ROUNDING: Final = 1e-5
 """Share of an iteration that may be missing: times come through registers in single precision."""
 
 
-MOST_ITERATIONS: Final = 1_000_000
-"""In an updating period, however fast the PLC: solvers have converged long before."""
+MOST_ITERATIONS: Final = 0xFFFF
+"""In an updating period, however fast the PLC: what their register holds; solvers have converged long before."""
 
 
 class ComputingTimes(NamedTuple):

@@ -272,7 +272,11 @@ class Plan(NamedTuple):
         ),
     ] = 0.0
     suspects: Annotated[
-        int, u32("Outputs whose reading is not used, as prediction and other readings contradict it: bit i is output i")
+        int,
+        u32(
+            "Outputs whose reading is not used, as prediction and other readings contradict it: bit i is output i; "
+            "after these bits, inputs that are left where they are, as they have no effect"
+        ),
     ] = 0
     crc: Annotated[int, u32("CRC-32 of the registers before; none, or a wrong one, is refused")] = 0
 

@@ -282,6 +282,8 @@ class StationMode(IntEnum):
     """No compressor runs: total trip. The cold box is isolated, the high-pressure line empties into the buffer."""
     STARTING = 5
     """The first compressor idles or is being loaded, with the bypass open; the cold box is isolated until it is."""
+    OVERRIDE = 6
+    """A pressure is beyond a limit: it moves the buffer's valves, whatever the controller asks for."""
 
 
 class StationAlarm(IntFlag):
@@ -304,6 +306,8 @@ class StationAlarm(IntFlag):
     """It was the protection that tripped the turbine; held until the turbine is switched off."""
     ACTUATOR = 4096
     """CV155, CV156 or the heater is not as the control PLC asks."""
+    SUCTION_TRIP = 8192
+    """The low pressure has stopped a compressor; held until that is switched off."""
 
 
 class StationSample(NamedTuple):
@@ -317,7 +321,7 @@ class StationSample(NamedTuple):
         int,
         u16(
             "Pressure control: 0 automatic, 1 a valve at its end, 2 charging stopped, 3 one compressor, 4 stopped, "
-            "5 starting"
+            "5 starting, 6 a pressure beyond its limit moves the buffer's valves"
         ),
     ] = StationMode.AUTOMATIC
     alarms: Annotated[
@@ -325,7 +329,7 @@ class StationSample(NamedTuple):
         u16(
             "Bits: 1 HP high, 2 HP low, 4 LP high, 8 LP low, 16 NC1, 32 NC2 tripped, 64 nitrogen low, 128 helium lost, "
             "256 total trip, 512 relief of the bath, 1024 turbine tripped, "
-            "2048 by overspeed, 4096 an actuator not as asked"
+            "2048 by overspeed, 4096 an actuator not as asked, 8192 a compressor tripped by low suction pressure"
         ),
     ] = 0
 

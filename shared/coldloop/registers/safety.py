@@ -85,6 +85,8 @@ class AlarmKind(IntEnum):
     """The load is one that no inputs within their limits hold: the bands will be left."""
     SENSOR_SUSPECT = 21
     """A reading contradicts the prediction and the other readings."""
+    INPUT_WITHOUT_EFFECT = 22
+    """The optimiser leaves an input where it is: that of a turbine which stands moves nothing."""
 
 
 class CapacityCause(IntEnum):

@@ -4,7 +4,8 @@ A lease is granted to a connection with its first write, and refused to all othe
 silence, or by hand-over: when the connection of a simple client closes, at once; when that of a holder with a number
 closes, after a moment in which it may come back over another connection, from the same address and with the same
 certificate: the number is no password, anyone can read it. A holder that reconnects leaves its former connection for
-good: another client that writes over it has the same number.
+good: another client that writes over it has the same number. A lease that is shared is held by all connections of its
+holder side by side, until the last of them closes.
 """
 
 import time
@@ -30,18 +31,23 @@ class Lease:
         what: What the lease is of, for messages.
         silence_s: Returns how long, in real time, a holder may be silent; 0 is for ever.
         now: A clock, s.
+        shared: Whether a holder with a number may write over several connections in turn.
     """
 
-    def __init__(self, what: str, silence_s: Callable[[], float], now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, what: str, silence_s: Callable[[], float], now: Callable[[], float] = time.monotonic, *,
+        shared: bool = False,
+    ) -> None:  # fmt: skip
         self._what = what
+        self._shared = shared
         self._silence_s = silence_s
         self._now = now
         self._caller: Caller | None = None
         self._holder = SIMPLE_CLIENT
         self._heard_at = 0.0
         self._closed_at: float | None = None
-        self._left: set[int] = set()
-        """Open connections that the holder has left for the present one."""
+        self._others: dict[int, Caller] = {}
+        """Open connections that the holder had before the present one; it has left them, unless the lease is shared."""
         self.refused = 0
 
     @property
@@ -71,7 +77,7 @@ class Lease:
         if held is None or held.connection == caller.connection or self.state is LeaseState.FREE:
             return
         known = holder is not None and holder == self._holder != SIMPLE_CLIENT and caller.station == held.station
-        if known and caller.connection not in self._left:
+        if self._shared if caller.connection in self._others else known:
             return
         self.refused += 1
         raise BusyError(f"{held.name} holds the lease of {self._what}")
@@ -79,23 +85,27 @@ class Lease:
     def take(self, caller: Caller, holder: int | None = None) -> bool:
         """Note a write that `check` has let pass; return whether the lease has a new holder with it."""
         held, state = self._caller, self.state
-        same = held is not None and held.connection == caller.connection
+        same = held is not None and caller.connection in {held.connection, *self._others}
         number = self._holder if holder is None and same else holder or SIMPLE_CLIENT
         new = held is None or state is LeaseState.FREE or not (same or number == self._holder != SIMPLE_CLIENT)
         new = new or number != self._holder
         if new:
-            self._left.clear()
-        elif held is not None and not same and self._closed_at is None:
-            self._left.add(held.connection)
+            self._others.clear()
+        elif held is not None and self._closed_at is None:
+            self._others[held.connection] = held
+        self._others.pop(caller.connection, None)
         self._caller, self._holder = caller, number
         self._heard_at, self._closed_at = self._now(), None
         return new
 
     def closed(self, caller: Caller) -> bool:
         """Note that a connection has closed; return whether it held the lease."""
-        self._left.discard(caller.connection)
+        self._others.pop(caller.connection, None)
         gone = self._caller is None or self._caller.connection != caller.connection
         if gone or self._closed_at is not None:
+            return False
+        if self._shared and self._others:
+            self._caller = self._others.popitem()[1]
             return False
         self._closed_at = self._now()
         if self._holder == SIMPLE_CLIENT:

@@ -29,6 +29,7 @@ class WriterLease:
         silence_s: Returns how long, in real time, the holder may be silent.
         note: Takes the events, with the name of the client.
         now: A clock, s.
+        shared: Whether a holder with a number may write over several connections in turn.
     """
 
     def __init__(
@@ -37,8 +38,10 @@ class WriterLease:
         silence_s: Callable[[], float],
         note: Callable[[LeaseEvent, str], None],
         now: Callable[[], float] = time.monotonic,
+        *,
+        shared: bool = False,
     ) -> None:
-        self._lease = Lease(what, silence_s, now)
+        self._lease = Lease(what, silence_s, now, shared=shared)
         self._note = note
         self._now = now
         self._name: str | None = None

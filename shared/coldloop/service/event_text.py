@@ -156,6 +156,7 @@ _ALARM_CAUSES: Final[Mapping[int, Words]] = {
     AlarmKind.MODE: _causes(Cause),
     AlarmKind.SENSOR_BAD: _listed(OUTPUT_NAMES),
     AlarmKind.SENSOR_SUSPECT: _listed(OUTPUT_NAMES),
+    AlarmKind.INPUT_WITHOUT_EFFECT: _listed(INPUT_NAMES),
     AlarmKind.CAPACITY: _listed(_SHORTAGE),
     AlarmKind.SEQUENCE_REJECTED: _causes(Verdict),
     AlarmKind.PLANT_LOST: _causes(LinkCause),

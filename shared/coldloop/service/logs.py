@@ -119,7 +119,6 @@ def set_up_logs(service: str, level: str, stream: TextIO = sys.stderr) -> None:
     handler.setFormatter(JsonFormatter(service))
     handler.addFilter(FloodFilter())
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
-    logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # what it would say is raised by our client
     _handlers[:] = [handler]
 
 

@@ -33,7 +33,7 @@ SECTIONS = ("limits", "model", "session", "plant", "control_plc", "optimizer_plc
 
 def main(name: str, settings: type[S], serve: Callable[[S], Awaitable[None]], arguments: Sequence[str] | None) -> int:
     """Run a service until it is stopped; return its exit code."""
-    parser = argparse.ArgumentParser(prog=f"python -m {name}", description=f"Coldloop: the {name} service.")
+    parser = argparse.ArgumentParser(f"python -m {name}", description=f"Coldloop: {name}.", allow_abbrev=False)
     add_configuration_options(parser)
     parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
     parser.add_argument(

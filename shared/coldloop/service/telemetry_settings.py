@@ -3,7 +3,10 @@
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, field_validator, model_validator
+
+from coldloop.errors import ConfigurationError
+from coldloop.text_file import read_text
 
 
 class TelemetrySettings(BaseModel):
@@ -14,17 +17,27 @@ class TelemetrySettings(BaseModel):
     broker: str = ""
     """Host of the broker; empty is off."""
     port: Annotated[int, Field(ge=1, le=65535)] = 1883
+    """Its TCP port."""
     username: str = ""
     """Name at the broker; empty is a broker that asks for none."""
     password_file: Path | None = None
     """File that holds the password for it, on one line. It is read at each connection; without TLS it is sent as it
     is, so this is for a private network."""
     prefix: Annotated[str, Field(pattern=r"^[^#+]+$")] = "coldloop"
+    """Of topics; a rig at other ports than the usual ones adds its first port, unless this is set."""
     period_s: PositiveFloat = 1.0
     """Real time between snapshots."""
     queue: Annotated[int, Field(ge=1)] = 100
     """Snapshots kept while the broker is away; the oldest go first."""
     timeout_s: PositiveFloat = 5.0
+    """How long connecting may take, s."""
+
+    @field_validator("broker")
+    @classmethod
+    def _is_a_host(cls, value: str) -> str:
+        if value.count(":") == 1 or set("/[]") & set(value):
+            raise ValueError("name its host alone; the port is telemetry.port")
+        return value
 
     @model_validator(mode="after")
     def _password_belongs_to_a_name(self) -> Self:
@@ -36,8 +49,8 @@ class TelemetrySettings(BaseModel):
         """Return the password, if one is set.
 
         Raises:
-            OSError: The file cannot be read.
+            ConfigurationError: The file cannot be read.
         """
         if self.password_file is None:
             return None
-        return self.password_file.read_text(encoding="utf-8").rstrip("\r\n")
+        return read_text(self.password_file, "telemetry.password_file names it", ConfigurationError).rstrip("\r\n")

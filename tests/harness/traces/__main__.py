@@ -19,7 +19,9 @@ from tests.harness.traces.workers import found_now
 def main(words: Sequence[str]) -> int:
     """Check or record; return 1 where something differs."""
     parser = argparse.ArgumentParser(
-        prog="scripts/traces", description="Checks traces of runs in one process against tests/traces.json."
+        allow_abbrev=False,
+        prog="scripts/traces",
+        description="Checks traces of runs in one process against tests/traces.json.",
     )
     parser.add_argument("configurations", nargs="*", metavar="CONFIGURATION", help="which ones; by default all")
     parser.add_argument("--record", metavar="REASON", help="write them anew, with the reason why they have moved")

@@ -1,5 +1,6 @@
 // The alarm line that is always in sight, the list of alarms, the history, the audit.
-import { ask, element, isStale, onChange, state, timeText } from "./store.js";
+import { numberText, secondsOf, timeText } from "./numbers.js";
+import { ask, element, isStale, onChange, state } from "./store.js";
 import { command } from "./commands.js";
 
 const LETTERS = { 4: "C", 3: "H", 2: "M", 1: "L" };
@@ -19,8 +20,9 @@ function line() {
   const holder = byId("alarm-line"), active = state.alarms.filter((one) => ["unacknowledged", "acknowledged", "returned"].includes(one.state));
   const waiting = active.filter((one) => WAITING.includes(one.state)).length;
   const hidden = state.alarms.filter((one) => ["shelved", "out of service"].includes(one.state)).length;
-  const parts = active.slice(0, 4).map((one) => element("a", { class: `alarm ${WAITING.includes(one.state) ? "unacknowledged" : ""}`, href: "#alarms" }, badge(one), element("span", { text: `${one.name}${one.cause ? ` (${one.cause})` : ""}, ${STATES[one.state]}` })));
-  for (const name of state.plant.alarms || []) parts.push(element("a", { class: "alarm of-station", href: "#alarms" }, badge({ state: "acknowledged", priority: 3 }), element("span", { text: `station: ${name}` })));
+  const link = (one) => element("a", { class: `alarm ${WAITING.includes(one.state) ? "unacknowledged" : ""}`, href: "#alarms" }, badge(one), element("span", { text: `${one.name}${one.cause ? ` (${one.cause})` : ""}, ${STATES[one.state]}` }));
+  const ofStation = (state.plant.alarms || []).map((name) =>element("a", { class: "alarm of-station", href: "#alarms" }, badge({ state: "acknowledged", priority: 3 }), element("span", { text: `station: ${name}` })));
+  const parts = [...active.filter((one) => one.state !== "returned").map(link), ...ofStation, ...active.filter((one) => one.state === "returned").map(link)];
   if (!parts.length) parts.push(element("span", { class: "minor", text: "No alarms" }));
   const station = (state.plant.alarms || []).length;
   const counts = `${active.length} alarm${active.length === 1 ? "" : "s"}, ${waiting} unacknowledged${hidden ? `, ${hidden} suppressed` : ""}${station ? `, ${station} of the station` : ""}`;
@@ -54,7 +56,7 @@ function row(one) {
 function shelvingNote() {
   const factor = state.values["plant.pace.factor"], real = state.values["plant.pace.realtime"], paused = state.values["plant.pace.paused"];
   const text = !state.values["plant.pace.session"] || (real && !paused && factor === 1) ? "" : !real ? "Shelving counts plant time, which advances as it is granted."
-    : paused ? "Shelving counts plant time, which is paused." : `Shelving counts plant time: at factor ${factor}, 15 min are over in ${(900 / factor).toPrecision(3)} s by the clock.`;
+    : paused ? "Shelving counts plant time, which is paused." : `Shelving counts plant time: at factor ${factor}, 15 min are over in ${numberText(900 / factor, 3)} s by the clock.`;
   const note = byId("shelving-note");
   note.hidden = !text;
   if (note.textContent !== text) note.textContent = text;
@@ -76,13 +78,22 @@ function table() {
   });
 }
 
+let eventPage = 0; // 0 has the newest
+const turn = (pages) => () => { eventPage = Math.max(0, eventPage + pages); history(); };
 async function history() {
   if (byId("alarms").hidden) return;
-  const query = `search=${encodeURIComponent(byId("event-search").value)}&service=${encodeURIComponent(byId("event-service").value)}`;
+  const [from, to] = ["event-from", "event-to"].map((id) => {
+    const time = secondsOf(byId(id).value);
+    byId(id).setCustomValidity(Number.isNaN(time) ? "a time such as 1:02:03" : "");
+    return time || (time === 0 ? 0 : "");
+  });
+  const query = `search=${encodeURIComponent(byId("event-search").value)}&service=${encodeURIComponent(byId("event-service").value)}&from=${from}&to=${to}`;
   byId("event-csv").href = `api/events.csv?${query}`;
   try {
-    const { found, events } = await ask(`api/events?${query}`);
-    byId("event-count").textContent = `${found} events${found > events.length ? `, the newest ${events.length} shown` : ""}`;
+    const { found, first, pages, events } = await ask(`api/events?${query}&page=${eventPage}`);
+    if (eventPage && eventPage >= pages) { eventPage = Math.max(0, pages - 1); history(); return; }
+    byId("event-count").textContent = `${found} events${pages > 1 ? `, ${first} to ${first + events.length - 1} of them, the newest first` : ""}`;
+    byId("event-newer").disabled = !eventPage; byId("event-older").disabled = eventPage >= pages - 1;
     byId("event-table").querySelector("tbody").replaceChildren(...events.map((one) => element("tr", {}, element("td", { text: timeText(one.time_s) }), element("td", { text: one.utc.replace("T", " ").replace("Z", "") }), element("td", { text: one.service }), element("td", { text: one.sentence }))));
   } catch { /* the banner says it */ }
   if (!state.me.operates) return;
@@ -102,8 +113,9 @@ function stationNote() {
 
 export function initAlarms() {
   for (const service of state.catalog.services) byId("event-service").append(element("option", { value: service, text: service }));
-  byId("event-search").addEventListener("input", history);
-  byId("event-service").addEventListener("change", history);
+  for (const id of ["event-search", "event-from", "event-to", "event-service"]) byId(id).addEventListener("input", () => { eventPage = 0; history(); });
+  byId("event-newer").addEventListener("click", turn(-1));
+  byId("event-older").addEventListener("click", turn(1));
   onChange(({ alarms, names }) => {
     const station = JSON.stringify(state.plant.alarms || []);
     if (alarms || names === null || station !== shownStation) { shownStation = station; line(); table(); stationNote(); }

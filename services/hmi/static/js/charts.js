@@ -1,6 +1,9 @@
 // Charts over plant time: lines, bands, predictions, marks and the ribbon of modes, drawn with uPlot.
+import { axisLabels, numberText, timeText } from "./numbers.js";
+import { TEXTS } from "./quality.js";
+import { scaleOf } from "./readout.js";
 import uPlot from "../vendor/uPlot.js";
-import { timeText } from "./store.js";
+
 
 export function colour(name) { return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim(); }
 
@@ -10,7 +13,7 @@ const TITLE_HEIGHT = 16; // above the curves, never over them
 
 // lines: [{label, stroke, stepped, width}], options: {title, unit, decimals, log, band, sync, axis, small}
 export function makeChart(holder, lines, options) {
-  const extra = { substituted: {}, replaced: [], replacedEnds: [], band: null, predictions: [], planned: false, marks: [], modes: [], gaps: [], now: null };
+  const extra = { doubtful: {}, replaced: [], replacedEnds: [], band: null, predictions: [], planned: false, marks: [], modes: [], gaps: [], now: null };
   const axis = (side) => ({
     stroke: colour("muted"), grid: { stroke: colour("line"), width: 0.5 }, ticks: { stroke: colour("line"), width: 0.5, size: 4 },
     font: "11px system-ui, sans-serif", ...side,
@@ -26,14 +29,14 @@ export function makeChart(holder, lines, options) {
     legend: { show: false },
     cursor: { sync: options.sync ? { key: options.sync, setSeries: false } : undefined, drag: { x: Boolean(options.onZoom), y: false, setScale: false }, points: { size: 5 }, y: false },
     scales: { x: { time: false, range: (_u, low, high) => options.range ? options.range(low, high) : [low, high] },
-      y: options.log ? { distr: 3 } : { range: (_u, low, high) => spread(low, high, [...(extra.band || []), ...extra.replacedEnds], options.spread) } },
+      y: options.log ? { distr: 3 } : { range: (_u, low, high) => scaleOf(Math.min(low ?? Infinity, ...extra.replacedEnds), Math.max(high ?? -Infinity, ...extra.replacedEnds), known(extra.band), options.spread) } },
     axes: [
       axis({ show: Boolean(options.axis), size: options.small ? 20 : 24, values: (_u, ticks) => ticks.map((tick) => (tick < 0 ? "" : timeText(tick))), space: 90 }),
-      axis({ size: options.small ? 42 : 58, space: 22, ...(options.log ? { filter: decades, grid: { stroke: colour("line"), width: 0.5, filter: decades } } : {}), values: (_u, ticks) => ticks.map((tick) => (tick === null ? "" : short(tick))) }),
+      axis({ size: (_u, labels) => Math.max(options.small ? 42 : 58, 14 + 6.5 * Math.max(0, ...(labels || []).map((label) => label.length))), space: 22, ...(options.log ? { filter: decades, grid: { stroke: colour("line"), width: 0.5, filter: decades } } : {}), values: (_u, ticks) => (options.log ? ticks.map((tick) => (tick === null ? "" : numberText(tick, 3))) : axisLabels(ticks)) }),
     ],
     series: [{}, ...lines.map((line) => ({
       label: line.label, stroke: () => colour(line.stroke), width: line.width || 1.4, points: { show: false }, dash: line.dash,
-      paths: line.stepped ? uPlot.paths.stepped({ align: 1 }) : undefined, spanGaps: false,
+      paths: line.stepped ? uPlot.paths.stepped({ align: 1 }) : undefined, spanGaps: false, pxAlign: 0, // not to whole pixels: a small step would be none
     }))],
     hooks: {
       drawClear: [(u) => drawGround(u, extra)],
@@ -44,20 +47,20 @@ export function makeChart(holder, lines, options) {
   }, [[], ...lines.map(() => [])], holder);
   if (options.onPick) chart.over.addEventListener("click", () => { if (chart.cursor.left >= 0) options.onPick(chart.posToVal(chart.cursor.left, "x")); });
   new ResizeObserver(() => chart.setSize(size())).observe(holder);
-  return { chart, extra, lines, title: options.title, show(data, more = {}) { Object.assign(extra, more); chart.setData(withoutReplaced(data, lines, extra)); Object.assign(holder.dataset, { substituted: extra.replaced.length, gaps: extra.gaps.length, ahead: extra.planned && extra.predictions.length > 0 }); } };
+  return { chart, extra, lines, title: options.title, show(data, more = {}) { Object.assign(extra, more); chart.setData(withoutReplaced(data, lines, extra)); Object.assign(holder.dataset, { doubtful: extra.replaced.length, gaps: extra.gaps.length, ahead: extra.planned && extra.predictions.length > 0 }); } };
 }
 
-// Where a sensor is bad it is substituted: what is not measured is drawn differently.
+// What is not measured, or in doubt, is drawn differently.
 function withoutReplaced([times, ...columns], lines, extra) {
   extra.replaced = []; extra.replacedEnds = [];
   return [times, ...columns.map((values, place) => {
     let shown = values;
-    for (const [from, to] of extra.substituted[lines[place].label] || []) {
+    for (const [from, to, quality] of extra.doubtful[lines[place].label] || []) {
       const points = times.map((time, i) => [time, values[i], i]).filter(([time, value]) => time >= from && time < to && value !== null);
       if (shown === values) shown = [...values];
       for (const [, , i] of points) shown[i] = null;
       if (!points.length) continue;
-      extra.replaced.push([...points, [to, points.at(-1)[1]]]);
+      extra.replaced.push({ quality, points: [...points, [to, points.at(-1)[1]]] });
       for (const [, value] of points) extra.replacedEnds.push(value);
     }
     return shown;
@@ -72,14 +75,14 @@ function drawReplaced(u, extra) {
   ctx.strokeStyle = ctx.fillStyle = colour("muted"); ctx.lineWidth = 1.4 * devicePixelRatio;
   ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
   const size = 4 * devicePixelRatio;
-  for (const points of extra.replaced) {
+  for (const { quality, points } of extra.replaced) {
     const places = points.map(([time, value]) => [u.valToPos(time, "x", true), u.valToPos(value, "y", true)]);
     ctx.setLineDash([2 * devicePixelRatio, 4 * devicePixelRatio]);
     ctx.beginPath(); places.forEach(([x, y], i) => (i ? ctx.lineTo(x, y) : ctx.moveTo(x, y))); ctx.stroke();
     ctx.setLineDash([]);
     for (const [x, y] of [places[0], places.at(-1)]) { ctx.beginPath(); ctx.moveTo(x - size, y - size); ctx.lineTo(x + size, y + size); ctx.moveTo(x - size, y + size); ctx.lineTo(x + size, y - size); ctx.stroke(); }
     const left = Math.max(bbox.left, places[0][0]);
-    if (places.at(-1)[0] - left > 120 * devicePixelRatio) ctx.fillText("sensor bad: substituted", left + 2 * size, places[0][1] - 1.5 * size);
+    if (places.at(-1)[0] - left > ctx.measureText(TEXTS[quality]).width + 4 * size) ctx.fillText(TEXTS[quality], left + 2 * size, places[0][1] - 1.5 * size);
   }
   ctx.restore();
 }
@@ -88,7 +91,7 @@ function swatch(line) {
   const made = document.createElement("span");
   made.className = "swatch";
   made.style.borderColor = `var(--${line.stroke})`;
-  if (line.dash) made.style.borderTopStyle = "dashed";
+  if (line.dash) made.style.borderTopStyle = line.dash[0] > 2 ? "dashed" : "dotted";
   return made;
 }
 
@@ -102,32 +105,20 @@ export function legendOf(found, { predictions = false, names = Object.keys(found
   const modes = [...new Set(found.modes.map((one) => one.mode))].filter((mode) => MODE_SHADE[mode]);
   const entries = modes.map((mode) => entry("ground", `mode ${mode}`, MODE_SHADE[mode]));
   if (found.gaps.length) entries.push(entry("gap", "nothing read"));
-  if (names.some((name) => (found.substituted[name] || []).length)) entries.push(entry("dotted", "sensor bad: substituted"));
+  const doubts = new Set(names.flatMap((name) => found.doubtful[name] || []).map(([, , quality]) => quality));
+  for (const quality of doubts) entries.push(entry("dotted", TEXTS[quality]));
   if (predictions && found.planned && found.predictions.length) entries.push(entry("dashed", "expected from the newest sequence"));
   if (predictions && found.predictions.length > (found.planned ? 1 : 0)) entries.push(entry("faint", "earlier predictions"));
   for (const kind of new Set(found.marks.map((mark) => mark.kind))) entries.push(entry(`mark ${kind}`, MARKS[kind] || kind));
+  if (found.marks_since_s !== null) entries.push(entry("mark", `marks before ${timeText(found.marks_since_s)} are not shown`));
   return entries;
-}
-
-function short(value) {
-  const size = Math.abs(value);
-  if (size >= 1e5 || (size > 0 && size < 1e-3)) return value.toExponential(0);
-  return String(Number(value.toPrecision(6)));
 }
 
 // The least range of a chart of a signal, from the ends of its bar.
 export const leastSpread = ([low, high]) => Math.min(1, (high - low) / 8);
-
-// The range shows the whole band, and is never so narrow that noise looks like movement.
-function spread(low, high, band, least = 0.1) {
-  const all = [low, high, ...(band || [])].filter((value) => Number.isFinite(value));
-  if (!all.length) return [0, 1];
-  let [from, to] = [Math.min(...all), Math.max(...all)];
-  const missing = least - (to - from);
-  if (missing > 0) { from -= missing / 2; to += missing / 2; }
-  const margin = (to - from) * 0.08;
-  return [from - margin, to + margin];
-}
+const known = (band) => (band && band.every(Number.isFinite) && band[1] > band[0] ? band : null);
+// Of several curves in a chart each has a dash of its own: colour alone tells nobody in print.
+export const DASHES = [undefined, [8, 3], [2, 2], [12, 3, 2, 3]];
 
 function drawGround(u, extra) {
   const { ctx, bbox } = u;
@@ -142,7 +133,10 @@ function drawGround(u, extra) {
     for (const y of [top, bottom]) { ctx.beginPath(); ctx.moveTo(bbox.left, y); ctx.lineTo(bbox.left + bbox.width, y); ctx.stroke(); }
     ctx.setLineDash([]);
     ctx.fillStyle = colour("muted"); ctx.font = `${10 * devicePixelRatio}px system-ui, sans-serif`; ctx.textAlign = "right";
-    if (extra.bandName) ctx.fillText(extra.bandName, bbox.left + bbox.width - 4 * devicePixelRatio, Math.max(top, bbox.top) + 11 * devicePixelRatio);
+    const right = bbox.left + bbox.width - 4 * devicePixelRatio, name = extra.bandName || "band";
+    if (extra.bandName && bottom > bbox.top && top >= bbox.top) ctx.fillText(name, right, top + 11 * devicePixelRatio);
+    if (top < bbox.top) ctx.fillText(`▲ ${name} to ${numberText(extra.band[1], 7)}`, right, bbox.top + 11 * devicePixelRatio);
+    if (bottom > bbox.top + bbox.height) ctx.fillText(`▼ ${name} from ${numberText(extra.band[0], 7)}`, right, bbox.top + bbox.height - 4 * devicePixelRatio);
     ctx.textAlign = "left";
   }
   for (const [from, to] of extra.gaps) drawGap(u, from, to);
@@ -215,12 +209,12 @@ function drawAhead(u, extra, lines) {
   ctx.restore();
 }
 
-// Several holders of charts, one below the other, as one picture.
-export function asPicture(charts) {
+// Several holders of charts, one below the other, as one picture; below them what their signs mean.
+export function asPicture(charts, legend) {
   const canvases = charts.map((one) => one.chart.ctx.canvas);
   const picture = document.createElement("canvas");
   picture.width = Math.max(...canvases.map((one) => one.width));
-  picture.height = canvases.reduce((sum, one) => sum + one.height + 18 * devicePixelRatio, 0);
+  picture.height = canvases.reduce((sum, one) => sum + one.height + 18 * devicePixelRatio, 20 * devicePixelRatio);
   const ctx = picture.getContext("2d");
   ctx.fillStyle = colour("panel"); ctx.fillRect(0, 0, picture.width, picture.height);
   let top = 0;
@@ -238,5 +232,12 @@ export function asPicture(charts) {
     ctx.drawImage(canvases[i], 0, top + 18 * devicePixelRatio);
     top += canvases[i].height + 18 * devicePixelRatio;
   });
+  let left = 8;
+  for (const entry of legend.querySelectorAll(".entry")) {
+    ctx.fillStyle = getComputedStyle(entry.querySelector("i")).backgroundColor;
+    ctx.fillRect(left, top + 5 * devicePixelRatio, 14 * devicePixelRatio, 8 * devicePixelRatio);
+    ctx.fillStyle = colour("ink"); ctx.fillText(entry.textContent, left + 18 * devicePixelRatio, top + 13 * devicePixelRatio);
+    left += ctx.measureText(entry.textContent).width + 34 * devicePixelRatio;
+  }
   return picture;
 }

@@ -1,18 +1,32 @@
 // Commands in two steps, preview and confirmation, with their results. Login.
-import { ask, element, isStale, onChange, send, signal, state, timeText } from "./store.js";
+import { numberText, timeText } from "./numbers.js";
+import { ask, element, isStale, onChange, send, signal, state } from "./store.js";
 import { bindAll, inputBar } from "./values.js";
 
 const byId = (id) => document.getElementById(id);
 let onUser = () => {};
 
-// What has come of a command: in the list, and in the line above the alarms until the next one. It covers nothing.
+// What has come of a command: in the line above the alarms until the next one. It covers nothing. The list is the server's.
 const WORDS = { applied: "applied: ", refused: "refused because ", uncertain: "UNCERTAIN: " };
-function note(asked, what, detail) {
-  const time = timeText(state.tick * state.catalog.tick_s), came = `${WORDS[what]}${detail}`;
-  const body = byId("outcome-table").querySelector("tbody");
-  body.prepend(element("tr", {}, element("td", { class: "number", text: time }), element("td", { text: asked }), element("td", { class: what, text: came })));
-  while (body.children.length > 50) body.lastChild.remove();
-  say(what, asked, came);
+function note(asked, what, detail) { say(what, asked, `${WORDS[what]}${detail}`); return refreshLog(); }
+
+// All commands of all users of this page, and who was the last: for those who may operate.
+const MOST_LOGGED = 200, OUTCOMES = { done: "applied", refused: "refused", uncertain: "uncertain" };
+let logged = -1, told = "";
+async function refreshLog() {
+  if (!state.me.operates) return;
+  logged = state.commands;
+  let entries;
+  try { ({ entries } = await ask("api/audit")); } catch { return; } // logged out meanwhile
+  const commands = entries.filter((one) => one.what === "command").slice(0, MOST_LOGGED), last = commands.find((one) => one.outcome === "done");
+  const utc = (one) => one.utc.replace("T", " ").replace("Z", "");
+  byId("outcome-table").querySelector("tbody").replaceChildren(...commands.map((one) => element("tr", {}, element("td", { text: utc(one) }), element("td", { text: one.who }),
+    element("td", { class: OUTCOMES[one.outcome], text: `${OUTCOMES[one.outcome]}: ${one.detail}` }))));
+  byId("last-command").hidden = !last;
+  if (!last) { told ||= "none"; return; }
+  byId("last-command").textContent = `Last command: ${last.who}, ${utc(last).slice(11, 19)} UTC: ${last.detail}`;
+  if (told && last.who !== state.me.user && last.utc !== told) say("applied", `${last.who}`, last.detail); // others' are seen at once
+  told = last.utc;
 }
 
 function say(what, asked, came) {
@@ -24,7 +38,9 @@ function say(what, asked, came) {
   line.hidden = false;
 }
 
+// Enter in a field prepares, as its button does; it never confirms.
 // Asks for the number in a field; for nothing when it has none: an empty field is not a zero.
+const enters = (field, button) => field.addEventListener("keydown", (event) => { if (event.key === "Enter") { event.preventDefault(); button.click(); } });
 function numberIn(field, then) { if (field.value === "") field.focus(); else then(Number(field.value)); }
 
 // `atOnce` is for what does not touch the process, such as acknowledging an alarm. One command at a time: another one
@@ -58,24 +74,33 @@ const kindOf = (body) => body.kind.replaceAll("_", " ");
 async function oneCommand(body, atOnce) {
   let prepared;
   try { prepared = await send("api/commands", body); } catch (error) { await failed(body.kind, error, "refused"); return; }
-  if (!atOnce && !(await confirmed(prepared.text))) { say("cancelled", prepared.text, "not confirmed; nothing was done"); return; }
-  try {
-    const { asked, applied, refused_because: refused, uncertain_because: uncertain } = await send(`api/commands/${prepared.token}`, {});
-    note(asked, uncertain ? "uncertain" : refused ? "refused" : "applied", uncertain || refused || applied);
-  } catch (error) { await failed(prepared.text, error, "uncertain"); }
+  for (let asks = !atOnce, changed = ""; ; asks = true) {
+    if (asks && !(await confirmed(prepared, changed))) { say("cancelled", prepared.text, "not confirmed; nothing was done"); return; }
+    try {
+      const { asked, applied, refused_because: refused, uncertain_because: uncertain } = await send(`api/commands/${prepared.token}`, {});
+      await note(asked, uncertain ? "uncertain" : refused ? "refused" : "applied", uncertain || refused || applied);
+      return;
+    } catch (error) {
+      if (!error.preview) { await failed(prepared.text, error, "uncertain"); return; }
+      say("refused", prepared.text, error.message); // what it was asked for has changed: it is asked again, as it is now
+      prepared = error.preview; changed = error.message;
+    }
+  }
 }
 
 // Without a status there was no answer: a prepared command is not done, the result of a confirmed one is unknown.
 async function failed(asked, error, unanswered) {
-  if (error.status) note(asked, "refused", error.message);
-  else note(asked, unanswered, "the page's own server did not answer; check its effect before repeating it");
+  if (error.status) await note(asked, "refused", error.message);
+  else await note(asked, unanswered, "the page's own server did not answer; check its effect before repeating it");
   if (error.status === 401) await refreshUser().catch(() => {});
 }
 
 // Enter does not confirm by itself: a held key or a double click must not confirm an unread question.
-function confirmed(text) {
+function confirmed({ text, now }, changed) {
   const dialog = byId("confirm");
+  byId("confirm-changed").textContent = changed;
   byId("confirm-text").textContent = `${text}?`;
+  byId("confirm-now").textContent = now ? `Now: ${now}.` : "";
   dialog.showModal();
   byId("confirm-no").focus();
   byId("confirm-yes").disabled = true;
@@ -96,7 +121,7 @@ function follow(field, name, others = []) {
   onChange(() => {
     const value = state.values[name];
     if (touched || typeof value !== "number") return;
-    const text = String(Number(value.toFixed(signal(name).decimals)));
+    const { decimals } = signal(name), text = decimals === null ? numberText(value, 7) : String(Number(value.toFixed(decimals)));
     for (const one of [field, ...others]) if (one.value !== text && one !== document.activeElement) one.value = text;
   });
   return (sent) => { if (Number(field.value) === sent) touched = false; };
@@ -116,6 +141,7 @@ function faceplates() {
     const input = one.name;
     const value = element("input", { type: "number", step: "any", id: `setpoint-${input}`, "aria-label": `New setpoint of ${input} in ${one.unit}` });
     const button = element("button", { type: "button", text: "Write", onclick: () => numberIn(value, (wanted) => command({ kind: "setpoint", input, value: wanted })) });
+    enters(value, button);
     const plate = element("div", { class: "faceplate" },
       inputBar(one, input),
       element("div", { class: "row" }, element("span", { class: "label", text: "setpoint" }), element("span", { class: "value", "data-signal": `control_plc.operator.${one.register}` }), element("span", { class: "spacer" }), value, button));
@@ -143,6 +169,8 @@ export function showUser() {
   for (const one of document.querySelectorAll(".view-only")) one.hidden = state.me.operates;
   for (const one of document.querySelectorAll("#commands button:not(#login-open-2), #commands input, #commands select")) one.disabled = !state.me.operates;
   byId("outcome-line").hidden = !state.me.operates && !byId("outcome-line").title;
+  byId("last-command").hidden = true;
+  logged = -1;
   onUser();
 }
 
@@ -165,6 +193,7 @@ function loadPanel() {
   slider.addEventListener("input", () => { number.value = slider.value; });
   number.addEventListener("input", () => { slider.value = number.value; });
   const followLoad = follow(number, "plant.load status.watts", [slider]);
+  enters(number, byId("load-set"));
   byId("load-set").addEventListener("click", () => numberIn(number, (watts) => command({ kind: "load", watts }).then(() => followLoad(watts))));
   byId("load-play").addEventListener("click", playFile);
 }
@@ -175,6 +204,8 @@ export function initCommands(userChanged) {
   for (const one of document.querySelectorAll("[data-command]")) one.addEventListener("click", () => command(JSON.parse(one.dataset.command)));
   loadPanel();
   const followFactor = follow(byId("factor"), "plant.pace.factor");
+  enters(byId("factor"), byId("factor-set"));
+  enters(byId("fault-value"), byId("fault-set"));
   byId("factor-set").addEventListener("click", () => numberIn(byId("factor"), (factor) => command({ kind: "factor", factor }).then(() => followFactor(factor))));
   byId("training").hidden = !state.catalog.training;
   for (const output of state.catalog.outputs) byId("fault-output").append(element("option", { text: output }));
@@ -194,5 +225,6 @@ export function initCommands(userChanged) {
     } catch (error) { byId("login-error").textContent = error.message; }
   });
   onChange(showMode);
+  onChange(() => { if (state.me.operates && state.commands !== logged) refreshLog(); });
   setInterval(() => refreshUser().catch(() => {}), 15000);
 }

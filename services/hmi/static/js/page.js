@@ -1,11 +1,13 @@
 // Starts the page: views, theme, links, the state of the stream.
-import { ask, connect, digits, element, indexed, isStale, onChange, pageIsSilent, signal, state, take } from "./store.js";
+import { fixedText, numberText } from "./numbers.js";
+import { ask, connect, element, indexed, isStale, onChange, pageIsSilent, signal, state, take, titleOf, valueText } from "./store.js";
 import { bindAll, bindNames, controlledBar, inputBar, loadBar, measuredBar } from "./values.js";
 import { hideTrends, initTrends, recolourStrips, recolourTrends, refreshStrips, showTrends } from "./trends.js";
 import { initWhy, pick, recolourWhy, showWhy } from "./why.js";
 import { initAlarms, redrawAlarms } from "./alarms.js";
 import { initCommands, showUser } from "./commands.js";
 import { initDetail } from "./detail.js";
+import { initPoint } from "./point.js";
 import { initReplay } from "./replay.js";
 
 const VIEWS = ["overview", "trends", "why", "alarms", "commands", "detail"];
@@ -60,28 +62,30 @@ function bars() {
 
 function overview() {
   const { load } = state.catalog.process, { decimals } = signal("plant.load status.watts");
-  const loadText = (value, digits = decimals) => (value === null ? "–" : `${value.toFixed(Math.max(0, digits))} ${load.unit}`);
+  const loadText = (value, places = decimals ?? 4) => `${fixedText(value, Math.max(0, places))} ${load.unit}`;
   const tau = byId("tau-u"), facts = byId("load-facts");
   onChange(({ update, names }) => {
     if (update || names === null) {
       const found = state.update;
-      tau.textContent = found ? `${found.period_s.toFixed(2)} s` : "–";
-      byId("tau-u-q").textContent = found ? `q = ${found.q}, J = ${digits(found.update.j_effective)}` : "";
+      tau.textContent = found ? `${fixedText(found.period_s, 2)} s` : "–";
+      byId("tau-u-q").textContent = found ? `q = ${found.q}, J = ${numberText(found.update.j_effective)}` : "";
       byId("tau-u-sentence").replaceChildren(...(found ? indexed(found.sentence) : ["No update yet."]));
     }
     const values = state.values, upcoming = values["plant.load status.upcoming"];
     const note = byId("tau-u-note"), inUse = !state.stale.includes("update");
     note.hidden = inUse;
     if (!inUse) note.textContent = "Of the last update: MPC is not active now.";
-    const ofLoad = () => [["expected next", state.replay ? "–" : upcoming ? `${loadText(values["plant.load status.next_watts"])} in ${((values["plant.load status.next_tick"] - state.tick) * state.catalog.tick_s).toFixed(0)} s` : "as now", "plant.", "control_plc.process."],
+    const ofLoad = () => [["expected next", state.replay ? "–" : upcoming ? `${loadText(values["plant.load status.next_watts"])} in ${fixedText((values["plant.load status.next_tick"] - state.tick) * state.catalog.tick_s, 0)} s` : "as now", "plant.", "control_plc.process."],
       ["estimated mismatch", state.update ? loadText(state.update.update.load_mismatch) : "–", "optimizer_plc.", "update"]];
     const rows = [...(load ? ofLoad() : []), ["plant against model", state.deviation || "–", "optimizer_plc."]];
     const shortage = values["control_plc.plan.shortage"];
-    if (load && shortage) rows.unshift(["load", `${loadText(Math.abs(shortage), decimals - 1)} ${shortage > 0 ? "more than can be held" : "less than is needed"}`, "control_plc.", "update"]);
+    if (load && shortage) rows.unshift(["load", `${loadText(Math.abs(shortage), (decimals ?? 4) - 1)} ${shortage > 0 ? "more than can be held" : "less than is needed"}`, "control_plc.", "update"]);
     const text = JSON.stringify(rows);
     if (facts.dataset.text !== text) { facts.dataset.text = text; facts.replaceChildren(...rows.flatMap(([name, value, ...sources]) => [element("dt", { text: name }), element("dd", { class: "value", text: value, "data-sources": sources.join(" ") })])); }
     for (const one of facts.querySelectorAll("dd")) one.classList.toggle("stale", one.dataset.sources.split(" ").some(isStale));
     const mode = state.values["control_plc.ladder.mode"];
+    const title = titleOf({ alarms: state.alarms, stale: isStale("control_plc."), mode: valueText("control_plc.ladder.mode", "mode") });
+    if (document.title !== title) document.title = title;
     byId("drive-chip").classList.toggle("abnormal-mode", mode !== undefined && mode !== 1);
     for (const one of document.querySelectorAll("#strips, #charts")) one.classList.toggle("stale", isStale("control_plc.process."));
   });
@@ -115,7 +119,7 @@ async function start() {
   bars(); initDetail(); for (const one of [document.querySelector("header"), byId("overview"), byId("commands")]) bindAll(one);
   links(); overview();
   initTrends((time) => { location.hash = "#why"; pick(`?at=${time}`); });
-  initWhy(); initCommands(redrawAlarms); initAlarms(); initReplay();
+  initPoint(document); initWhy(); initCommands(redrawAlarms); initAlarms(); initReplay();
   showUser();
   if (first) take(first); else if (!state.me.role) byId("login-open").click();
   connect(); show();

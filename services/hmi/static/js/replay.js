@@ -1,5 +1,6 @@
 // The bar of a replay: play, speed, position.
-import { onChange, send, state, timeText } from "./store.js";
+import { timeText } from "./numbers.js";
+import { onChange, send, state } from "./store.js";
 
 export function initReplay() {
   if (!state.catalog.replay) return;

@@ -1,6 +1,8 @@
 // What the server has sent, the clock for its age, and the listeners to its changes.
+import { fixedText, numberText, timeText } from "./numbers.js";
+import { isListed, qualityIn, worse } from "./quality.js";
 
-export const state = { catalog: null, me: null, values: {}, services: {}, stale: [], alarms: [], update: null, plant: { kind: "" }, deviation: "", tick: 0, heard: 0, refused: "" };
+export const state = { catalog: null, me: null, values: {}, services: {}, stale: [], quality: {}, commands: 0, alarms: [], update: null, plant: { kind: "" }, deviation: "", tick: 0, heard: 0, refused: "" };
 const listeners = [];
 const SILENT_MS = 1500, GIVEN_UP_MS = 5000, SEND_MS = 20000;
 
@@ -27,7 +29,7 @@ export function take(message) {
   const reset = message.whole;
   if (reset) state.values = {};
   Object.assign(state.values, message.values);
-  Object.assign(state, { services: message.services, plant: message.plant, deviation: message.deviation, stale: message.stale, tick: message.tick, heard: performance.now() });
+  Object.assign(state, { services: message.services, plant: message.plant, deviation: message.deviation, stale: message.stale, quality: message.quality, commands: message.commands, tick: message.tick, heard: performance.now() });
   if ("alarms" in message) state.alarms = message.alarms;
   if ("update" in message) state.update = message.update;
   if ("replay" in message) state.replay = message.replay;
@@ -37,12 +39,15 @@ export function take(message) {
 // The page itself is silent: nothing of what it shows is current.
 export function pageIsSilent() { return performance.now() - state.heard > SILENT_MS; }
 
-export function isStale(name) {
-  return pageIsSilent() || state.stale.some((one) => name === one || (one.endsWith(".") && name.startsWith(one)));
-}
+export function isStale(name) { return pageIsSilent() || isListed(state.stale, name); }
+export function qualityOf(name) { return worse(qualityIn(state.quality, name), pageIsSilent() ? "stale" : "good"); }
 
-// A number as short as that; a dash where it is not finite, or not known.
-export function digits(value, count = 4) { return value === null || value === undefined ? "–" : Number(value.toPrecision(count)).toString(); }
+// The title of the tab: what an operator has to know who looks at another one.
+export function titleOf({ alarms, stale, mode }) {
+  const active = alarms.filter((one) => one.active && ["unacknowledged", "acknowledged"].includes(one.state)).length;
+  const parts = [stale ? "NOT CURRENT" : "", active ? `${active} alarm${active === 1 ? "" : "s"}` : "", !stale && mode !== "MPC" ? mode : ""];
+  return [...parts.filter(Boolean), "Coldloop"].join(" · ");
+}
 
 export function signal(name) { return state.catalog.signals[name] || null; }
 
@@ -70,34 +75,27 @@ export function connect() {
   }, 250);
 }
 
-export function timeText(seconds) {
-  if (!Number.isFinite(seconds)) return "–";
-  const sign = seconds < 0 ? "-" : "", all = Math.abs(seconds);
-  const hours = Math.floor(all / 3600), minutes = Math.floor(all / 60) % 60, rest = all % 60;
-  const pad = (number) => String(number).padStart(2, "0");
-  const tail = Number.isInteger(all) ? pad(rest) : rest.toFixed(2).padStart(5, "0");
-  return `${sign}${hours}:${pad(minutes)}:${tail}`;
-}
-
-// A length of time such as "15 min", in the largest unit that it is a whole number of.
-export function durationText(seconds) {
-  const [unit, length] = [["h", 3600], ["min", 60], ["s", 1]].find((one) => seconds % one[1] === 0) || ["s", 1];
-  return `${Number((seconds / length).toPrecision(3))} ${unit}`;
-}
-
 export function valueText(name, as) {
   const value = state.values[name], about = signal(name);
   if (value === undefined || value === null) return "–";
   const tick = state.catalog.tick_s;
   if (as === "time") return timeText(value * tick);
-  if (as === "ticks") return `${(value * tick).toFixed(2)} s`;
+  if (as === "ticks") return `${fixedText(value * tick, 2)} s`;
   if (as === "pace") return paceText(value);
   if (about && about.words[value] !== undefined) return as === "mode" ? about.words[value].toUpperCase() : about.words[value];
-  const text = about && about.decimals !== null && typeof value === "number" ? value.toFixed(about.decimals) : String(value);
+  if (about && about.counts) return about.counts === "time" ? `${timeText(value * tick)} (tick ${value})` : `${fixedText(value * tick, 2)} s (${value} ticks)`;
+  const text = signalText(value, about);
   return about && about.unit ? `${text} ${about.unit}` : text;
 }
 
-function paceText(factor) {
+// A value with the digits of its signal, without its unit.
+export function signalText(value, about) {
+  if (typeof value !== "number" || !about) return String(value);
+  return about.decimals !== null ? fixedText(value, about.decimals) : about.digits ? numberText(value, about.digits) : String(value);
+}
+
+function paceText(value) {
+  const factor = numberText(value);
   if (!state.values["plant.pace.session"]) return "no session";
   if (!state.values["plant.pace.realtime"]) return "lock-step";
   return state.values["plant.pace.paused"] ? `paused (× ${factor})` : `× ${factor}`;
@@ -113,7 +111,7 @@ export async function ask(path) {
 export async function send(path, body) {
   const answer = await fetch(path, { method: "POST", signal: AbortSignal.timeout(SEND_MS), headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
   const document_ = await answer.json();
-  if (!answer.ok) throw Object.assign(new Error(document_.error || answer.statusText), { status: answer.status });
+  if (!answer.ok) throw Object.assign(new Error(document_.error || answer.statusText), { status: answer.status, preview: document_.token ? document_ : null });
   return document_;
 }
 

@@ -1,6 +1,9 @@
 // Trends: a window of plant time, the horizon ahead, zoom, values at the cursor, export.
-import { ask, durationText, element, state, timeText } from "./store.js";
-import { asPicture, leastSpread, legendOf, makeChart } from "./charts.js";
+import { durationText, timeText } from "./numbers.js";
+import { LETTERS, TEXTS } from "./quality.js";
+import { valuesAt } from "./readout.js";
+import { ask, element, qualityOf, signalText, state } from "./store.js";
+import { DASHES, asPicture, leastSpread, legendOf, makeChart } from "./charts.js";
 
 const WINDOWS = [60, 180, 360, 720, 1440]; // sampling periods: 5 min to 2 h of the cold box
 const COLOURS = ["trend", "trend-2", "trend-3"];
@@ -15,18 +18,19 @@ const controlledChart = (one, place) => ({ id: one.name, title: `${one.name} ${o
 function inputChart(unit) {
   const group = state.catalog.process.inputs.filter((one) => one.unit === unit), names = group.map((one) => one.name);
   const { bounds, bar } = group[0], isShared = group.every((one) => String(one.bounds) === String(bounds));
-  return { id: names[0], title: titled(names, unit), lines: names.map((name, i) => line(name, COLOURS[i % 3], { stepped: true })), bounds: isShared ? names[0] : null, spread: (bar[1] - bar[0]) / 25, ahead: names, isInputs: true };
+  return { id: names[0], title: titled(names, unit), lines: names.map((name, i) => line(name, COLOURS[i % 3], { stepped: true, dash: DASHES[i % 4] })), bounds: isShared ? names[0] : null, spread: (bar[1] - bar[0]) / 25, ahead: names, isInputs: true };
 }
 function loadChart() {
   const { inputs, load } = state.catalog.process;
   if (!load) return [];
   const names = inputs.filter((one) => one.unit === load.unit).map((one) => one.name);
-  return [{ id: "load", title: titled(["load", ...names], load.unit), lines: [line("load", "trend-3", { stepped: true }), ...names.map((name, i) => line(name, COLOURS[i % 2], { stepped: true }))], spread: (load.bar[1] - load.bar[0]) / 20 }];
+  return [{ id: "load", title: titled(["load", ...names], load.unit), lines: [line("load", "trend-3", { stepped: true }), ...names.map((name, i) => line(name, COLOURS[i % 2], { stepped: true, dash: DASHES[1 + (i % 3)] }))], spread: (load.bar[1] - load.bar[0]) / 20 }];
 }
+const disturbanceCharts = () => state.catalog.process.disturbances.map((one) => ({ id: one.name, title: `${one.name} ${one.unit}`, lines: [line(one.name, "trend-3")], spread: leastSpread(one.bar) }));
 function ofProcess() {
   const { controlled, inputs, load } = state.catalog.process;
   const units = [...new Set(inputs.map((one) => one.unit))].filter((unit) => !load || unit !== load.unit);
-  return [...controlled.map(controlledChart), ...units.map(inputChart), ...loadChart()];
+  return [...controlled.map(controlledChart), ...units.map(inputChart), ...loadChart(), ...disturbanceCharts()];
 }
 // Of a whole refrigerator the pressures too, between the inputs and the updating period.
 const PRESSURES = [["P12", "HP bar"], ["P11", "LP bar"]].map(([name, title]) => ({ id: name, title, lines: [{ label: name, stroke: "trend", from: "series" }], station: name, spread: name === "P12" ? 0.4 : 0.04 }));
@@ -37,7 +41,8 @@ const MOST_PENS = 8;
 let pens = [];
 const layout = () => [...drawn(), ...pens.map((name) => ({ id: `pen-${name}`, title: `${name}${unitOf(name)}`, lines: [{ label: name, stroke: "trend", from: "series", stepped: name === "mode" }], spread: 0.01 })), ...LAST];
 const names = () => layout().flatMap((one) => one.lines).filter((line) => line.from === "series").map((line) => line.label).join(",");
-const unitOf = (name) => { const about = ["process.y.", "process.u.", "process."].map((part) => state.catalog.signals[`control_plc.${part}${name}`]).concat(state.catalog.signals[`plant.station.signals.${name}`]).find(Boolean); return about && about.unit ? ` ${about.unit}` : ""; };
+const aboutOf = (name) => ["process.y.", "process.u.", "process."].map((part) => state.catalog.signals[`control_plc.${part}${name}`]).concat(state.catalog.signals[`plant.station.signals.${name}`]).find(Boolean);
+const unitOf = (name) => { const about = aboutOf(name); return about && about.unit ? ` ${about.unit}` : ""; };
 const stationBand = (name) => { const [low, high] = (state.plant.bands || {})[`plant.station.signals.${name}`] || []; return Number.isFinite(low) && Number.isFinite(high) ? [low, high] : null; };
 const REFRESH_MS = 500;
 
@@ -58,7 +63,7 @@ function build() {
     holder.append(box);
     const made = makeChart(box, one.lines, {
       title: one.title, spread: one.spread, log: one.log, sync: "trends", axis: place === all.length - 1, range,
-      onZoom: (from, to) => { zoom = [from, to]; document.getElementById("unzoom").hidden = false; refresh(); },
+      onZoom: (from, to) => { zoom = [from, Math.max(to, from + 8 * state.catalog.tick_s)]; document.getElementById("unzoom").hidden = false; refresh(); },
       onCursor: readout, onPick: one.id === "tau" || one.id === "cost" ? (time) => onPick(time) : null,
     });
     return { ...one, ...made };
@@ -69,11 +74,10 @@ function readout(u) {
   const time = u.cursor.left >= 0 ? u.posToVal(u.cursor.left, "x") : null;
   const target = document.getElementById("readout");
   if (time === null || !newest) { target.textContent = ""; return; }
-  const at = (times, values) => { let i = times.findIndex((one) => one > time); i = i < 0 ? times.length - 1 : i - 1; return i < 0 ? null : values[i]; };
-  const isReplaced = (name) => (newest.substituted[name] || []).some(([from, to]) => from <= time && time < to);
-  const parts = Object.entries(newest.series).map(([name, values]) => [`${name}${isReplaced(name) ? " (substituted)" : ""}`, at(newest.time, values)]);
-  parts.push(["τu", at(newest.updates.time, newest.updates.tau_u)], ["q", at(newest.updates.time, newest.updates.q)]);
-  target.textContent = `${timeText(Math.round(time / state.catalog.tick_s) * state.catalog.tick_s)}  ${parts.filter((one) => one[1] !== null).map(([name, value]) => `${name} ${Number(value.toPrecision(5))}`).join("  ")}`;
+  const tick = state.catalog.tick_s, words = { tau_u: "τu", predicted: " (predicted)" };
+  const said = (one) => words[one.quality] || (LETTERS[one.quality] ? ` ${LETTERS[one.quality]}` : "");
+  const parts = valuesAt(newest, time).map((one) => `${words[one.name] || one.name} ${signalText(one.value, aboutOf(one.name))}${said(one)}`);
+  target.textContent = [timeText(Math.round(time / tick) * tick), ...(parts.length ? parts : ["nothing known"])].join("  ");
 }
 
 function show(one) {
@@ -83,7 +87,7 @@ function show(one) {
   one.show([times, ...one.lines.map(source)], {
     band: one.band ? newest.bands[one.band] : one.station ? stationBand(one.station) : one.bounds ? newest.bounds[one.bounds] : null,
     bandName: one.band ? "band" : one.station ? "alarm limits" : one.bounds ? ["bounds", "bounds of both"][one.lines.length - 1] || "bounds of all" : "",
-    predictions, planned: newest.planned, gaps: newest.gaps, substituted: newest.substituted, marks: newest.marks, modes: newest.modes, now: newest.now_s, ribbon: one.ribbon,
+    predictions, planned: newest.planned, gaps: newest.gaps, doubtful: newest.doubtful, marks: newest.marks, modes: newest.modes, now: newest.now_s, ribbon: one.ribbon,
   });
 }
 
@@ -117,7 +121,7 @@ export function initTrends(pick) {
   document.getElementById("hold").addEventListener("click", (event) => { held = !held; event.target.setAttribute("aria-pressed", String(held)); refresh(); });
   document.getElementById("unzoom").addEventListener("click", (event) => { zoom = null; event.target.hidden = true; refresh(); });
   document.getElementById("export-png").addEventListener("click", () => {
-    asPicture(charts || []).toBlob((blob) => { const link = element("a", { href: URL.createObjectURL(blob), download: "coldloop-trends.png" }); link.click(); URL.revokeObjectURL(link.href); });
+    asPicture(charts || [], document.getElementById("trend-legend")).toBlob((blob) => { const link = element("a", { href: URL.createObjectURL(blob), download: "coldloop-trends.png" }); link.click(); URL.revokeObjectURL(link.href); });
   });
   pens = (localStorage.getItem("pens") || "").split(",").filter((name) => state.catalog.trended.includes(name)).slice(0, MOST_PENS);
   document.getElementById("pen-add").addEventListener("change", (event) => setPens([...pens, event.target.value]));
@@ -147,15 +151,20 @@ export function recolourTrends() { if (charts) { charts.forEach((one) => one.cha
 function stripCharts() {
   const { controlled, load } = state.catalog.process;
   return [...controlled.map((one) => ({ title: `${one.name} ${one.unit} and its band`, lines: [{ label: one.name, stroke: "trend" }], band: one.name, spread: leastSpread(one.bar) })),
-    ...loadChart().map((one) => ({ ...one, title: `load ${load.unit}`, lines: [{ label: "load", stroke: "trend", stepped: true }] })),
+    ...loadChart().map((one) => ({ ...one, title: `load ${load.unit}`, lines: [{ label: "load", stroke: "trend", stepped: true }] })), ...disturbanceCharts(),
     { title: "τu s", lines: [{ label: "tau_u", stroke: "trend", stepped: true }], spread: 1, updates: true }];
+}
+// What the letters beside values mean, of those that are shown now.
+function lettersShown() {
+  const shown = new Set(state.catalog.outputs.map((name) => qualityOf(`control_plc.process.y.${name}`)));
+  return [...shown].filter((quality) => LETTERS[quality]).map((quality) => element("span", { class: "entry", text: `${LETTERS[quality]}: ${TEXTS[quality]}` }));
 }
 let strips = null, stripsNow = 0;
 export async function refreshStrips() {
   if (document.getElementById("overview").hidden) return;
-  const { controlled, sample_s } = state.catalog.process, length = WINDOWS[0] * sample_s;
+  const { controlled, disturbances, load, sample_s } = state.catalog.process, length = WINDOWS[0] * sample_s;
   let found;
-  try { found = await ask(`api/trend?names=${[...controlled.map((one) => one.name), "load"]}&seconds=${length}&points=400`); } catch { return; }
+  try { found = await ask(`api/trend?names=${[...controlled, ...disturbances].map((one) => one.name).concat(load ? "load" : [])}&seconds=${length}&points=400`); } catch { return; }
   const holder = document.getElementById("strip-charts");
   stripsNow = found.now_s;
   if (!strips) {
@@ -164,8 +173,8 @@ export async function refreshStrips() {
   }
   for (const one of strips) {
     const times = one.updates ? found.updates.time : found.time;
-    one.show([times, one.updates ? found.updates.tau_u : found.series[one.lines[0].label]], { band: one.band ? found.bands[one.band] : null, substituted: found.substituted, modes: found.modes, marks: found.marks, gaps: found.gaps });
+    one.show([times, one.updates ? found.updates.tau_u : found.series[one.lines[0].label]], { band: one.band ? found.bands[one.band] : null, doubtful: found.doubtful, modes: found.modes, marks: found.marks, gaps: found.gaps });
   }
-  document.getElementById("strip-legend").replaceChildren(...legendOf(found));
+  document.getElementById("strip-legend").replaceChildren(...legendOf(found), ...lettersShown());
 }
 export function recolourStrips() { if (strips) { strips.forEach((one) => one.chart.destroy()); strips = null; refreshStrips(); } }

@@ -1,5 +1,7 @@
 // Values on the page: text, analogue bars and the tags of the mimic, all bound to a signal by data-signal.
-import { element, isStale, onChange, shape, signal, state, valueText } from "./store.js";
+import { endsText } from "./numbers.js";
+import { LETTERS, TEXTS, worse } from "./quality.js";
+import { element, isStale, onChange, qualityOf, shape, signal, state, valueText } from "./store.js";
 
 const bound = new Map(); // signal -> functions that draw
 const watched = [];      // [element, signals or prefixes: all of them are current, or the element is crossed out]
@@ -41,6 +43,9 @@ function ownBand(one, name) {
   return low === null && high === null ? null : [low === null ? Number(one.dataset.low) : low, high === null ? Number(one.dataset.high) : high];
 }
 
+// How far an output may be beyond its band until it is marked.
+const deadBand = (name) => (state.catalog.process.controlled.find((one) => name.endsWith(`.y.${one.name}`)) || { dead_band: 0 }).dead_band;
+
 function place(one, parts, width) {
   const name = one.dataset.signal, value = number(name);
   const own = ownBand(one, name), band = own || pair(one.dataset.band), bounds = pair(one.dataset.bounds);
@@ -53,13 +58,11 @@ function place(one, parts, width) {
   }
   parts.pointer.classList.toggle("unknown", !Number.isFinite(value));
   if (Number.isFinite(value)) parts.pointer.setAttribute("x", at(value) * width - 1.5);
-  const outside = known && (value < ends[0] || value > ends[1]);
+  const dead = own ? 0 : deadBand(name), outside = known && (value < ends[0] - dead || value > ends[1] + dead);
   one.classList.toggle("abnormal", Boolean(band) && outside);
   one.classList.toggle("at-limit", Boolean(bounds) && known && (value <= ends[0] || value >= ends[1]));
   return { value, from, to };
 }
-
-const short = (value) => String(Number(value.toPrecision(3)));
 
 // What is not current is crossed out from corner to corner: a line along the middle would hide a sign.
 const cross = (width, height) => shape("line", { class: "cross", x1: -2, y1: height, x2: width + 2, y2: 0 });
@@ -68,7 +71,7 @@ const cross = (width, height) => shape("line", { class: "cross", x1: -2, y1: hei
 function bindSmallTag(tag) {
   const name = tag.dataset.signal, width = Number(tag.dataset.width) || 100;
   const text = shape("text", { x: width, y: 12, "text-anchor": "end", class: "reading" });
-  tag.append(shape("rect", { class: "ground", x: -2, y: 0, width: width + 4, height: 16, rx: 2, opacity: 0.85 }), shape("text", { class: "name", x: 0, y: 12 }, tag.dataset.name), text, cross(width, 16));
+  tag.append(shape("rect", { class: "ground", x: -2, y: 0, width: width + 4, height: 16, rx: 2, opacity: 0.85 }), shape("text", { class: "name", x: 0, y: 12 }, tag.dataset.name), shape("text", { class: "mark", x: -14, y: 13 }), text, cross(width, 16));
   bind(name, () => { text.textContent = valueText(name); });
   watched.push([tag, name]);
 }
@@ -79,14 +82,14 @@ function bindTag(tag) {
   const frame = shape("rect", { class: "frame", x: -3, y: -1, width: width + 6, height: 32, rx: 2 });
   const ground = shape("rect", { class: "ground", x: -2, y: 0, width: width + 4, height: 30, rx: 2, opacity: 0.85 });
   const label = shape("text", { class: "name", x: 0, y: 14 }, tag.dataset.name);
-  const letter = shape("text", { class: "letter", x: -14, y: 15 }, "!");
+  const letter = shape("text", { class: "letter", x: -14, y: 15 }, "!"), mark = shape("text", { class: "mark", x: -14, y: 29 });
   const text = shape("text", { x: width, y: 14, "text-anchor": "end", class: "reading" });
   const parts = {
     track: shape("rect", { class: "track", x: 0, y: 20, width, height: 6 }),
     band: shape("rect", { class: "band", x: 0, y: 20, width: 0, height: 6 }),
     pointer: shape("rect", { class: "pointer", x: 0, y: 18, width: 3, height: 10 }),
   };
-  tag.append(ground, frame, label, letter, text, parts.track, parts.band, parts.pointer, cross(width, 30));
+  tag.append(ground, frame, label, letter, mark, text, parts.track, parts.band, parts.pointer, cross(width, 30));
   const draw = () => {
     text.textContent = valueText(name);
     place(tag, parts, width);
@@ -146,7 +149,7 @@ function bindBar(bar) {
   const text = element("span", { class: "value reading", "data-reading": name });
   const low = element("span"), high = element("span");
   bar.append(element("span", { class: "name", text: bar.dataset.name, title: about ? about.description : "" }), drawing, text, element("span", { class: "ends", "aria-hidden": "true" }, low, high));
-  const draw = () => { text.textContent = valueText(name); const { from, to } = place(bar, parts, width); low.textContent = short(from); high.textContent = short(to); };
+  const draw = () => { text.textContent = valueText(name); const { from, to } = place(bar, parts, width); [low.textContent, high.textContent] = endsText(from, to); };
   for (const one of [name, ...(pair(bar.dataset.band) || []), ...(pair(bar.dataset.bounds) || [])]) bind(one, draw);
   watched.push([text, name], [drawing, name]);
 }
@@ -158,11 +161,22 @@ function drawStation() {
   for (const one of document.querySelectorAll("[data-station], [data-alarm-of]")) one.classList.toggle("stale", isStale("plant.station."));
 }
 
+// One form of quality everywhere: what is doubtful has a letter beside its value.
+export function show(one, names) {
+  const quality = names.map(qualityOf).reduce(worse);
+  one.classList.toggle("stale", names.some(isStale));
+  if ((one.dataset.quality || "good") === quality) return;
+  if (quality === "good") delete one.dataset.quality; else one.dataset.quality = quality;
+  const mark = one.querySelector(".mark");
+  if (mark) mark.textContent = LETTERS[quality]; else one.dataset.letter = LETTERS[quality];
+  if (one instanceof HTMLElement) one.title = TEXTS[quality] || "";
+}
+
 onChange(({ names }) => {
   drawStation();
   const drawn = new Set();
   for (const name of names === null ? bound.keys() : names) {
     for (const draw of bound.get(name) || []) if (!drawn.has(draw)) { drawn.add(draw); draw(); }
   }
-  for (const [one, ...names] of watched) one.classList.toggle("stale", names.some(isStale));
+  for (const [one, ...names] of watched) show(one, names);
 });

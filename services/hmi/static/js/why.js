@@ -1,5 +1,6 @@
 // Explanation of the updating period of one update.
-import { ask, digits, element, indexed, onChange, shape, state, timeText } from "./store.js";
+import { numberText, timeText } from "./numbers.js";
+import { ask, element, indexed, onChange, shape, state } from "./store.js";
 import { leastSpread, makeChart } from "./charts.js";
 
 let following = true, shown = null, charts = null, window_ = [0, 1], asked = 0;
@@ -11,17 +12,17 @@ function quantities(found) {
     ["q", found.q_before === null ? `${found.q}` : `${found.q_before} → ${found.q}`, "number of the period in the ladder, before → now"],
     ["n", before ? `${before.iterations} → ${u.iterations}` : `${u.iterations}`, "iterations done, before → now"],
     ["τ_u", found.period_before_s === null ? `${found.period_s} s` : `${found.period_before_s} → ${found.period_s} s`, "updating period"],
-    ["J_k", before ? digits(before.j_effective, 6) : "–", "cost reached at the instant before"],
-    ["J⁺_k", before ? digits(before.j_hot_start, 6) : "–", "shifted profile, at the predicted state"],
-    ["Ĵ_{k+1}", before ? digits(before.j_delivered, 6) : "–", "delivered profile, as predicted"],
-    ["J_{k+1}", digits(u.j_effective, 6), "the same profile, at the state that was reached"],
-    ["E", digits(u.efficiency, 6), "efficiency of the solver, Ĵ_{k+1} / J⁺_k"],
-    ["D", digits(u.mismatch, 6), "model mismatch"],
-    ["K", digits(u.contraction, 6), "contraction, E D"],
-    ["ΔE/Δn", found.increments ? digits(found.increments.efficiency) : "–", ""],
-    ["ΔD/Δn", found.increments ? digits(found.increments.mismatch) : "–", ""],
-    ["ΔK/Δn", found.increments ? digits(found.increments.contraction) : "–", ""],
-    ["Γ", digits(u.gamma), !found.increments ? "" : u.contraction >= 1 ? "= ΔK/Δn, as K ≥ 1" : "= Δt_r/Δn, as K < 1"],
+    ["J_k", before ? numberText(before.j_effective, 6) : "–", "cost reached at the instant before"],
+    ["J⁺_k", before ? numberText(before.j_hot_start, 6) : "–", "shifted profile, at the predicted state"],
+    ["Ĵ_{k+1}", before ? numberText(before.j_delivered, 6) : "–", "delivered profile, as predicted"],
+    ["J_{k+1}", numberText(u.j_effective, 6), "the same profile, at the state that was reached"],
+    ["E", numberText(u.efficiency, 6), "efficiency of the solver, Ĵ_{k+1} / J⁺_k"],
+    ["D", numberText(u.mismatch, 6), "model mismatch"],
+    ["K", numberText(u.contraction, 6), "contraction, E D"],
+    ["ΔE/Δn", found.increments ? numberText(found.increments.efficiency) : "–", ""],
+    ["ΔD/Δn", found.increments ? numberText(found.increments.mismatch) : "–", ""],
+    ["ΔK/Δn", found.increments ? numberText(found.increments.contraction) : "–", ""],
+    ["Γ", numberText(u.gamma), !found.increments ? "" : u.contraction >= 1 ? "= ΔK/Δn, as K ≥ 1" : "= Δt_r/Δn, as K < 1"],
     ["branch", found.branch, "what decided"],
   ];
   byId("why-quantities").replaceChildren(...rows.map(([name, value, meaning]) => element("tr", {}, element("td", {}, ...indexed(name)), element("td", { class: "number", text: value }), element("td", { class: "minor" }, ...indexed(meaning)))));
@@ -30,7 +31,7 @@ function quantities(found) {
 function alternatives(found) {
   const rows = found.alternatives.map((one) => element("tr", { class: one.q === found.q ? "chosen" : "" },
     element("td", { class: "number", text: `${one.q}${one.q === found.q ? " (chosen)" : ""}` }), element("td", { class: "number", text: `${one.period_s} s` }),
-    element("td", { class: "number", text: digits(one.contraction, 6) }), element("td", { class: "number", text: one.response_s === null ? "does not fall" : `${digits(one.response_s)} s` })));
+    element("td", { class: "number", text: numberText(one.contraction, 6) }), element("td", { class: "number", text: one.response_s === null ? "does not fall" : `${numberText(one.response_s)} s` })));
   byId("why-alternatives").replaceChildren(...(rows.length ? rows : [element("tr", {}, element("td", { colspan: "4", class: "minor", text: ["up", "down", "level"].includes(found.branch) ? "K is 1 to the precision of the registers: no estimate for other q." : "Algorithm 1 did not decide here." }))]));
 }
 
@@ -43,8 +44,8 @@ function budget(found) {
   for (let i = 0; i < iterations; i += 1) block(preparation + i * iteration, preparation + (i + 1) * iteration, "iteration");
   if (slack >= 0) block(answer, period, "slack"); else block(period, answer, "late");
   const word = (time, text, y, anchor = "middle") => drawing.append(shape("text", { x: at(time), y, "text-anchor": anchor }, text));
-  word(0, "measured", 11, "start"); word(preparation, `prepared ${digits(preparation, 3)} s`, 50, "start");
-  word(answer, `answer ${digits(answer, 3)} s`, 11, "end"); word(end, slack >= 0 ? `slack ${digits(slack, 3)} s, takes effect at ${digits(period, 3)} s` : `late by ${digits(-slack, 3)} s`, 50, "end");
+  word(0, "measured", 11, "start"); word(preparation, `prepared ${numberText(preparation, 3)} s`, 50, "start");
+  word(answer, `answer ${numberText(answer, 3)} s`, 11, "end"); word(end, slack >= 0 ? `slack ${numberText(slack, 3)} s, takes effect at ${numberText(period, 3)} s` : `late by ${numberText(-slack, 3)} s`, 50, "end");
   byId("why-budget").replaceChildren(drawing);
 }
 
@@ -59,10 +60,10 @@ async function curves(found) {
   }
   for (const one of charts) {
     const predictions = found.prediction ? [{ time: found.prediction.time, curves: [found.prediction[one.name]] }] : [];
-    one.show([trend.time, trend.series[one.name]], { band: trend.bands[one.name], bandName: "band", substituted: trend.substituted, gaps: trend.gaps, predictions, planned: true, now: found.time_s });
+    one.show([trend.time, trend.series[one.name]], { band: trend.bands[one.name], bandName: "band", doubtful: trend.doubtful, gaps: trend.gaps, predictions, planned: true, now: found.time_s });
   }
-  const came = found.came === null ? "not known yet" : digits(found.came, 5);
-  byId("why-cost").textContent = `Cost at the end of this period: predicted ${digits(found.predicted, 5)}, came ${came}. ${found.prediction ? "Dashed: the trajectory that was predicted." : "The predicted trajectory of this update is not kept any more."} Vertical line: the updating instant.`;
+  const came = found.came === null ? "not known yet" : numberText(found.came, 5);
+  byId("why-cost").textContent = `Cost at the end of this period: predicted ${numberText(found.predicted, 5)}, came ${came}. ${found.prediction ? "Dashed: the trajectory that was predicted." : "The predicted trajectory of this update is not kept any more."} Vertical line: the updating instant.`;
 }
 
 export async function showUpdate(query) {

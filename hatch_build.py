@@ -1,0 +1,16 @@
+"""Puts the pages of `docs/` into the wheel, where `coldloop docs` finds them; an image of a service has none."""
+
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+
+class Pages(BuildHookInterface):  # type: ignore[type-arg]
+    """The hook of `[tool.hatch.build.targets.wheel.hooks.custom]`."""
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Add the pages, but to an editable installation, which reads them where they are."""
+        if version != "editable":
+            pages = Path(self.root, "docs").glob("*.md")
+            build_data["force_include"].update({str(page): f"rig/pages/{page.name}" for page in pages})

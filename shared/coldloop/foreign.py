@@ -1,0 +1,24 @@
+"""The guard of every call into code that is not ours: an FMU, a plant's class, a solver, a rule, an estimator."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from coldloop.errors import ColdloopError, ModelFileError
+
+
+@contextmanager
+def foreign(
+    what: str, instead: str = "", *, kind: type[ColdloopError] = ModelFileError, said: Sequence[str] = ()
+) -> Iterator[None]:
+    """Call `what`, code that is not ours: what it raises, `SystemExit` too, becomes an error of a kind, in one line.
+
+    `instead` ends the line: what happens instead, or what to do; `said` is what the code has reported itself, which is
+    told in the place of its exception. An error of this kind passes as it is.
+    """
+    try:
+        yield
+    except kind:
+        raise
+    except (Exception, SystemExit) as error:
+        reason = " ".join(said) or f"{type(error).__name__}: {error}".removesuffix(": ")
+        raise kind(f"{what}: {' '.join(reason.split())}" + (f"; {instead}" if instead else "")) from error

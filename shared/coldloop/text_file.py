@@ -1,0 +1,61 @@
+"""Text files of users: UTF-8, with a byte order mark or without, or UTF-16 with one."""
+
+import codecs
+from pathlib import Path
+from typing import Final
+
+from coldloop.errors import ColdloopError, UsageError
+
+MOST_BYTES: Final = 2**28
+"""Size of a file, at most."""
+MARKS: Final = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+"""Byte order marks, and the encodings that they begin."""
+
+
+def read_text(
+    path: Path, remedy: str, error: type[ColdloopError] = UsageError, most: int = MOST_BYTES
+) -> str:  # fmt: skip
+    """Return the text of a file.
+
+    Args:
+        path: The file, or a pipe.
+        remedy: Ends the message where the file cannot be read.
+        error: What is raised.
+        most: Size of the file in bytes.
+
+    Raises:
+        ColdloopError: It cannot be read, is too large or no text; one line, of the kind `error`.
+    """
+    data = read_bytes(path, remedy, error, most)
+    try:
+        return decoded(data)
+    except UnicodeDecodeError as failure:
+        raise error(f"{path}: {not_text(failure)}") from None
+
+
+def read_bytes(
+    path: Path, remedy: str, error: type[ColdloopError] = UsageError, most: int = MOST_BYTES
+) -> bytes:  # fmt: skip
+    """Return the content of a file, as `read_text` does."""
+    try:
+        with path.open("rb") as file:  # a pipe will do, a device without an end will not
+            data = file.read(most + 1)
+    except (OSError, ValueError) as failure:
+        raise error(f"{path}: {getattr(failure, 'strerror', failure)}; {remedy}") from None
+    if len(data) > most:
+        raise error(f"{path}: more than {most} bytes; {remedy}")
+    return data
+
+
+def decoded(data: bytes) -> str:
+    """Return the text that bytes hold.
+
+    Raises:
+        UnicodeDecodeError: They are not UTF-8, nor UTF-16 with a byte order mark.
+    """
+    return data.decode(next((coding for mark, coding in MARKS.items() if data.startswith(mark)), "utf-8"))
+
+
+def not_text(error: UnicodeDecodeError) -> str:
+    """Return what is wrong with a file that is no text, and the remedy."""
+    return f"not UTF-8 text (byte {error.start}); save it as UTF-8, not compressed"
