@@ -162,6 +162,13 @@ class PlausibilitySettings(BaseModel):
     moves about its trend by so many standard deviations of its sensor for `settled_s`, or by more for less; 0: never.
     """
 
+    @field_validator("level_span")
+    @classmethod
+    def _low_first(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if not value[0] < value[1]:
+            raise ValueError("give the lower end first, then the higher one")
+        return value
+
     @property
     def spans(self) -> tuple[tuple[float, float], ...]:
         """Within which predictions each output is judged."""
