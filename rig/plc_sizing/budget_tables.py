@@ -8,8 +8,9 @@ import numpy as np
 from coldloop.process.lti_model import load
 from coldloop.process.signals import SAMPLING_PERIOD_S, TICK_S
 from optimizer_plc.budget import PlcBudget
-from optimizer_plc.computing_settings import Arithmetic
+from optimizer_plc.computing_settings import Arithmetic, EstimatorKind
 from optimizer_plc.estimator import check_detectability
+from optimizer_plc.plausibility import watched_output
 from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.qp.design import ControlDesign, Target, trivial_design
 from optimizer_plc.qp.prediction import PredictionModel, prediction_of
@@ -55,11 +56,12 @@ def budget_tables(settings: Settings, period_s: float | None, executed: Callable
         executed: Returns what an iteration as exported takes.
     """
     problem, prediction = problem_of(settings)
-    limited = settings.optimizer_plc.program.cold_end.approach_k > 0.0
+    program = settings.optimizer_plc.program
+    limited, apart = program.cold_end.approach_k > 0.0, predicted_apart(program, prediction)
     return "\n".join([
         _speed(reference_curve(), problem.size),
-        _operations(problem, prediction, limited=limited) + executed(problem),
-        _iterations(settings.optimizer_plc.program, problem, period_s),
+        _operations(problem, prediction, apart, limited=limited) + executed(problem),
+        _iterations(program, problem, period_s),
         _memory(settings, problem, prediction, MEMORY_BYTES),
     ])  # fmt: skip
 
@@ -78,7 +80,8 @@ def plc_tables(
     problem, prediction = problem_of(settings)
     settings = with_power(settings, power_of(profile, problem.size))
     program = settings.optimizer_plc.program
-    needed = footprint(problem, estimator_memory(prediction, program.estimator), program.solver)
+    apart = predicted_apart(program, prediction)
+    needed = footprint(problem, estimator_memory(prediction, program.estimator, apart), program.solver)
     sentences = [verdict(profile, program, problem, needed)]
     if fits(profile, program, problem, needed):
         sentences += [costs(settings)]
@@ -131,7 +134,13 @@ def _speed(curve: SpeedCurve, size: int) -> str:
     )
 
 
-def _operations(problem: PredictiveProblem, prediction: PredictionModel, *, limited: bool) -> str:
+def predicted_apart(program: ProgramSettings, prediction: PredictionModel) -> int:
+    """Return how many predictions there are beside the filter's, without the watched reading."""
+    kalman = program.estimator.kind is EstimatorKind.KALMAN
+    return 2 * (kalman and watched_output(program.plausibility, prediction) >= 0)
+
+
+def _operations(problem: PredictiveProblem, prediction: PredictionModel, apart: int, *, limited: bool) -> str:
     dense, without_zeros = counted_sizes(problem)
     m, mean = dense.m, ACTIVE_ROWS.mean
     variants: dict[str, Callable[[QpSizes], Operations]] = {
@@ -153,7 +162,7 @@ def _operations(problem: PredictiveProblem, prediction: PredictionModel, *, limi
     sizes = operations.PreparationSizes(
         dense, m - 4 * len(problem.design.constraint_instants), problem.n_knots, prediction.n_states,
         prediction.D.shape[1], prediction.D.shape[0], segments=1, samples=1,
-        targets=problem.design.target is not Target.OPERATING_POINT, limited=limited,
+        targets=problem.design.target is not Target.OPERATING_POINT, limited=limited, apart=apart,
     )  # fmt: skip
     once = operations.preparation(sizes, mean)
     rows.append(("preparation, once an updating period", f"{once.flops:,.0f}", "", f"{once.bytes / 1e3:.1f}", ""))
@@ -191,7 +200,7 @@ def _memory(
     settings: Settings, problem: PredictiveProblem, prediction: PredictionModel, memory_bytes: int
 ) -> str:  # fmt: skip
     program = settings.optimizer_plc.program
-    estimator = estimator_memory(prediction, program.estimator)
+    estimator = estimator_memory(prediction, program.estimator, predicted_apart(program, prediction))
     problems = (problem, _problem(settings, prediction, trivial_design(program.design)))
     footprints = [footprint(one, estimator, program.solver) for one in problems]
     names = {"hessian": "Phi", "problem": "Gamma and maps", "shift": "shift of the profile", "solver": "solver",

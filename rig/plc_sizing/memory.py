@@ -64,7 +64,7 @@ class Footprint(NamedTuple):
     solver: int
     """Its workspace."""
     estimator: int
-    """Transitions, Kalman gains and inverse covariances of every updating period, output matrices."""
+    """Transitions, Kalman gains and inverse covariances of every updating period, output matrices, states beside."""
     sequence: int
     """Two buffers of the longest sequence: the one being played, the one being written."""
 
@@ -74,13 +74,14 @@ class Footprint(NamedTuple):
         return sum(self)
 
 
-def estimator_memory(prediction: PredictionModel, settings: EstimatorSettings) -> int:
-    """Return the bytes of the estimator."""
+def estimator_memory(prediction: PredictionModel, settings: EstimatorSettings, apart: int = 0) -> int:
+    """Return the bytes of the estimator, with so many predictions beside the filter's."""
     real = real_of(Arithmetic.FLOAT32)
     single = prediction.rounded(real)
     gains = (array.astype(real) for array in stationary_gains(prediction, settings))
     transitions = (M for step in single.transitions.values() for M in step)
-    return sum(M.nbytes for M in (*gains, *transitions, single.C, single.D, single.G))
+    states = WORD * apart * (prediction.n_states + 1)
+    return states + sum(M.nbytes for M in (*gains, *transitions, single.C, single.D, single.G))
 
 
 def footprint(problem: PredictiveProblem, estimator: int, solver: SolverName) -> Footprint:

@@ -174,6 +174,8 @@ class PreparationSizes(NamedTuple):
     """Whether the cost is about a target that is sought."""
     limited: bool
     """Whether there is a limit of the feed, by two outputs that are estimated."""
+    apart: int = 0
+    """Predictions without the watched reading, beside the filter's."""
 
 
 def preparation(sizes: PreparationSizes, active: float) -> Operations:
@@ -183,12 +185,14 @@ def preparation(sizes: PreparationSizes, active: float) -> Operations:
         product((states + 1) * sizes.outputs), Operations(states + sizes.inputs + 2 * sizes.outputs + 4)
     )
     predict = _response(states, sizes).times(sizes.segments)
+    apart = correct.plus(Operations(2 * sizes.outputs + 1), predict).times(sizes.apart)
     start = gradient(sizes.problem, active).plus(Operations(3 * n + 2))
     sequence = product(sizes.samples * sizes.inputs * sizes.knots).plus(Operations(4 * sizes.samples * sizes.inputs))
     costs = augmented_cost(sizes.problem, active).times(2)
     sought = target(sizes.inputs) if sizes.targets else Operations(0)
     limit = _response(2, sizes).plus(Operations(13)) if sizes.limited else Operations(0)
-    return correct.plus(predict, instance(sizes).times(2), product(n * n), costs, start, sequence, sought, limit)
+    once = (product(n * n), costs, start, sequence, sought, limit)
+    return correct.plus(predict, apart, instance(sizes).times(2), *once)
 
 
 def instance(sizes: PreparationSizes) -> Operations:

@@ -152,6 +152,28 @@ class PlausibilitySettings(BaseModel):
     minute (and but for its allowance). While it does not, no other reading is suspected, and suspects are taken back:
     what contradicts them is wrong itself. L1, which has no constant error, is taken back where two or more say so."""
 
+    spike_s: Annotated[float, Field(ge=0)] = 7.5 * STRETCH
+    """A reading that contradicts the others is left out at once, and a suspect when it has done so for longer than
+    this, less a tenth of the time in which it did not."""
+    level_span: tuple[float, float] = (5.0, 95.0)
+    """A level that is predicted outside of this, %, is not judged: a bath that runs dry or full is not as its model."""
+    movement_sigmas: Annotated[float, Field(ge=0)] = 6.0
+    """A reading without a constant error (L1) is stuck when it shows only its noise while the prediction without it
+    moves about its trend by so many standard deviations of its sensor for `settled_s`, or by more for less; 0: never.
+    """
+
+    @field_validator("level_span")
+    @classmethod
+    def _low_first(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if not value[0] < value[1]:
+            raise ValueError("give the lower end first, then the higher one")
+        return value
+
+    @property
+    def spans(self) -> tuple[tuple[float, float], ...]:
+        """Within which predictions each output is judged."""
+        return tuple(self.level_span if output.quantity == "level" else (-1e30, 1e30) for output in PROCESS.outputs)
+
     @property
     def allowances(self) -> tuple[float, ...]:
         """Of each output."""

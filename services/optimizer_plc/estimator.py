@@ -16,6 +16,7 @@ from optimizer_plc.computing_settings import (
     NoiseReference,
     PlausibilitySettings,
 )
+from optimizer_plc.open_loop import NONE, Apart, none_apart, predict_apart, watch
 from optimizer_plc.plausibility import (
     USED,
     Plausibility,
@@ -89,6 +90,7 @@ class Belief(NamedTuple):
     filter expects: mean square over about `MEMORY_TICKS`, shape (n_y,)."""
     readings: Any
     """Records, shape (n_y,): which of them are believed, and since when."""
+    apart: Apart
 
 
 def estimator_of(
@@ -115,7 +117,7 @@ def estimator_of(
         Transition(*(np.array(M) for M in zip(*m.transitions.values(), strict=True))),
         m.outputs, np.array(m.x0), np.array(m.u0), np.array(m.y0), m.w0, real(TICK_S), kalman, settings.load_known,
         StationaryGains(*(array.astype(real, copy=False) for array in stationary)),
-        plausibility_of(plausibility, prediction, len(prediction.transitions) * TICK_S, real),
+        plausibility_of(plausibility, prediction, settings.sensors, len(prediction.transitions) * TICK_S, real),
     )  # fmt: skip
 
 
@@ -124,7 +126,7 @@ def no_belief(n_states: int, real: Real = DOUBLE) -> Belief:
     numbers = np.zeros(1, [("w", real), ("mismatch", real), ("since", "i8")])
     belief = Belief(
         numbers, np.zeros(n_states, real), np.zeros(n_states, real), np.zeros(len(OUTPUT_NAMES), real),
-        new_readings(real),
+        new_readings(real), none_apart(n_states, real),
     )  # fmt: skip
     forget(belief)
     return belief
@@ -138,9 +140,11 @@ def forget(belief: Belief) -> None:
     belief.predicted[:] = zero
     belief.surprise[:] = zero
     b.w, b.mismatch, b.since = zero, zero, 1
+    belief.apart.watch[0].age_s = NONE
     for i in range(belief.readings.shape[0]):
         r = belief.readings[i]
-        r.state, r.since_s, r.agreed_s, r.jump, r.jumped_to, r.difference = USED, zero, zero, zero, zero, zero
+        r.state, r.since_s, r.agreed_s, r.spikes_s = USED, zero, zero, zero
+        r.jump, r.jumped_to, r.difference = zero, zero, zero
 
 
 @kernel
@@ -184,6 +188,7 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
             c.plausible, belief.readings, belief.surprise, belief.predicted, y, innovation, J,
             real(b.since) * c.tick_s,
         )  # fmt: skip
+    believed = innovation.copy()
     if not are_finite(innovation):
         innovation = imputed(innovation, J)
     if b.since <= c.stationary.gains.shape[0]:  # J is for no longer time
@@ -194,6 +199,11 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
     belief.predicted[:] = belief.x
     b.mismatch += correction[belief.x.size]
     b.w = known + b.mismatch
+    if c.plausible.watched >= 0:
+        watch(
+            c.plausible, maps, c.stationary.gains[period], J, belief, known, u_before - c.u0, y - c.y0, believed,
+            real(b.since) * c.tick_s,
+        )  # fmt: skip
 
 
 @kernel
@@ -213,6 +223,8 @@ def predict(c: Estimator, belief: Belief, u: Array, ticks: int) -> None:
         step = min(ticks, longest)
         A, B, F = c.steps.A[step - 1], c.steps.B[step - 1], c.steps.F[step - 1]
         belief.predicted[:] = respond(A, B, F, belief.predicted, u, b.w)
+        if belief.apart.watch[0].age_s >= 0.0:
+            predict_apart(A, B, F, belief, u)
         ticks -= step
 
 

@@ -6,13 +6,14 @@ innovations loses without the output. So one wrong reading has the largest resid
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import OUTPUT_NAMES
+from coldloop.process.signals import CONTROLLED, OUTPUT_NAMES
 from optimizer_plc.computing_settings import PlausibilitySettings
 from optimizer_plc.qp.arithmetic import Real
 from optimizer_plc.qp.linear_algebra import cholesky, cholesky_solve
@@ -26,14 +27,21 @@ MISSING: Final = 1
 """There is no number: the control PLC has taken it out."""
 SUSPECT: Final = 2
 """It contradicts prediction and other readings, and is left out."""
+STUCK: Final = 3
+"""The same of one that shows nothing but its noise while the prediction moves (`open_loop`)."""
+FORGETTING: Final = 0.1
+"""Share of the time without a spike that is taken off the time with one."""
+RESTART, LONGEST_WATCH = 0.5, 10.0
+"""Of `settled_s`."""
 
 READING: Final = (
     ("state", "i8"), ("since_s", "real"), ("agreed_s", "real"), ("jump", "real"), ("jumped_to", "real"),
-    ("difference", "real"),
+    ("difference", "real"), ("spikes_s", "real"),
 )  # fmt: skip
-"""state: `USED`, `MISSING` or `SUSPECT`. since_s: how long it has been that. agreed_s: for how long a suspect has
-agreed with the others again. jump, jumped_to: by how much it differed from what the others say of it after its last
-jump, and what it showed then. difference: by how much it differs now."""
+"""state: `USED`, `MISSING`, `SUSPECT` or `STUCK`. since_s: how long it has been that. agreed_s: for how long a suspect
+has agreed with the others again. jump, jumped_to: by how much it differed from what the others say of it after its last
+jump, and what it showed then; of one that is stuck, where. difference: by how much it differs now. spikes_s: for how
+long one that is used has been left out as a spike."""
 
 
 class Plausibility(NamedTuple):
@@ -55,12 +63,29 @@ class Plausibility(NamedTuple):
     """Largest residual over its standard deviation, root mean square, while the model holds."""
     constants: NDArray[np.int64]
     """State that is the constant error of each output; below 0: it has none. Shape (22,)."""
+    spike_s: float
+    forgetting: float
+    low: Array
+    """Outputs whose prediction is outside of these are not judged, shape (22,)."""
+    high: Array
+    noise: Array
+    """Standard deviation of each sensor, shape (22,)."""
+    watched: int
+    """Output that is judged by predictions without it, or -1."""
+    origin: float
+    """What it shows at the operating point."""
+    movement: float
+    """Integral of the square of that about its trend from which on the reading must move, squared unit times s."""
+    restart_s: float
+    """After which such a prediction begins again where the reading moves; longer than a frozen one goes unnoticed."""
+    longest_watch_s: float
 
 
 def plausibility_of(
-    settings: PlausibilitySettings, prediction: PredictionModel, longest_period_s: float, real: Real
-) -> Plausibility:
-    """Return what is plausible with a model and inverse covariances for periods up to the longest."""
+    settings: PlausibilitySettings, prediction: PredictionModel, noise: Sequence[float], longest_period_s: float,
+    real: Real,
+) -> Plausibility:  # fmt: skip
+    """Return what is plausible with a model, sensors and inverse covariances for periods up to the longest."""
     n_y = len(OUTPUT_NAMES)
     constants = np.full(n_y, -1)
     disturbances = prediction.disturbances
@@ -69,11 +94,23 @@ def plausibility_of(
             constants[signal] = place
     spread = 2.0 / (9.0 * n_y)  # Wilson and Hilferty: the quantile of chi-square at so many sigmas
     in_all = n_y * (1.0 - spread + settings.sigmas * math.sqrt(spread)) ** 3
+    low, high = np.array(settings.spans, real).T
+    watched = watched_output(settings, prediction)
+    movement = (settings.movement_sigmas * noise[watched]) ** 2 * settings.settled_s
     return Plausibility(
         real(settings.sigmas), np.array(settings.allowances, real), real(in_all), real(longest_period_s),
         real(settings.settled_s), real(settings.agreeing_s), real(settings.longest_s), settings.most,
-        real(settings.model_sigmas), constants,
+        real(settings.model_sigmas), constants, real(settings.spike_s), real(FORGETTING), low.copy(), high.copy(),
+        np.array(noise, real), watched, real(prediction.y0[watched]), real(movement),
+        real(RESTART * settings.settled_s), real(LONGEST_WATCH * settings.settled_s),
     )  # fmt: skip
+
+
+def watched_output(settings: PlausibilitySettings, prediction: PredictionModel) -> int:
+    """Return the controlled output that has no constant error, where readings are judged; or -1."""
+    without = [output for output in CONTROLLED if output not in prediction.disturbances]
+    judged = settings.sigmas and settings.movement_sigmas and not prediction.ahead
+    return without[0] if judged and without else -1
 
 
 def new_readings(real: Real) -> Any:  # noqa: ANN401 records
@@ -151,6 +188,9 @@ def judge(
         if r.since_s < p.settled_s <= r.since_s + elapsed_s:
             surprise[i] = 0.0  # by what it has shown until now nobody is judged
         r.since_s += elapsed_s
+        r.spikes_s = max(r.spikes_s - p.forgetting * elapsed_s, innovation.dtype.type(0.0))
+        if r.state == USED and not p.low[i] <= y[i] - innovation[i] <= p.high[i]:
+            r.since_s = 0.0  # there the plant is not as its model
         if not np.isfinite(innovation[i]):
             enter(r, MISSING)
         elif r.state != USED:
@@ -160,7 +200,7 @@ def judge(
     if returning:
         take_back(p, readings, predicted, y, innovation, believed, J, elapsed_s, contradicting)
     if elapsed_s <= p.longest_period_s and contradicting < 2:
-        suspect_some(p, readings, believed, J, contradicts)
+        suspect_some(p, readings, believed, J, contradicts, elapsed_s)
     return believed
 
 
@@ -180,7 +220,7 @@ def against_the_model(p: Plausibility, readings: Any, surprise: Array, J: Array)
 def enter(r: Any, state: int) -> None:  # noqa: ANN401 a record
     """Let a reading be in a state."""
     if r.state != state:
-        r.state, r.since_s, r.agreed_s = state, 0.0, 0.0
+        r.state, r.since_s, r.agreed_s, r.spikes_s = state, 0.0, 0.0, 0.0
 
 
 @kernel
@@ -192,7 +232,8 @@ def take_back(
 
     After a long time, or when others contradict the model, what they say of a reading is no better than the reading:
     its constant error, if it has one, is set so that it agrees. One without (L1) counts again in full, and so only
-    where two or more contradict: one of them may itself be wrong.
+    where two or more contradict: one of them may itself be wrong. One that is stuck must have moved before. One that
+    agrees has been judged all the time, and no jump ends the longest time.
     """
     expected = imputed(believed, J)
     for i in range(innovation.shape[0]):
@@ -203,17 +244,26 @@ def take_back(
                 r.agreed_s = 0.0
             else:
                 r.agreed_s += elapsed_s
-            if r.since_s <= elapsed_s or abs(difference - r.difference) > largest:
+            jumps = r.since_s <= elapsed_s or abs(difference - r.difference) > largest
+            if r.state == STUCK:
+                jumps = abs(y[i] - r.jumped_to) > (p.sigmas + p.sigmas) * p.noise[i]
+                if jumps:
+                    r.state, r.agreed_s = SUSPECT, 0.0
+            if jumps and r.state != STUCK:
                 r.jump, r.jumped_to = difference, y[i]
             r.difference = difference
             agrees = r.state == SUSPECT and r.agreed_s >= p.agreeing_s
             model_fails = contradicting > (0 if p.constants[i] >= 0 else 1)
-            if agrees or model_fails or wanders_off(r, y[i], largest) or r.state == MISSING or r.since_s >= p.longest_s:
+            wanders = r.state == SUSPECT and wanders_off(r, y[i], largest)
+            too_long = r.state == SUSPECT and r.since_s >= p.longest_s and not jumps
+            if agrees or model_fails or wanders or too_long or r.state == MISSING:
                 believed[i] = innovation[i]
                 if not agrees and p.constants[i] >= 0:
                     predicted[p.constants[i]] += difference
                     believed[i] = expected[i]
                 enter(r, USED)
+                if agrees:
+                    r.since_s = p.settled_s
 
 
 @kernel
@@ -230,10 +280,13 @@ def wanders_off(r: Any, shown: float, least: float) -> bool:  # noqa: ANN401 a r
 
 
 @kernel
-def suspect_some(p: Plausibility, readings: Any, believed: Array, J: Array, only: int) -> None:  # noqa: ANN401
+def suspect_some(
+    p: Plausibility, readings: Any, believed: Array, J: Array, only: int, elapsed_s: float  # noqa: ANN401
+) -> None:  # fmt: skip
     """Leave out readings whose residual is too large, the worst first, if what is left then agrees in all.
 
-    Where one says that the model does not hold it is the `only` one that may be wrong itself; -1: any may.
+    Where one says that the model does not hold it is the `only` one that may be wrong itself; -1: any may. A reading
+    is a suspect when it has been left out for longer than a spike.
     """
     before, expected, out = believed.copy(), believed.copy(), count_suspects(readings)
     if not are_finite(believed):
@@ -255,7 +308,10 @@ def suspect_some(p: Plausibility, readings: Any, believed: Array, J: Array, only
         return
     for i in range(believed.shape[0]):
         if np.isfinite(before[i]) and not np.isfinite(believed[i]):
-            enter(readings[i], SUSPECT)
+            r = readings[i]
+            r.spikes_s += elapsed_s + p.forgetting * elapsed_s
+            if r.spikes_s > p.spike_s:
+                enter(r, SUSPECT)
 
 
 @kernel
@@ -263,7 +319,7 @@ def count_suspects(readings: Any) -> int:  # noqa: ANN401 records
     """Return how many readings are suspects."""
     count = 0
     for i in range(readings.shape[0]):
-        if readings[i].state == SUSPECT:
+        if readings[i].state >= SUSPECT:
             count += 1
     return count
 
@@ -285,7 +341,7 @@ def suspects_of(readings: Any) -> int:  # noqa: ANN401 records
     """Return the suspects: bit i is output i."""
     mask, bit = 0, 1
     for i in range(readings.shape[0]):
-        if readings[i].state == SUSPECT:
+        if readings[i].state >= SUSPECT:
             mask += bit
         bit += bit
     return mask

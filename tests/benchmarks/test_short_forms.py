@@ -83,7 +83,7 @@ def test_a_short_form_ends_and_prints(printed_by: Benchmark, tmp_path: Path, nam
 
 def test_a_dead_sensor_is_noticed(printed_by: Benchmark) -> None:
     text = printed_by("sensor_faults.py", "--outputs", "L1", "--faults", "dead", "--minutes", "6")
-    assert re.search(r"^L1 \| dead \| 0 s bad \|", text, re.MULTILINE), text
+    assert re.search(r"^a \| L1 \| dead \| 0 s bad \|", text, re.MULTILINE), text
 
 
 @pytest.mark.night

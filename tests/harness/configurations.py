@@ -8,7 +8,8 @@ from plant.load import find_load
 PROGRAM: Final = "optimizer_plc.program."
 NOISE: Final = ("plant.sensors.level=0.02", "plant.sensors.speed=0.5", "plant.sensors.temperature=0.02")
 SUSPECTS: Final = tuple(
-    f"{PROGRAM}plausibility.{each}" for each in ("sigmas=1.5", "settled_s=5", "agreeing_s=5", "longest_s=9")
+    f"{PROGRAM}plausibility.{each}"
+    for each in ("sigmas=1.5", "settled_s=5", "agreeing_s=5", "longest_s=9", "spike_s=0")
 )
 REFRIGERATOR: Final = "plant.kind=refrigerator"
 SINGLE: Final = f'{PROGRAM}arithmetic="float32"'

@@ -70,7 +70,7 @@ async def test_noise_suspects_and_the_low_word_first_change_nothing_about_the_eq
     lively: LoadProfile, simulate: "Simulate", on_the_bus: "OnTheBus"
 ) -> None:
     scenario = three_minutes(lively, seed=20)
-    limits = PlausibilitySettings(sigmas=2.0, settled_s=5.0, agreeing_s=5.0)
+    limits = PlausibilitySettings(sigmas=2.0, settled_s=5.0, agreeing_s=5.0, spike_s=0.0)
     suspicious = OptimizerSection(program=ProgramSettings(plausibility=limits))
     async with on_the_bus(Settings(plant=NOISY, optimizer_plc=suspicious), order=WordOrder.LOW_FIRST) as bus:
         networked = await bus.record(scenario)
