@@ -15,6 +15,8 @@ from optimizer_plc.qp.penalties import Preset
 from optimizer_plc.scheme import Constants, limit_of_feed, most_open, problem_at
 from optimizer_plc.settings import ProgramSettings
 
+pytestmark = pytest.mark.usefixtures("compiles")  # these kernels are called by others alone
+
 LIMITS = InputLimits()
 
 

@@ -10,6 +10,8 @@ from optimizer_plc.scheme import Constants, shortage
 from optimizer_plc.settings import ProgramSettings
 from tests.optimizer_plc.test_target import LIMITS
 
+pytestmark = pytest.mark.usefixtures("compiles")  # these kernels are called by others alone
+
 CV155, HEATER, CV156 = range(len(INPUT_NAMES))
 PER_CENT_W = (9.48784, -1.0, -0.209227)
 """What a per cent of CV155, a watt of the heater and a per cent of CV156 hold at rest, W."""
