@@ -78,7 +78,7 @@ def test_a_replay_takes_no_commands(served: Served) -> None:
 
 def test_recorded_settings_give_rule_and_limits(recorded_run: Path) -> None:
     recorded = RecordedPage(RunFolder(recorded_run))
-    assert (recorded.rule.q_first, recorded.rule.delta, recorded.rule.iteration) == (9, 2, 0.25)
+    assert (recorded.rule.q_first, recorded.rule.delta, recorded.rule.iteration) == (5, 0, 0.25)
     assert recorded.limits.output_high == (61.0, 16.0)
 
 

@@ -109,7 +109,7 @@ def test_while_others_drive_the_guess_is_where_they_have_led_the_inputs(
         ({"interrupting_load_step_w": 10.0, "sequence_ticks": 240}, 240),
         ({"adaptive": {"rule": "contraction"}}, 18),
         ({"adaptive": {"rule": "contraction"}, "budget": {"power": 0.5}}, 18),
-        ({"adaptive": {"delta": 10, "q_first": 1, "q_min": 1}, "budget": {"power": 0.5}}, 20),
+        ({"adaptive": {"rule": "algorithm-1", "delta": 10, "q_first": 1, "q_min": 1}, "budget": {"power": 0.5}}, 20),
     ],
 )
 def test_a_sequence_lasts_until_the_next_one_can_arrive(settings: dict[str, Any], rows: int) -> None:

@@ -18,7 +18,7 @@ from rig.text_tables import markdown_table
 
 CONDITIONS: Final = {**conditions.CONDITIONS, **conditions.BESIDE_THE_BOX, **conditions.UNKNOWN_LOADS, **LINEAR}
 TUNED: Final = f"{PROGRAM}preset=tuned"
-DEFAULT: Final = "tuned, Algorithm 1"
+DEFAULT: Final = "tuned, adaptive"
 CONTROLLERS: Final = {
     DEFAULT: (ADAPTIVE, (TUNED,)),
     "paper, Algorithm 1": (ADAPTIVE, ()),

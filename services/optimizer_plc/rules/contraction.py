@@ -1,4 +1,4 @@
-"""This project's rule: Algorithm 1 with a dead band, that rests at its shortest period.
+"""This project's rule, the default of the cold box: Algorithm 1 with a dead band, that rests at its shortest period.
 
 The cost contracts from J_k to J_{k+1} by K. Where |ln K| is within `band` times its usual size, it says nothing, and q
 goes down by one to `q_rest`. Beyond that, q goes up by one where the gradient Gamma of the response time asks for a

@@ -102,6 +102,7 @@ COLD_BOX: Final = Process(
     tuned={
         "estimator": {"disturbances": ("outputs",), "load_walk_w": 1.0},
         "unmeasured": {"load_walk_w": 10.0},
+        "adaptive": {"rule": "contraction"},
         "cold_end": {"approach_k": 0.3},
         "design": {"band_margin": (0.1, 0.3)},
         "plausibility": {"sigmas": 6.0},
