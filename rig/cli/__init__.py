@@ -1,6 +1,7 @@
 """The command `coldloop`."""
 
 import argparse
+import errno
 import logging
 import os
 import platform
@@ -69,6 +70,8 @@ EXTRAS: Final = {
     "h5py": "hdf5", "jinja2": "report", "markdown_it": "report", "pandas": "records", "plotly": "report",
 }  # fmt: skip
 """The extra that brings a package which not every command needs."""
+OF_THE_OUTPUT: Final = (errno.ENOSPC, errno.EIO, errno.EBADF, errno.EDQUOT, errno.EFBIG)
+"""Errors of writing."""
 INTERRUPTED = 130
 OF_THE_COLD_BOX: Final = ("study", "reproduce", "model", "exergy")
 """Commands that are about its equations, its loads or the paper's figures."""
@@ -147,7 +150,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _discard_output()
             return 0
         except OSError as error:  # commands report errors of their own files: what is left is mostly standard output
-            place = error.filename or (f"{given[0]}" if _output_works() else "standard output")
+            place = error.filename or ("standard output" if error.errno in OF_THE_OUTPUT else given[0])
             _discard_output()
             sys.stderr.write(f"coldloop: {place}: {error.strerror or error}\n")
             return 1
@@ -191,15 +194,6 @@ def _complete() -> NoReturn:
     parser = make_parser(words[1] if len(words) > 1 and words[1] in COMMANDS else None)
     autocomplete(parser)
     sys.exit(0)
-
-
-def _output_works() -> bool:
-    """Return whether what waits to be written to standard output can be: after a failure it still waits."""
-    try:
-        sys.stdout.flush()
-    except OSError:
-        return False
-    return True
 
 
 def _discard_output() -> None:

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -46,7 +47,8 @@ def _of_run(arguments: Sequence[str]) -> str | None:
     """Return the model file in the first folder of a run that a command only reads, or trusts; None for a cold box."""
     if not arguments or not (arguments[0] in READING or (arguments[0] == "rerun" and TRUST in arguments)):
         return None
-    places = [Path(each).parent if Path(each).name == "manifest.json" else Path(each) for each in arguments[1:]]
+    named = [each for before, each in pairwise(arguments) if before != "--out"]
+    places = [Path(each).parent if Path(each).name == "manifest.json" else Path(each) for each in named]
     model = next((place / "inputs" / "model.json" for place in places if (place / "manifest.json").is_file()), None)
     try:
         Process.of(parsed_json(model.read_bytes())["process"] if model is not None else {})

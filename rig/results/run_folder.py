@@ -34,6 +34,11 @@ OLDER: Final[dict[str, Any]] = {
     "optimizer_plc.program.plausibility.sigmas": 0.0,
 }
 """Configuration of runs that were recorded before there was a key: what the preset would decide now."""
+ADAPTIVE: Final = "optimizer_plc.program.adaptive."
+GONE: Final = frozenset(
+    f"{ADAPTIVE}contraction.{name}" for name in ("q_busy", "q_quiet", "q_step", "rate", "memory", "surprise")
+)
+"""Settings of a rule that was replaced, which are in the manifests of runs that did not use it, too."""
 TAU_U: Final = "tau_u_s"
 DRAWN_TICKS: Final = 60_000
 """A longer trace is drawn by the least and the largest value of many ticks."""
@@ -105,7 +110,9 @@ class RunFolder:
     def configuration(self) -> dict[str, Any]:
         """The configuration by dotted key; of an older run with what held then."""
         configured: dict[str, Any] = OLDER | self.manifest["configuration"]
-        return configured
+        if configured.get(f"{ADAPTIVE}rule") == "contraction":
+            return configured
+        return {key: value for key, value in configured.items() if key not in GONE}
 
     def file(self, name: str) -> pq.ParquetFile:
         """Return a Parquet file of the run.

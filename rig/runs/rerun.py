@@ -54,6 +54,9 @@ def repeat(folder: Path, out: Path | None, *, force: bool) -> tuple[bool, str]:
     if run.process != PROCESS or (FILE is not None and read_document(FILE)["digest"] != run.model_digest):
         raise UsageError(f"{folder}: a run of {run.process.name}, with another model than now; {run.remedy}")
     effective = _configuration(run)
+    loaded = read_document(effective.settings.model.file)
+    if bool(loaded.get("process")) != (FILE is not None) or (FILE is not None and loaded["digest"] != run.model_digest):
+        raise UsageError(f"{folder}: its model is of another kind of plant than it says; {run.remedy}")
     scenario = make_scenario(effective.settings, manifest["recorded_ticks"])
     if profile_digest(scenario.load) != manifest["inputs"]["load"]["profile_sha256"]:
         raise UsageError(f"load {manifest['inputs']['load']['source']}: this version has another load of that name")
@@ -70,6 +73,8 @@ def _configuration(run: RunFolder) -> Configuration[Settings]:
         copy = run.manifest["inputs"][entry]["file"]
         if copy is not None:
             values[key] = str(run.path / copy)
+        elif key == "model.file":  # the shipped one
+            values.pop(key, None)
     options: Mapping[str, tuple[object, str]] = {key: (value, SOURCE) for key, value in values.items()}
     return load_configuration(Settings, environment={}, options=options)
 

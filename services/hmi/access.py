@@ -152,13 +152,14 @@ class LoginLimit:
     def allows(self, address: str, name: str) -> bool:
         """Return whether a password is checked for this name from this address."""
         both = f"{address} {name}"
-        return self._of_names.allows(both) and (both in self._known or self._of_addresses.allows(address))
+        return (both in self._known or self._of_addresses.allows(address)) and self._of_names.allows(both)
 
     def succeeded(self, address: str, name: str) -> None:
         """Note that the password was right."""
         both = f"{address} {name}"
         self._of_names.give_back(both)
-        self._of_addresses.give_back(address)
+        if both not in self._known:
+            self._of_addresses.give_back(address)
         self._known[both] = None
         self._known.move_to_end(both)
         while len(self._known) > MOST_ADDRESSES:

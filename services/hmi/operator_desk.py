@@ -175,8 +175,9 @@ class OperatorDesk:
                 reason = f"not done, as it has changed since it was asked: {changes}{by}"
                 raise PremisesChangedError(reason, await self.prepare(prepared.command, user))
             result = await self._carry_out(prepared.command, prepared.text)
-            self._last = f"{user}'s: {prepared.text}"
-            self._model.commands += 1
+            if not result.refused_because:
+                self._last = f"{user}'s: {prepared.text}"
+                self._model.commands += 1
             return result
 
     async def _carry_out(self, command: Command, asked: str) -> CommandResult:

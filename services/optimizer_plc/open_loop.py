@@ -69,7 +69,7 @@ def watch(
         for which in range(belief.apart.x.shape[0]):
             expected = correct_apart(p, outputs, K, J, belief, which, known, u, y, believed)
             if which == YOUNGER and np.isfinite(believed[p.watched]):
-                note_movement(p, w, shown, expected, elapsed_s)
+                note_movement(w, p.noise.dtype.type(1.0), shown, expected, elapsed_s)
     if r.state != USED and r.since_s == zero and w.unchanged_s > zero:
         take_estimate(belief, YOUNGER if w.age_s >= w.unchanged_s else OLDER, known)
     w.unchanged_s = w.unchanged_s + elapsed_s if shown == w.shown else zero
@@ -145,9 +145,9 @@ def predict_apart(A: Array, B: Array, F: Array, belief: Any, u: Array) -> None: 
 
 
 @kernel
-def note_movement(p: Plausibility, w: Any, shown: float, expected: float, elapsed_s: float) -> None:  # noqa: ANN401
+def note_movement(w: Any, one: float, shown: float, expected: float, elapsed_s: float) -> None:  # noqa: ANN401
     """Let a reading count in mean and variance, and what was predicted of it by the time that it stands for."""
-    w.count += p.noise.dtype.type(1.0)
+    w.count += one
     off = shown - w.mean
     w.mean += off / w.count
     w.spread += (off * (shown - w.mean) - w.spread) / w.count

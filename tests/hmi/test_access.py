@@ -118,7 +118,7 @@ def test_scripts_come_from_the_page_alone(site: Site) -> None:
         ({"kind": "load", "watts": -1.0}, "greater than or equal to 0"),
         ({"kind": "nonsense"}, "kind"),
         ({"kind": "load_file", "content": "time_s,load_w\n0,400\n0.3,400\n"}, "multiple of 0.25"),
-        ({"kind": "load_file", "content": "time_s,load_w\n" + "9" * 200_000}, "write two numbers a line"),
+        ({"kind": "load_file", "content": "time_s,load_w\n" + "9" * 200_000}, "write a number in each column"),
         ({"kind": "alarm", "alarm": 999, "action": 1}, "unknown alarm 999"),
         ({"kind": "sensor_fault", "output": "T99", "fault": 1}, "unknown output T99"),
         ({"kind": "setpoint", "input": "CV155", "value": 99.0}, "not from 20 to 60"),

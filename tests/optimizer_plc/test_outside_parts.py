@@ -315,6 +315,9 @@ def raising(tmp_path: Path) -> dict[str, str]:
     return {"PYTHONPATH": str(site)}
 
 
+REMEDY = "mend it, or choose another"
+
+
 def test_a_solver_that_raises_on_the_bus_ends_the_run_with_one_line(
     raising: dict[str, str], processes: Processes, tmp_path: Path
 ) -> None:
@@ -322,7 +325,7 @@ def test_a_solver_that_raises_on_the_bus_ends_the_run_with_one_line(
     run = ("run", "--load", "a", "--duration", "2min", "--outside-solver", "raising", "--out", out)
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     code, _, complaints = processes.coldloop(*run, more=raising, **pipes).ended(PROGRAM_S)
-    words = "optimizer_plc: solver raising: ZeroDivisionError: no pivot"
+    words = "optimizer_plc: solver raising: ZeroDivisionError: no pivot; the optimiser ends here: " + REMEDY
     assert code != 0
     said = f"coldloop: the optimizer_plc service has ended with exit code 2: {words} (log: "
     assert complaints.splitlines()[-1].startswith(said), complaints

@@ -24,7 +24,9 @@ class Raising:
             raise ZeroDivisionError("no\\npivot")
         return guess, iterations
 """
-REASON: Final = "optimizer_plc: solver raising: ZeroDivisionError: no pivot"
+REASON: Final = (
+    "optimizer_plc: solver raising: ZeroDivisionError: no pivot; the optimiser ends here: mend it, or choose another"
+)
 
 
 @pytest.fixture

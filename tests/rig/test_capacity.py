@@ -141,7 +141,8 @@ def test_the_loads_that_can_be_held_are_those_of_the_steady_states_of_the_plant(
 def test_a_load_near_the_capacity_is_held_because_cv155_is_not_opened_too_far(tmp_path: Path) -> None:
     """Linear, the model expects ever more of CV155; the plant cools most at some 52 %, where T2 leaves T1."""
     limited, free = (
-        with_load(500.0, tmp_path, 50, {"cold_end": {"approach_k": kelvin}}) for kelvin in (0.3, 0.0)
+        with_load(500.0, tmp_path, 50, {"cold_end": {"approach_k": kelvin}, "adaptive": {"rule": "algorithm-1"}})
+        for kelvin in (0.3, 0.0)
     )  # fmt: skip
     opening, opening_free = (run.trace.to_dict()["CV155"] for run in (limited, free))
     assert max(opening) < 55.0

@@ -121,14 +121,25 @@ def test_updates_tile_the_time_without_a_gap(period_s: float, step: LoadProfile,
     assert FIVE_MINUTES - 20 <= tick < FIVE_MINUTES
 
 
-def test_the_adaptive_period_roams_within_2_to_19_iterations_by_steps_of_2(half_hour: Recording) -> None:
-    q = np.array([row.iterations for row in half_hour.updates])
+def test_the_adaptive_period_roams_within_2_to_19_iterations_by_steps_of_2(
+    load_a: LoadProfile, simulate: "Simulate"
+) -> None:
+    program = ProgramSettings.model_validate({"adaptive": {"rule": "algorithm-1"}})
+    run = simulate(Scenario(HALF_HOUR, load_a, 0.0, seed=1), optimizer_plc=OptimizerSection(program=program))
+    q = np.array([row.iterations for row in run.updates])
     assert q[0] == 9
     assert q.min() == 2
     assert q.max() <= 19
     assert len(set(q.tolist())) > 5
     assert (np.abs(np.diff(q)) <= 2).all()
-    assert [row.tau_u for row in half_hour.updates] == (q + 1).tolist()
+    assert [row.tau_u for row in run.updates] == (q + 1).tolist()
+
+
+def test_by_default_the_period_rests_at_its_shortest_and_grows_by_ones(half_hour: Recording) -> None:
+    q = np.array([row.iterations for row in half_hour.updates])
+    assert (q[0], q.min(), q.max()) == (5, 2, 5)
+    assert np.median(q) == 2
+    assert (np.abs(np.diff(q)) <= 1).all()
 
 
 def test_a_load_step_late_in_a_period_does_not_exhaust_the_sequence(simulate: "Simulate") -> None:

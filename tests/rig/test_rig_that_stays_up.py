@@ -59,7 +59,7 @@ def shown(coldloop: Coldloop, base: str) -> dict[str, str]:
 
     def answered() -> str:  # on a busy machine it may answer too slowly
         outcome = coldloop("status", "--port-base", base)
-        return "" if outcome.code else str(outcome.out)
+        return "" if outcome.code or "\nabsent" in outcome.out else str(outcome.out)
 
     return dict(line.split(maxsplit=1) for line in eventually(answered, "a status").splitlines())
 
