@@ -28,6 +28,7 @@ Curves = dict[str, NDArray[np.float64]]
 """Columns by name; what is null is NaN."""
 
 OLDER: Final[dict[str, Any]] = {
+    "optimizer_plc.program.adaptive.rule": "algorithm-1",
     "optimizer_plc.program.estimator.disturbances": [],
     "optimizer_plc.program.cold_end.approach_k": 0.0,
     "optimizer_plc.program.design.band_margin": [0.0, 0.0],

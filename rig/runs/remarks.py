@@ -12,10 +12,11 @@ from coldloop.process.signals import SAMPLING_PERIOD_S, TICK_S
 from coldloop.session.settings import TimeMode
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.qp.arithmetic import real_of
-from optimizer_plc.settings import ProgramSettings
+from optimizer_plc.settings import AdaptiveSettings, ProgramSettings, RuleName
 from rig.plc_sizing.holding import digits_last_s, shortest_period_s, waiting
 from rig.settings import Settings
 
+UNSET = AdaptiveSettings.model_fields
 PERIOD = "optimizer_plc.program.updating_period_s"
 
 
@@ -36,6 +37,12 @@ def remarks(effective: Configuration[Settings]) -> list[str]:
     found, left_out = [too_slow(program), certificate(effective.settings)], effective.notes()
     if not PROCESS.has_load and "plant.load" in effective.sources:
         found.append(f"load {effective.settings.plant.load}: the {PROCESS.name} has no load; only the length is taken")
+    adaptive = program.adaptive
+    unused = {"q_first", "q_min", "q_max", "delta"} & adaptive.model_fields_set
+    if adaptive.rule is RuleName.CONTRACTION and any(getattr(adaptive, one) != UNSET[one].default for one in unused):
+        found.append(
+            f"adaptive.{', adaptive.'.join(sorted(unused))}: of Algorithm 1; the rule is adaptive.rule=contraction"
+        )
     if left_out:
         found.append(f"not applied of the preset: {', '.join(left_out)}; `coldloop config` says why")
     return [*filter(None, found)]

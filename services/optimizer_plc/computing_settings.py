@@ -157,7 +157,7 @@ class PlausibilitySettings(BaseModel):
     this, less a tenth of the time in which it did not."""
     level_span: tuple[float, float] = (5.0, 95.0)
     """A level that is predicted outside of this, %, is not judged: a bath that runs dry or full is not as its model."""
-    movement_sigmas: Annotated[float, Field(ge=0)] = 6.0
+    movement_sigmas: Annotated[float, Field(ge=0)] = 10.0
     """A reading without a constant error (L1) is stuck when it shows only its noise while the prediction without it
     moves about its trend by so many standard deviations of its sensor for `settled_s`, or by more for less; 0: never.
     """

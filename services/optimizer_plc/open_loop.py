@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from optimizer_plc.plausibility import STUCK, USED, Plausibility, enter, imputed
+from optimizer_plc.plausibility import STUCK, USED, Plausibility, against_the_model, count_suspects, enter, imputed
 from optimizer_plc.qp.arithmetic import Real
 from optimizer_plc.qp.linear_algebra import add_transposed_product, respond
 from optimizer_plc.qp.prediction import Transition
@@ -37,7 +37,9 @@ class Apart(NamedTuple):
     """Predictions without the watched reading."""
 
     x: Array
-    """States of the younger and the older one, deviations, shape (2, n)."""
+    """States of the younger and the older one at the last measurement, deviations, shape (2, n)."""
+    predicted: Array
+    """The same predicted from there, as often as it is begun."""
     mismatch: Array
     """Their load mismatches, W, shape (2,)."""
     watch: Any
@@ -46,7 +48,8 @@ class Apart(NamedTuple):
 
 def none_apart(n_states: int, real: Real) -> Apart:
     """Return what is known at a beginning, for so many states of the model."""
-    return Apart(np.zeros((2, n_states), real), np.zeros(2, real), np.zeros(1, [(name, real) for name in WATCH]))
+    states = np.zeros((2, n_states), real)
+    return Apart(states, states.copy(), np.zeros(2, real), np.zeros(1, [(name, real) for name in WATCH]))
 
 
 @kernel
@@ -75,7 +78,10 @@ def watch(
     w.unchanged_s = w.unchanged_s + elapsed_s if shown == w.shown else zero
     w.shown = shown
     moves = has_moved(p, w)
-    if r.state == USED and r.since_s >= p.settled_s and not moves and is_expected_to_move(p, w):
+    alone = (
+        against_the_model(p, belief.readings, belief.surprise, J)[0] < 2 and count_suspects(belief.readings) < p.most
+    )
+    if alone and r.state == USED and r.since_s >= p.settled_s and not moves and is_expected_to_move(p, w):
         enter(r, STUCK)
         r.jumped_to = w.mean + p.origin
         take_estimate(belief, OLDER, known)
@@ -119,8 +125,8 @@ def correct_apart(
     a, zero = belief.apart, y.dtype.type(0.0)
     for i in range(y.size):
         if p.constants[i] >= 0 and belief.readings[i].since_s == zero:
-            a.x[which, p.constants[i]] = belief.x[p.constants[i]]
-    expected = respond(outputs.A, outputs.B, outputs.F, a.x[which], u, known + a.mismatch[which])
+            a.predicted[which, p.constants[i]] = belief.x[p.constants[i]]
+    expected = respond(outputs.A, outputs.B, outputs.F, a.predicted[which], u, known + a.mismatch[which])
     innovation = y - expected
     for i in range(y.size):
         if i == p.watched or not np.isfinite(believed[i]):
@@ -128,7 +134,7 @@ def correct_apart(
     correction = np.zeros(belief.x.size + 1, y.dtype)
     add_transposed_product(K, imputed(innovation, J), correction)
     for i in range(belief.x.size):
-        a.x[which, i] += correction[i]
+        a.x[which, i] = a.predicted[which, i] + correction[i]
     a.mismatch[which] += correction[belief.x.size]
     should: float = expected[p.watched]
     return should
@@ -139,9 +145,9 @@ def predict_apart(A: Array, B: Array, F: Array, belief: Any, u: Array) -> None: 
     """Predict over a step (A, B, F) under the input deviation u (3,), with the load that is measured."""
     b, a = belief.numbers[0], belief.apart
     for which in range(a.x.shape[0]):
-        later = respond(A, B, F, a.x[which], u, b.w - b.mismatch + a.mismatch[which])
+        later = respond(A, B, F, a.predicted[which], u, b.w - b.mismatch + a.mismatch[which])
         for i in range(later.size):
-            a.x[which, i] = later[i]
+            a.predicted[which, i] = later[i]
 
 
 @kernel

@@ -192,7 +192,8 @@ def judge(
         if r.state == USED and not p.low[i] <= y[i] - innovation[i] <= p.high[i]:
             r.since_s = 0.0  # there the plant is not as its model
         if not np.isfinite(innovation[i]):
-            enter(r, MISSING)
+            if r.state != STUCK:  # which it is still when it shows something again
+                enter(r, MISSING)
         elif r.state != USED:
             believed[i] = np.nan
             returning = True
@@ -248,7 +249,7 @@ def take_back(
             if r.state == STUCK:
                 jumps = abs(y[i] - r.jumped_to) > (p.sigmas + p.sigmas) * p.noise[i]
                 if jumps:
-                    r.state, r.agreed_s = SUSPECT, 0.0
+                    r.state, r.agreed_s, r.since_s = SUSPECT, 0.0, 0.0
             if jumps and r.state != STUCK:
                 r.jump, r.jumped_to = difference, y[i]
             r.difference = difference

@@ -294,7 +294,7 @@ def write_rows(c: Constants, z: Array, ticks: int, rows: NDArray[np.float32]) ->
     length = max(c.sequence_ticks, 2 * ticks)
     per_sample = c.fitting.shape[0] - 1
     samples = (length + per_sample - 1) // per_sample
-    inputs = np.empty((rows.shape[0] // per_sample, rows.shape[1]), z.dtype)
+    inputs = np.empty(((rows.shape[0] + per_sample - 1) // per_sample, rows.shape[1]), z.dtype)
     write_inputs(c.weights, z, c.input_scale, c.estimator.u0, c.rate, samples, inputs)
     for sample in range(samples):
         for tick in range(sample * per_sample, min((sample + 1) * per_sample, length)):
@@ -380,7 +380,8 @@ def limit_of_feed(c: Constants, m: OptimizerState, y: Array) -> float:
         return c.approach
     warmer = believed(c, belief, m.u, y, c.feed_temperature) - believed(c, belief, m.u, y, c.temperature)
     elapsed = y.dtype.type(belief.numbers[0].since) * c.estimator.tick_s
-    moved = (most_open(c, m.u, warmer) - before) * min(elapsed / c.following_s, y.dtype.type(1.0))
+    share = min(elapsed / c.following_s, y.dtype.type(1.0)) if m.numbers[0].planned else y.dtype.type(1.0)
+    moved = (most_open(c, m.u, warmer) - before) * share
     if not np.isfinite(moved):  # by an estimate that leads to no answer
         moved = y.dtype.type(0.0)
     limit: float = max(before + moved, c.opening_from / c.input_scale[c.target.feed])

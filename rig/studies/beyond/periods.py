@@ -32,7 +32,8 @@ OF_COLD_BOX: Final = {
 }
 """What differs; with exchangers 10 % worse the plant holds 513 W, and the hours d to f have up to 585 W."""
 DEFAULT: Final = f"{PROGRAM}preset=tuned"
-OTHER: Final = "Algorithm 1"
+OTHER_RULE: Final = "algorithm-1" if PROCESS.tuned.get("adaptive") else "contraction"
+OTHER: Final = "Algorithm 1" if PROCESS.tuned.get("adaptive") else "contraction rule"
 """The rule that is not the default."""
 REGIMES: Final[dict[str, tuple[str, ...]]] = {NOMINAL: (), **(OF_COLD_BOX if PROCESS is COLD_BOX else {})}
 COLUMNS: Final = (
@@ -111,7 +112,7 @@ def _runs(load: Load, regime: str) -> list[RunRequest]:
 
 
 def _other(load: Load, regime: str) -> RunRequest:
-    return load.request(ADAPTIVE, DEFAULT, f"{PROGRAM}adaptive.rule=algorithm-1", *REGIMES[regime])
+    return load.request(ADAPTIVE, DEFAULT, f"{PROGRAM}adaptive.rule={OTHER_RULE}", *REGIMES[regime])
 
 
 def _row(regime: str, name: str, period_s: float | str, outcome: Outcome) -> tuple[str | float, ...]:
