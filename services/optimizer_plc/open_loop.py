@@ -78,9 +78,8 @@ def watch(
     w.unchanged_s = w.unchanged_s + elapsed_s if shown == w.shown else zero
     w.shown = shown
     moves = has_moved(p, w)
-    alone = (
-        against_the_model(p, belief.readings, belief.surprise, J)[0] < 2 and count_suspects(belief.readings) < p.most
-    )
+    contradicting, _ = against_the_model(p, belief.readings, belief.surprise, J)
+    alone = contradicting < 2 and count_suspects(belief.readings) < p.most
     if alone and r.state == USED and r.since_s >= p.settled_s and not moves and is_expected_to_move(p, w):
         enter(r, STUCK)
         r.jumped_to = w.mean + p.origin

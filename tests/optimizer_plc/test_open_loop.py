@@ -19,7 +19,8 @@ from optimizer_plc.settings import ProgramSettings
 Array = NDArray[np.float64]
 
 SETTINGS = ProgramSettings()
-LIMITS, SENSORS = SETTINGS.plausibility, SETTINGS.estimator.sensors
+LIMITS = SETTINGS.plausibility.model_copy(update={"movement_sigmas": 6.0})
+SENSORS = SETTINGS.estimator.sensors
 TICKS = 10
 MINUTE = round(60.0 / (TICKS * TICK_S))
 """Updates."""
@@ -87,7 +88,7 @@ def test_variances_are_those_of_readings_and_of_predictions_about_their_trend(pr
     expected = 3.0 + 0.2 * ages + np.sin(ages)
     for age, since, y, e in zip(ages, elapsed, shown, expected, strict=True):
         w["age_s"] = age
-        note_movement(p, w, y, e, since)
+        note_movement(w, 1.0, y, e, since)
     root = np.sqrt(elapsed)
     line = np.stack([root, root * ages], axis=1)
     integral = np.linalg.lstsq(line, root * expected)[1][0]

@@ -89,7 +89,9 @@ class Lease:
         number = self._holder if holder is None and same else holder or SIMPLE_CLIENT
         new = held is None or state is LeaseState.FREE or not (same or number == self._holder != SIMPLE_CLIENT)
         new = new or number != self._holder
-        if new and not (same and number == self._holder):  # after a silence the same holder keeps its connections
+        if new and not (
+            self._shared and same and number == self._holder
+        ):  # after a silence the same holder keeps its connections
             self._others.clear()
         elif held is not None and self._closed_at is None:
             self._others[held.connection] = held
