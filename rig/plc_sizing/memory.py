@@ -80,7 +80,7 @@ def estimator_memory(prediction: PredictionModel, settings: EstimatorSettings, a
     single = prediction.rounded(real)
     gains = (array.astype(real) for array in stationary_gains(prediction, settings))
     transitions = (M for step in single.transitions.values() for M in step)
-    states = WORD * apart * (prediction.n_states + 1)
+    states = WORD * apart * (2 * prediction.n_states + 1)
     return states + sum(M.nbytes for M in (*gains, *transitions, single.C, single.D, single.G))
 
 

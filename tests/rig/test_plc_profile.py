@@ -67,7 +67,7 @@ def test_a_plc_that_fits_is_said_so_with_what_it_does(coldloop: "Coldloop", tmp_
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (("1_000_000", "300_000"), "does not fit: it takes 428,012 of 300,000 bytes."),
+        (("1_000_000", "300_000"), "does not fit: it takes 428,404 of 300,000 bytes."),
         (("overhead = 5", "overhead = 150"), "the slot of the preparation and an iteration take 15.9 s"),
     ],
 )
