@@ -117,6 +117,8 @@ def test_a_level_stuck_behind_its_noise_is_found_and_what_it_taught_taken_back(
     bath.updates(40 * MINUTE, "held")
     assert bath.suspects == ["L1"], "it is not believed again before it moves"
     bath.updates(3 * MINUTE)
+    assert bath.suspects == ["L1"], "after so long what the others say of it is vague, and does not agree"
+    bath.updates(round(LIMITS.longest_s / 60.0) * MINUTE)
     assert bath.suspects == []
 
 
