@@ -63,7 +63,7 @@ def program_with(model: LtiModel, estimated: float, **settings: object) -> Optim
     """Return a program whose limit was 55 %, and that believes T2 to be so much warmer than the model says (K)."""
     program = OptimizerProgram(model, ProgramSettings.model_validate(settings), LIMITS)
     c, m = program.constants, program.state
-    m.numbers["most_open"] = (55.0 - c.estimator.u0[0]) / c.input_scale[0]
+    m.numbers["most_open"], m.numbers["planned"] = (55.0 - c.estimator.u0[0]) / c.input_scale[0], True
     m.belief.x[c.estimator.plausible.constants[T2]] = estimated
     return program
 
