@@ -150,7 +150,7 @@ def line(status: RigStatus) -> str:
     plant, control = status.plant, status.control
     parts = ["no plant  "] if plant is None else [f"{plant.identity.tick * TICK_S:10.2f} s"]
     parts.append("no control PLC" if control is None else f"{word_of(Mode, control.ladder.mode):9}")
-    if plant is not None:
+    if plant is not None and PROCESS.has_load:
         parts.append(f"{plant.load.watts:6.1f} {LOAD_UNIT}")
     if control is not None:
         parts += [f"{OUTPUT_NAMES[i]} {control.y[i]:6.2f} {OUTPUT_UNITS[i]}" for i in CONTROLLED]

@@ -65,11 +65,13 @@ def certificate(settings: Settings, *, only_lost: bool = False) -> str:
     limits, program, more = settings.limits, settings.optimizer_plc.program, ""
     reach, shortest_s = np.array([limits.low, limits.high, limits.rate]), _shortest_s(program)
     needs, fixed_s = waiting(load(settings.model.file), PROCESS, reach, limits.rate_share), program.updating_period_s
-    period_s, longest_s = max(fixed_s, shortest_s), _budget(program).times.period(program.adaptive.q_max) * TICK_S
+    rule = "adaptive.contraction" if program.adaptive.rule is RuleName.CONTRACTION else "adaptive"
+    most = program.adaptive.contraction.q_max if rule == "adaptive.contraction" else program.adaptive.q_max
+    period_s, longest_s = max(fixed_s, shortest_s), _budget(program).times.period(most) * TICK_S
     if not needs or (only_lost and period_s <= needs.limit_s):
         return ""
     if not fixed_s and longest_s > needs.longest_s >= shortest_s:
-        more += f"; adaptive ones go up to {longest_s:.3g} s: lower optimizer_plc.program.adaptive.q_max"
+        more += f"; adaptive ones go up to {longest_s:.3g} s: lower optimizer_plc.program.{rule}.q_max"
     horizon_s = program.design.horizon * SAMPLING_PERIOD_S
     if horizon_s > (most_s := digits_last_s(needs.growth, real_of(program.arithmetic))):
         more += (

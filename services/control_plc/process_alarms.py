@@ -20,13 +20,16 @@ OPTIMIZER_DRIVES: Final = (Mode.MPC, Mode.REST)
 """Modes in which the optimiser's sequences are played."""
 
 
+DEAD_BANDS: Final = PROCESS.dead_bands
+
+
 def present_limits(bands: Sequence[Range], panel: AlarmPanel) -> list[Range]:
     """Return the limits of each output with a band: its band while its alarm is raised, wider by the dead band else."""
     level, further = (panel.rows[kind] for kind in BANDS)
     raised = [level.active, *(further.active and further.cause == place for place in range(len(bands) - 1))]
     return [
         (low, high) if is_raised else (low - dead_band, high + dead_band)
-        for (low, high), dead_band, is_raised in zip(bands, PROCESS.dead_bands, raised, strict=True)
+        for (low, high), dead_band, is_raised in zip(bands, DEAD_BANDS, raised, strict=True)
     ]
 
 

@@ -210,9 +210,10 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
 def begin_prediction(belief: Belief) -> None:
     """Predict from the last measurement on."""
     belief.predicted[:] = belief.x
-    for i in range(belief.x.size):
+    if belief.apart.watch[0].age_s >= 0.0:
         for which in range(belief.apart.x.shape[0]):
-            belief.apart.predicted[which, i] = belief.apart.x[which, i]
+            for i in range(belief.x.size):
+                belief.apart.predicted[which, i] = belief.apart.x[which, i]
     belief.numbers[0].since = 0
 
 

@@ -19,9 +19,12 @@ import pytest
 from scipy.io import loadmat
 
 from coldloop.errors import UsageError
+from coldloop.process.cold_box import COLD_BOX
+from coldloop.process.model_file import digest_of
 from rig import cli
 from rig.results.folders import claim_folder
 from rig.results.run_folder import RunFolder
+from rig.runs.inputs import configuration_digest, file_digest
 from tests.conftest import draw_nothing
 from tests.harness.processes import Processes
 
@@ -287,3 +290,25 @@ def test_another_trace_is_told_with_the_versions_that_differ(coldloop: "Coldloop
     assert outcome.code == 1
     assert "another trace" in outcome.out
     assert "instead of 0.1" in outcome.out
+
+
+@pytest.mark.parametrize("is_copied", [True, False], ids=["a model in the folder", "a model elsewhere"])
+def test_a_folder_that_calls_a_plant_of_its_own_a_cold_box_executes_nothing(
+    is_copied: bool, mpc: Path, coldloop: "Coldloop", tmp_path: Path  # noqa: FBT001
+) -> None:  # fmt: skip
+    executed, model = tmp_path / "executed", mpc / "inputs" / "model.json"
+    document = json.loads(model.read_text(encoding="utf-8"))
+    document |= {"process": COLD_BOX.document(), "plant": "python"}
+    source = f"open({str(executed)!r}, 'w')\nclass P: ..."
+    document["plant_parameters"] = {"source": source, "class": "P", "file": "p.py"}
+    document["digest"] = digest_of(document)
+    model.write_text(json.dumps(document), encoding="utf-8")
+    manifest = json.loads((mpc / "manifest.json").read_text(encoding="utf-8"))
+    manifest["configuration"] |= {"plant.kind": "of-process", "model.file": str(model)}
+    copy = {"file": "inputs/model.json", "sha256": file_digest(model)} if is_copied else {"file": None, "sha256": None}
+    manifest["inputs"]["model"] |= copy
+    manifest["hashes"]["configuration_sha256"] = configuration_digest(manifest["configuration"])
+    (mpc / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
+    outcome = coldloop("rerun", mpc)
+    assert (outcome.code, len(outcome.complaints)) != (0, 0)
+    assert not executed.exists(), outcome.complaints
