@@ -69,9 +69,10 @@ def _variant(file: Path, name: str, table: Any) -> Variant:  # noqa: ANN401 what
             if f"{key}.".startswith(f"{ineffective}."):
                 raise UsageError(f"{place}: {key}: has no effect on this study: {instead}")
     options = {key: (value, place) for key, value in settings.items()}
-    effective = load_configuration(Settings, environment={}, assignments=(PAPER, TUNED), options=options)
     try:
+        effective = load_configuration(Settings, environment={}, assignments=(PAPER, TUNED), options=options)
         outside_digests(effective.settings.optimizer_plc.program.outside)
     except ConfigurationError as error:
-        raise ConfigurationError(f"{place}: {error}") from None
+        said = str(error).removeprefix(f"{place}: ")
+        raise ConfigurationError(f"{place}: {said}") from None
     return Variant(name, (TUNED, *(f"{key}={as_toml(value)}" for key, value in sorted(settings.items()))))
