@@ -27,6 +27,8 @@ INEFFECTIVE: Final = {
 }  # fmt: skip
 """Keys and sections that do not act on a run of a study, and what to do instead."""
 LONGEST_NAME: Final = 40
+LAST_LETTER: Final = "\u04ff"
+"""Of those that the font of the figures has throughout: Latin, Greek, Cyrillic."""
 NOT_IN_NAMES: Final = frozenset("$|\\")
 """Characters that figures and Markdown tables read as marks."""
 
@@ -60,9 +62,11 @@ def _variant(file: Path, name: str, table: Any) -> Variant:  # noqa: ANN401 what
     place = f"{file} [{name}]"
     if not isinstance(table, Mapping):
         raise UsageError(f"{file}: {name} is not in the table of a variant; write [NAME] above it")
-    if not 0 < len(name) <= LONGEST_NAME or not name.isprintable() or NOT_IN_NAMES & set(name):
-        raise UsageError(f"{file} [{name[:LONGEST_NAME]!a}]: name it with 1 to {LONGEST_NAME} printable characters "
-                         "other than $, | and \\")  # fmt: skip
+    if not 0 < len(name) <= LONGEST_NAME or any(map(_is_unsuitable, name)):
+        raise UsageError(
+            f"{file} [{name[:LONGEST_NAME]!a}]: name it with 1 to {LONGEST_NAME} printable Latin, Greek or Cyrillic "
+            "characters other than $, | and \\"
+        )
     settings = {key: value for key, value in flattened(table).items() if value != {}}
     for key in settings:
         for ineffective, instead in INEFFECTIVE.items():
@@ -76,3 +80,8 @@ def _variant(file: Path, name: str, table: Any) -> Variant:  # noqa: ANN401 what
         said = str(error).removeprefix(f"{place}: ")
         raise ConfigurationError(f"{place}: {said}") from None
     return Variant(name, (TUNED, *(f"{key}={as_toml(value)}" for key, value in sorted(settings.items()))))
+
+
+def _is_unsuitable(character: str) -> bool:
+    """Return whether a character cannot be in a name: figures have no letter for it, or read it as a mark."""
+    return not character.isprintable() or character in NOT_IN_NAMES or character > LAST_LETTER
