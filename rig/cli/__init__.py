@@ -75,7 +75,7 @@ OF_THE_OUTPUT: Final = (errno.ENOSPC, errno.EIO, errno.EBADF, errno.EDQUOT, errn
 INTERRUPTED = 130
 OF_THE_COLD_BOX: Final = ("study", "reproduce", "model", "exergy")
 """Commands that are about its equations, its loads or the paper's figures."""
-OF_ANY_PROCESS: Final = ("periods",)
+OF_ANY_PROCESS: Final = ("periods", "compare")
 """Studies that are not."""
 
 

@@ -3,6 +3,7 @@
 from typing import Final
 
 from rig.studies.beyond.classical import ClassicalStudy
+from rig.studies.beyond.compare import CompareStudy
 from rig.studies.beyond.contest import ContestStudy
 from rig.studies.beyond.coupling import CouplingStudy
 from rig.studies.beyond.disturbances import DisturbancesStudy
@@ -37,6 +38,6 @@ _ALL: Final[tuple[Study, ...]] = (
 STUDIES: Final = {study.name: study for study in _ALL}
 """Those of the report, in the order of the paper."""
 
-_APART: Final[tuple[Study, ...]] = (RobustnessStudy(), ContestStudy(), PenaltiesStudy(), PeriodsStudy())
+_APART: Final[tuple[Study, ...]] = (RobustnessStudy(), ContestStudy(), PenaltiesStudy(), PeriodsStudy(), CompareStudy())
 APART: Final = {study.name: study for study in _APART}
 """Those that are too long for the report."""

@@ -11,7 +11,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -195,8 +195,8 @@ def perform_and_keep(request: RunRequest, folder: str, programs: str) -> None:
         StudyError: This is not the version of Coldloop that asks.
         ResultsError: The folder is not there, or cannot be written.
     """
-    if programs != programs_digest():
-        raise StudyError("a worker runs another version of Coldloop: install the same on all workers")
+    if programs != programs_digest() or replace(request).digest != request.digest:
+        raise StudyError("a worker runs another version of Coldloop, or of a package of yours: install the same on all")
     store = Store(Path(folder))
     if not store.folder.is_dir():
         raise ResultsError(f"{folder}: a worker has no such folder; {_SHARED}")

@@ -34,6 +34,7 @@ from rig.results.folders import installed_version
 from rig.results.indicators import Indicators, StageCost, evaluate, has_no_answer
 from rig.results.recording import Recorder, Recording
 from rig.settings import Settings
+from rig.studies.outside_parts import outside_digests
 from rig.studies.paired_run import harsh_run, paired_indicators, paired_run
 from rig.studies.problem_sequence import problem_sequence
 from rig.studies.settings import settings_of
@@ -45,7 +46,7 @@ DATA_SUFFIXES = (".json", ".npz", ".csv")
 T9 = [one.name for one in COLD_BOX.outputs].index("T9")
 DECISIVE = {"limits", "model", "session", "plant", "control_plc", "optimizer_plc"}
 """Sections of the configuration that a run reads."""
-LIBRARIES = ("casadi", "daqp", "numba", "numpy", "osqp")
+LIBRARIES = ("casadi", "clarabel", "daqp", "numba", "numpy", "osqp", "piqp", "qpalm")
 UPDATE_COLUMNS = (
     "tick", "tau_u", "iterations", "j_effective", "j_hot_start", "j_delivered", "j_dev", "j_cst", "violation",
 )  # fmt: skip
@@ -151,7 +152,8 @@ def decisive_digest(request: RunRequest, settings: Settings) -> str:
     for name in ("load", "assignments"):
         del asked[name]
     configured = _plain(settings.model_dump(include=DECISIVE))
-    content = json.dumps([asked, configured, programs_digest()], sort_keys=True, default=str)
+    outside = outside_digests(settings.optimizer_plc.program.outside)
+    content = json.dumps([asked, configured, programs_digest(), outside], sort_keys=True, default=str)
     return hashlib.sha256(content.encode()).hexdigest()[:20]
 
 

@@ -2,12 +2,21 @@
 
 import csv
 import io
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
+from coldloop import __version__
+from coldloop.process.signals import TICK_S
 from coldloop.whole_file import whole_text
 from rig.figures.run_plot import save_figure
-from rig.results.folders import writing
+from rig.results.folders import installed_version, write_json, writing
 from rig.studies.execution import Workers, checked_requests, perform_all
+from rig.studies.outside_parts import outside_digests
+from rig.studies.request import LIBRARIES, RunRequest, programs_digest
+from rig.studies.settings import settings_of
 from rig.studies.store import Store
 from rig.studies.study import RUNS, Study, StudyOptions, StudyResult
 from rig.text_tables import markdown_table
@@ -25,7 +34,28 @@ def conduct(study: Study, options: StudyOptions, workers: Workers, folder: Path)
     result.failed_runs = sum(outcome.failed_updates > 0 for outcome in outcomes.values())
     with writing(folder / study.name):
         _write(study, result, folder / study.name)
+        write_json(folder / study.name / "manifest.json", _manifest(study, options, requests))
     return result
+
+
+def _manifest(study: Study, options: StudyOptions, requests: Sequence[RunRequest]) -> dict[str, Any]:
+    """Return what the study was: versions, options, and its runs, each with the name of its file in `runs`."""
+    outside: dict[str, str] = {}
+    for assignments in {request.assignments for request in requests}:
+        outside |= outside_digests(settings_of(assignments).optimizer_plc.program.outside)
+    runs = [
+        {
+            "load": request.load, "draw": request.draw, "duration_s": request.ticks * TICK_S,
+            "updating_period_s": request.updating_period_s or "adaptive", "settings": request.assignments,
+            "outcome": f"{request.digest}.json",
+        }
+        for request in requests
+    ]  # fmt: skip
+    return {
+        "study": study.name, "coldloop": __version__, "python": platform.python_version(),
+        "dependencies": {name: installed_version(name) for name in LIBRARIES}, "programs": programs_digest(),
+        "outside": outside, "options": asdict(options), "runs": runs,
+    }  # fmt: skip
 
 
 def _write(study: Study, result: StudyResult, folder: Path) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Final, NamedTuple, Protocol
 
 from matplotlib.figure import Figure
 
@@ -31,6 +31,16 @@ def noise(factor: float) -> tuple[str, ...]:
 
 NOISE = noise(1.0)
 PROGRAM = "optimizer_plc.program."
+TUNED: Final = f"{PROGRAM}preset=tuned"
+"""What `coldloop run` has by default."""
+
+
+class Variant(NamedTuple):
+    """What the study `compare` sets beside others."""
+
+    name: str
+    assignments: tuple[str, ...]
+    """`section.key=value`, from the preset `paper` on."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +55,8 @@ class StudyOptions:
     """Names or files, instead of the study's own."""
     quick: bool = False
     """One seed, ten minutes, fewer points: to see that it works."""
+    variants: tuple[Variant, ...] = ()
+    """Of the study `compare`; the first is the reference."""
 
     @property
     def draws(self) -> range:

@@ -23,6 +23,16 @@ def made(part: Part, name: str, *given: object) -> Any:  # noqa: ANN401 the call
     Raises:
         ConfigurationError: There is none, or it cannot be made.
     """
+    with in_its_name(part, name, "cannot be made: "):
+        return loaded(part, name)(*given)
+
+
+def loaded(part: Part, name: str) -> Any:  # noqa: ANN401 as above
+    """Return what the entry point of this name points at, a class or a function.
+
+    Raises:
+        ConfigurationError: There is none, or it cannot be imported.
+    """
     group = f"coldloop.{part}s"
     there = entry_points(group=group)
     if name not in there.names:
@@ -31,7 +41,7 @@ def made(part: Part, name: str, *given: object) -> Any:  # noqa: ANN401 the call
             f"optimizer_plc.program.outside.{part}: no {part} '{name}' among the entry points {group}: {known}"
         )
     with in_its_name(part, name, "cannot be made: "):
-        return there[name].load()(*given)
+        return there[name].load()
 
 
 def in_its_name(part: Part, name: str, what: str = "") -> AbstractContextManager[None]:

@@ -18,7 +18,7 @@ FIGURE_FORMATS: Final = ("png", "pdf", "svg")
 STUDIES: Final = (
     "cholesky", "unlimited", "limited", "solver-comparison", "trajectories", "updating-period", "plc-2h", "adaptive-2h",
     "trade-off", "classical", "single-precision", "coupling", "disturbances",
-    "robustness", "contest", "penalties", "periods",
+    "robustness", "contest", "penalties", "periods", "compare",
 )  # fmt: skip
 
 

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rig.studies.execution import Workers
     from rig.studies.study import Study, StudyOptions
 
+COMPARE: Final = "compare"
 OF_RUNS: Final = ("load", "duration", "seeds", "workers", "scheduler", "quick", "shard", "merge")
 """Options that only a study with runs has a use for."""
 
@@ -27,6 +28,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=duration, help="plant time of each run (default: that of its load)")
     parser.add_argument("--load", nargs="+", metavar="LOAD", default=[],
                         help="named loads or CSV files time_s,load_w")  # fmt: skip
+    parser.add_argument("--variants", type=Path, metavar="FILE",
+                        help="of `compare`: TOML, a table of settings for each variant, the reference first"
+                        " (`coldloop docs compare`)")  # fmt: skip
     parts = parser.add_mutually_exclusive_group()
     parts.add_argument("--shard", metavar="I/N", help="do every N-th run only, from the I-th on, without evaluation")
     parts.add_argument("--merge", type=Path, nargs="+", metavar="FOLDER",
@@ -63,15 +67,21 @@ def workers(options: argparse.Namespace) -> "Workers":
 def study_options(options: argparse.Namespace) -> "StudyOptions":
     """Return the extent of the study."""
     from rig.studies.study import StudyOptions
+    from rig.studies.variants import read_variants
 
     given = vars(options)
-    return StudyOptions(options.seeds, given.get("duration"), tuple(given.get("load", ())), options.quick)
+    variants = read_variants(options.variants) if given.get("variants") else ()
+    return StudyOptions(options.seeds, given.get("duration"), tuple(given.get("load", ())), options.quick, variants)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Do a study, or list them."""
     if options.name is not None and options.name not in STUDIES:
         raise UsageError(f"study {options.name}: unknown study; `coldloop study --list` lists them")
+    if options.variants is not None and options.name != COMPARE:
+        raise UsageError(f"--variants: only `coldloop study {COMPARE}` compares them")
+    if options.variants is None and options.name == COMPARE:
+        raise UsageError(f"study {COMPARE}: name the file of the variants with --variants (`coldloop docs compare`)")
     for name in options.load:
         check_load(name)
     from rig.studies import APART

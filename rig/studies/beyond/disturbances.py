@@ -11,10 +11,9 @@ from coldloop.registers.safety import AlarmKind
 from coldloop.service.event_text import word_of
 from rig.results.driving import CONTROL
 from rig.studies.beyond.coupling import REFRIGERATOR, TRACE_TICKS
-from rig.studies.beyond.robust_controllers import TUNED
 from rig.studies.drawing import over_time
 from rig.studies.request import Happening, Outcome, RunRequest
-from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
+from rig.studies.study import TUNED, Load, Outcomes, StudyOptions, StudyResult, loads
 
 
 def _events(*events: tuple[int, str, float]) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from rig.studies.drawing import legend_outside, panels
 from rig.studies.intervals import Interval, geometric_mean, mean_ratio
 from rig.studies.loop_cost import ADAPTIVE, require_costs
 from rig.studies.request import Outcome, RunRequest
-from rig.studies.study import NOISE, PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
+from rig.studies.study import NOISE, PROGRAM, TUNED, Load, Outcomes, StudyOptions, StudyResult, loads
 from rig.text_tables import markdown_table
 
 Array = NDArray[np.float64]
@@ -31,7 +31,6 @@ OF_COLD_BOX: Final = {
     "rate limits by elapsed time": ("limits.rate_reference=elapsed",),
 }
 """What differs; with exchangers 10 % worse the plant holds 513 W, and the hours d to f have up to 585 W."""
-DEFAULT: Final = f"{PROGRAM}preset=tuned"
 OTHER_RULE: Final = "algorithm-1" if PROCESS.tuned.get("adaptive") else "contraction"
 OTHER: Final = "Algorithm 1" if PROCESS.tuned.get("adaptive") else "contraction rule"
 """The rule that is not the default."""
@@ -108,11 +107,11 @@ def _has_others(training: NDArray[np.bool_]) -> bool:
 
 
 def _runs(load: Load, regime: str) -> list[RunRequest]:
-    return [load.request(period, DEFAULT, *REGIMES[regime]) for period in PERIODS_S]
+    return [load.request(period, TUNED, *REGIMES[regime]) for period in PERIODS_S]
 
 
 def _other(load: Load, regime: str) -> RunRequest:
-    return load.request(ADAPTIVE, DEFAULT, f"{PROGRAM}adaptive.rule={OTHER_RULE}", *REGIMES[regime])
+    return load.request(ADAPTIVE, TUNED, f"{PROGRAM}adaptive.rule={OTHER_RULE}", *REGIMES[regime])
 
 
 def _row(regime: str, name: str, period_s: float | str, outcome: Outcome) -> tuple[str | float, ...]:

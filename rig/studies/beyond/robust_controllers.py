@@ -13,11 +13,10 @@ from rig.studies.drawing import ratio_rows
 from rig.studies.intervals import Interval, interval_of_mean, mean_ratio
 from rig.studies.paper.updating_period import ADAPTIVE
 from rig.studies.request import Procedure, RunRequest, Series
-from rig.studies.study import PROGRAM, Load, StudyOptions, loads
+from rig.studies.study import TUNED, Load, StudyOptions, loads
 from rig.text_tables import markdown_table
 
 CONDITIONS: Final = {**conditions.CONDITIONS, **conditions.BESIDE_THE_BOX, **conditions.UNKNOWN_LOADS, **LINEAR}
-TUNED: Final = f"{PROGRAM}preset=tuned"
 DEFAULT: Final = "tuned, adaptive"
 CONTROLLERS: Final = {
     DEFAULT: (ADAPTIVE, (TUNED,)),
