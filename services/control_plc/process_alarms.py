@@ -5,7 +5,7 @@ from typing import Final
 
 from coldloop.process.declaration import Range
 from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import CONTROLLED, INPUT_NAMES
+from coldloop.process.signals import CONTROLLED
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.safety import AlarmKind, CapacityCause
@@ -46,6 +46,8 @@ class ProcessAlarms:
         self._panel = panel
         self._journal = journal
         self._bands = bands
+        self._raised: tuple[int, int, int] | None = None
+        self._limits: list[Range] = []
         self._before: dict[AlarmKind, frozenset[int]] = dict.fromkeys(SENSORS, frozenset())
         self._suspects = 0
 
@@ -76,7 +78,11 @@ class ProcessAlarms:
             suspects: Outputs that the optimiser does without: bit i is output i; then inputs that have no effect.
         """
         report = self._panel.report
-        limits = zip(CONTROLLED, present_limits(self._bands, self._panel), strict=True)
+        first, others = (self._panel.rows[kind] for kind in BANDS)
+        raised = first.active, others.active, others.cause
+        if raised != self._raised:
+            self._raised, self._limits = raised, present_limits(self._bands, self._panel)
+        limits = zip(CONTROLLED, self._limits, strict=True)
         outside = [not (cooling or low <= y[output] <= high) for output, (low, high) in limits]
         report(AlarmKind.LEVEL_BAND, condition=outside[0])
         further = [place for place, is_outside in enumerate(outside[1:]) if is_outside]
@@ -92,9 +98,9 @@ class ProcessAlarms:
         report(AlarmKind.CAPACITY, condition=bool(short), cause=short, value=abs(shortage))
         self._watch_sensors(tick, AlarmKind.SENSOR_BAD, frozenset(bad))
         self._suspects = suspects if mode in OPTIMIZER_DRIVES else 0
-        suspected = (output for output in range(len(y)) if self._suspects >> output & 1)
-        self._watch_sensors(tick, AlarmKind.SENSOR_SUSPECT, frozenset(suspected))
-        idle = [place for place in range(len(INPUT_NAMES)) if self._suspects >> len(y) + place & 1]
+        named = [place for place in range(self._suspects.bit_length()) if self._suspects >> place & 1]
+        self._watch_sensors(tick, AlarmKind.SENSOR_SUSPECT, frozenset(place for place in named if place < len(y)))
+        idle = [place - len(y) for place in named if place >= len(y)]
         report(AlarmKind.INPUT_WITHOUT_EFFECT, condition=bool(idle), cause=idle[0] if idle else 0)
 
     def _watch_sensors(self, tick: int, kind: AlarmKind, found: frozenset[int]) -> None:

@@ -59,9 +59,9 @@ class Estimator(NamedTuple):
     """
 
     steps: Transition
-    """Transitions over 1, 2, ... ticks, stacked."""
+    """Transitions over 1, 2, ... ticks, stacked, each matrix transposed."""
     outputs: Transition
-    """C, D, G."""
+    """C, D, G, transposed."""
     x0: Array
     u0: Array
     y0: Array
@@ -114,8 +114,9 @@ def estimator_of(
     m = prediction.rounded(real)
     stationary = stationary_gains(prediction, settings) if kalman else StationaryGains(*np.zeros((2, 1, 1, 1)))
     return Estimator(
-        Transition(*(np.array(M) for M in zip(*m.transitions.values(), strict=True))),
-        m.outputs, np.array(m.x0), np.array(m.u0), np.array(m.y0), m.w0, real(TICK_S), kalman, settings.load_known,
+        Transition(*map(np.array, zip(*(step.transposed() for step in m.transitions.values()), strict=True))),
+        m.outputs.transposed(), np.array(m.x0), np.array(m.u0), np.array(m.y0), m.w0, real(TICK_S), kalman,
+        settings.load_known,
         StationaryGains(*(array.astype(real, copy=False) for array in stationary)),
         plausibility_of(plausibility, prediction, settings.sensors, len(prediction.transitions) * TICK_S, real),
     )  # fmt: skip
@@ -211,9 +212,7 @@ def begin_prediction(belief: Belief) -> None:
     """Predict from the last measurement on."""
     belief.predicted[:] = belief.x
     if belief.apart.watch[0].age_s >= 0.0:
-        for which in range(belief.apart.x.shape[0]):
-            for i in range(belief.x.size):
-                belief.apart.predicted[which, i] = belief.apart.x[which, i]
+        belief.apart.predicted[:] = belief.apart.x
     belief.numbers[0].since = 0
 
 

@@ -5,6 +5,8 @@ played from its end on. Decisions are those of `decisions.py`, the arithmetic is
 of the session. Pure: no sockets, no clock, no sleeping.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,9 +50,10 @@ Array = NDArray[np.float64]
 
 
 @np.errstate(over="ignore")
-def _single(value: float) -> float:
-    """Return a number as registers carry it: infinite beyond single precision."""
-    return float(np.float32(value))
+def _single(values: Sequence[float] | Array) -> list[float]:
+    """Return numbers as registers carry them: infinite beyond single precision."""
+    single: list[float] = np.asarray(values, np.float64).astype(np.float32).tolist()
+    return single
 
 
 def _described(settings: ProgramSettings) -> str:
@@ -253,8 +256,8 @@ class OptimizerProgram:
         end = self._prediction.n_estimated
         constants[list(self.disturbances)] = belief.x[end - len(self.disturbances) : end]
         return ModelDeviation(
-            _single(belief.numbers[0]["mismatch"]), tuple(map(_single, constants[n_y:])),
-            tuple(map(_single, constants[:n_y])), tuple(map(_single, np.sqrt(belief.surprise))),
+            _single([belief.numbers[0]["mismatch"]])[0], tuple(_single(constants[n_y:])),
+            tuple(_single(constants[:n_y])), tuple(_single(np.sqrt(belief.surprise))),
         )  # fmt: skip
 
     @property
@@ -272,11 +275,14 @@ class OptimizerProgram:
         if not (self._sent["length"] or self._now["solved"]):
             raise RuntimeError("call solve before report")
         now, sent = self._now, self._sent
+        of_sent, of_now = ("j_dev", "j_cst", "violation"), ("efficiency", "mismatch", "contraction", "gamma")
+        numbers = [self.state.belief.numbers[0]["mismatch"], now["effective"], sent["hot_start"], sent["delivered"]]
+        mismatch, effective, hot_start, delivered, *others = _single(
+            [*numbers, *(sent[name] for name in of_sent), *(now[name] for name in of_now)]
+        )
         return Optimization(
             update=int(now["update"]), tick=int(now["tick"]), tau_u=int(now["ticks"]), q=int(now["q"]),
             iterations=int(sent["iterations"]), verdict=verdict,
-            load_mismatch=_single(self.state.belief.numbers[0]["mismatch"]), j_effective=_single(now["effective"]),
-            j_hot_start=_single(sent["hot_start"]), j_delivered=_single(sent["delivered"]),
-            **{name: _single(sent[name]) for name in ("j_dev", "j_cst", "violation")},
-            **{name: _single(now[name]) for name in ("efficiency", "mismatch", "contraction", "gamma")},
+            load_mismatch=mismatch, j_effective=effective, j_hot_start=hot_start, j_delivered=delivered,
+            **dict(zip((*of_sent, *of_now), others, strict=True)),
         )  # fmt: skip

@@ -356,11 +356,11 @@ def believed(c: Constants, belief: Belief, u: Array, y: Array, output: int) -> f
         shown: float = y[output]
         return shown
     maps = e.outputs
-    value: float = e.y0[output] + maps.F[output, 0] * belief.numbers[0].w
+    value: float = e.y0[output] + maps.F[0, output] * belief.numbers[0].w
     for j in range(belief.x.shape[0]):
-        value += maps.A[output, j] * belief.x[j]
+        value += maps.A[j, output] * belief.x[j]
     for j in range(u.shape[0]):
-        value += maps.B[output, j] * u[j]
+        value += maps.B[j, output] * u[j]
     return value
 
 

@@ -74,6 +74,14 @@ def shared(clock: Clock) -> Lease:
     return held
 
 
+def test_a_holder_that_shares_it_has_all_its_connections_after_a_silence(shared: Lease, clock: Clock) -> None:
+    clock.now = 11.0
+    assert shared.take(on(1), NUMBER)
+    for connection in (2, 3, 1):
+        shared.check(on(connection))
+        assert not shared.take(on(connection))
+
+
 def test_connections_of_a_holder_write_side_by_side_and_say_their_number_once(shared: Lease) -> None:
     for connection in (1, 3, 2, 1):
         shared.check(on(connection))

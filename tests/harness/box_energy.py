@@ -28,8 +28,8 @@ def energy_rates(x: Array, u: Array, w: float, box: ColdBox, helium: Helium) -> 
     stored = stored_rate(x, dx, box, box.P_HP, helium)
     first34 = 2 + box.nef1.cells + box.nef2.cells
     top = outflow(box.separator, x[0], x[1], saturation(x[0], helium), helium)
-    h_in, _, _ = supply_cell(box.P_HP, box.T_in, helium)
-    h_turbine, _, _ = supply_cell(box.P_HP, x[first34 + box.nef34.cells - 1], helium)
+    h_in, _, _ = supply_cell(box.P_HP, box.T_in, helium.isobar, helium.departure)
+    h_turbine, _, _ = supply_cell(box.P_HP, x[first34 + box.nef34.cells - 1], helium.isobar, helium.departure)
     crossing = (s.m_jt + s.m_t) * h_in - warm.mass_flow * warm.h - relief * top.h
     crossing += at_least(u[1], 0.0) + w - s.m_t * (h_turbine - s.exhaust.h_out)
     return stored, crossing

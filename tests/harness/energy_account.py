@@ -68,7 +68,8 @@ def accounted_tick(
     x = advance_refrigerator(x, acting.u, v, acting.d, 0.25, acting.plant, helium)
     filling = evaluate_refrigerator(x, acting.u, v, acting.d, acting.plant, helium, slope, y, signals).filling
     given += np.sum(filling.cells[FIRST:COIL, MASS])
-    sums[CROSSED] += given * supply_cell(filling.P, d[1] + plant.station.cooler_approach, helium)[0]
+    T_in = d[1] + plant.station.cooler_approach
+    sums[CROSSED] += given * supply_cell(filling.P, T_in, helium.isobar, helium.departure)[0]
     return x
 
 

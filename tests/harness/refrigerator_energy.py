@@ -29,7 +29,7 @@ def refrigerator_energy_rates(
     stored = bath.U_P * dx[0] + bath.U_V * dx[1] + plant.precooler.nef5.capacity * dx[pipes.coil]
     stored += stored_in_passes(x, dx, filling.P, filling.P_rate, plant, helium)
     top = outflow(box.separator, x[0], x[1], saturation(x[0], helium), helium)
-    h_turbine, _, _ = supply_cell(filling.P, x[BOX_STATES - 1], helium)
+    h_turbine, _, _ = supply_cell(filling.P, x[BOX_STATES - 1], helium.isobar, helium.departure)
     inwards = filling.entering * filling.h - leaving.mass_flow * leaving.h - crossing.relief * top.h
     inwards -= at_least(leaving.mass_flow, TRICKLE) * WARM_CP * (cooling.warm_end.T - leaving.T)
     inwards += at_least(crossing.heater, 0.0) + load - cold.m_t * (h_turbine - cold.exhaust.h_out)

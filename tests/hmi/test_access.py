@@ -313,6 +313,25 @@ def test_who_has_logged_in_from_an_address_comes_first_there() -> None:
     assert limit.allows("elsewhere", "berta")
 
 
+def test_who_is_known_gives_others_at_the_address_no_further_tries() -> None:
+    limit, checked = LoginLimit(Clock()), 0
+    for i in range(100):
+        assert limit.allows("proxy", "anna")
+        limit.succeeded("proxy", "anna")
+        checked += limit.allows("proxy", f"guess {i}")
+    assert checked == PASSWORD_BURST
+
+
+def test_a_try_that_the_address_refuses_does_not_count_against_the_name() -> None:
+    clock = Clock()
+    limit = LoginLimit(clock)
+    for i in range(int(PASSWORD_BURST + LOGINS_A_MINUTE)):
+        assert limit.allows("proxy", f"guess {i}") == (i < PASSWORD_BURST)
+        assert i < PASSWORD_BURST or not limit.allows("proxy", "berta")
+    clock.time = 1.0
+    assert limit.allows("proxy", "berta")
+
+
 def test_one_name_is_guessed_six_times_a_minute() -> None:
     clock = Clock()
     limit = LoginLimit(clock)

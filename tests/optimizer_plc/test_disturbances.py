@@ -117,7 +117,7 @@ def test_constant_errors_are_found_and_leave_no_offset(
     x, u = np.zeros(28), np.array([0.5, -3.0, 0.2])
     for _ in range(6000 // ticks):
         y = model.C @ x + model.D @ u + model.G * unseen + p
-        seen = respond(*disturbed.outputs, belief.predicted, u, belief.numbers[0]["w"])
+        seen = respond(*disturbed.outputs.transposed(), belief.predicted, u, belief.numbers[0]["w"])
         correct(estimator, belief, u + model.u0, model.w0, y + model.y0, np.zeros(49))
         begin_prediction(belief)
         predict(estimator, belief, u, ticks)

@@ -105,7 +105,7 @@ def test_the_stationary_gain_is_that_of_the_riccati_equation(
     mismatch = 0.0
     for output, seen in enumerate(np.eye(22)):
         x = estimator.predict([(nothing, ticks)])
-        y = respond(*prediction.outputs, x, nothing, mismatch) + seen
+        y = respond(*prediction.outputs.transposed(), x, nothing, mismatch) + seen
         estimate = estimator.correct(told(model, np.zeros(28), nothing, y, 0.0))
         gain[:, output] = np.append(estimate.x - x, estimate.mismatch - mismatch)
         mismatch = estimate.mismatch
@@ -196,7 +196,8 @@ def test_state_feedback_returns_the_state_and_believes_the_known_load(
         assert estimate.w == pytest.approx(15.0)
         assert estimate.mismatch == 0.0
         world.move(u, 15.0)
-    assert np.allclose(estimator.predict([(u, 10)]), respond(*prediction.transitions[10], estimate.x, u, estimate.w))
+    step = prediction.transitions[10].transposed()
+    assert np.allclose(estimator.predict([(u, 10)]), respond(*step, estimate.x, u, estimate.w))
 
 
 def test_a_prediction_may_be_cut_into_segments_of_any_length(model: LtiModel, prediction: PredictionModel) -> None:
@@ -217,13 +218,13 @@ def test_a_load_that_is_not_measured_is_estimated(model: LtiModel, prediction: P
     kalman, deaf = Estimating(prediction, settings), Estimating(prediction, settings)
     x, u = np.zeros(28), np.zeros(3)
     for number in range(60):
-        y = respond(*prediction.outputs, x, u, 100.0)
+        y = respond(*prediction.outputs.transposed(), x, u, 100.0)
         estimate = kalman.correct(told(model, x, u, y, 100.0, number))
         again = deaf.correct(told(model, x, u, y, -55.0, number))
         assert estimate.w == estimate.mismatch == again.w
         for one in (kalman, deaf):
             one.predict([(u, 20)])
-        x = respond(*prediction.transitions[20], x, u, 100.0)
+        x = respond(*prediction.transitions[20].transposed(), x, u, 100.0)
     assert estimate.w == pytest.approx(100.0, rel=0.02)
 
 
@@ -248,10 +249,10 @@ def test_a_filter_without_a_past_begins_where_the_plant_rests_with_its_inputs_an
     begin_at_rest(rest_map(prediction), belief, np.array(u), load or 0.0, load is not None, level)
     x, (_, mismatch, _) = belief.predicted, belief.numbers[0].tolist()
     step, applied = prediction.sample, np.array(u)
-    moved = x - respond(step.A, step.B, step.F, x, applied, 0.0)
+    moved = x - respond(*step.transposed(), x, applied, 0.0)
     acting = float(np.linalg.lstsq(step.F, moved, rcond=None)[0][0])
     assert np.allclose(step.F[:, 0] * acting, moved, atol=1e-7 * (1.0 + np.abs(x).max()))
-    y = respond(prediction.C, prediction.D, prediction.G, x, applied, acting)
+    y = respond(*prediction.outputs.transposed(), x, applied, acting)
     assert y[L1] == pytest.approx(level, abs=1e-5)
     assert mismatch == pytest.approx(acting if load is None else 0.0, abs=1e-5)
 
@@ -262,10 +263,10 @@ def test_an_optimiser_that_begins_within_a_session_believes_that_the_plant_rests
     """Its first update has what sensors say at rest with inputs that others have set: nothing is to be corrected."""
     moved, rest = np.array([2.0, -3.0, 40.0]), no_belief(prediction.n_states)
     begin_at_rest(rest_map(prediction), rest, moved, 0.0, load_known=True, level=1.0)
-    y = respond(prediction.C, prediction.D, prediction.G, rest.predicted, moved, 0.0)
+    y = respond(*prediction.outputs.transposed(), rest.predicted, moved, 0.0)
     program = OptimizerProgram(model, ProgramSettings(), InputLimits())
     program.restart(0.0)
     u, outputs = tuple((model.u0 + moved).tolist()), tuple((model.y0 + y).tolist())
     program.plan(Update(1, 0, 1000, 77, load=model.w0, u_before=u, u=u, y=outputs, x=tuple(model.x0.tolist())))
-    believed = respond(prediction.C, prediction.D, prediction.G, program.state.belief.x[: len(rest.x)], moved, 0.0)
+    believed = respond(*prediction.outputs.transposed(), program.state.belief.x[: len(rest.x)], moved, 0.0)
     assert np.allclose(believed, y, rtol=1e-3, atol=1e-3 * np.abs(y).max())

@@ -132,7 +132,7 @@ def entropy_produced(x: RealArray, u: RealArray, w: float) -> float:
     first = 2
     for exchanger in (REFERENCE.nef1, REFERENCE.nef2, REFERENCE.nef34):
         for i in range(first, first + exchanger.cells):
-            _, rho_cp, c_wall = supply_cell(16e5, x[i], HELIUM)
+            _, rho_cp, c_wall = supply_cell(16e5, x[i], HELIUM.isobar, HELIUM.departure)
             stored += (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells * dx[i] / x[i]
         first += exchanger.cells
     leaving = (s.m_v + s.m_t) * entropy(warm.P, warm.h, HELIUM) + relief * sat.s_v

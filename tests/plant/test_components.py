@@ -101,7 +101,7 @@ def test_what_an_exchanger_takes_from_one_stream_it_gives_to_the_other(
     leaving = exchange(exchanger, T, high, entering, HELIUM, dT, is_supply_held=True)
     stored = 0.0
     for T_cell, rate in zip(T, dT, strict=True):
-        _, rho_cp, c_wall = supply_cell(16e5, T_cell, HELIUM)
+        _, rho_cp, c_wall = supply_cell(16e5, T_cell, HELIUM.isobar, HELIUM.departure)
         stored += (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells * rate
     h_in, _ = supply_enthalpy_and_density(16e5, T_high, HELIUM)
     h_out, _ = supply_enthalpy_and_density(16e5, T[-1], HELIUM)

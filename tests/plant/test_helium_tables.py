@@ -24,7 +24,7 @@ def test_the_16_bar_isobar_agrees(T: float) -> None:
     from plant.helium.tabulate import aluminium_heat_capacity  # noqa: PLC0415 loads CoolProp
 
     h, rho = helium_at.supply_enthalpy_and_density(16e5, T, HELIUM)
-    h_cell, rho_cp, c_wall = helium_at.supply_cell(16e5, T, HELIUM)
+    h_cell, rho_cp, c_wall = helium_at.supply_cell(16e5, T, HELIUM.isobar, HELIUM.departure)
     density, cp = coolprop("D", "P", 16e5, "T", T), coolprop("C", "P", 16e5, "T", T)
     assert h_cell == h == pytest.approx(coolprop("H", "P", 16e5, "T", T), abs=4e-7 * cp)
     assert rho == pytest.approx(density, rel=1e-7)
@@ -107,7 +107,7 @@ def vapour_density(P: float, h: float) -> float:
 
 @given(T=st.floats(2.5, 4.0))
 def test_the_isobar_agrees_down_to_its_coldest_end(T: float) -> None:
-    h, rho_cp, _ = helium_at.supply_cell(16e5, T, HELIUM)
+    h, rho_cp, _ = helium_at.supply_cell(16e5, T, HELIUM.isobar, HELIUM.departure)
     density, cp = coolprop("D", "P", 16e5, "T", T), coolprop("C", "P", 16e5, "T", T)
     assert h == pytest.approx(coolprop("H", "P", 16e5, "T", T), abs=4e-7 * cp)
     assert rho_cp == pytest.approx(density * cp, rel=1e-6)
@@ -150,7 +150,7 @@ def test_entropy_goes_on_nearly_as_it_does_where_helium_is_colder_than_its_table
 
 @given(P=st.floats(5e5, 19e5), T=st.floats(4.0, 80.0))
 def test_the_supply_away_from_16_bar_is_as_close_as_it_says(P: float, T: float) -> None:
-    h, rho_cp, _ = helium_at.supply_cell(P, T, HELIUM)
+    h, rho_cp, _ = helium_at.supply_cell(P, T, HELIUM.isobar, HELIUM.departure)
     _, rho = helium_at.supply_enthalpy_and_density(P, T, HELIUM)
     density, cp = coolprop("D", "P", P, "T", T), coolprop("C", "P", P, "T", T)
     near_its_peak = T < 10.0

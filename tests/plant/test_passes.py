@@ -127,7 +127,7 @@ def test_what_a_cell_holds_is_what_the_flows_of_the_plant_are_reckoned_with(P: f
     exchanger = HeatExchanger(UA=0.0, volume=1e-3, aluminium=0.0, cells=1)
     cells = held_cells(exchanger, P, T)
     h, rho = supply_enthalpy_and_density(P, T, HELIUM)
-    h_cell, _, _ = supply_cell(P, T, HELIUM)
+    h_cell, _, _ = supply_cell(P, T, HELIUM.isobar, HELIUM.departure)
     assert h == h_cell
     assert cells[0, H] == pytest.approx(h, rel=1e-12)
     assert cells[0, MASS] == pytest.approx(1e-3 * rho, rel=1e-12)

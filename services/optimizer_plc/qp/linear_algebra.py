@@ -74,15 +74,18 @@ def add_transposed_product(A: Array, x: Array, result: Array) -> None:
 
 @kernel
 def respond(A: Array, B: Array, F: Array, x: Array, u: Array, w: float) -> Array:
-    """Return A x + B u + F w for A (n, k), B (n, m), F (n, 1)."""
-    result = np.empty(A.shape[0], A.dtype)
-    for i in range(A.shape[0]):
-        total = F[i, 0] * w
-        for j in range(A.shape[1]):
-            total += A[i, j] * x[j]
-        for j in range(B.shape[1]):
-            total += B[i, j] * u[j]
-        result[i] = total
+    """Return A x + B u + F w for the transposes A (k, n), B (m, n), F (1, n): sums of columns."""
+    result = np.empty(A.shape[1], A.dtype)
+    for i in range(result.size):
+        result[i] = F[0, i] * w
+    for j in range(A.shape[0]):
+        factor = x[j]
+        for i in range(result.size):
+            result[i] += factor * A[j, i]
+    for j in range(B.shape[0]):
+        factor = u[j]
+        for i in range(result.size):
+            result[i] += factor * B[j, i]
     return result
 
 

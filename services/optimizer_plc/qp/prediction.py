@@ -36,6 +36,10 @@ class Transition(NamedTuple):
             multiply(later.A, self.F) + later.F,
         )
 
+    def transposed(self) -> "Transition":
+        """Return A', B' and F', which is how `respond` takes them."""
+        return Transition(*(np.ascontiguousarray(M.T) for M in self))
+
 
 class Ahead(NamedTuple):
     """A state that stands for how much a disturbance will differ, in some samples of the horizon, from what it is."""

@@ -24,7 +24,7 @@ NODE = np.sqrt(0.6)  # of Gauss and Legendre's rule of three nodes
 @kernel
 def heat_capacity(exchanger: HeatExchanger, P: float, T: float, helium: Helium) -> float:
     """Return the heat capacity of one cell (J/K) at `P` (Pa) and `T` (K)."""
-    _, rho_cp, c_wall = supply_cell(P, T, helium)
+    _, rho_cp, c_wall = supply_cell(P, T, helium.isobar, helium.departure)
     return (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells
 
 

@@ -100,24 +100,22 @@ def exchange(
     T_out = T_m - (T_m - T_L) exp(-UA/(N m_L cp_L)), with cp_L where it enters the cell. As the high-pressure flow comes
     to rest, T_m becomes the temperature of the cell itself.
     """
-    sat = saturation(low.P, helium)
+    sat, isobar, departure, vapour = saturation(low.P, helium), helium.isobar, helium.departure, helium.vapour
     UA = exchanger.UA / exchanger.cells
     sweeping = at_least(low.mass_flow, TRICKLE)
     moving = at_most(high.mass_flow / STILL, 1.0)
     T_low, h_low = low.T, low.h
-    _, cp_low = vapour_enthalpy_and_cp(low.P, T_low, sat.T, helium.vapour)
-    h_cell, rho_cp, c_wall = supply_cell(high.P, T[exchanger.cells - 1], helium)
+    _, cp_low = vapour_enthalpy_and_cp(low.P, T_low, sat.T, vapour)
+    h_cell, rho_cp, c_wall = supply_cell(high.P, T[exchanger.cells - 1], isobar, departure)
     for i in range(exchanger.cells - 1, -1, -1):
         T_before = T[i - 1] if i > 0 else high.T
         T_ahead = T_before if moving.real >= 1.0 else T[i] + moving * (T_before - T[i])
         drive = driving_difference(T_ahead, T[i], T_low)
-        T_low, h_next, cp_low = take_up(
-            LowPressureFlow(sweeping, low.P, T_low, h_low), cp_low, drive, UA, sat, helium.vapour
-        )
+        T_low, h_next, cp_low = take_up(LowPressureFlow(sweeping, low.P, T_low, h_low), cp_low, drive, UA, sat, vapour)
         heat = low.mass_flow * (h_next - h_low)
         h_low = h_next
         if is_supply_held:
-            h_before, rho_cp_before, c_wall_before = supply_cell(high.P, T_before, helium)
+            h_before, rho_cp_before, c_wall_before = supply_cell(high.P, T_before, isobar, departure)
             capacity = (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells
             given[i] = (high.mass_flow * (h_before - h_cell) - heat) / capacity
             h_cell, rho_cp, c_wall = h_before, rho_cp_before, c_wall_before

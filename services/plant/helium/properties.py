@@ -123,10 +123,10 @@ def helium_of(fields: Any) -> Helium:  # noqa: ANN401 - any nesting of tuples
 
 
 @inlined
-def _departure(P: float, function: int, i: int, weights: Weights, helium: Helium) -> float:
+def _departure(P: float, function: int, i: int, weights: Weights, departure: Curves) -> float:
     """Return by how much a function of the isobar differs at `P` (Pa, 5e5 to 19e5) from that at 16 bar."""
     bar = at_most(at_least((P - ISOBAR_PRESSURE) / 1e5, LOWEST_DEPARTURE), HIGHEST_DEPARTURE)
-    nodes = helium.departure.nodes
+    nodes = departure.nodes
     cubic: float = bar * (
         read_curve(nodes, i, 3 * function, weights)
         + bar
@@ -160,30 +160,29 @@ def supply_enthalpy_and_density(P: float, T: float, helium: Helium) -> tuple[flo
     h = read_curve(table.nodes, i, 0, weights) + 0.0 * P
     rho = read_curve(table.nodes, i, 1, weights) + 0.0 * P
     if P != ISOBAR_PRESSURE:
-        h += _departure(P, 0, i, weights, helium)
-        rho = thinned(P, rho + _departure(P, 1, i, weights, helium))
+        h += _departure(P, 0, i, weights, helium.departure)
+        rho = thinned(P, rho + _departure(P, 1, i, weights, helium.departure))
     if T.real > WARMEST_ISOBAR:
         return h + WARM_CP * (T - WARMEST_ISOBAR), rho * WARMEST_ISOBAR / T
     return h, rho
 
 
 @inlined
-def supply_cell(P: float, T: float, helium: Helium) -> tuple[float, float, float]:
+def supply_cell(P: float, T: float, table: Curves, departure: Curves) -> tuple[float, float, float]:
     """Return what an exchanger cell needs at `P` (Pa) and `T` (K): h (J/kg), rho cp (J/(m3 K)), c_Al (J/(kg K)).
 
-    Ranges as for `supply_enthalpy_and_density`; rho cp is within 18 % below 10 K
-    (9 % from 12 to 19 bar) and 6 % above.
+    `table` and `departure` are `Helium.isobar` and `Helium.departure`. Ranges as for
+    `supply_enthalpy_and_density`; rho cp is within 18 % below 10 K (9 % from 12 to 19 bar) and 6 % above.
     """
-    table = helium.isobar
-    i, t = locate(np.log(at_least(T, COLDEST)), table.start, table.step, table.before, table.nodes.shape[0])
-    weights = hermite_weights(t)
     nodes = table.nodes
+    i, t = locate(np.log(at_least(T, COLDEST)), table.start, table.step, table.before, nodes.shape[0])
+    weights = hermite_weights(t)
     h = read_curve(nodes, i, 0, weights) + 0.0 * P
     rho_cp = read_curve(nodes, i, 2, weights) + 0.0 * P
     c_wall = read_curve(nodes, i, 3, weights)
     if P != ISOBAR_PRESSURE:
-        h += _departure(P, 0, i, weights, helium)
-        rho_cp = thinned(P, rho_cp + _departure(P, 2, i, weights, helium))
+        h += _departure(P, 0, i, weights, departure)
+        rho_cp = thinned(P, rho_cp + _departure(P, 2, i, weights, departure))
     if T.real > WARMEST_ISOBAR:
         return h + WARM_CP * (T - WARMEST_ISOBAR), rho_cp * WARMEST_ISOBAR / T, c_wall
     return h, rho_cp, c_wall
