@@ -8,11 +8,11 @@ from coldloop.errors import LinkError, UsageError
 from coldloop.operating.commands import read_command
 from coldloop.parsing import parsed_json
 from hmi.access import LoginSession
+from hmi.assets import compressed_answer
 from hmi.audit import Audit
 from hmi.documents import encoded
 from hmi.guard import Guard, cookie_name, refusal
 from hmi.operator_desk import OperatorDesk, PremisesChangedError
-from hmi.reading import json_answer
 from hmi.settings import HmiSection
 from hmi.users import Users
 
@@ -97,7 +97,7 @@ class Commanding:
         operator = self._operator(request)
         if isinstance(operator, web.Response):
             return operator
-        return json_answer(encoded({"entries": self._audit.entries[::-1]}))
+        return compressed_answer(request, encoded({"entries": self._audit.entries[::-1]}))
 
     async def prepare(self, request: web.Request) -> web.Response:
         """Take a command: answer with what it would do and the token that confirms it."""
@@ -128,7 +128,7 @@ class Commanding:
         self._audit.note(  # by name: the login may have ended meanwhile
             "command", who=operator.user.name, address=request.remote or "", outcome=word, detail=detail
         )
-        return json_answer(encoded(outcome._asdict()))
+        return compressed_answer(request, encoded(outcome._asdict()))
 
     def _operator(self, request: web.Request) -> LoginSession | web.Response:
         """Return the session of an operator, or the refusal."""

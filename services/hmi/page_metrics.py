@@ -4,12 +4,14 @@ from collections.abc import Iterator
 
 from prometheus_client.core import Metric
 
+from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.declaration import fields_of
 from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.service.event_text import alarm_word
 from coldloop.service.metrics import block_families, build_family, gauge
 from hmi.process_image import Model
+from hmi.quality import RAW, Quality, qualities
 
 
 def page_families(model: Model, browsers: int) -> Iterator[Metric]:
@@ -26,10 +28,30 @@ def page_families(model: Model, browsers: int) -> Iterator[Metric]:
             record = model.sources[service].records.get(block.name)
             if record is not None and block.writer is None:
                 yield from block_families(service, block, record)
+    yield _qualities(model, live)
     if "control_plc" in live:
         yield from _alarms(model)
     if "optimizer_plc" in live and model.updates:
         yield from _update(model.updates[-1])
+
+
+def _qualities(model: Model, live: list[str]) -> Metric:
+    """Return the quality of the outputs, wherever they are read, and of the last update, as page and API have them."""
+    found, places = qualities(model.doubts, model.stale_prefixes()), ("control_plc.process.y.", *RAW)
+    names = [f"{place}{name}" for place in places if place.partition(".")[0] in live for name in OUTPUT_NAMES]
+    if "optimizer_plc" in live and model.updates:
+        names.append("update")
+    worst = dict.fromkeys(names, 0)
+    for number, quality in enumerate(Quality):
+        entries = [entry for entry, one in found.items() if one is quality]
+        concerned = [
+            name
+            for name in names
+            if any(name == each or (each[-1] == "." and name.startswith(each)) for each in entries)
+        ]
+        worst.update(dict.fromkeys(concerned, number))
+    description = ", ".join(f"{number} {quality}" for number, quality in enumerate(Quality))
+    return gauge("coldloop_quality", f"Quality of a value: {description}", worst, label="signal")
 
 
 def _alarms(model: Model) -> Iterator[Metric]:

@@ -13,6 +13,7 @@ from aiohttp.log import server_logger
 from coldloop.errors import ConfigurationError, PortInUseError
 from coldloop.modbus.refusals import RefusalLog
 from coldloop.modbus.tls_listener import TlsListener
+from hmi.assets import html_file, static_files
 from hmi.audit import Audit
 from hmi.broadcast import Broadcast
 from hmi.commanding import LONGEST_REQUEST, Commanding
@@ -21,7 +22,7 @@ from hmi.documents import encoded, state_document
 from hmi.guard import Guard, told_in_a_line
 from hmi.operator_desk import OperatorDesk
 from hmi.process_image import Model
-from hmi.reading import STATIC, Reading, static_files
+from hmi.reading import Reading
 from hmi.settings import HmiSection
 from hmi.users import Users
 
@@ -69,7 +70,7 @@ class PageServer:
         if len(exhibits) == 1:
             app.add_routes(self._routes(exhibits[0]))
         else:
-            app.add_routes([web.get("/", _side_by_side), *static_files()])
+            app.add_routes([html_file("two-runs.html"), *static_files()])
             for number, exhibit in enumerate(exhibits, 1):
                 part = web.Application()
                 part.add_routes(self._routes(exhibit))
@@ -156,10 +157,6 @@ async def _send_changes(model: Model, broadcast: Broadcast, news: asyncio.Event)
         changed, model.changed = model.changed, set()
         if len(broadcast):
             broadcast.send(message(state_document(model, changed)))
-
-
-async def _side_by_side(_request: web.Request) -> web.StreamResponse:
-    return web.FileResponse(STATIC / "two-runs.html")
 
 
 def message(document: dict[str, object]) -> bytes:

@@ -7,8 +7,6 @@ import math
 import time
 from collections.abc import Mapping
 from contextlib import AbstractAsyncContextManager, suppress
-from functools import partial
-from pathlib import Path
 from typing import Final
 
 from aiohttp import BasicAuth, hdrs, web
@@ -18,6 +16,7 @@ from coldloop.process.signals import INPUT_NAMES, TICK_S
 from coldloop.registers.optimizer_plc import BANDED_OUTPUTS
 from coldloop.service.metrics import exposition
 from coldloop.service.metrics_server import CONTENT_TYPE
+from hmi.assets import JSON, StreamCompression, compressed_answer, html_file, kept_answer, static_files, takes_gzip
 from hmi.broadcast import Broadcast
 from hmi.documents import (
     alarms_document,
@@ -36,7 +35,6 @@ from hmi.process_image import JournalEntry, Model
 from hmi.settings import HmiSection
 from hmi.trends import NAMES, STATION_NAMES
 
-STATIC: Final = Path(__file__).parent / "static"
 POINTS: Final = 800
 MOST_POINTS: Final = 4000
 MOST_NAMES: Final = 8 + 1 + len(PROCESS.disturbances) + len(INPUT_NAMES) + len(BANDED_OUTPUTS) + len(STATION_NAMES)
@@ -74,7 +72,7 @@ class Reading:
     def routes(self) -> list[web.AbstractRouteDef]:
         """Return what is served."""
         return [
-            web.get("/", self.page),
+            html_file("index.html"),
             *static_files(),
             web.get("/mimic.svg", self.mimic),
             web.get("/api/catalog", self.catalog),
@@ -90,25 +88,19 @@ class Reading:
             web.get("/metrics", self.metrics),
         ]
 
-    async def page(self, request: web.Request) -> web.StreamResponse:
-        """Answer with the page."""
-        return await _file(STATIC / "index.html", request)
-
     async def mimic(self, _request: web.Request) -> web.Response:
         """Answer with the drawing that the process brings; those of the cold box are static files."""
         answer = web.Response(text=PROCESS.mimic, content_type="image/svg+xml")
         add_headers(answer)
         return answer
 
-    async def catalog(self, _request: web.Request) -> web.Response:
+    async def catalog(self, request: web.Request) -> web.Response:
         """Answer with what the page is made from."""
-        answer = json_answer(self._catalog)
-        answer.enable_compression()
-        return answer
+        return kept_answer(request, self._catalog, JSON)
 
-    async def state(self, _request: web.Request) -> web.Response:
+    async def state(self, request: web.Request) -> web.Response:
         """Answer with the whole state."""
-        return json_answer(encoded(state_document(self._model)))
+        return compressed_answer(request, encoded(state_document(self._model)))
 
     async def stream(self, request: web.Request) -> web.StreamResponse:
         """Answer with the state and its changes, as server-sent events, until the browser goes or its session ends."""
@@ -116,6 +108,9 @@ class Reading:
         if stream is None:
             return refusal(503, f"{len(self._broadcast)} browsers are connected: close some, or raise hmi.browsers")
         answer = web.StreamResponse(headers={hdrs.CONTENT_TYPE: "text/event-stream"})
+        compression = StreamCompression() if takes_gzip(request) else None
+        if compression is not None:
+            answer.headers[hdrs.CONTENT_ENCODING] = "gzip"
         add_headers(answer)
         try:
             await answer.prepare(request)
@@ -123,7 +118,7 @@ class Reading:
                 if not self._settings.login.anonymous_view and self._guard.session(request) is None:
                     break
                 async with asyncio.timeout(STALLED_S):
-                    await answer.write(message)
+                    await answer.write(compression.message(message) if compression else message)
         except (ConnectionError, TimeoutError, asyncio.CancelledError):
             pass
         return answer
@@ -156,10 +151,12 @@ class Reading:
         if key not in self._trends:
             async with self._turn(request):
                 document = encoded(trend_document(self._model, names, start, end, points))
+                answer = compressed_answer(request, document)  # takes time, too
             while len(self._trends) >= CACHED:
                 self._trends.pop(next(iter(self._trends)))
             self._trends[key] = document
-        return json_answer(self._trends[key])
+            return answer
+        return compressed_answer(request, self._trends[key])
 
     def _turn(self, request: web.Request) -> AbstractAsyncContextManager[None]:
         return self._long_reads.turn(has_session=self._guard.party(request).has_session)
@@ -204,11 +201,11 @@ class Reading:
         if document is None:
             wanted = printable(number or at) or "(the last one)"
             return refusal(404, f"update {wanted} is not known: only the newest are kept")
-        return json_answer(encoded(document))
+        return compressed_answer(request, encoded(document))
 
-    async def alarms(self, _request: web.Request) -> web.Response:
+    async def alarms(self, request: web.Request) -> web.Response:
         """Answer with all alarms."""
-        return json_answer(encoded({"alarms": alarms_document(self._model)}))
+        return compressed_answer(request, encoded({"alarms": alarms_document(self._model)}))
 
     def _events(self, query: Mapping[str, str]) -> list[JournalEntry]:
         """Return the events that a search finds, the newest first.
@@ -240,7 +237,7 @@ class Reading:
             shown = [*map(event_document, found[start : start + EVENTS_SHOWN])]
             pages = -(-len(found) // EVENTS_SHOWN)
             document = encoded({"found": len(found), "first": start + 1, "pages": pages, "events": shown})
-        return json_answer(document)
+            return compressed_answer(request, document)
 
     async def events_table(self, request: web.Request) -> web.Response:
         """Answer with all events that a search finds as CSV."""
@@ -278,7 +275,7 @@ class Reading:
             if isinstance(user, web.Response):
                 return user
         body = exposition(page_families(self._model, len(self._broadcast)))
-        return web.Response(body=body, headers={hdrs.CONTENT_TYPE: CONTENT_TYPE})
+        return compressed_answer(request, body, CONTENT_TYPE)
 
 
 def safe_cell(value: object) -> object:
@@ -298,11 +295,6 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def json_answer(body: bytes) -> web.Response:
-    """Return an answer of JSON that is encoded already."""
-    return web.Response(body=body, content_type="application/json", charset="utf-8")
-
-
 def csv_headers(name: str) -> dict[str, str]:
     """Return the headers of a file of comma-separated values."""
     return {
@@ -314,19 +306,3 @@ def csv_headers(name: str) -> dict[str, str]:
 def printable(text: str) -> str:
     """Return a request's text for a message: short, and on one line."""
     return "".join(one if one.isprintable() else "?" for one in text[:LONGEST_NAME])
-
-
-def static_files() -> list[web.RouteDef]:
-    """Return a route for each file of the page: no other name is ever looked for."""
-    return [
-        web.get(f"/static/{file.relative_to(STATIC).as_posix()}", partial(_file, file))
-        for file in sorted(STATIC.rglob("*"))
-        if file.is_file()
-    ]
-
-
-async def _file(file: Path, request: web.Request) -> web.StreamResponse:
-    answer = web.FileResponse(file, headers={hdrs.CACHE_CONTROL: "no-cache"})  # asked for again, sent if it has changed
-    if hdrs.IF_NONE_MATCH not in request.headers:  # otherwise the answer may have no body to compress
-        answer.enable_compression()
-    return answer

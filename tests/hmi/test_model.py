@@ -398,3 +398,22 @@ def test_metrics_of_a_silent_service_say_only_that_it_is_silent(model: Model, cl
     text = exposition(page_families(model, 2)).decode()
     assert 'coldloop_up{service="control_plc"} 0.0' in text
     assert "coldloop_control_plc_ladder_mode" not in text
+
+
+def test_metrics_have_the_qualities_of_the_page(model: Model, clock: Clock) -> None:
+    def told(*signals: str) -> list[int]:
+        text = exposition(page_families(model, 0)).decode()
+        return [int(float(text.partition(f'coldloop_quality{{signal="{one}"}} ')[2].split()[0])) for one in signals]
+
+    first, second = (f"y.{name}" for name in OUTPUT_NAMES[:2])
+    signals = [f"control_plc.process.{first}", f"control_plc.process.{second}", f"plant.measurement.{first}"]
+    assert told(*signals) == [0, 0, 0]
+    model.put("control_plc", LadderStatus(Mode.MPC, 0, 0, 1, 1, 0))
+    assert told(*signals) == [2, 0, 3], "held; its raw reading is bad"
+    model.put_updates([Optimization(*(1,) * len(Optimization._fields))])
+    assert told("update") == [0]
+    model.put("control_plc", LadderStatus(Mode.MANUAL, 0, 0, 1, 1, 0))
+    clock.time += 10
+    for service in MAPS:
+        model.heard(service)
+    assert told(*signals, "update") == [4, 4, 4, 4], "the tick does not move; no update is in force"
