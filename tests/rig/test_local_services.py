@@ -30,6 +30,7 @@ def test_a_service_that_ended_is_named_even_when_the_work_fails_with_it(tmp_path
     asyncio.run(check())
 
 
+@pytest.mark.usefixtures("programs")
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of another process are Linux's")
 async def test_the_log_of_a_program_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(local_services, "MOST_LOG_BYTES", 100_000)
