@@ -4,6 +4,8 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import Final
 
+from coldloop.errors import printable
+
 Cell = str | float | int
 
 SHA256: Final = re.compile("[0-9a-f]{64}")
@@ -12,6 +14,7 @@ SHA256: Final = re.compile("[0-9a-f]{64}")
 
 def aligned(rows: Sequence[Sequence[str]], *, numbers: bool = False) -> str:
     """Return rows as lines of aligned columns; of `numbers`, all columns but the first are aligned to the right."""
+    rows = [[printable(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     others = str.rjust if numbers else str.ljust
     lines = ("  ".join([row[0].ljust(widths[0]), *map(others, row[1:], widths[1:])]).rstrip() for row in rows)
@@ -26,7 +29,7 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Cell]], captio
 
 
 def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
+    return f"| {' | '.join(map(printable, cells))} |"
 
 
 def _cell(value: Cell) -> str:

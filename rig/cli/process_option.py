@@ -13,6 +13,7 @@ from coldloop.errors import UsageError
 from coldloop.kernels.cache_folder import find_cache_folder
 from coldloop.parsing import parsed_json
 from coldloop.process.declaration import VARIABLE, Process
+from coldloop.text_file import held_file, read_bytes
 from rig.interpreter import PYTHON
 
 OPTION: Final = "--process"
@@ -49,12 +50,12 @@ def _of_run(arguments: Sequence[str]) -> str | None:
         return None
     named = [each for before, each in pairwise(arguments) if before != "--out"]
     places = [Path(each).parent if Path(each).name == "manifest.json" else Path(each) for each in named]
-    model = next((place / "inputs" / "model.json" for place in places if (place / "manifest.json").is_file()), None)
+    model = next(((place, "inputs/model.json") for place in places if (place / "manifest.json").is_file()), None)
     try:
-        Process.of(parsed_json(model.read_bytes())["process"] if model is not None else {})
-    except (OSError, ValueError, TypeError, KeyError):  # the command itself says what is wrong
+        Process.of(parsed_json(read_bytes(held_file(*model, "restore it"), "restore it"))["process"] if model else {})
+    except (UsageError, ValueError, TypeError, KeyError):  # the command itself says what is wrong
         return None
-    return str(model)
+    return str(Path(*model)) if model else None
 
 
 def _split(arguments: Sequence[str]) -> tuple[list[str], str | None]:

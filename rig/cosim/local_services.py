@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import os
 import signal
+import sys
 from collections.abc import Awaitable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Self, TypeVar
@@ -20,9 +21,14 @@ from rig.interpreter import PYTHON
 from rig.results.recording import Recorder
 from rig.settings import Settings
 
+if sys.platform != "win32":
+    import resource
+
 T = TypeVar("T")
 
 STOP_GRACE_S = 5.0
+MOST_LOG_BYTES = 2**26
+"""Size of a file that a service writes, its log among them: a write beyond it fails."""
 EXIT_S = 2.0
 """How long a process may take to end after it has closed its connections."""
 
@@ -206,10 +212,14 @@ async def start_program(
     It has a session of its own: a Ctrl-C is the rig's to answer, in good order.
     """
     others = {name: value for name, value in os.environ.items() if not name.startswith(PREFIX)}
-    return await asyncio.create_subprocess_exec(
+    process = await asyncio.create_subprocess_exec(
         *command, "--with-parent", env={**others, **configured}, start_new_session=True,
         stdin=asyncio.subprocess.PIPE, stdout=log, stderr=log,
     )  # fmt: skip
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):  # it has ended already
+            resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (MOST_LOG_BYTES, MOST_LOG_BYTES))
+    return process
 
 
 def terminate(process: asyncio.subprocess.Process) -> None:

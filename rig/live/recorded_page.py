@@ -28,7 +28,7 @@ from optimizer_plc.settings import OptimizerSettings
 from optimizer_plc.solvers import make_solver
 from rig.results.columns import STATION_FILE
 from rig.results.recorded_alarms import alarms_after
-from rig.results.run_folder import RunFolder
+from rig.results.run_folder import MOST_IN_MEMORY, MOST_LISTED, RunFolder
 
 PROCESS: Final = (LOAD_COLUMN, *INPUT_NAMES, *OUTPUT_NAMES)
 SECTIONS: Final = ("model", "limits", "session", "optimizer_plc", "telemetry")
@@ -46,7 +46,7 @@ class RecordedPage:
     def __init__(self, folder: RunFolder) -> None:
         self._folder = folder
         self.name = folder.path.resolve().name
-        with folder.reading("trace.parquet") as file:
+        with folder.reading("trace.parquet", MOST_IN_MEMORY) as file:
             table = file.read(columns=[*PROCESS, "mode", "cause", "bad_sensors"])
             self._values = np.column_stack([table[name].to_numpy() for name in PROCESS]).astype(np.float32)
             self._modes = table["mode"].to_pylist()
@@ -65,7 +65,7 @@ class RecordedPage:
         """Return signals, mode and alarms of the station, a row a tick; None of a cold box alone."""
         if not (self._folder.path / STATION_FILE).exists():
             return None
-        with self._folder.reading(STATION_FILE) as file:
+        with self._folder.reading(STATION_FILE, MOST_IN_MEMORY) as file:
             table = file.read(columns=[*STATION_SIGNAL_NAMES, "mode", "alarms"])
         return np.column_stack([column.to_numpy() for column in table.columns]).astype(np.float32)
 
@@ -83,7 +83,7 @@ class RecordedPage:
     @cached_property
     def updates(self) -> list[Optimization]:
         """Updates whose sequence was played."""
-        with self._folder.reading("updates.parquet") as file:
+        with self._folder.reading("updates.parquet", MOST_LISTED) as file:
             return [_optimization(row) for row in file.read().to_pylist()]
 
     @cached_property

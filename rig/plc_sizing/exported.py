@@ -8,11 +8,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from coldloop.errors import UsageError
 from coldloop.parsing import parsed_json
 from coldloop.process.signals import TICK_S
+from coldloop.text_file import held_file, read_bytes
 from optimizer_plc.budget import MAX_PERIOD_TICKS
 from rig.plc_sizing.profile import PlcProfile
 from rig.text_tables import markdown_table
 
 MANIFEST: Final = "manifest.json"
+MOST_BYTES: Final = 2**24
 ITERATION: Final = "iteration"
 COLUMNS: Final = ("call", "least", "mean", "most recorded", "worst case")
 
@@ -89,8 +91,8 @@ def read_cost(folder: Path) -> ExportCost:
         UsageError: It is no export.
     """
     try:
-        return ExportCost.model_validate(parsed_json((folder / MANIFEST).read_text(encoding="ascii")))
-    except (OSError, ValueError, ValidationError):
+        return ExportCost.model_validate(parsed_json(read_bytes(held_file(folder, MANIFEST, ""), "", most=MOST_BYTES)))
+    except (UsageError, ValueError, ValidationError):
         raise UsageError(f"{folder}: has no manifest of an export (coldloop export plc --out FOLDER)") from None
 
 

@@ -3,6 +3,7 @@
 Whatever is not drawing is left out, where an editor has written it, or refused, where it would act.
 """
 
+import math
 import re
 from collections.abc import Collection, Iterator, Mapping
 from itertools import islice
@@ -52,7 +53,7 @@ def drawing_of(path: Path, signals: Collection[str]) -> str:
     """
     root = _parsed(path)
     named = {one.get("id"): one for one in root.iter()}
-    if sum(1 for _ in islice(_drawn(root, path, named), MOST_DRAWN + 1)) > MOST_DRAWN:
+    if sum(1 for _ in islice(_drawn(root, path, named, _referring(root)), MOST_DRAWN + 1)) > MOST_DRAWN:
         raise UsageError(f"{path}: more than {MOST_DRAWN} elements, as often as they are used; draw less")
     _keep_drawing(root, path)
     for one in [each for each in root.iter() if each.tag in TEXTS]:
@@ -60,7 +61,7 @@ def drawing_of(path: Path, signals: Collection[str]) -> str:
     for one in root.iter():
         _check_bound(one, path, signals)
     size = [_number(part) for part in root.get("viewBox", "").replace(",", " ").split()]
-    if len(size) != VIEW_BOX or None in size:
+    if len(size) != VIEW_BOX or not all(each is not None and math.isfinite(each) for each in size):
         raise UsageError(f"{path}: no viewBox of 4 numbers, so the page would not know its size; save it as plain SVG")
     for length in ("width", "height"):
         root.attrib.pop(length, None)
@@ -83,14 +84,37 @@ def _parsed(path: Path) -> ET.Element:
     return root
 
 
-def _drawn(one: ET.Element, path: Path, named: Mapping[str | None, ET.Element], level: int = 1) -> Iterator[ET.Element]:
-    """Yield an element and all within it, each time that it is used."""
+def _referring(root: ET.Element) -> dict[ET.Element, frozenset[str]]:
+    """Return the names that each element refers to, as paint, marker, mask, clip path or original.
+
+    What an element refers to counts for all within it, as paints and markers are inherited.
+    """
+    found: dict[ET.Element, frozenset[str]] = {}
+    left: list[tuple[ET.Element, frozenset[str]]] = [(root, frozenset())]
+    while left:
+        one, above = left.pop()
+        inherited = above | {name for value in one.attrib.values() for _, name in INSIDE.findall(value)}
+        original = one.get("href", one.get(XLINK_HREF, "#"))[1:]
+        found[one] = inherited | {original} if original else inherited
+        left += [(each, inherited) for each in one]
+    return found
+
+
+def _drawn(
+    one: ET.Element, path: Path, named: Mapping[str | None, ET.Element],
+    referring: Mapping[ET.Element, frozenset[str]], level: int = 1, given: frozenset[str] = frozenset(),
+) -> Iterator[ET.Element]:  # fmt: skip
+    """Yield an element and all within it, each time that it is used; what is used inherits what is `given`."""
     if level > DEEPEST:
         raise UsageError(f"{path}: elements within elements on more than {DEEPEST} levels; ungroup some")
     yield one
-    used = named.get(one.get("href", one.get(XLINK_HREF, "#"))[1:]) if one.tag == f"{SVG}use" else None
-    for each in (*one, *(() if used is None else (used,))):
-        yield from _drawn(each, path, named, level + 1)
+    for each in one:
+        yield from _drawn(each, path, named, referring, level + 1, given)
+    passed = referring[one] | given if one.tag == f"{SVG}use" else frozenset()
+    original = one.get("href", one.get(XLINK_HREF, "#"))[1:]
+    for name in sorted((referring[one] | given) & {key for key in named if key}):
+        used = passed - {original} if name == original else frozenset()
+        yield from _drawn(named[name], path, named, referring, level + 1, used)
 
 
 def _keep_drawing(parent: ET.Element, path: Path) -> None:
@@ -164,6 +188,7 @@ def _check_bound(one: ET.Element, path: Path, signals: Collection[str]) -> None:
 
 def _number(text: str | None) -> float | None:
     try:
-        return float(text or "")
+        number = float(text or "")
     except ValueError:
         return None
+    return None if math.isnan(number) else number

@@ -12,9 +12,10 @@ import pyarrow.parquet as pq
 
 from coldloop.errors import UsageError
 from coldloop.whole_file import whole_file
+from rig.durations import LONGEST_TICKS
 from rig.results.columns import ALL_FILES, FILES
 from rig.results.folders import prepare_folder, writing
-from rig.results.run_folder import RunFolder
+from rig.results.run_folder import MOST_IN_MEMORY, RunFolder
 
 Tables = dict[str, pq.ParquetFile]
 """Files of a run by the name of their table."""
@@ -38,7 +39,7 @@ def export(run: Path, kind: str, out: Path, *, force: bool) -> list[Path]:
         try:
             with writing(path):
                 whole_file(path, write)
-        except (pa.ArrowException, KeyError) as error:
+        except (pa.ArrowException, KeyError, TypeError, ValueError) as error:
             raise UsageError(f"{folder.path}: a damaged file: {str(error).splitlines()[0]}") from None
     return list(paths)
 
@@ -47,9 +48,9 @@ Writers = dict[str, Callable[[Path], object]]
 """What writes a file, by the file's name."""
 
 
-def _tables(run: RunFolder) -> Tables:
+def _tables(run: RunFolder, most: int = LONGEST_TICKS) -> Tables:
     present = [name for name in ALL_FILES if name in FILES or (run.path / name).exists()]
-    return {name.removesuffix(".parquet"): run.file(name) for name in present}
+    return {name.removesuffix(".parquet"): run.file(name, most) for name in present}
 
 
 def _csv(run: RunFolder) -> Writers:
@@ -71,7 +72,7 @@ def _mat(run: RunFolder) -> Writers:
     from scipy.io import savemat  # noqa: PLC0415 only MATLAB needs it
 
     def write(path: Path) -> None:
-        tables = {name: file.read() for name, file in _tables(run).items()}
+        tables = {name: file.read() for name, file in _tables(run, MOST_IN_MEMORY).items()}
         content: dict[str, Any] = {
             name: {column: _for_matlab(table[column]) for column in table.column_names}
             for name, table in tables.items()

@@ -4,16 +4,16 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
-from coldloop.errors import UsageError
+from coldloop.errors import UsageError, printable
 from coldloop.parsing import parsed_json
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
@@ -21,8 +21,10 @@ from coldloop.process.loaded import PROCESS
 from coldloop.process.model_file import read_document
 from coldloop.registers.control_plc import Mode
 from coldloop.service.event_text import word
+from coldloop.text_file import held_file, read_text
+from rig.durations import LONGEST_TICKS
 from rig.results.arrow_arrays import numbers_of
-from rig.results.columns import FORMAT
+from rig.results.columns import ALL_FILES, EVENTS, FORMAT
 
 Curves = dict[str, NDArray[np.float64]]
 """Columns by name; what is null is NaN."""
@@ -41,8 +43,32 @@ GONE: Final = frozenset(
 )
 """Settings of a rule that was replaced, which are in the manifests of runs that did not use it, too."""
 TAU_U: Final = "tau_u_s"
+EVENTS_FILE: Final = "events.parquet"
 DRAWN_TICKS: Final = 60_000
 """A longer trace is drawn by the least and the largest value of many ticks."""
+
+
+BANDS: Final = ("optimizer_plc.program.design.output_low", "optimizer_plc.program.design.output_high")
+BOUNDS: Final = ("limits.low", "limits.high")
+"""Keys that have a number for each output with a band, and for each input."""
+ENDED: Final = "name the folder of a run that has ended"
+MOST_BYTES: Final = 2**24
+"""Of a JSON document."""
+MOST_COLUMNS: Final = 2000
+MOST_TEXT: Final = 4096
+"""Bytes of a text in a table."""
+ROW_BYTES: Final = 4096
+"""Of a row, on average, before it is compressed; `SPARE_BYTES` more for the file."""
+SPARE_BYTES: Final = 2**20
+MOST_IN_MEMORY: Final = 2_000_000
+"""Rows of a file that is read as a whole: 139 h of ticks."""
+MOST_LISTED: Final = 500_000
+"""Rows of a file of which each becomes an object of Python: events and updates."""
+KINDS: Final = {
+    name: {column.name: column.kind for column in columns} for name, (_, columns) in ALL_FILES.items()
+}  # fmt: skip
+"""Types of the columns of each file."""
+Ticks = Annotated[int, Field(ge=0, le=LONGEST_TICKS)]
 
 
 class _Hashes(BaseModel):
@@ -51,6 +77,40 @@ class _Hashes(BaseModel):
     configuration_sha256: str
     model_sha256: str
     trace_sha256: str | None
+
+
+class _Input(BaseModel):
+    """A file that a run has read, or what took its place."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+    source: str
+    file: str | None
+    sha256: str = ""
+    profile_sha256: str = ""
+
+
+class _Inputs(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    load: _Input
+    model: _Input
+
+
+class _Configured(BaseModel):
+    """Keys that a figure of any run shows."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+    load: str = Field(alias="plant.load")
+    driver: str = Field(alias="control_plc.driver")
+    period: float | None = Field(alias="optimizer_plc.program.updating_period_s")
+    solver: str = Field(alias="optimizer_plc.program.solver")
+    outside: str | None = Field(alias="optimizer_plc.program.outside.solver", default=None)
+    band_low: list[FiniteFloat] = Field(alias="optimizer_plc.program.design.output_low")
+    band_high: list[FiniteFloat] = Field(alias="optimizer_plc.program.design.output_high")
+    low: list[FiniteFloat] = Field(alias="limits.low")
+    high: list[FiniteFloat] = Field(alias="limits.high")
 
 
 class _Manifest(BaseModel):
@@ -66,10 +126,10 @@ class _Manifest(BaseModel):
     platform: str
     dependencies: dict[str, str]
     way: str
-    ticks: int
-    recorded_ticks: int
-    configuration: dict[str, Any]
-    inputs: dict[str, dict[str, Any]]
+    ticks: Ticks
+    recorded_ticks: Ticks
+    configuration: _Configured
+    inputs: _Inputs
     hashes: _Hashes
 
 
@@ -94,13 +154,16 @@ class RunFolder:
 
     def _document(self, name: str) -> dict[str, Any]:
         try:
-            document: dict[str, Any] = parsed_json((self.path / name).read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            reason = error.strerror if isinstance(error, OSError) else error
-            raise UsageError(f"{self.path / name}: {reason}; name the folder of a run that has ended") from None
+            document: dict[str, Any] = parsed_json(read_text(self.held(name), ENDED, most=MOST_BYTES))
+        except ValueError as error:
+            raise UsageError(f"{self.path / name}: {error}; {ENDED}") from None
         if not isinstance(document, dict):
-            raise UsageError(f"{self.path / name}: not an object; name the folder of a run that has ended")
+            raise UsageError(f"{self.path / name}: not an object; {ENDED}")
         return document
+
+    def held(self, name: str) -> Path:
+        """Return the path of a regular file in the folder, as `held_file` does."""
+        return held_file(self.path, name, ENDED)
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -115,16 +178,37 @@ class RunFolder:
             return configured
         return {key: value for key, value in configured.items() if key not in GONE}
 
-    def file(self, name: str) -> pq.ParquetFile:
-        """Return a Parquet file of the run.
+    def file(self, name: str, most: int = LONGEST_TICKS) -> pq.ParquetFile:
+        """Return a Parquet file of the run, of `most` rows at most, after a look at its footer and at its texts.
 
         Raises:
-            UsageError: It cannot be read.
+            UsageError: It cannot be read, or is larger than a run of so many ticks makes it, or has other types.
         """
+        path = self.held(name)
         try:
-            return pq.ParquetFile(self.path / name)
+            file = pq.ParquetFile(path)
+            wrong = self._excess(name, file.metadata, most) or _other_type(name, file.schema_arrow)
+            if not wrong and _has_long_text(path, file.schema_arrow):
+                wrong = f"a text of more than {MOST_TEXT} bytes"
         except (OSError, pa.ArrowException) as error:
-            raise UsageError(f"{self.path / name}: {str(error).splitlines()[0]}") from None
+            wrong = str(error).splitlines()[0]
+        if wrong:
+            raise UsageError(f"{path}: damaged, or of something else: {wrong}")
+        return file
+
+    def _excess(self, name: str, footer: pq.FileMetaData, most: int) -> str:
+        """Return what a file has too much of, by its footer."""
+        rows, ticks = footer.num_rows, self.manifest["recorded_ticks"]
+        size = sum(footer.row_group(group).total_byte_size for group in range(footer.num_row_groups))
+        if name != EVENTS_FILE and rows > ticks:
+            return f"{rows} rows, and manifest.json says {ticks} ticks"
+        if not rows and name == "trace.parquet":
+            return "no rows"
+        if rows > most:
+            return f"{rows} rows; {most} at most are read into memory"
+        if footer.num_columns > MOST_COLUMNS or size > SPARE_BYTES + ROW_BYTES * rows:
+            return f"{footer.num_columns} columns of {size} bytes in {rows} rows"
+        return ""
 
     @property
     def process(self) -> Process:
@@ -160,7 +244,7 @@ class RunFolder:
 
     @property
     def _document_of_model(self) -> dict[str, Any]:
-        return read_document(self.path / self._model, "restore it") if self._model else {}
+        return read_document(self.held(self._model), "restore it") if self._model else {}
 
     @property
     def _model(self) -> str | None:
@@ -169,16 +253,16 @@ class RunFolder:
         return place
 
     @contextmanager
-    def reading(self, name: str) -> Iterator[pq.ParquetFile]:
+    def reading(self, name: str, most: int = LONGEST_TICKS) -> Iterator[pq.ParquetFile]:
         """Open a Parquet file of the run; a damaged one is a one-line error.
 
         Raises:
             UsageError: It cannot be read, or has other columns.
         """
         try:
-            with self.file(name) as file:
+            with self.file(name, most) as file:
                 yield file
-        except (OSError, pa.ArrowException, KeyError) as error:
+        except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
             if self.process.name != PROCESS.name:
                 raise UsageError(
                     f"{self.path}: a run of {self.process.name}, and not of {PROCESS.name}; {self.remedy}"
@@ -200,13 +284,43 @@ class RunFolder:
             every = max(1, math.ceil(file.metadata.num_rows / (longest / 2))) if file.metadata.num_rows > longest else 1
             batches = file.iter_batches(batch_size=every * 4096, columns=[*names, "mode"] if TAU_U in names else names)
             parts = [_reduced(_in_force(batch, names), every) for batch in batches]
-            return {name: np.concatenate([part[name] for part in parts] or [np.empty(0)]) for name in names}
+            series = {name: np.concatenate([part[name] for part in parts] or [np.empty(0)]) for name in names}
+            if not np.isfinite(series["time_s"]).all() or (np.diff(series["time_s"]) < 0).any():
+                raise ValueError("time_s does not rise")
+        for keys, signals in ((BANDS, PROCESS.banded), (BOUNDS, PROCESS.inputs)):
+            for key in keys:
+                if len(self.configuration[key]) != len(signals):
+                    raise UsageError(f"{self.path / 'manifest.json'}: {key} is not of {len(signals)} numbers")
+        return series
 
     def events(self) -> list[dict[str, Any]]:
         """Return the events."""
-        with self.reading("events.parquet") as file:
-            rows: list[dict[str, Any]] = file.read().to_pylist()
+        with self.reading(EVENTS_FILE, MOST_LISTED) as file:
+            table = file.read(columns=[column.name for column in EVENTS])
+            missing = [name for name in table.column_names if name != "value" and table[name].null_count]
+            if missing:
+                raise ValueError(f"{missing[0]} is missing in a row")
+            rows: list[dict[str, Any]] = table.to_pylist()
         return rows
+
+
+def _other_type(name: str, schema: pa.Schema) -> str:
+    """Return which column has another type than in our file, or one that no column of it has."""
+    kinds = KINDS[name]
+    for field in schema:
+        if field.type not in ({kinds[field.name]} if field.name in kinds else {*kinds.values()}):
+            return f"{printable(field.name[:MOST_TEXT])} is {str(field.type)[:80]}"
+    return ""
+
+
+def _has_long_text(path: Path, schema: pa.Schema) -> bool:
+    """Return whether a text is too long; a few bytes may stand for the same long text in millions of rows."""
+    texts = [field.name for field in schema if pa.types.is_string(field.type)]
+    with pq.ParquetFile(path, read_dictionary=texts) as file:
+        return any(
+            len(column.dictionary) and pc.max(pc.binary_length(column.dictionary)).as_py() > MOST_TEXT
+            for batch in file.iter_batches(columns=texts) for column in batch.columns
+        )  # fmt: skip
 
 
 def _in_force(batch: pa.RecordBatch, names: Sequence[str]) -> Curves:

@@ -6,15 +6,16 @@ import shutil
 from pathlib import Path
 from typing import Any, Final
 
-from coldloop.errors import UsageError
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.text_file import held_file, read_bytes
 from plant.load import named_families
 from rig.settings import Settings
 
 FOLDER: Final = "inputs"
 LOAD_COPY: Final = f"{FOLDER}/load.csv"
 MODEL_COPY: Final = f"{FOLDER}/model.json"
+RESTORE: Final = "the run cannot be repeated without it"
 
 
 def copy_inputs(settings: Settings, profile: LoadProfile, folder: Path) -> dict[str, Any]:
@@ -48,10 +49,7 @@ def file_digest(path: Path) -> str:
     Raises:
         UsageError: It cannot be read.
     """
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}; the run cannot be repeated without it") from None
+    return hashlib.sha256(read_bytes(path, RESTORE)).hexdigest()
 
 
 def profile_digest(profile: LoadProfile) -> str:
@@ -69,7 +67,7 @@ def changed_inputs(manifest: dict[str, Any], folder: Path) -> list[str]:
     changed = [
         f"{folder / entry['file']}: is not the {name} that the run read"
         for name, entry in manifest["inputs"].items()
-        if entry["file"] is not None and file_digest(folder / entry["file"]) != entry["sha256"]
+        if entry["file"] is not None and file_digest(held_file(folder, entry["file"], RESTORE)) != entry.get("sha256")
     ]
     if configuration_digest(manifest["configuration"]) != manifest["hashes"]["configuration_sha256"]:
         changed.append(f"{folder / 'manifest.json'}: the configuration is not the one that the run had")

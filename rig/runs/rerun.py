@@ -10,10 +10,11 @@ from typing import Any
 
 from coldloop import __version__
 from coldloop.config import Configuration, load_configuration
-from coldloop.errors import UsageError
+from coldloop.errors import UsageError, printable
 from coldloop.process.loaded import FILE, PROCESS
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import read_document
+from plant.load import named_families
 from rig.cosim.job import Job
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
@@ -72,9 +73,11 @@ def _configuration(run: RunFolder) -> Configuration[Settings]:
     for key, entry in (("plant.load", "load"), ("model.file", "model")):
         copy = run.manifest["inputs"][entry]["file"]
         if copy is not None:
-            values[key] = str(run.path / copy)
+            values[key] = str(run.held(copy))
         elif key == "model.file":  # the shipped one
             values.pop(key, None)
+        elif named_families(str(values.get(key))) is None:
+            raise UsageError(f"{run.path / 'manifest.json'}: {key} is no named load, and the folder has no copy of it")
     options: Mapping[str, tuple[object, str]] = {key: (value, SOURCE) for key, value in values.items()}
     return load_configuration(Settings, environment={}, options=options)
 
@@ -107,4 +110,4 @@ def _differences(manifest: Mapping[str, Any], run: RunFolder, trace: str) -> str
         lines.append(f"the run missed {misses} deadlines, which depend on the machine")
     if len(lines) == 1:
         lines.append("inputs, configuration and versions are the same: the programs have changed, or the machine")
-    return "\n".join(lines) + "\n"
+    return "".join(f"{printable(line)}\n" for line in lines)

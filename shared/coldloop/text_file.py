@@ -1,6 +1,7 @@
-"""Text files of users: UTF-8, with a byte order mark or without, or UTF-16 with one."""
+"""Text files of users: UTF-8, with a byte order mark or without, or UTF-16 with one; files in folders of others."""
 
 import codecs
+import stat
 from pathlib import Path
 from typing import Final
 
@@ -45,6 +46,31 @@ def read_bytes(
     if len(data) > most:
         raise error(f"{path}: more than {most} bytes; {remedy}")
     return data
+
+
+def held_file(folder: Path, name: str, remedy: str, error: type[ColdloopError] = UsageError) -> Path:
+    """Return the path of a regular file in a folder that somebody else has made.
+
+    Args:
+        folder: The folder.
+        name: Of the file, relative to the folder, as the folder itself may say it.
+        remedy: Ends the message.
+        error: What is raised.
+
+    Raises:
+        ColdloopError: There is none, or it is something else, or outside the folder, by its name or by a link.
+    """
+    path = folder / name
+    try:
+        status = path.stat()
+        inside = path.resolve().is_relative_to(folder.resolve()) and ".." not in Path(name).parts
+    except (OSError, ValueError, RuntimeError) as failure:
+        raise error(f"{path}: {getattr(failure, 'strerror', None) or failure}; {remedy}") from None
+    if not inside or Path(name).is_absolute():
+        raise error(f"{path}: outside the folder that names it; {remedy}")
+    if not stat.S_ISREG(status.st_mode):
+        raise error(f"{path}: not a regular file; {remedy}")
+    return path
 
 
 def decoded(data: bytes) -> str:

@@ -164,6 +164,23 @@ def test_what_is_no_profile_is_as_good_as_the_guess_and_what_raises_is_said_in_o
         OutsideSolver(OutsideSettings(solver="Quick"))
 
 
+@pytest.mark.usefixtures("named")
+@pytest.mark.parametrize(("count", "done"), [(-5, 0), (-(10**30), 0), (10**30, 3)])
+def test_a_solver_neither_writes_into_its_problem_nor_counts_outside_its_limit(
+    count: int, done: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def solve(_: Halving, given: QuadraticProblem, guess: np.ndarray, __: int) -> tuple[np.ndarray, int]:
+        for part in given[:-1]:
+            part[...] = np.nan
+        return guess, count
+
+    monkeypatch.setattr(Halving, "solve", solve)
+    qp = problem()
+    answer = OutsideSolver(OutsideSettings(solver="Halving")).solve(qp, np.zeros(len(qp.phi)), (3,))
+    assert np.isfinite(qp.Phi).all()
+    assert answer.iterations.tolist() == [done]
+
+
 def test_the_conformance_suite_finds_what_a_solver_does_not_keep() -> None:
     problems = list(problems_of(Settings(), 3))
     assert not any(one.failures for one in requirements(Halving(), problems))

@@ -96,6 +96,17 @@ REFUSED: Final = {
     "<g id='a'><use href='#a'/></g>": "more than 100 levels",
     "<g id='a0'/>"
     + "".join(f"<g id='a{k}'>{10 * USE}</g>".replace("?", f"{k - 1}") for k in range(1, 7)): "more than 50000",
+    "<pattern id='p0'/>"
+    + "".join(
+        f"<pattern id='p{k}'>{10 * '<rect #>'}</pattern>".replace("#", f"{how}='url(#p{k - 1})'/")
+        for k, how in enumerate(("fill", "mask", "style='x:y' clip-path", "marker-end", "stroke", "filter"), start=1)
+    ): "more than 50000",
+    "<g id='q0'/>"
+    + "".join(
+        f"<g fill='url(#q{k - 1})'><pattern id='q{k}'>{10 * '<rect/>'}</pattern></g>" for k in range(1, 7)
+    ): "more than 50000",
+    "<pattern id='p'><rect style='fill: url(#p)'/></pattern>": "more than 100 levels",
+    "<rect height='5' data-fill='h1' data-low='nan' data-high='1'/>": "data-low and data-high are two",
     "<rect data-fill='T5'/>": "T5 is no signal",
     "<rect>": "not an SVG file: mismatched tag",
 }
@@ -114,6 +125,8 @@ def test_what_would_act_or_is_unknown_is_refused_in_one_line(inside: str, tmp_pa
     [
         ("<svg xmlns='http://www.w3.org/2000/svg'/>", "no viewBox"),
         ("<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 wide high'/>", "no viewBox of 4 numbers"),
+        ("<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 nan 5'/>", "no viewBox of 4 numbers"),
+        ("<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 5 inf'/>", "no viewBox of 4 numbers"),
         ("<html/>", "it begins with html"),
         ("<!DOCTYPE svg [<!ENTITY a 'b'>]><svg xmlns='http://www.w3.org/2000/svg'>&a;</svg>", "declares entities"),
         ("<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 1 1'>" + 500_000 * " " + "</svg>", "500000 at most"),

@@ -1,6 +1,7 @@
 """The exported optimiser, in C, takes the place of ours on the bus: what was simulated is what is loaded."""
 
 import asyncio
+import hashlib
 import json
 import re
 import shutil
@@ -61,6 +62,12 @@ def export(folder: Path) -> Path:
     return folder
 
 
+@pytest.fixture
+def program(export: Path) -> str:
+    """Its program."""
+    return exported_optimizer.exported_optimizer(f"export:{export}", settings())[0]
+
+
 def assert_same(coldloop: Coldloop, export: Path, tmp_path: Path, *scenario: str) -> None:
     """Check that runs with ours, and with the exported one on the bus, have the same trace and the same updates."""
     for way in (("--in-process",), ("--optimizer", f"export:{export}")):
@@ -90,9 +97,9 @@ def test_so_have_two_hours(coldloop: Coldloop, export: Path, tmp_path: Path, per
 @pytest.mark.usefixtures("realtime")
 @pytest.mark.parametrize("order", list(WordOrder))
 async def test_it_drives_in_either_word_order_and_drives_again_after_a_restart(
-    order: WordOrder, load_a: LoadProfile, on_the_bus: "OnTheBus", processes: Processes, export: Path
+    order: WordOrder, load_a: LoadProfile, on_the_bus: "OnTheBus", processes: Processes, program: str
 ) -> None:
-    program, own = export / "optimizer" / "bus" / "optimizer", processes.free_port()
+    own = processes.free_port()
     async with on_the_bus(order=order, services=REQUIRED) as bus:
         where = ("--port", str(bus.endpoints.control_plc.port), "--listen", str(own))
         rig = SessionClient(bus.endpoints, bus.settings, services=REQUIRED)
@@ -148,8 +155,7 @@ def test_it_is_kept_up_and_finds_a_control_plc_that_was_killed(
         assert cli.main(["down", "--port-base", str(base)]) == 0
 
 
-async def test_it_ends_with_the_program_that_has_started_it(processes: Processes, export: Path) -> None:
-    program = export / "optimizer" / "bus" / "optimizer"
+async def test_it_ends_with_the_program_that_has_started_it(processes: Processes, program: str) -> None:
     started = await asyncio.create_subprocess_exec(
         program, "--listen", str(processes.free_port()), "--with-parent", stdin=asyncio.subprocess.PIPE
     )
@@ -165,9 +171,7 @@ async def test_it_ends_with_the_program_that_has_started_it(processes: Processes
 @pytest.fixture
 def copy(folder: Path, tmp_path: Path) -> Path:
     """The same, not compiled."""
-    made = shutil.copytree(folder, tmp_path / "copy")
-    (made / "optimizer" / "bus" / "optimizer").unlink(missing_ok=True)
-    return made
+    return Path(shutil.copytree(folder, tmp_path / "copy"))
 
 
 def refusal(folder: Path, *assignments: str) -> str:
@@ -224,6 +228,30 @@ def test_a_source_that_was_changed_is_refused(copy: Path) -> None:
     with (copy / "optimizer" / "kernels.c").open("a") as file:
         file.write("\n")
     assert "optimizer/kernels.c is not as it was exported: export it again" in refusal(copy)
+
+
+@pytest.mark.usefixtures("compiles")
+@pytest.mark.parametrize("name", ["/dev/zero", "../kernels.c", "bus"])
+def test_files_are_those_of_the_export(name: str, copy: Path) -> None:
+    (copy / "optimizer" / "optimizer.c").write_bytes(b"")
+    changed_manifest(copy, files={"optimizer.c": hashlib.sha256(b"").hexdigest(), name: "ab" * 32})
+    assert re.search("outside the folder|not a regular file", refusal(copy))
+
+
+@pytest.mark.usefixtures("compiles")
+def test_a_program_that_lies_in_an_export_is_not_executed(
+    copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planted = copy / "optimizer" / "bus" / "optimizer"
+    planted.write_text("#!/bin/sh\n")
+    planted.chmod(0o755)
+    monkeypatch.setenv("COLDLOOP_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(exported_optimizer, "_make", lambda _, __, made: (made / "program").write_text("ours"))
+    monkeypatch.setattr(shutil, "which", lambda _: "cc")
+    (program,) = exported_optimizer.exported_optimizer(f"export:{copy}", settings())
+    assert Path(program).read_text() == "ours"
+    assert Path(program).parent == tmp_path / "cache" / "exports"
+    assert Path(program).parent.stat().st_mode & 0o777 == 0o700
 
 
 @pytest.mark.usefixtures("compiles")

@@ -1,5 +1,6 @@
 """Gains of the prediction model that are estimated from a record."""
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -188,8 +189,13 @@ def run_of(recorded: Path, tmp_path: Path) -> RunOf:
     def make(record: Record) -> Path:
         folder = Path(shutil.copytree(recorded, tmp_path / "run"))
         columns = dict(zip((*INPUT_NAMES, "load_w", *OUTPUT_NAMES), [*record.inputs.T, *record.y.T], strict=True))
-        table = pa.table({"time_s": np.arange(len(record.y)) * TICK_S} | columns)
+        table = pa.table(
+            {"time_s": np.arange(len(record.y)) * TICK_S}
+            | {name: pa.array(column, pa.float32()) for name, column in columns.items()}
+        )
         pq.write_table(table, folder / "trace.parquet")
+        manifest = json.loads((folder / "manifest.json").read_text())
+        (folder / "manifest.json").write_text(json.dumps(manifest | {"recorded_ticks": len(table)}))
         return folder
 
     return make

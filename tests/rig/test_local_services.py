@@ -1,11 +1,13 @@
 """Services started on localhost, and what their owner hears when one ends."""
 
 import asyncio
+import sys
 from pathlib import Path
 
 import pytest
 
 from coldloop.errors import LinkError, PeerUnreachableError
+from rig.cosim import local_services
 from rig.cosim.local_services import LocalServices
 from rig.settings import Settings
 
@@ -26,6 +28,18 @@ def test_a_service_that_ended_is_named_even_when_the_work_fails_with_it(tmp_path
                 await services.during(unreachable())
 
     asyncio.run(check())
+
+
+@pytest.mark.usefixtures("programs")
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of another process are Linux's")
+async def test_the_log_of_a_program_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local_services, "MOST_LOG_BYTES", 100_000)
+    endless = (sys.executable, "-c", "import os\ninput()\nwhile True: os.write(1, bytes(1000))")
+    with (tmp_path / "log").open("ab") as log:
+        process = await local_services.start_program(endless, {}, log)
+        await process.communicate(b"\n")
+    assert process.returncode
+    assert 100_000 <= (tmp_path / "log").stat().st_size < 110_000
 
 
 @pytest.mark.usefixtures("processes")

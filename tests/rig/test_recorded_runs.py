@@ -10,10 +10,11 @@ import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import h5py
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from scipy.io import loadmat
@@ -255,6 +256,79 @@ def test_a_trace_that_is_damaged_is_one_line(command: str, damage: str, coldloop
         return
     assert (outcome.code, len(outcome.complaints)) == (2, 1), outcome
     assert "damaged" in outcome.complaints[0]
+
+
+def table_with(column: str, values: pa.Array) -> Callable[[Path], None]:
+    """Return what replaces a column of a Parquet file."""
+
+    def change(file: Path) -> None:
+        table = pq.read_table(file)
+        pq.write_table(table.slice(0, 1).append_column("x", values[:1]).drop_columns([column]).rename_columns(
+            [*(name for name in table.column_names if name != column), column]), file)  # fmt: skip
+
+    return change
+
+
+def fifo(file: Path) -> None:
+    file.unlink()
+    os.mkfifo(file)
+
+
+def device(file: Path) -> None:
+    file.unlink()
+    file.symlink_to("/dev/zero")
+
+
+def many_rows(file: Path) -> None:
+    schema = pq.read_schema(file)
+    pq.write_table(pa.table([pa.nulls(600_000, one.type) for one in schema], schema=schema), file)
+
+
+def long_text(file: Path) -> None:
+    table_with("cause", pa.array(["x" * 500_000]))(file)
+
+
+FOREIGN: Final = {
+    "FIFO for a manifest": ("rerun", "manifest.json", fifo, "not a regular file"),
+    "FIFO for a table": ("plot", "trace.parquet", fifo, "not a regular file"),
+    "FIFO for a model": ("identify", "inputs/model.json", fifo, "not a regular file"),
+    "link to a device": ("report", "summary.json", device, "outside the folder"),
+    "type": ("plot", "trace.parquet", table_with("time_s", pa.array(["x"])), "time_s is string"),
+    "missing time": ("report", "events.parquet", table_with("time_s", pa.array([None], pa.float64())), "is missing"),
+    "rows of ticks": ("plot", "updates.parquet", many_rows, "600000 rows, and manifest.json says 360 ticks"),
+    "rows of events": ("report", "events.parquet", many_rows, "600000 rows; 500000 at most"),
+    "text": ("plot", "trace.parquet", long_text, "a text of more than 4096 bytes"),
+}
+
+
+@pytest.mark.parametrize("what", FOREIGN)
+def test_a_folder_of_somebody_else_is_data_within_bounds(what: str, coldloop: "Coldloop", mpc: Path) -> None:
+    command, name, damage, why = FOREIGN[what]
+    damage(mpc / name)
+    outcome = coldloop("page" if name == "updates.parquet" else command, mpc)
+    assert (outcome.code, len(outcome.complaints)) == (2, 1), outcome
+    assert name in outcome.complaints[0]
+    assert why in outcome.complaints[0]
+
+
+@pytest.mark.parametrize("place", ["/dev/zero", "../mpc/inputs/model.json"])
+def test_a_manifest_names_files_of_its_folder_alone(place: str, coldloop: "Coldloop", mpc: Path) -> None:
+    manifest = json.loads((mpc / "manifest.json").read_text())
+    manifest["inputs"]["model"]["file"] = place
+    (mpc / "manifest.json").write_text(json.dumps(manifest))
+    outcome = coldloop("rerun", mpc)
+    assert outcome.code == 2
+    assert "outside the folder that names it" in outcome.complaints[-1]
+
+
+def test_what_a_manifest_says_is_printed_as_printable(coldloop: "Coldloop", runs: Path, mpc: Path) -> None:
+    manifest = json.loads((mpc / "manifest.json").read_text())
+    manifest["configuration"]["plant.\x1b[31m"] = "\x1b[2J"
+    (mpc / "manifest.json").write_text(json.dumps(manifest))
+    outcome = coldloop("compare", mpc, runs / "classical", "--out", mpc / "figure.png")
+    assert outcome.code == 0
+    assert "\x1b" not in outcome.out
+    assert "\\x1b[2J" in outcome.out
 
 
 @pytest.mark.usefixtures("programs")

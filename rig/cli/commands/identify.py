@@ -33,7 +33,7 @@ def execute(options: argparse.Namespace) -> int:
         if out.exists():
             raise UsageError(f"{out}: exists; name another file with --out")
     run = RunFolder(options.run)
-    model = load(options.model or run.path / MODEL_COPY)
+    model = load(options.model or run.held(MODEL_COPY))
     found = identify(model, read_record(run, model))
     sys.stdout.write(describe(model, found))
     if out is None:

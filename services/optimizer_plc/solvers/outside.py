@@ -4,6 +4,7 @@ The entry point is a class without arguments that follows `OutsideMethod`; `docs
 """
 
 from collections.abc import Sequence
+from copy import copy
 from typing import Protocol
 
 import numpy as np
@@ -29,7 +30,7 @@ class OutsideMethod(Protocol):
 
 
 class OutsideSolver:
-    """One of these as a solver: what it returns is checked, put into the box and judged by the augmented cost."""
+    """One of these as a solver, given copies: its answer is checked, put into the box, judged by the augmented cost."""
 
     def __init__(self, settings: OutsideSettings) -> None:
         self.alpha = settings.alpha
@@ -60,9 +61,9 @@ class OutsideSolver:
         if not count:
             return guess, 0
         with in_its_name(Part.SOLVER, self.name):
-            point, done = self._method.solve(problem, guess.copy(), count)
-            found = np.asarray(point, dtype=np.float64)
-            done = min(int(done), count)
+            point, done = self._method.solve(QuadraticProblem(*map(copy, problem)), guess.copy(), count)
+            found = np.array(point, dtype=np.float64)
+            done = max(0, min(int(done), count))
         if found.shape != guess.shape or not np.isfinite(found).all():
             return guess, done
         return np.clip(found, problem.low, problem.high), done

@@ -11,6 +11,7 @@ from typing import Any
 
 from coldloop.errors import ModelFileError
 from coldloop.parsing import parsed_json
+from coldloop.text_file import read_bytes
 from coldloop.whole_file import whole_text
 
 FORMAT = 1
@@ -104,9 +105,9 @@ def read_document(path: Path, remedy: str = REMEDY) -> dict[str, Any]:
         ModelFileError: the file is missing, unreadable, not JSON, not finite, of another version or damaged.
     """
     try:
-        document = parsed_json(path.read_bytes(), parse_constant=_refuse)
-    except FileNotFoundError as error:
-        raise ModelFileError(f"{path}: no such model file; {remedy}") from error
+        if not path.exists():
+            raise ModelFileError(f"{path}: no such model file; {remedy}")
+        document = parsed_json(read_bytes(path, remedy, ModelFileError), parse_constant=_refuse)
     except (OSError, ValueError) as error:
         raise ModelFileError(f"{path}: not a readable model file ({error}); {remedy}") from error
     if not isinstance(document, dict) or document.get("format") != FORMAT:
