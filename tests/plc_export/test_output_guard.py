@@ -247,7 +247,7 @@ def test_what_cannot_be_is_refused_in_c(loaded: Callable[[str], ctypes.CDLL]) ->
 def self_test(texts: Mapping[str, str]) -> tuple[bool, int]:
     """Return verdict and what failed first, from where a register table would have them."""
     machine = Machine(*texts.values())
-    program, verdict = machine.instance("cl_main"), machine.globals.cl_verdict
+    program, verdict = machine.instance("cg_main"), machine.globals.cg_verdict
     while not verdict[0]:
         program.run_()
     assert (program.test.passed, program.test.what) == (bool(verdict[1]), verdict[3])

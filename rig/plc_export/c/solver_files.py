@@ -63,7 +63,8 @@ class OdeExport:
         """Return the texts of the files by their names, with some golden vectors."""
         return {
             **self.kernels.texts(), "problem.h": self._problem_header(), "problem.c": self._problem(),
-            "tables.h": self._tables_header(), "tables.c": self._tables(), **self._golden(list(vectors)), "self_test.c": self._self_test(),
+            "tables.h": self._tables_header(), "tables.c": self._tables(),
+            **self._golden(list(vectors)), "self_test.c": self._self_test(),
         }  # fmt: skip
 
     def sizes(self, vectors: Iterable[GoldenVector]) -> Sizes:
