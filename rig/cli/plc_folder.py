@@ -133,7 +133,7 @@ def c99(recorded: GoldenVectors, vectors: list[GoldenVector], profile: PlcProfil
     """Return the files of C99 by their names."""
     export = OdeExport(recorded.method, vectors[0].problem, np.arange(1, len(vectors[0].answer.costs) + 1))
     texts, sizes = export.files(vectors), export.sizes(vectors)
-    needed = {"constants": sizes.constants, "stack of `solve_problem`, about": sizes.stack,
+    needed = {"constants": sizes.constants, "stack of `solve_problem`, arrays and numbers": sizes.stack,
               "self-test and golden vectors": sizes.self_test}  # fmt: skip
     return described("c/readme_solver.md", recorded, vectors, texts, {}, needed, profile, WHOLE)
 
@@ -210,7 +210,7 @@ def optimizer_in_c(_: str, settings: Settings, recorder: UpdateRecorder, golden:
     order, shown = settings.optimizer_plc.word_order, selected(settings, SHOWN)
     texts = {**export.files(), **bus_files(recorder.optimizer, export.kernels, order, shown)}
     sizes = export.sizes()
-    needed = {"constants": sizes.constants, "state": sizes.state, "stack, about": sizes.stack}
+    needed = {"constants": sizes.constants, "state": sizes.state, "stack, arrays and numbers": sizes.stack}
     return "c/readme_optimizer.md", texts, {}, needed
 
 
