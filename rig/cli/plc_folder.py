@@ -37,7 +37,7 @@ from rig.plc_export.kernels.guard_program import GuardKernels
 from rig.plc_export.kernels.recorded_problems import LOAD, TICKS, GoldenVector, GoldenVectors, paper_settings, record
 from rig.plc_export.kernels.recorded_updates import GoldenUpdate, UpdateRecorder, refuse
 from rig.plc_export.problem_layout import problem_layout
-from rig.plc_export.structured_text.guard_files import GuardText
+from rig.plc_export.structured_text.guard_files import GuardText, of_guard
 from rig.plc_export.structured_text.optimizer_files import OptimizerText
 from rig.plc_export.structured_text.pausing import PIECE
 from rig.plc_export.structured_text.plcopen import plcopen_xml
@@ -133,7 +133,7 @@ def c99(recorded: GoldenVectors, vectors: list[GoldenVector], profile: PlcProfil
     """Return the files of C99 by their names."""
     export = OdeExport(recorded.method, vectors[0].problem, np.arange(1, len(vectors[0].answer.costs) + 1))
     texts, sizes = export.files(vectors), export.sizes(vectors)
-    needed = {"constants": sizes.constants, "stack of `solve_problem`, about": sizes.stack,
+    needed = {"constants": sizes.constants, "stack of `solve_problem`, arrays and numbers": sizes.stack,
               "self-test and golden vectors": sizes.self_test}  # fmt: skip
     return described("c/readme_solver.md", recorded, vectors, texts, {}, needed, profile, WHOLE)
 
@@ -210,7 +210,7 @@ def optimizer_in_c(_: str, settings: Settings, recorder: UpdateRecorder, golden:
     order, shown = settings.optimizer_plc.word_order, selected(settings, SHOWN)
     texts = {**export.files(), **bus_files(recorder.optimizer, export.kernels, order, shown)}
     sizes = export.sizes()
-    needed = {"constants": sizes.constants, "state": sizes.state, "stack, about": sizes.stack}
+    needed = {"constants": sizes.constants, "state": sizes.state, "stack, arrays and numbers": sizes.stack}
     return "c/readme_optimizer.md", texts, {}, needed
 
 
@@ -243,7 +243,14 @@ def output_guard(target: str, settings: Settings) -> dict[str, str]:
     counts = {call: CallCost(**found._asdict()) for call, found in counted_guard(kernels, golden).items()}
     counts["judgement"] = counts["judgement"].model_copy(update={"worst": counted_longest(kernels)})
     cost = ExportCost(variables=len(INPUT_NAMES), operations=counts, bytes=export.sizes())
-    parts = {**loading(target), "VERDICT": verdict_table(GuardText.outputs)} if target != "c" else {}
+    parts = (
+        {
+            name: of_guard(text)
+            for name, text in (*loading(target).items(), ("VERDICT", verdict_table(GuardText.outputs)))
+        }
+        if target != "c"
+        else {}
+    )
     texts[README] = filled(template(f"{name}/{GUARD}/readme.md"), {
         **parts, "COST": cost_text(cost), "GOLDEN": str(len(golden)), "ROWS": str(SEQUENCE_ROWS),
         "FILES": ", ".join(f"`{each}`" for each in texts),

@@ -91,7 +91,7 @@ def assert_found(folder: Path, copy: Path, name: str, most: int) -> None:
 
 
 @pytest.mark.usefixtures("compiles")
-@pytest.mark.parametrize("name", ["kernels.c", "problem.c", "golden.c"])
+@pytest.mark.parametrize("name", ["tables.c", "golden.c"])
 def test_a_changed_bit_of_a_literal_a_matrix_or_a_golden_vector_is_found(
     folder: Path, tmp_path: Path, name: str
 ) -> None:
@@ -99,6 +99,6 @@ def test_a_changed_bit_of_a_literal_a_matrix_or_a_golden_vector_is_found(
 
 
 @pytest.mark.night
-@pytest.mark.parametrize("name", ["kernels.c", "problem.c", "golden.c"])
+@pytest.mark.parametrize("name", ["tables.c", "golden.c"])
 def test_many_changed_bits_are_found(folder: Path, tmp_path: Path, name: str) -> None:
     assert_found(folder, tmp_path / "copy", name, 30)

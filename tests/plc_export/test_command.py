@@ -25,7 +25,7 @@ TANK = Path(__file__).parents[2] / "examples" / "processes" / "quadruple_tank.to
 SOLVER_TEXTS = ["types.st", "functions.st", "kernels.st", "golden.st", "self_test.st", "configuration.st"]
 GUARD_TEXTS = ["types.st", "functions.st", "kernels.st", "output_guard.st", "self_test.st", "configuration.st"]
 DESCRIBED = ["README.md", "manifest.json"]
-OF_SOLVER = "kernels.h kernels.c problem.h problem.c golden.h golden.c self_test.c"
+OF_SOLVER = "kernels.h kernels.c problem.h problem.c tables.h tables.c golden.h golden.c self_test.c"
 OF_OPTIMIZER = (
     "kernels.h kernels.c constants.h constants.c golden.h golden.c optimizer.h optimizer.c self_test.c bus/main.c"
     " bus/control_plc.c bus/control_plc.h bus/diagnostics.c bus/diagnostics.h bus/words.c bus/words.h bus/registers.h"

@@ -179,6 +179,6 @@ def test_blocks_and_interfaces_keep_what_is_said_of_them(project: ET.Element) ->
     notes = {pou.get("name"): child(pou, "documentation")[0].text for pou in child(project, "types/pous")
              if pou.find(f"{{{NAMESPACE}}}documentation") is not None}  # fmt: skip
     of_guard = "cl_guard_scan" in notes
-    kernel, source = ("cl_admit", "output_limits.py") if of_guard else ("cl_excess_by_columns", "qp/costs.py")
+    kernel, source = ("cg_admit", "output_limits.py") if of_guard else ("cl_excess_by_columns", "qp/costs.py")
     assert source in (notes[kernel] or "")
-    assert f"what: {4 if of_guard else 1}" in (notes["cl_self_test"] or "")
+    assert f"what: {4 if of_guard else 1}" in (notes["cg_self_test" if of_guard else "cl_self_test"] or "")

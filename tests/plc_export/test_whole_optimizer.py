@@ -69,7 +69,7 @@ def last_bit(number: re.Match[str]) -> str:
 
 
 @pytest.mark.usefixtures("programs")
-@pytest.mark.parametrize("name", ["kernels.c", "constants.c", "golden.c"])
+@pytest.mark.parametrize("name", ["constants.c", "golden.c"])
 def test_a_changed_bit_of_a_literal_a_matrix_or_a_golden_update_is_found(
     folder: Path, tmp_path: Path, name: str
 ) -> None:

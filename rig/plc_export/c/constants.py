@@ -39,14 +39,16 @@ class ConstantRecords:
         self._sum = crc(array.astype(self.real if real else np.int32), self._sum)
         function, kind = ("sum_of_reals", self.type) if real else ("sum_of_integers", "int32_t")
         if array.ndim:
-            self._sums.append(f"sum = {function}(sum, {path}, {array.size});")
             name = path.replace(".", "_")
+            self._sums.append(f"changed = changed || *(const {kind} *const volatile *)&{path} != {name};")
+            self._sums.append(f"sum = {function}(sum, {name}, {array.size});")
             self.arrays[name] = array
             return name
-        self._sums.append(f"sum = {function}(sum, &({kind}){{{path}}}, 1);")
-        if real:
-            return self.printer.number(float(array))
-        return str(bool(value)).lower() if isinstance(value, bool | np.bool_) else str(int(array))
+        if isinstance(value, bool | np.bool_):
+            self._sums.append(f"sum = sum_of_integers(sum, &(int32_t){{*(const volatile unsigned char *)&{path}}}, 1);")
+            return str(bool(value)).lower()
+        self._sums.append(f"sum = {function}(sum, &{path}, 1);")
+        return self.printer.number(float(array)) if real else str(int(array))
 
     def bytes(self) -> int:
         """Return the bytes of arrays and literals."""
@@ -62,8 +64,8 @@ class ConstantRecords:
         """Return the declarations of the sum, and what it is."""
         return f"""/* Sum over literals and constants; SUM_OF_CONSTANTS is what it was when they were written. */
 uint32_t sum_of_constants(void);
-uint32_t sum_of_reals(uint32_t sum, const {self.type} *values, int32_t count);
-uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
+uint32_t sum_of_reals(uint32_t sum, const volatile {self.type} *values, int32_t count);
+uint32_t sum_of_integers(uint32_t sum, const volatile int32_t *values, int32_t count);
 #define SUM_OF_CONSTANTS UINT32_C({self._sum})
 """
 
@@ -73,7 +75,8 @@ uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
         body = "".join(f"    {each}\n" for each in self._sums)
         return f"""{filled(template("c/sums.c"), bits)}
 uint32_t sum_of_constants(void) {{
+    bool changed = false; /* where an array is */
     uint32_t sum = sum_of_reals(0, literals, N_LITERALS);
-{body}    return sum;
+{body}    return changed ? ~SUM_OF_CONSTANTS : sum;
 }}
 """

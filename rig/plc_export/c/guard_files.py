@@ -32,7 +32,7 @@ class GuardExport:
 
     def __init__(self, kernels: GuardKernels, golden: Sequence[GoldenCall]) -> None:
         self._printer, self._tables = Printer(np.float64), tables_of(golden)
-        self._kernels = KernelFiles(self._printer, kernels.functions, kernels.entries)
+        self._kernels = KernelFiles(self._printer, kernels.functions, kernels.entries, "guard", ["limits"])
         self.constants = ConstantRecords(self._printer)
         self._limits = self.constants.printed("limits", kernels.limits)
 
@@ -56,7 +56,8 @@ class GuardExport:
         header = (f'{GENERATED}#ifndef LIMITS_H\n#define LIMITS_H\n\n#include "kernels.h"\n\n'
                   f"extern const Limits limits;\n\n{self.constants.declared()}\n#endif\n")  # fmt: skip
         source = (f'{GENERATED}#include <math.h>\n#include <string.h>\n\n#include "limits.h"\n\n'
-                  f"{self.constants.arrays_text()}\nconst Limits limits = {self._limits};\n\n"
+                  f"{self._kernels.literals()}\n{self.constants.arrays_text()}\n"
+                  f"const Limits limits = {self._limits};\n\n"
                   f"{self.constants.summing()}")  # fmt: skip
         return {"limits.h": header, "limits.c": source}
 

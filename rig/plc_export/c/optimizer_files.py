@@ -22,6 +22,7 @@ from rig.plc_export.tree.nodes import ArrayType, Kind, RecordType, RowsType, Str
 
 Array = NDArray[Any]
 SINGLE: Final = np.dtype(np.float32)
+TABLES: Final = ("constants", "method", "rules", "starts")
 
 
 class OptimizerSizes(NamedTuple):
@@ -49,7 +50,7 @@ class OptimizerExport:
         self.printer = Printer(np.float32)
         functions = self.kernels.functions
         made = (kind for each in functions for kind in self.printer.made_in(each))
-        self._kernels = KernelFiles(self.printer, functions, self.kernels.entries, made)
+        self._kernels = KernelFiles(self.printer, functions, self.kernels.entries, "optimizer", TABLES, made)
         self.state_type = next(each for each in self._kernels.records if each.name == "OptimizerState")
         self.constants = ConstantRecords(self.printer)
         self._initial = {name: self.constants.printed(name, record) for name, record in self._leading()}
@@ -110,6 +111,7 @@ extern const {starts} starts[{len(self.kernels.rules)}];
 
 #include "constants.h"
 
+{self._kernels.literals()}
 {self.constants.arrays_text()}
 const Constants constants = {self._initial["constants"]};
 

@@ -3,8 +3,8 @@
 #include <string.h>
 
 #include "problem.h"
+#include "tables.h"
 
-@ARRAYS@
 @SUMS_OF_BYTES@
 uint32_t sum_of_constants(void) {
     uint32_t sum = sum_of_reals(0, literals, N_LITERALS);

@@ -6,6 +6,7 @@
 
 #include "golden.h"
 #include "problem.h"
+#include "tables.h"
 
 static int failures = 0;
 static double took_us = 0;
@@ -80,6 +81,9 @@ static void check_vector(int32_t vector) {
 int main(void) {
     check_platform();
     check_constants();
+    if (failures > 0) { /* what follows may go anywhere */
+        return 1;
+    }
     for (int32_t vector = 0; vector < N_GOLDEN; vector += 1) {
         check_vector(vector);
     }

@@ -47,7 +47,7 @@ class OdeExport:
         self.printer = Printer(problem.phi.dtype.type)
         self.real = self.printer.scalars[Kind.REAL]
         self.entry = self.program.entry
-        self.kernels = KernelFiles(self.printer, self.program.functions, [self.entry])
+        self.kernels = KernelFiles(self.printer, self.program.functions, [self.entry], "solver", self._constants())
 
     # -- files ---------------------------------------------------------------------------------------------------------
 
@@ -63,6 +63,7 @@ class OdeExport:
         """Return the texts of the files by their names, with some golden vectors."""
         return {
             **self.kernels.texts(), "problem.h": self._problem_header(), "problem.c": self._problem(),
+            "tables.h": self._tables_header(), "tables.c": self._tables(),
             **self._golden(list(vectors)), "self_test.c": self._self_test(),
         }  # fmt: skip
 
@@ -80,7 +81,7 @@ class OdeExport:
         return f"""{GENERATED}#ifndef PROBLEM_H
 #define PROBLEM_H
 
-#include "kernels.h"
+#include <stdint.h>
 
 #define N_VARIABLES {n}
 #define N_ROWS {m}
@@ -92,10 +93,23 @@ void solve_problem(
     const {self.real} high[N_VARIABLES], const {self.real} guess[N_VARIABLES], {self.real} *guessed,
     {self.real} points[N_COUNTS * N_VARIABLES], {self.real} costs[N_COUNTS], int32_t iterations[N_COUNTS]);
 
+#endif
+"""
+
+    def _tables_header(self) -> str:
+        declared = "".join(f"extern const {self.printer.scalar(values)} {name}[{values.size}];\n"
+                           for name, values in self._constants().items())  # fmt: skip
+        return f"""{GENERATED}#ifndef TABLES_H
+#define TABLES_H
+
+#include "kernels.h"
+
+/* In a file of their own, so that the compiler does not copy them into the code. */
+{declared}
 /* Sum over the constants and the literals; SUM_OF_CONSTANTS is what it was when they were written. */
 uint32_t sum_of_constants(void);
-uint32_t sum_of_reals(uint32_t sum, const {self.real} *values, int32_t count);
-uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
+uint32_t sum_of_reals(uint32_t sum, const volatile {self.real} *values, int32_t count);
+uint32_t sum_of_integers(uint32_t sum, const volatile int32_t *values, int32_t count);
 #define SUM_OF_CONSTANTS UINT32_C({self._sum_of_constants()})
 
 #endif
@@ -118,7 +132,6 @@ uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
 
     def _problem(self) -> str:
         constants = self._constants()
-        arrays = "\n".join(self.printer.array(name, values) for name, values in constants.items())
         sums = "\n".join(
             f"    sum = sum_of_{'reals' if values.dtype.kind == 'f' else 'integers'}(sum, {name}, {values.size});"
             for name, values in constants.items()
@@ -138,13 +151,16 @@ uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
         bytes_ = template("c/sums.c")
         body = {
             "SUMS_OF_BYTES": bytes_,
-            "ARRAYS": arrays,
             "SUMS": sums,
             "METHOD": f"{matrices}\n{settings}",
             "BEFORE": none,
             "VECTORS": vectors,
         }
         return self._filled(head, body)
+
+    def _tables(self) -> str:
+        arrays = "\n".join(self.printer.array(name, values, "") for name, values in self._constants().items())
+        return f'{GENERATED}#include <math.h>\n\n#include "tables.h"\n\n{self.kernels.literals()}\n{arrays}'
 
     def _golden(self, vectors: list[GoldenVector]) -> dict[str, str]:
         """Return the files of the golden vectors: inputs and results of all in a row."""

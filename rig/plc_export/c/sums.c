@@ -1,3 +1,4 @@
+/* Values are read where they are, whatever the compiler knows of them: they are volatile. */
 static uint32_t sum_of_byte(uint32_t sum, uint32_t byte) {
     sum ^= byte;
     for (int bit = 0; bit < 8; bit += 1) {
@@ -6,11 +7,12 @@ static uint32_t sum_of_byte(uint32_t sum, uint32_t byte) {
     return sum;
 }
 
-uint32_t sum_of_reals(uint32_t sum, const @REAL@ *values, int32_t count) {
+uint32_t sum_of_reals(uint32_t sum, const volatile @REAL@ *values, int32_t count) {
     sum = ~sum;
     for (int32_t i = 0; i < count; i += 1) {
         @BITS@ bits;
-        memcpy(&bits, &values[i], sizeof bits);
+        const @REAL@ value = values[i];
+        memcpy(&bits, &value, sizeof bits);
         for (int byte = @BYTES@ - 1; byte >= 0; byte -= 1) {
             sum = sum_of_byte(sum, (uint32_t)((bits >> (8 * byte)) & 0xFFU));
         }
@@ -18,7 +20,7 @@ uint32_t sum_of_reals(uint32_t sum, const @REAL@ *values, int32_t count) {
     return ~sum;
 }
 
-uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count) {
+uint32_t sum_of_integers(uint32_t sum, const volatile int32_t *values, int32_t count) {
     sum = ~sum;
     for (int32_t i = 0; i < count; i += 1) {
         const uint32_t bits = (uint32_t)values[i];

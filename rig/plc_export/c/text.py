@@ -3,26 +3,36 @@
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-from rig.plc_export.c.printer import Printer
+from rig.plc_export.c.printer import Printer, identifier
 from rig.plc_export.tree.nodes import Function, Kind, RecordType, RowsType, StructType, Type
 
 GENERATED: Final = "/* Written by Coldloop from the kernels of its optimiser; changes belong there. */\n"
 
 
+SUMS: Final = ("sum_of_constants", "sum_of_reals", "sum_of_integers")
+
+
 class KernelFiles:
-    """Kernels as two files.
+    """Kernels as two files, whose literals are for a file of tables.
+
+    A compiler that sees a table copies its numbers into the code, and a sum over the table is not one over the copies.
 
     Args:
         printer: It gets their literals.
         functions: Callees before their callers.
         entries: Those that others call.
+        part: Part of the export; what the linker sees has this prefix, so that several parts link in one program.
+        tables: Names of the part's tables that the linker sees, beside the literals.
         more: Types of records beside those of the parameters.
     """
 
     def __init__(
-        self, printer: Printer, functions: Sequence[Function], entries: Sequence[Function], more: Iterable[Type] = ()
+        self, printer: Printer, functions: Sequence[Function], entries: Sequence[Function], part: str,
+        tables: Iterable[str], more: Iterable[Type] = (),
     ) -> None:  # fmt: skip
         self._printer, self._entries = printer, entries
+        seen = (*(identifier(each.name) for each in entries), printer.table, *SUMS, *tables)
+        self._names = "".join(f"#define {each} {part}_kernel_{each}\n" for each in seen)
         self._real = printer.scalars[Kind.REAL]
         self._text = "\n".join(printer.function(each, "" if each in entries else "static ") for each in functions)
         self.records = records_in([*(one.type for each in functions for one in each.parameters), *more])
@@ -32,7 +42,6 @@ class KernelFiles:
         printer = self._printer
         records = "\n".join(map(printer.structure, self.records))
         signatures = "\n".join(f"{printer.signature(each)};" for each in self._entries)
-        literals = "".join(f"    {each},\n" for each in printer.literals)
         return {
             "kernels.h": f"""{GENERATED}#ifndef KERNELS_H
 #define KERNELS_H
@@ -40,6 +49,8 @@ class KernelFiles:
 #include <stdbool.h>
 #include <stdint.h>
 
+/* Names that the linker sees. */
+{self._names}
 #define N_LITERALS {len(printer.literals)}
 extern const {self._real} literals[N_LITERALS];
 
@@ -52,12 +63,14 @@ extern const {self._real} literals[N_LITERALS];
 
 #include "kernels.h"
 
-const {self._real} literals[N_LITERALS] = {{
-{literals}}};
-
 {helpers(self._real, self._text)}
 {self._text}""",
         }
+
+    def literals(self) -> str:
+        """Return the definition of the table of literals, for a file without kernels."""
+        listed = "".join(f"    {each},\n" for each in self._printer.literals)
+        return f"const {self._real} literals[N_LITERALS] = {{\n{listed}}};\n"
 
 
 def helpers(real: str, kernels: str) -> str:

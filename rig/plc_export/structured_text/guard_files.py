@@ -1,5 +1,6 @@
 """The control PLC's output guard as Structured Text: blocks of its kernels in LREAL, interface, limits, a self-test."""
 
+import re
 from collections.abc import Sequence
 from typing import ClassVar, Final
 
@@ -12,6 +13,7 @@ from rig.plc_export.kernels.golden_calls import GoldenCall, tables_of
 from rig.plc_export.kernels.guard_program import GuardKernels
 from rig.plc_export.kernels.ode_program import leaves
 from rig.plc_export.structured_text.constants import Constants, types_in
+from rig.plc_export.structured_text.dialects import portable
 from rig.plc_export.structured_text.lowering import VALUE, Lowering
 from rig.plc_export.structured_text.optimizer_files import state_types
 from rig.plc_export.structured_text.places import Record
@@ -38,6 +40,11 @@ PLACES: Final = {"state": Record(STATE), "twin": Record(TWIN), "limits": Record(
 ROW: Final = {"applied": "wide", "wanted": "wide", "row": "row"}
 """Variables of the interface's blocks that are handed to parameters of the kernels."""
 ROWS: Final = {"meanwhile": "before", "rows": "wide", "waiting": "0"}
+
+
+def of_guard(text: str) -> str:
+    """Return text with a prefix of the guard's own for global names, so that the optimiser is loaded beside it."""
+    return re.sub(r"\bcl_(?!guard_)", "cg_", text)
 
 
 class GuardText:
@@ -81,7 +88,7 @@ class GuardText:
             "configuration.st": self._configuration(),
         }  # fmt: skip
         texts["types.st"] = self.printer.types()
-        return {name: GENERATED + text for name, text in texts.items()}
+        return {name: GENERATED + of_guard(portable(text)) for name, text in texts.items()}
 
     def sizes(self) -> dict[str, int]:
         """Return the bytes of what a PLC needs."""

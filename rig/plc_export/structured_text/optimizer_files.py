@@ -25,6 +25,7 @@ from rig.plc_export.structured_text.constants import (
     summing,
     types_in,
 )
+from rig.plc_export.structured_text.dialects import portable
 from rig.plc_export.structured_text.lowering import Lowering, zeroed
 from rig.plc_export.structured_text.pausing import ANEW, PIECE, Pausing
 from rig.plc_export.structured_text.places import Entry, Place, Record, Rows, dotted
@@ -123,7 +124,7 @@ class OptimizerText:
             "self_test.st": self._self_test(len(pages)), "configuration.st": self._configuration(),
         }  # fmt: skip
         texts["types.st"] = self.printer.types()
-        return {name: GENERATED + text for name, text in texts.items()}
+        return {name: GENERATED + portable(text) for name, text in texts.items()}
 
     def sizes(self) -> Sizes:
         """Return the bytes of constants, state, blocks and self-test."""

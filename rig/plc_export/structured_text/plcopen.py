@@ -124,7 +124,9 @@ def _configuration(text: str) -> ET.Element:
         running = ET.SubElement(within, "task", name=task, interval=f"T#{interval}", priority=priority)
         ET.SubElement(running, "pouInstance", name=instance, typeName=program)
     for number, (_, constant, listed) in enumerate(_SECTION.findall(declared), 1):
-        configuration.append(_variables("globalVars", listed, constant=bool(constant), name=f"cl_constants_{number}"))
+        configuration.append(
+            _variables("globalVars", listed, constant=bool(constant), name=f"{name[:3]}constants_{number}")
+        )
     return configuration
 
 

@@ -103,8 +103,8 @@ class StructuredTextPrinter(TreePrinter):
     def types(self) -> str:
         """Return the definitions of the types of arrays so far, and of the table of literals."""
         self.arrays[f"{TABLE}_table"] = f"ARRAY [0..{len(self.literals) - 1}] OF {self.scalars[Kind.REAL]}"
-        body = "".join(f"    {name} : {definition};\n" for name, definition in sorted(self.arrays.items()))
-        return f"TYPE\n{body}END_TYPE\n"
+        return "".join(f"TYPE\n    {name} : {definition};\nEND_TYPE\n"
+                       for name, definition in sorted(self.arrays.items()))  # fmt: skip
 
     # -- blocks --------------------------------------------------------------------------------------------------------
 

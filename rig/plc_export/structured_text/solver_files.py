@@ -16,6 +16,7 @@ from rig.plc_export.structured_text.constants import (
     summing,
     types_in,
 )
+from rig.plc_export.structured_text.dialects import portable
 from rig.plc_export.structured_text.lowering import Lowering
 from rig.plc_export.structured_text.pausing import ANEW, Pausing
 from rig.plc_export.structured_text.places import Record
@@ -95,7 +96,7 @@ class StructuredTextExport:
         functions, lists = template("structured_text/functions.st"), self.constants.configuration()
         texts = {"types.st": self.printer.types(), "functions.st": functions, "kernels.st": self.kernels,
                  "golden.st": golden, "self_test.st": test, "configuration.st": lists}  # fmt: skip
-        return {name: GENERATED + text for name, text in texts.items()}
+        return {name: GENERATED + portable(text) for name, text in texts.items()}
 
     def sizes(self) -> Sizes:
         """Return the bytes of the constants, of the solver and of the self-test."""
