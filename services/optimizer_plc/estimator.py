@@ -212,7 +212,9 @@ def begin_prediction(belief: Belief) -> None:
     """Predict from the last measurement on."""
     belief.predicted[:] = belief.x
     if belief.apart.watch[0].age_s >= 0.0:
-        belief.apart.predicted[:] = belief.apart.x
+        for which in range(belief.apart.x.shape[0]):
+            for i in range(belief.x.size):
+                belief.apart.predicted[which, i] = belief.apart.x[which, i]
     belief.numbers[0].since = 0
 
 

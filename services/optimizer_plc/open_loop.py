@@ -94,11 +94,10 @@ def watch(
 @kernel
 def begin_younger(belief: Any) -> None:  # noqa: ANN401 a belief
     """Let the younger prediction become the older one, and one that begins at the estimate the younger."""
-    w, x, mismatch, now = belief.apart.watch[0], belief.apart.x, belief.apart.mismatch, belief.x
-    zero = now.dtype.type(0.0)
-    for i in range(now.size):
-        x[OLDER, i], x[YOUNGER, i] = x[YOUNGER, i], now[i]
-    mismatch[OLDER], mismatch[YOUNGER] = mismatch[YOUNGER], belief.numbers[0].mismatch
+    w, a, zero = belief.apart.watch[0], belief.apart, belief.x.dtype.type(0.0)
+    for i in range(belief.x.size):
+        a.x[OLDER, i], a.x[YOUNGER, i] = a.x[YOUNGER, i], belief.x[i]
+    a.mismatch[OLDER], a.mismatch[YOUNGER] = a.mismatch[YOUNGER], belief.numbers[0].mismatch
     w.age_s, w.count, w.mean, w.spread, w.weight_s = zero, zero, zero, zero, zero
     w.when_s, w.span, w.expected, w.movement, w.trend = zero, zero, zero, zero, zero
 
@@ -122,33 +121,32 @@ def correct_apart(
 
     Constant errors that the filter has just set to what a reading shows are the same in both.
     """
-    constants, watched, readings, now = p.constants, p.watched, belief.readings, belief.x
-    x, predicted, mismatch = belief.apart.x[which], belief.apart.predicted[which], belief.apart.mismatch
+    a, zero = belief.apart, y.dtype.type(0.0)
     for i in range(y.size):
-        if constants[i] >= 0 and readings[i].since_s == y.dtype.type(0.0):
-            predicted[constants[i]] = now[constants[i]]
-    expected = respond(outputs.A, outputs.B, outputs.F, predicted, u, known + mismatch[which])
+        if p.constants[i] >= 0 and belief.readings[i].since_s == zero:
+            a.predicted[which, p.constants[i]] = belief.x[p.constants[i]]
+    expected = respond(outputs.A, outputs.B, outputs.F, a.predicted[which], u, known + a.mismatch[which])
     innovation = y - expected
     for i in range(y.size):
-        if i == watched or not np.isfinite(believed[i]):
+        if i == p.watched or not np.isfinite(believed[i]):
             innovation[i] = np.nan
-    correction = np.zeros(now.size + 1, y.dtype)
+    correction = np.zeros(belief.x.size + 1, y.dtype)
     add_transposed_product(K, imputed(innovation, J), correction)
-    for i in range(now.size):
-        x[i] = predicted[i] + correction[i]
-    mismatch[which] += correction[now.size]
-    should: float = expected[watched]
+    for i in range(belief.x.size):
+        a.x[which, i] = a.predicted[which, i] + correction[i]
+    a.mismatch[which] += correction[belief.x.size]
+    should: float = expected[p.watched]
     return should
 
 
 @kernel
 def predict_apart(A: Array, B: Array, F: Array, belief: Any, u: Array) -> None:  # noqa: ANN401 a belief
     """Predict over a step (A, B, F, transposed) under the input deviation u (3,), with the load that is measured."""
-    b, predicted, mismatch = belief.numbers[0], belief.apart.predicted, belief.apart.mismatch
-    for which in range(mismatch.size):
-        later = respond(A, B, F, predicted[which], u, b.w - b.mismatch + mismatch[which])
+    b, a = belief.numbers[0], belief.apart
+    for which in range(a.x.shape[0]):
+        later = respond(A, B, F, a.predicted[which], u, b.w - b.mismatch + a.mismatch[which])
         for i in range(later.size):
-            predicted[which, i] = later[i]
+            a.predicted[which, i] = later[i]
 
 
 @kernel

@@ -155,12 +155,15 @@ def imputed(innovation: Array, inverse_covariance: Array) -> Array:
     J_MM e_M = -J_MO e_O, with the inverse covariance J (n_y, n_y): the gain for all outputs then corrects as that for
     the others alone. Without any it is zero.
     """
-    n, real = innovation.size, innovation.dtype.type
-    mean, finite = np.zeros(n, innovation.dtype), np.isfinite(innovation)
-    missing = n - np.count_nonzero(finite)
+    n, real, missing = innovation.size, innovation.dtype.type, 0
+    M, mean = np.zeros((n, n), innovation.dtype), np.zeros(n, innovation.dtype)
+    finite = np.isfinite(innovation)
+    for i in range(n):
+        if not finite[i]:
+            missing += 1
     if missing == 1:  # most often; what follows would find the same, bit by bit
-        return imputed_one(innovation, inverse_covariance)
-    M = np.zeros((n, n), innovation.dtype)
+        impute_one(innovation, inverse_covariance, mean)
+        return mean
     for i in range(n):
         if finite[i]:
             M[i, i], mean[i] = real(1.0), innovation[i]
@@ -175,19 +178,20 @@ def imputed(innovation: Array, inverse_covariance: Array) -> Array:
 
 
 @kernel
-def imputed_one(innovation: Array, inverse_covariance: Array) -> Array:
-    """Return `imputed` where one element is not finite."""
-    mean, missing = innovation.copy(), 0
+def impute_one(innovation: Array, inverse_covariance: Array, mean: Array) -> None:
+    """Write what `imputed` returns where one element is not finite into `mean` (n_y,)."""
+    missing = 0
     for i in range(mean.size):
-        if not np.isfinite(innovation[i]):
-            mean[i], missing = innovation.dtype.type(0.0), i
-    total = mean[missing]
+        if np.isfinite(innovation[i]):
+            mean[i] = innovation[i]
+        else:
+            missing = i
+    total = innovation.dtype.type(0.0)
     for j in range(mean.size):
         if j != missing:
             total -= inverse_covariance[missing, j] * innovation[j]
     pivot = np.sqrt(inverse_covariance[missing, missing])
     mean[missing] = total / pivot / pivot
-    return mean
 
 
 @kernel
@@ -201,15 +205,14 @@ def judge(
     before. Constant errors in `predicted` are set to what a reading shows that is taken back. There are no new suspects
     after a longer time than J is for.
     """
-    believed, returning, settled_s, forgetting = innovation.copy(), False, p.settled_s, p.forgetting
-    low, high = p.low, p.high
+    believed, returning = innovation.copy(), False
     for i in range(innovation.shape[0]):
         r = readings[i]
-        if r.since_s < settled_s <= r.since_s + elapsed_s:
+        if r.since_s < p.settled_s <= r.since_s + elapsed_s:
             surprise[i] = 0.0  # by what it has shown until now nobody is judged
         r.since_s += elapsed_s
-        r.spikes_s = max(r.spikes_s - forgetting * elapsed_s, innovation.dtype.type(0.0))
-        if r.state == USED and not low[i] <= y[i] - innovation[i] <= high[i]:
+        r.spikes_s = max(r.spikes_s - p.forgetting * elapsed_s, innovation.dtype.type(0.0))
+        if r.state == USED and not p.low[i] <= y[i] - innovation[i] <= p.high[i]:
             r.since_s = 0.0  # there the plant is not as its model
         if not np.isfinite(innovation[i]):
             if r.state != STUCK:  # which it is still when it shows something again
@@ -228,10 +231,10 @@ def judge(
 @kernel
 def against_the_model(p: Plausibility, readings: Any, surprise: Array, J: Array) -> tuple[int, int]:  # noqa: ANN401
     """Return how many readings that are believed and judged say that the model does not hold; one of them, or -1."""
-    count, one, allowance, model_sigmas, settled_s = 0, -1, p.allowance, p.model_sigmas, p.settled_s
+    count, one = 0, -1
     for i in range(surprise.shape[0]):
-        limit, r = model_sigmas + allowance[i] * np.sqrt(J[i, i]), readings[i]
-        judged = r.state == USED and r.since_s >= settled_s
+        limit = p.model_sigmas + p.allowance[i] * np.sqrt(J[i, i])
+        judged = readings[i].state == USED and readings[i].since_s >= p.settled_s
         if judged and surprise[i] > limit * limit:
             count, one = count + 1, i
     return count, one
@@ -348,10 +351,10 @@ def count_suspects(readings: Any) -> int:  # noqa: ANN401 records
 @kernel
 def least_plausible(p: Plausibility, readings: Any, believed: Array, expected: Array, J: Array, only: int) -> int:  # noqa: ANN401
     """Return the reading with the largest residual of those that are too large, or -1; new ones are not judged."""
-    worst, largest, allowance, settled_s = -1, p.sigmas, p.allowance, p.settled_s
+    worst, largest = -1, p.sigmas
     for i in range(believed.shape[0]):
-        if np.isfinite(believed[i]) and readings[i].since_s >= settled_s and (only < 0 or only == i):
-            size = abs(residual_of(i, expected, J)) - allowance[i] * np.sqrt(J[i, i])
+        if np.isfinite(believed[i]) and readings[i].since_s >= p.settled_s and (only < 0 or only == i):
+            size = abs(residual_of(i, expected, J)) - p.allowance[i] * np.sqrt(J[i, i])
             if size > largest:
                 worst, largest = i, size
     return worst

@@ -14,7 +14,7 @@ from coldloop.registers.maps import MAPS
 from coldloop.registers.plant import StationAlarm, StationStatus
 from hmi.compression_station import plant_document
 from hmi.process_image import Model
-from hmi.reading import STATIC
+from hmi.assets import STATIC
 from hmi.signals import signals_of
 from tests.harness.waiting import eventually
 from tests.hmi.conftest import Served, Site, opened, record, write_registers

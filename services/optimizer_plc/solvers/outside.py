@@ -4,7 +4,7 @@ The entry point is a class without arguments that follows `OutsideMethod`; `docs
 """
 
 from collections.abc import Sequence
-from copy import copy
+from copy import deepcopy
 from typing import Protocol
 
 import numpy as np
@@ -61,7 +61,7 @@ class OutsideSolver:
         if not count:
             return guess, 0
         with in_its_name(Part.SOLVER, self.name):
-            point, done = self._method.solve(QuadraticProblem(*map(copy, problem)), guess.copy(), count)
+            point, done = self._method.solve(deepcopy(problem), guess.copy(), count)
             found = np.array(point, dtype=np.float64)
             done = max(0, min(int(done), count))
         if found.shape != guess.shape or not np.isfinite(found).all():
