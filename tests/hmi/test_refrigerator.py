@@ -12,9 +12,9 @@ import pytest
 from coldloop.process.signals import OUTPUT_NAMES, STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
 from coldloop.registers.maps import MAPS
 from coldloop.registers.plant import StationAlarm, StationStatus
+from hmi.assets import STATIC
 from hmi.compression_station import plant_document
 from hmi.process_image import Model
-from hmi.assets import STATIC
 from hmi.signals import signals_of
 from tests.harness.waiting import eventually
 from tests.hmi.conftest import Served, Site, opened, record, write_registers
