@@ -63,9 +63,9 @@ def export(folder: Path) -> Path:
 
 
 @pytest.fixture
-def program(export: Path) -> str:
+def program(export: Path) -> Path:
     """Its program."""
-    return exported_optimizer.exported_optimizer(f"export:{export}", settings())[0]
+    return Path(exported_optimizer.exported_optimizer(f"export:{export}", settings())[0])
 
 
 def assert_same(coldloop: Coldloop, export: Path, tmp_path: Path, *scenario: str) -> None:
@@ -97,7 +97,7 @@ def test_so_have_two_hours(coldloop: Coldloop, export: Path, tmp_path: Path, per
 @pytest.mark.usefixtures("realtime")
 @pytest.mark.parametrize("order", list(WordOrder))
 async def test_it_drives_in_either_word_order_and_drives_again_after_a_restart(
-    order: WordOrder, load_a: LoadProfile, on_the_bus: "OnTheBus", processes: Processes, program: str
+    order: WordOrder, load_a: LoadProfile, on_the_bus: "OnTheBus", processes: Processes, program: Path
 ) -> None:
     own = processes.free_port()
     async with on_the_bus(order=order, services=REQUIRED) as bus:
@@ -155,7 +155,7 @@ def test_it_is_kept_up_and_finds_a_control_plc_that_was_killed(
         assert cli.main(["down", "--port-base", str(base)]) == 0
 
 
-async def test_it_ends_with_the_program_that_has_started_it(processes: Processes, program: str) -> None:
+async def test_it_ends_with_the_program_that_has_started_it(processes: Processes, program: Path) -> None:
     started = await asyncio.create_subprocess_exec(
         program, "--listen", str(processes.free_port()), "--with-parent", stdin=asyncio.subprocess.PIPE
     )
@@ -256,8 +256,9 @@ def test_a_program_that_lies_in_an_export_is_not_executed(
 
 @pytest.mark.usefixtures("compiles")
 def test_without_a_compiler_or_libmodbus_one_line_says_what_to_install(
-    copy: Path, monkeypatch: pytest.MonkeyPatch
+    copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("COLDLOOP_CACHE_DIR", str(tmp_path / "nothing compiled"))
     if shutil.which("cc"):
         monkeypatch.setattr(exported_optimizer, "LIBRARY", "#include <modbus/there_is_no_such_header.h>\n")
         assert "libmodbus is not installed: on Debian, install libmodbus-dev" in refusal(copy)
