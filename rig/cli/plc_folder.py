@@ -243,14 +243,8 @@ def output_guard(target: str, settings: Settings) -> dict[str, str]:
     counts = {call: CallCost(**found._asdict()) for call, found in counted_guard(kernels, golden).items()}
     counts["judgement"] = counts["judgement"].model_copy(update={"worst": counted_longest(kernels)})
     cost = ExportCost(variables=len(INPUT_NAMES), operations=counts, bytes=export.sizes())
-    parts = (
-        {
-            name: of_guard(text)
-            for name, text in (*loading(target).items(), ("VERDICT", verdict_table(GuardText.outputs)))
-        }
-        if target != "c"
-        else {}
-    )
+    said = {} if target == "c" else {**loading(target), "VERDICT": verdict_table(GuardText.outputs)}
+    parts = {each: of_guard(text) for each, text in said.items()}
     texts[README] = filled(template(f"{name}/{GUARD}/readme.md"), {
         **parts, "COST": cost_text(cost), "GOLDEN": str(len(golden)), "ROWS": str(SEQUENCE_ROWS),
         "FILES": ", ".join(f"`{each}`" for each in texts),

@@ -67,8 +67,4 @@ def over_best_fixed(costs: NDArray[np.float64]) -> tuple[int, Interval]:
 
 def pays(ratio: Interval) -> str:
     """Return whether it does, in words; of costs, those of the adaptive period over others."""
-    if np.isnan(ratio.low):
-        return "one load has no interval; name several"
-    if ratio.high < 1.0:
-        return "it pays"
-    return "it does not pay" if ratio.low > 1.0 else "no difference is shown"
+    return ratio.in_words("it pays", "it does not pay", "one load has no interval; name several")

@@ -28,6 +28,14 @@ class Interval(NamedTuple):
             return f"{self.value:.{digits}f}"
         return f"{self.value:.{digits}f} [{self.low:.{digits}f}, {self.high:.{digits}f}]"
 
+    def in_words(self, below: str, above: str, without: str) -> str:
+        """Return what it shows of a ratio: that it is below 1, above 1, neither, or that there is no interval."""
+        if np.isnan(self.low):
+            return without
+        if self.high < 1.0:
+            return below
+        return above if self.low > 1.0 else "no difference is shown"
+
     def brief(self, digits: int = 3) -> str:
         """Write value and interval with so many significant digits."""
         value = f"{self.value:.{digits}g}" if np.isfinite(self.value) else "none"

@@ -79,11 +79,7 @@ def over_reference(costs: Array) -> list[Interval]:
 
 def in_words(ratio: Interval) -> str:
     """Return what an interval of a ratio of costs shows."""
-    if np.isnan(ratio.low):
-        return "one draw has no interval"
-    if ratio.high < 1.0:
-        return "costs less"
-    return "costs more" if ratio.low > 1.0 else "no difference is shown"
+    return ratio.in_words("costs less", "costs more", "one draw has no interval")
 
 
 def _run(load: Load, variant: Variant) -> RunRequest:
