@@ -21,6 +21,7 @@ from rig.live.link_cuts import CuttableLinks
 from rig.live.page_process import PageProcess
 from rig.live.private_folder import make_own_folder, make_private
 from rig.live.started_rigs import DEFAULT_PORTS, STATE_FILE, RunningRig
+from rig.runs.inputs import with_copied_load
 from rig.runs.running import make_scenario
 from rig.settings import Settings
 
@@ -69,7 +70,7 @@ class UpRig:
         """
         links = self._links
         services = LocalServices(
-            self._settings,
+            with_copied_load(self._settings, self._scenario.load, self.folder),
             make_private(self.folder / "logs"),
             ports=self._ports,
             detours=None if links is None else links.detours,

@@ -6,9 +6,12 @@ import shutil
 from pathlib import Path
 from typing import Any, Final
 
-from coldloop.process.load_profile import LoadProfile
+from coldloop.process.load_profile import LOAD_COLUMN, LoadProfile
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.signals import TICK_S
+from coldloop.table import TIME
 from coldloop.text_file import held_file, read_bytes
+from coldloop.whole_file import whole_text
 from plant.load import named_families
 from rig.settings import Settings
 
@@ -31,16 +34,27 @@ def copy_inputs(settings: Settings, profile: LoadProfile, folder: Path) -> dict[
     (folder / FOLDER).mkdir(exist_ok=True)
     name, model_file = settings.plant.load, settings.model.file
     load: dict[str, Any] = {"source": name, "file": None, "profile_sha256": profile_digest(profile)}
-    if Path(name).is_file() and named_families(name) is None:
-        load |= _copied(Path(name), folder, LOAD_COPY)
-    shipped = model_file == DEFAULT_MODEL_FILE
-    model = {"source": "shipped" if shipped else str(model_file), **_copied(model_file, folder, MODEL_COPY)}
+    if with_copied_load(settings, profile, folder) is not settings:
+        load |= {"file": LOAD_COPY, "sha256": file_digest(folder / LOAD_COPY)}
+    shutil.copyfile(model_file, folder / MODEL_COPY)
+    source = "shipped" if model_file == DEFAULT_MODEL_FILE else str(model_file)
+    model = {"source": source, "file": MODEL_COPY, "sha256": file_digest(folder / MODEL_COPY)}
     return {"load": load, "model": model}
 
 
-def _copied(source: Path, folder: Path, name: str) -> dict[str, str]:
-    shutil.copyfile(source, folder / name)
-    return {"file": name, "sha256": file_digest(folder / name)}
+def with_copied_load(settings: Settings, profile: LoadProfile, folder: Path) -> Settings:
+    """Return settings that name a copy of the load in the folder of a run; those of a named load as they are.
+
+    The copy is written from what was read: a pipe is read once, and a file may change meanwhile.
+    """
+    if named_families(settings.plant.load) is not None:
+        return settings
+    (folder / FOLDER).mkdir(exist_ok=True)
+    steps = zip(profile.times, profile.watts, strict=True)
+    rows = "".join(f"{tick * TICK_S!r},{watts!r}\n" for tick, watts in steps)
+    whole_text(folder / LOAD_COPY, f"{TIME},{LOAD_COLUMN}\n{rows}")
+    plant = settings.plant.model_copy(update={"load": str(folder / LOAD_COPY)})
+    return settings.model_copy(update={"plant": plant})
 
 
 def file_digest(path: Path) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from coldloop.errors import ColdloopError, ModelFileError
+from coldloop.errors import ColdloopError, ModelFileError, RunInterruptedError
 
 
 @contextmanager
@@ -17,8 +17,8 @@ def foreign(
     """
     try:
         yield
-    except kind:
+    except (kind, KeyboardInterrupt, RunInterruptedError):  # the last two are signals
         raise
-    except (Exception, SystemExit) as error:
+    except BaseException as error:
         reason = " ".join(said) or f"{type(error).__name__}: {error}".removesuffix(": ")
         raise kind(f"{what}: {' '.join(reason.split())}" + (f"; {instead}" if instead else "")) from error
