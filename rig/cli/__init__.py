@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from coldloop import __version__
@@ -79,11 +80,24 @@ OF_ANY_PROCESS: Final = ("periods", "compare")
 """Studies that are not."""
 
 
+USES: Final = {
+    "read": "a file, read",
+    "name": "a name, or a file, read",
+    "folder": "a folder, read",
+    "export": "a folder, whose sources are compiled and executed",
+    "write": "a file, written",
+    "into": "a folder, written into",
+}
+"""Types of options that are paths: what a command does with them."""
+
+
 class OneLineParser(argparse.ArgumentParser):
     """Reports a usage error as one line, and takes no abbreviations of options."""
 
     def __init__(self, *args: Any, **options: Any) -> None:  # noqa: ANN401 as argparse has them
         super().__init__(*args, **{"allow_abbrev": False, **options})
+        for use in USES:
+            self.register("type", use, str if use in ("name", "export") else Path)
 
     def error(self, message: str) -> NoReturn:
         """End with exit code 2."""

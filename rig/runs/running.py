@@ -6,8 +6,8 @@ from typing import Any
 
 from coldloop.errors import UsageError
 from coldloop.process.lti_model import load as load_model
-from coldloop.session.settings import TimeMode
 from coldloop.registers.plant import PlantSample
+from coldloop.session.settings import TimeMode
 from plant.load import find_load
 from rig.cosim.job import Job, StopRequest
 from rig.cosim.one_process import OneProcessRig

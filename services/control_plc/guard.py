@@ -17,7 +17,7 @@ class OutputGuard:
     """Keeps every output inside its bounds, its rate window and the slew limit, whatever is requested.
 
     Its time is that of the ticks, but never faster than the time that has really passed, and it does not go back: a
-    leap of the tick ends no window, and ticks that come again, after one back by `SET_BACK_TICKS` or less, do not count.
+    leap of the tick ends no window, and ticks that come again after a leap of `SET_BACK_TICKS` back do not count.
     """
 
     def __init__(self, limits: InputLimits, applied: SequenceRow) -> None:

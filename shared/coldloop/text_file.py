@@ -60,8 +60,7 @@ def _opened(path: str, flags: int) -> int:
     if path.startswith(HANDED_OVER):
         return os.open(path, flags)
     descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))  # not on Windows
-    mode = os.fstat(descriptor).st_mode
-    if stat.S_ISREG(mode) or stat.S_ISDIR(mode):  # a folder is what `open` refuses
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):
         return descriptor
     os.close(descriptor)
     raise OSError(errno.EINVAL, "not a regular file")
