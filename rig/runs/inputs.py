@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import shutil
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,6 +17,7 @@ from rig.settings import Settings
 FOLDER: Final = "inputs"
 LOAD_COPY: Final = f"{FOLDER}/load.csv"
 MODEL_COPY: Final = f"{FOLDER}/model.json"
+REFRIGERATOR_COPY: Final = f"{FOLDER}/refrigerator.json"
 RESTORE: Final = "the run cannot be repeated without it"
 
 
@@ -36,10 +36,18 @@ def copy_inputs(settings: Settings, profile: LoadProfile, folder: Path) -> dict[
     load: dict[str, Any] = {"source": name, "file": None, "profile_sha256": profile_digest(profile)}
     if with_copied_load(settings, profile, folder) is not settings:
         load |= {"file": LOAD_COPY, "sha256": file_digest(folder / LOAD_COPY)}
-    shutil.copyfile(model_file, folder / MODEL_COPY)
-    source = "shipped" if model_file == DEFAULT_MODEL_FILE else str(model_file)
-    model = {"source": source, "file": MODEL_COPY, "sha256": file_digest(folder / MODEL_COPY)}
-    return {"load": load, "model": model}
+    model = _copied(model_file, folder, MODEL_COPY)
+    if model_file == DEFAULT_MODEL_FILE:
+        model["source"] = "shipped"
+    rest = settings.plant.refrigerator.file
+    more = {} if rest is None else {"refrigerator": _copied(rest, folder, REFRIGERATOR_COPY)}
+    return {"load": load, "model": model, **more}
+
+
+def _copied(source: Path, folder: Path, name: str) -> dict[str, str]:
+    content = read_bytes(source, RESTORE)
+    (folder / name).write_bytes(content)
+    return {"source": str(source), "file": name, "sha256": hashlib.sha256(content).hexdigest()}
 
 
 def with_copied_load(settings: Settings, profile: LoadProfile, folder: Path) -> Settings:
@@ -81,7 +89,7 @@ def changed_inputs(manifest: dict[str, Any], folder: Path) -> list[str]:
     changed = [
         f"{folder / entry['file']}: is not the {name} that the run read"
         for name, entry in manifest["inputs"].items()
-        if entry["file"] is not None and file_digest(held_file(folder, entry["file"], RESTORE)) != entry.get("sha256")
+        if entry and entry["file"] is not None and file_digest(held_file(folder, entry["file"], RESTORE)) != entry.get("sha256")
     ]
     if configuration_digest(manifest["configuration"]) != manifest["hashes"]["configuration_sha256"]:
         changed.append(f"{folder / 'manifest.json'}: the configuration is not the one that the run had")

@@ -321,6 +321,15 @@ def test_a_manifest_names_files_of_its_folder_alone(place: str, coldloop: "Coldl
     assert "outside the folder that names it" in outcome.complaints[-1]
 
 
+def test_no_file_that_a_configuration_names_is_opened_outside_the_folder(coldloop: "Coldloop", mpc: Path) -> None:
+    manifest = json.loads((mpc / "manifest.json").read_text())
+    manifest["configuration"] |= {"plant.kind": "refrigerator", "plant.refrigerator.file": "/dev/zero"}
+    manifest["hashes"]["configuration_sha256"] = configuration_digest(manifest["configuration"])
+    (mpc / "manifest.json").write_text(json.dumps(manifest))
+    complaint = f"coldloop: {mpc / 'manifest.json'}: plant.refrigerator.file: the folder has no copy of it"
+    assert coldloop("rerun", mpc).complaints == [complaint]
+
+
 def test_what_a_manifest_says_is_printed_as_printable(coldloop: "Coldloop", runs: Path, mpc: Path) -> None:
     manifest = json.loads((mpc / "manifest.json").read_text())
     manifest["configuration"]["plant.\x1b[31m"] = "\x1b[2J"
