@@ -89,7 +89,9 @@ def changed_inputs(manifest: dict[str, Any], folder: Path) -> list[str]:
     changed = [
         f"{folder / entry['file']}: is not the {name} that the run read"
         for name, entry in manifest["inputs"].items()
-        if entry and entry["file"] is not None and file_digest(held_file(folder, entry["file"], RESTORE)) != entry.get("sha256")
+        if entry
+        and entry["file"] is not None
+        and file_digest(held_file(folder, entry["file"], RESTORE)) != entry.get("sha256")
     ]
     if configuration_digest(manifest["configuration"]) != manifest["hashes"]["configuration_sha256"]:
         changed.append(f"{folder / 'manifest.json'}: the configuration is not the one that the run had")
