@@ -31,7 +31,6 @@ class Interruption:
         self._before: dict[signal.Signals, object] = {}
         self._number = signal.SIGINT
         """The last one that was received."""
-        self._in_one_process = self._left_to_system = False
 
     def __enter__(self) -> Self:
         """Install the handler; outside the main thread nothing is changed."""
@@ -69,22 +68,18 @@ class Interruption:
             return
         before = signal.signal(signal.SIGALRM, self._raise)
         self._handle(signal.SIG_DFL)
-        self._in_one_process = True
         try:
             yield
         finally:
-            self._in_one_process = False
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             signal.signal(signal.SIGALRM, before)
             self.begun()
 
     def begun(self) -> None:
         """Take SIGTERM and SIGHUP back: there is something to keep, and compiling is over."""
-        if self._left_to_system:
-            self._handle(self._received)
+        self._handle(self._received)
 
     def _handle(self, handler: Callable[[int, FrameType | None], None] | signal.Handlers) -> None:
-        self._left_to_system = handler is signal.SIG_DFL
         for number in self._before.keys() - {signal.SIGINT}:
             signal.signal(number, handler)
 
@@ -97,7 +92,7 @@ class Interruption:
             end_at_once(number)
         self._number = signal.Signals(number)
         request(self._number)
-        if self._in_one_process:
+        if signal.getsignal(signal.SIGALRM) == self._raise:
             signal.setitimer(signal.ITIMER_REAL, LISTENS_S)
 
 

@@ -80,15 +80,8 @@ OF_ANY_PROCESS: Final = ("periods", "compare")
 """Studies that are not."""
 
 
-USES: Final = {
-    "read": "a file, read",
-    "name": "a name, or a file, read",
-    "folder": "a folder, read",
-    "export": "a folder, whose sources are compiled and executed",
-    "write": "a file, written",
-    "into": "a folder, written into",
-}
-"""Types of options that are paths: what a command does with them."""
+USES: Final = {"read": Path, "name": str, "folder": Path, "export": str, "write": Path, "into": Path}
+"""Types of options that are paths: a file or a folder to read, a name or a file, sources to run, or what is written."""
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -96,8 +89,8 @@ class OneLineParser(argparse.ArgumentParser):
 
     def __init__(self, *args: Any, **options: Any) -> None:  # noqa: ANN401 as argparse has them
         super().__init__(*args, **{"allow_abbrev": False, **options})
-        for use in USES:
-            self.register("type", use, str if use in ("name", "export") else Path)
+        for use, kind in USES.items():
+            self.register("type", use, kind)
 
     def error(self, message: str) -> NoReturn:
         """End with exit code 2."""

@@ -17,6 +17,7 @@ from rig.cli.register_listing import FORMATS
 from rig.plc_sizing.profile import PlcProfile
 from rig.process_file.declaration import ProcessFile
 from rig.settings import Settings
+from tests.harness.path_options import path_table
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -38,6 +39,10 @@ def test_the_pages_of_keys_are_what_the_commands_print(model: type[BaseModel], p
 
 def test_the_page_of_commands_is_what_the_parsers_say() -> None:
     assert (ROOT / "docs" / "commands.md").read_text(encoding="utf-8").endswith(command_listing())
+
+
+def test_the_table_of_paths_is_what_the_parsers_say() -> None:
+    assert path_table() in (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
 
 
 def test_the_map_from_the_paper_to_the_code_names_what_is_there() -> None:
