@@ -22,6 +22,8 @@ CLIENTS = {**{role.value: role.value for role in Role}, "reader": None}
 CONFIGURATION = "tls.toml"
 REVOCATIONS = "ca.crl"
 OURS = "name the folder of `coldloop certificates`"
+MADE = "name a certificate that `coldloop certificates` has made"
+KEY = "the key of the authority is needed to revoke"
 LOCAL = ("localhost", "127.0.0.1")
 OWNERS = {
     "plant.server.tls": "plant",
@@ -83,16 +85,16 @@ def revoke(out: Path, names: Sequence[str], days: int) -> tuple[int, Path]:
 
 def _certificate(file: Path) -> x509.Certificate:
     try:
-        return x509.load_pem_x509_certificate(read_bytes(file, OURS))
+        return x509.load_pem_x509_certificate(read_bytes(file, MADE))
     except ValueError as error:
-        raise UsageError(f"{file}: {error}; name a certificate that `coldloop certificates` has made") from None
+        raise UsageError(f"{file}: {error}; {MADE}") from None
 
 
 def _key(file: Path) -> ec.EllipticCurvePrivateKey:
     try:
-        key = load_pem_private_key(read_bytes(file, OURS), password=None)
+        key = load_pem_private_key(read_bytes(file, KEY), password=None)
     except (ValueError, TypeError) as error:
-        raise UsageError(f"{file}: {error}; the key of the authority is needed to revoke") from None
+        raise UsageError(f"{file}: {error}; {KEY}") from None
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise UsageError(f"{file}: not a key that `coldloop certificates` has made")
     return key

@@ -174,7 +174,7 @@ def _public_key_of(file: Path, what: str) -> PublicKeyTypes:
 
 def _contents(file: Path, what: str) -> bytes:
     try:
-        return read_bytes(file, "name a readable file, or make some with `coldloop certificates`", most=2**20)
+        return read_bytes(file, "name a readable file, or make some with `coldloop certificates`", most=2**24)
     except UsageError as error:
         raise ConfigurationError(f"{what} {error}") from None
 
