@@ -16,9 +16,8 @@ from rig.chaos.sequencer import FaultSequencer, Progress
 from rig.chaos.trace import ChaosTrace
 from rig.cosim.scenario import Scenario
 from rig.cosim.session_client import SessionClient
-from rig.cosim.wiring import START_PATIENCE_S
+from rig.cosim.wiring import START_PATIENCE_S, with_copied_load
 from rig.results.recording import Recorder
-from rig.runs.inputs import with_copied_load
 from rig.settings import Settings
 
 SLOWEST: Final = 20.0

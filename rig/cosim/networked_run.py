@@ -17,9 +17,9 @@ from rig.cosim.saved_session import restore_session, save_session
 from rig.cosim.scenario import Scenario
 from rig.cosim.session_client import SessionClient
 from rig.cosim.session_recording import SessionUnderWay, find_session, record_session
+from rig.cosim.wiring import with_copied_load
 from rig.results.recording import Recorder
 from rig.results.way import Way
-from rig.runs.inputs import with_copied_load
 from rig.settings import Settings
 
 ATTACH_PATIENCE_S: Final = 5.0

@@ -16,12 +16,11 @@ from coldloop.registers.plant import PLANT_MAP, Measurement
 from rig.cosim.kept_up import keep_up, say
 from rig.cosim.local_services import KeptService, LocalServices
 from rig.cosim.session_client import SessionClient
-from rig.cosim.wiring import RETAINING, SERVICES, START_PATIENCE_S, retaining
+from rig.cosim.wiring import RETAINING, SERVICES, START_PATIENCE_S, retaining, with_copied_load
 from rig.live.link_cuts import CuttableLinks
 from rig.live.page_process import PageProcess
 from rig.live.private_folder import make_own_folder, make_private
 from rig.live.started_rigs import DEFAULT_PORTS, STATE_FILE, RunningRig
-from rig.runs.inputs import with_copied_load
 from rig.runs.running import make_scenario
 from rig.settings import Settings
 

@@ -5,19 +5,14 @@ import json
 from pathlib import Path
 from typing import Any, Final
 
-from coldloop.process.load_profile import LOAD_COLUMN, LoadProfile
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
-from coldloop.process.signals import TICK_S
-from coldloop.table import TIME
 from coldloop.text_file import held_file, read_bytes
-from coldloop.whole_file import whole_text
-from plant.load import named_families
+from rig.cosim.wiring import INPUTS, LOAD_COPY, with_copied_load
 from rig.settings import Settings
 
-FOLDER: Final = "inputs"
-LOAD_COPY: Final = f"{FOLDER}/load.csv"
-MODEL_COPY: Final = f"{FOLDER}/model.json"
-REFRIGERATOR_COPY: Final = f"{FOLDER}/refrigerator.json"
+MODEL_COPY: Final = f"{INPUTS}/model.json"
+REFRIGERATOR_COPY: Final = f"{INPUTS}/refrigerator.json"
 RESTORE: Final = "the run cannot be repeated without it"
 
 
@@ -31,7 +26,7 @@ def copy_inputs(settings: Settings, profile: LoadProfile, folder: Path) -> dict[
 
     A load that has a name is described by the digest of its steps, the model that is shipped by its own digest.
     """
-    (folder / FOLDER).mkdir(exist_ok=True)
+    (folder / INPUTS).mkdir(exist_ok=True)
     name, model_file = settings.plant.load, settings.model.file
     load: dict[str, Any] = {"source": name, "file": None, "profile_sha256": profile_digest(profile)}
     if with_copied_load(settings, profile, folder) is not settings:
@@ -48,21 +43,6 @@ def _copied(source: Path, folder: Path, name: str) -> dict[str, str]:
     content = read_bytes(source, RESTORE)
     (folder / name).write_bytes(content)
     return {"source": str(source), "file": name, "sha256": hashlib.sha256(content).hexdigest()}
-
-
-def with_copied_load(settings: Settings, profile: LoadProfile, folder: Path) -> Settings:
-    """Return settings that name a copy of the load in the folder of a run; those of a named load as they are.
-
-    The copy is written from what was read: a pipe is read once, and a file may change meanwhile.
-    """
-    if named_families(settings.plant.load) is not None:
-        return settings
-    (folder / FOLDER).mkdir(exist_ok=True)
-    steps = zip(profile.times, profile.watts, strict=True)
-    rows = "".join(f"{tick * TICK_S!r},{watts!r}\n" for tick, watts in steps)
-    whole_text(folder / LOAD_COPY, f"{TIME},{LOAD_COLUMN}\n{rows}")
-    plant = settings.plant.model_copy(update={"load": str(folder / LOAD_COPY)})
-    return settings.model_copy(update={"plant": plant})
 
 
 def file_digest(path: Path) -> str:
