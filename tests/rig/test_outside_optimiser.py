@@ -23,7 +23,8 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.process.signals import OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import MAGIC, Identity
-from coldloop.registers.control_plc import CONTROL_MAP, LadderStatus, Mode, Status, Verdict
+from coldloop.registers.control_plc import LadderStatus, Mode, Status, Verdict
+from coldloop.registers.maps import CONTROL_MAP
 from coldloop.registers.safety import LeaseState, LeaseStatus
 from rig import cli
 from rig.cosim.endpoints import REQUIRED
