@@ -25,7 +25,7 @@ from coldloop.process.signals import STATE_NAMES
 RealArray: TypeAlias = NDArray[np.float64]
 
 UNNAMED: dict[str, Any] = {
-    "plant": COLD_BOX, "note": "", "plant_parameters": {}, "plant_rest": {}, "process": {},
+    "plant": COLD_BOX, "note": "", "plant_parameters": {}, "plant_rest": {}, "process": {}, "declaration_digest": "",
 }  # fmt: skip
 """What a model file leaves out."""
 MATRICES = ("A", "B", "F", "C", "D", "G", "A_tick", "B_tick", "F_tick")
@@ -101,6 +101,8 @@ class LtiModel:
     """`coldloop.process.declaration.Process` as plain data; none is the cold box."""
     plant_rest: dict[str, Any] = field(default_factory=dict)
     """Where a refrigerator is at rest, and the gains of its pressure controller; none are those that are shipped."""
+    declaration_digest: str = ""
+    """SHA-256 of the process file that it was made from, and of the files that this names; empty: of none."""
 
     def __post_init__(self) -> None:
         n, m, p = len(self.state_names), len(self.input_names), len(self.output_names)
@@ -132,13 +134,13 @@ class LtiModel:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the content, in hexadecimal: the model's identity on the bus."""
+        """SHA-256 of the content, in hexadecimal: of each bit of the matrices."""
         return digest_of(self._document())
 
     @property
     def short_digest(self) -> int:
-        """The first 32 bits of the digest, as they stand in the registers."""
-        return short_digest_of(self.digest)
+        """What services compare: the first 32 bits of the declaration's digest, or of the model's where it has none."""
+        return short_digest_of(self.declaration_digest or self.digest)
 
     def save(self, path: Path) -> None:
         """Write the model as JSON with its digest; the file appears whole or not at all (OSError if it cannot)."""
