@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from coldloop.config import load_configuration
 from coldloop.process.load_profile import LOAD_COLUMN
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, TICK_S
+from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Mode, ProcessNow
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, UpdatingRuleStatus

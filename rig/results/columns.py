@@ -8,15 +8,8 @@ import pyarrow as pa
 
 from coldloop.process.load_profile import LOAD_COLUMN
 from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import (
-    OUTPUT_NAMES,
-    OUTPUT_UNITS,
-    STATE_NAMES,
-    STATE_UNITS,
-    STATION_SIGNAL_NAMES,
-    STATION_SIGNAL_UNITS,
-    TICK_UNIT,
-)
+from coldloop.process.signals import OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS, TICK_UNIT
+from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS
 from coldloop.registers.audit import Event
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP

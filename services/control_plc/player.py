@@ -7,7 +7,8 @@ Scans can be missed and time can leap, so everything here goes by ticks, never b
 from collections.abc import Sequence
 from enum import IntEnum
 
-from coldloop.process.signals import LAST_NUMBER, TICKS_PER_SAMPLE
+from coldloop.process.declaration import LAST_NUMBER
+from coldloop.process.signals import TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Acknowledgement, Plan, Update, Verdict
 from coldloop.safety.sequence import Inputs, InputSequence, checksum
 from control_plc.guard import OutputGuard

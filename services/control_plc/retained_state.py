@@ -10,7 +10,8 @@ from typing import Annotated, Any, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from coldloop.process.signals import INPUT_NAMES, LAST_NUMBER, LAST_TICK
+from coldloop.process.declaration import LAST_NUMBER, LAST_TICK
+from coldloop.process.signals import INPUT_NAMES
 from coldloop.registers.codec import check_record
 from coldloop.registers.common import SessionPace
 from coldloop.registers.control_plc import SEQUENCE_ROWS, CoolDownStep, Operator, SequenceHeader

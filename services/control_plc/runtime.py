@@ -17,8 +17,9 @@ from coldloop.config import selected
 from coldloop.errors import LinkError, PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
+from coldloop.process.declaration import LAST_TICK
 from coldloop.process.model_file import read_header
-from coldloop.process.signals import LAST_TICK, TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import SessionPace

@@ -10,7 +10,8 @@ from typing import Any, Final, NamedTuple, Protocol
 from aiohttp import web
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from coldloop.process.signals import STATION_VALVE_NAMES, TICK_S
+from coldloop.process.signals import TICK_S
+from coldloop.process.station import STATION_VALVE_NAMES
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, ProcessNow
 from coldloop.registers.maps import MAPS

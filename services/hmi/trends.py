@@ -8,7 +8,8 @@ from itertools import pairwise
 from typing import Final, NamedTuple
 
 from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, TICK_S
+from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.control_plc import Mode, ProcessNow
 from hmi.quality import SOUND, Doubts, Quality
 

@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.process.cold_box import L1, T1, T5
+from coldloop.process.cold_box import L1, OUTPUT_NAMES, T1, T5
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.control_plc import Cause, CoolDownStep, Mode, Operator, OperatorMode
 from control_plc.cool_down import CoolDown, CoolDownSettings
 from control_plc.ladder import Ladder, LadderInputs

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from coldloop.errors import DamagedAnswerError, LinkError, PeerUnreachableError, RequestRefusedError
+from coldloop.process.cold_box import TICK_S
 from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
-from coldloop.process.signals import TICK_S
 from coldloop.registers.bank import BusyError, Caller
 from coldloop.registers.control_plc import (
     Operator,

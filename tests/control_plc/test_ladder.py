@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.process.cold_box import L1, T5
+from coldloop.process.cold_box import INPUT_NAMES, L1, OUTPUT_NAMES, T5
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Heartbeat, Mode, Operator, OperatorMode, Update, Verdict
 from coldloop.registers.plant import Measurement

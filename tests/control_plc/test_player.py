@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from coldloop.process.declaration import LAST_NUMBER
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import LAST_NUMBER
 from coldloop.registers.control_plc import Mode, Plan, Update, Verdict
 from control_plc.guard import OutputGuard
 from control_plc.player import SequencePlayer

@@ -19,7 +19,7 @@ from coldloop.operating.commands import (
     duration_text,
 )
 from coldloop.operating.execution import lead_ticks
-from coldloop.process.signals import TICK_S
+from coldloop.process.cold_box import TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
 from coldloop.registers.plant import LoadAhead, LoadStatus

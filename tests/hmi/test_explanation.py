@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from coldloop.process.cold_box import T5
-from coldloop.process.signals import OUTPUT_NAMES
+from coldloop.process.cold_box import OUTPUT_NAMES, T5
 from coldloop.registers.codec import blank
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.maps import OPTIMIZER_MAP

@@ -10,7 +10,7 @@ import pytest
 
 from coldloop.errors import LinkError
 from coldloop.modbus.endpoints import Endpoint
-from coldloop.process.signals import OUTPUT_NAMES
+from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind, JournalPage
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Mode, Plan, ProcessNow

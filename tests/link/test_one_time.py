@@ -5,7 +5,7 @@ import contextlib
 from statistics import median
 from typing import TYPE_CHECKING
 
-from coldloop.process.signals import TICK_S
+from coldloop.process.cold_box import TICK_S
 from coldloop.registers.common import Identity
 from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Actuators

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.process.cold_box import T5
-from coldloop.process.signals import OUTPUT_NAMES
+from coldloop.process.cold_box import OUTPUT_NAMES, T5
 from coldloop.registers.common import Identity
 from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Measurement

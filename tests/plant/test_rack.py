@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.process.cold_box import L1, T5
-from coldloop.process.signals import LAST_TICK
+from coldloop.process.declaration import LAST_TICK
 from coldloop.registers.audit import EventKind
 from coldloop.registers.common import SessionPace
 from coldloop.registers.plant import (

@@ -6,8 +6,8 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from coldloop.process.declaration import LAST_TICK
 from coldloop.process.load_profile import LOAD_SPAN
-from coldloop.process.signals import LAST_TICK
 from coldloop.registers.codec import check_record
 from coldloop.registers.common import SessionPace
 from coldloop.registers.maps import PLANT_MAP

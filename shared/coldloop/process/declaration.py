@@ -15,6 +15,12 @@ from typing import Any, ClassVar, Final, Self, get_args, get_type_hints
 VARIABLE: Final = "COLDLOOP_PROCESS"
 """Of the environment: the model file that a program is loaded with."""
 
+LAST_TICK: Final = 2**32 - 2**16 - 1
+"""Last tick of a session, after 34 years: what is planned from there still fits a register."""
+
+LAST_NUMBER: Final = LAST_TICK
+"""Largest number of an update, or of a sequence."""
+
 Range = tuple[float, float]
 
 

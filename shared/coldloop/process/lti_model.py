@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import ModelFileError
-from coldloop.process.loaded import PROCESS
+from coldloop.process.cold_box import COLD_BOX as THE_COLD_BOX
+from coldloop.process.declaration import Process
 from coldloop.process.model_file import (
     COLD_BOX,
     FORMAT,
@@ -20,7 +21,6 @@ from coldloop.process.model_file import (
     short_digest_of,
     write_document,
 )
-from coldloop.process.signals import STATE_NAMES
 
 RealArray: TypeAlias = NDArray[np.float64]
 
@@ -138,6 +138,15 @@ class LtiModel:
         return digest_of(self._document())
 
     @property
+    def declared(self) -> Process:
+        """The process that the plant is.
+
+        Raises:
+            KeyError, TypeError, ValueError: The model says something else there.
+        """
+        return Process.of(self.process) if self.process else THE_COLD_BOX
+
+    @property
     def short_digest(self) -> int:
         """What services compare: the first 32 bits of the declaration's digest, or of the model's where it has none."""
         return short_digest_of(self.declaration_digest or self.digest)
@@ -200,9 +209,13 @@ def load(path: Path) -> LtiModel:
         model = LtiModel(**described, **arrays)
     except (KeyError, TypeError, ValueError) as error:
         raise ModelFileError(f"{path}: {error} in the model file; {REMEDY}") from error
-    if len(model.state_names) < len(STATE_NAMES):
+    try:
+        process = model.declared
+    except (KeyError, TypeError, ValueError) as error:
+        raise ModelFileError(f"{path}: process: {error}; {REMEDY}") from error
+    if len(model.state_names) < len(process.states):
         raise ModelFileError(
-            f"{path}: {len(model.state_names)} states in the model file, a {PROCESS.name} has {len(STATE_NAMES)}; "
+            f"{path}: {len(model.state_names)} states in the model file, a {process.name} has {len(process.states)}; "
             f"{REMEDY}"
         )
     return model

@@ -11,6 +11,8 @@ from typing import Any
 
 from coldloop.errors import ModelFileError
 from coldloop.parsing import parsed_json
+from coldloop.process.cold_box import COLD_BOX as THE_COLD_BOX
+from coldloop.process.declaration import Process
 from coldloop.text_file import read_bytes
 from coldloop.whole_file import whole_text
 
@@ -58,6 +60,15 @@ class ModelHeader:
     """Where a refrigerator is at rest, and the gains of its pressure controller; none are those that are shipped."""
     declaration_digest: str = ""
     """SHA-256 of the process file that it was made from, and of the files that this names; empty: of none."""
+
+    @property
+    def declared(self) -> Process:
+        """The process that the plant is.
+
+        Raises:
+            KeyError, TypeError, ValueError: The file says something else there.
+        """
+        return Process.of(self.process) if self.process else THE_COLD_BOX
 
     @property
     def short_digest(self) -> int:

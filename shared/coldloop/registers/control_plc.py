@@ -4,8 +4,7 @@ from enum import IntEnum
 from functools import cache
 from typing import Annotated, Final, NamedTuple
 
-from coldloop.process.declaration import Process
-from coldloop.process.signals import LAST_NUMBER, LAST_TICK
+from coldloop.process.declaration import LAST_NUMBER, LAST_TICK, Process
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK

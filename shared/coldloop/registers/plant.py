@@ -6,8 +6,8 @@ from functools import cache
 from itertools import accumulate, pairwise
 from typing import Annotated, Final, NamedTuple
 
-from coldloop.process.declaration import Process
-from coldloop.process.signals import LAST_TICK, STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, STATION_VALVE_NAMES
+from coldloop.process.declaration import LAST_TICK, Process
+from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, STATION_VALVE_NAMES
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
