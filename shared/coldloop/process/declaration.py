@@ -6,6 +6,7 @@ Needs the standard library only.
 """
 
 import json
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from functools import cached_property
@@ -132,6 +133,12 @@ class Load:
     """What operators call it; its name where this is empty."""
     bar: Range | None = None
     """Ends of its bar on the operator's page; its span where they are not given."""
+
+    @property
+    def stored_span(self) -> Range:
+        """Its span as registers have it, in single precision."""
+        low, high = struct.unpack("2f", struct.pack("2f", *self.span))
+        return low, high
 
 
 @dataclass(frozen=True, kw_only=True)
