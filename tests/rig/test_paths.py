@@ -31,7 +31,7 @@ LINES: Final = {
         f"import {EXAMPLES}/quadruple_tank_record.csv --inputs v1 v2 --out OUT", "identify RUN", "exergy",
         "study compare --load a --out OUT", "reproduce --quick", "config",
     )
-}  # fmt: skip
+} | {"export --plc": "export plc --target c --ticks 200 --out OUT"}  # fmt: skip
 """Of each command a line with what it needs besides the option; a positional argument is its second word."""
 OPTIONS: Final = [each for each in path_options() if each.name not in ("--config", "--tls") or each.command == ("run",)]
 
@@ -39,7 +39,7 @@ OPTIONS: Final = [each for each in path_options() if each.name not in ("--config
 def words(option: PathOption, path: Path, run: Path) -> list[str]:
     """Return a line of the command with this option."""
     places = {"RUN": str(run), "OUT": str(path.with_name("out")), "OUT.png": str(path.with_name("out.png"))}
-    line = [places.get(word, word) for word in LINES[option.command[0]].split()]
+    line = [places.get(word, word) for word in LINES.get(str(option), LINES[option.command[0]]).split()]
     value = f"export:{path}" if option.use == "export" else str(path)
     if not option.name.startswith("--"):
         line[len(option.command)] = value
