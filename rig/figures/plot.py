@@ -40,7 +40,7 @@ def with_unit(name: str, unit: str) -> str:
 
 LABELS: Final[Mapping[str, str]] = {
     **({LOAD_COLUMN: with_unit(LOAD_WORD, PROCESS.load.unit)} if PROCESS.has_load else {}),
-    **{one.name: with_unit(one.name, one.unit) for one in PROCESS.disturbances},
+    **{one.name: with_unit(one.name, one.unit) for one in PROCESS.measured_disturbances},
     **{name: with_unit(name, unit) for name, unit in {**BANDED, **MOVED}.items()},
     "tau_u_s": "tau_u (s)",
     "stage_cost": "stage cost (1)",

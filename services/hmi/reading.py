@@ -37,7 +37,7 @@ from hmi.trends import NAMES, STATION_NAMES
 
 POINTS: Final = 800
 MOST_POINTS: Final = 4000
-MOST_NAMES: Final = 8 + 1 + len(PROCESS.disturbances) + len(INPUT_NAMES) + len(BANDED_OUTPUTS) + len(STATION_NAMES)
+MOST_NAMES: Final = 9 + sum(map(len, (PROCESS.disturbances, INPUT_NAMES, BANDED_OUTPUTS, STATION_NAMES)))
 """Signals of one trend: what the page draws without being asked, and eight pens."""
 ROWS_AT_ONCE: Final = 500
 """Rows of a table that are made and sent at a time."""
