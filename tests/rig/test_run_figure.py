@@ -81,7 +81,7 @@ def test_the_updating_period_is_drawn_only_while_it_was_in_force() -> None:
 def test_studies_draw_periods_and_iterations_while_they_were_in_force() -> None:
     """From tick 6 on another mode drove, until the update at tick 9."""
     updates = {"tick": [0.0, 4.0, 9.0], "tau_u": [4.0, 2.0, 4.0], "iterations": [3.0, 1.0, 3.0]}
-    run = Outcome("", None, "", 0, updates, {})  # type: ignore[arg-type] no indicators are drawn
+    run = Outcome("", None, "", 0, updates, {})  # type: ignore[arg-type]
     place = dict(zip(("iterations", "tau_u"), Figure().subplots(2), strict=True))
     _updates(place, "run", run, "black")
     for name, scale in (("iterations", 1.0), ("tau_u", 0.25)):
