@@ -40,7 +40,7 @@ def with_unit(name: str, unit: str) -> str:
 
 LABELS: Final[Mapping[str, str]] = {
     **({LOAD_COLUMN: with_unit(LOAD_WORD, PROCESS.load.unit)} if PROCESS.has_load else {}),
-    **{one.name: with_unit(one.name, one.unit) for one in PROCESS.disturbances},
+    **{one.name: with_unit(one.name, one.unit) for one in PROCESS.measured_disturbances},
     **{name: with_unit(name, unit) for name, unit in {**BANDED, **MOVED}.items()},
     "tau_u_s": "tau_u (s)",
     "stage_cost": "stage cost (1)",
@@ -123,7 +123,7 @@ def draw_run(curves: RunCurves) -> Figure:
             legend_above(place)
             place.text(LABEL_AT, 1.03, f"({letter})", transform=place.transAxes, fontsize=8, ha="center")
             place.yaxis.set_label_coords(LABEL_AT, 0.5)
-            label_marks(place)
+        label_marks(figure)
         axes[-1].set_xlabel(f"plant time ({unit})")
         axes[-1].set_xlim(float(time[0]), float(time[-1]) if len(time) > 1 else float(time[0]) + 1)
         figure.suptitle(curves.title, y=0.99)
@@ -139,10 +139,11 @@ class MarkLabels(ScalarFormatter):
         return axis_labels(values)
 
 
-def label_marks(axes: Axes) -> None:
-    """Give the marks of the vertical axis their labels, if it is a linear one without words."""
-    if isinstance(axes.yaxis.get_major_formatter(), ScalarFormatter):
-        axes.yaxis.set_major_formatter(MarkLabels())
+def label_marks(figure: Figure) -> None:
+    """Give the marks of all linear axes without words their labels."""
+    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+        if isinstance(axis.get_major_formatter(), ScalarFormatter):
+            axis.set_major_formatter(MarkLabels())
 
 
 def time_unit(time_s: Series) -> tuple[float, str]:

@@ -11,10 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from coldloop.number_text import ends_text
 from coldloop.process.limits import InputLimits
 from coldloop.process.signals import TICK_S
 from coldloop.registers.plant import StationMode
-from rig.figures.plot import COLOURS, INK, LONGEST_TAU_U_S, STYLE, draw_tau_u, legend_above, limit
+from rig.figures.plot import COLOURS, INK, LONGEST_TAU_U_S, STYLE, draw_tau_u, label_marks, legend_above, limit
 from rig.studies.intervals import Interval
 from rig.studies.request import Outcome
 from rig.studies.study import StudyResult
@@ -29,6 +30,7 @@ def panels(
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, sharex="col" if sharex else False)
         yield figure, list(np.ravel(axes))
+        label_marks(figure)
 
 
 def legend_outside(figure: Figure, axes: Axes, columns: int = 4) -> None:
@@ -88,7 +90,7 @@ def time_panels(outcomes: Sequence[tuple[str, Outcome]], bands: Sequence[tuple[f
         edges = [*bands, *zip(limits.low, limits.high, strict=True)]
         for name, edge, what in zip(LIMITED, edges, ("band", "band", "bounds", "bounds", "bounds"), strict=True):
             together = np.concatenate([outcome.series(name) for _, outcome in outcomes])
-            limit(place[name], together, edge, f"{what} {edge[0]:g} to {edge[1]:g}")
+            limit(place[name], together, edge, f"{what} {ends_text(*edge)}")
         place["cost"].set_yscale("log")
         place["cost"].set_ylim(bottom=1e-4)
         for (name, label), letter in zip(shown, "abcdefghi", strict=False):
@@ -102,15 +104,18 @@ def time_panels(outcomes: Sequence[tuple[str, Outcome]], bands: Sequence[tuple[f
 
 
 def _updates(place: Mapping[str, Axes], label: str, outcome: Outcome, colour: str) -> None:
-    """Draw what changes at updating instants."""
-    start_s = outcome.column("tick") * TICK_S
-    place["iterations"].step(
-        start_s / 3600, outcome.column("iterations"), where="post", color=colour, linewidth=0.7, label=label
-    )
-    if "tau_u" in place and len(start_s) > 1:
-        time_s = np.arange(start_s[0], start_s[-1], TICK_S)
-        held = outcome.column("tau_u")[np.searchsorted(start_s, time_s, side="right") - 1]
-        draw_tau_u(place["tau_u"], time_s / 3600, held * TICK_S, time_s, colour, label)
+    """Draw what changes at updating instants, as long as it was in force: for an updating period at most."""
+    start = outcome.column("tick").astype(int)
+    if not len(start):
+        return
+    ticks = np.arange(start[0], start[-1] + 1)
+    update = np.searchsorted(start, ticks, side="right") - 1
+    in_force = ticks < start[update] + outcome.column("tau_u")[update]
+    tau_u, iterations = (np.where(in_force, outcome.column(name)[update], np.nan) for name in ("tau_u", "iterations"))
+    hours = ticks * TICK_S / 3600
+    place["iterations"].step(hours, iterations, where="post", color=colour, linewidth=0.7, label=label)
+    if "tau_u" in place:
+        draw_tau_u(place["tau_u"], hours, tau_u * TICK_S, ticks * TICK_S, colour, label)
         place["tau_u"].set_ylim(0, LONGEST_TAU_U_S + 0.3)
 
 
