@@ -50,7 +50,9 @@ def _asked(asked: str, pages: Mapping[str, Path]) -> str:
     text = pages[name].read_text(encoding="utf-8")
     if not section:
         return text
-    texts = (text, pages[evidence].read_text(encoding="utf-8")) if (evidence := f"evidence-{name}") in pages else (text,)
+    texts = (
+        (text, pages[evidence].read_text(encoding="utf-8")) if (evidence := f"evidence-{name}") in pages else (text,)
+    )
     if part := next(filter(None, (_section(each, section) for each in texts)), None):
         return part
     known = ", ".join(anchor(words) for *_, words in headings(text))
