@@ -219,6 +219,7 @@ class Reader:
             assert done.returncode == 0, (command, done.stdout[-2000:], done.stderr[-2000:])
             if words[0] == "mbpoll":
                 assert re.search(r"\[\d+\]: \t[\d.]+|Written 1 references", done.stdout), done.stdout
+            return done.stdout
         return ""
 
     def _started(self, words: list[str]) -> Process:

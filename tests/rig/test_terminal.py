@@ -28,7 +28,7 @@ def test_text_within_the_width_keeps_its_words(columns: int) -> None:
 
 def test_a_table_continues_below_its_first_column() -> None:
     assert "solver  periods\node          19\n" in fitted(TEXT, 45)
-    assert "           it leaves its band\n" in fitted(TEXT, 60), "a label keeps its text behind it"
+    assert "           leaves its band\n" in fitted(TEXT, 60), "a label keeps its text behind it"
 
 
 def test_text_for_a_file_is_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
