@@ -6,7 +6,7 @@ from pathlib import Path
 from sphinx.application import Sphinx
 
 HERE = Path(__file__).parent
-SECTION = re.compile(r"^## (.+)\n(.*?)(?=^## |\Z)", re.MULTILINE | re.DOTALL)
+SECTION = re.compile(r"^## ([^\n]+)\n(.*?)(?=^## |\Z)", re.MULTILINE | re.DOTALL)
 OUTSIDE = re.compile(r"\[([^\]]+)\]\(\.\./(?!images|[a-z-]+\.md)([^)#]+)[^)]*\)")
 """Links to files of the sources that are no pages."""
 
@@ -21,7 +21,7 @@ html_title = f"Coldloop {release}"
 html_show_sphinx = False
 html_show_copyright = False
 html_copy_source = False
-html_baseurl = ""
+html_show_search_summary = False  # they are fetched, which pages from files may not do
 
 
 def prepare(_app: Sphinx, page: str, source: list[str]) -> None:
