@@ -202,9 +202,12 @@ def hour_panels(
             draw(name, place)
             place.set_title(f"({Path(name).name})", loc="left")
             place.set_ylabel(label)
-            place.set_yscale("log")
-            place.set_yticks(ticks, map(str, ticks))
-            place.minorticks_off()
+            low, high = place.get_ylim()
+            if sum(low <= mark <= high for mark in ticks) > 1:  # else costs that are nearly the same: a linear axis
+                place.set_yscale("log")
+                place.set_yticks(ticks, map(str, ticks))
+                place.minorticks_off()
+                place.set_ylim(max(low, 0.8 * ticks[0]), high)
         legend_outside(figure, axes[0], columns)
         for place in axes[-beside:]:
             place.set_xlabel("updating period (s)")
