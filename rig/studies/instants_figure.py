@@ -41,5 +41,9 @@ def drawn(found: Sequence[Judged], names: Sequence[str]) -> Figure:
         loss.set_ylabel("loss: J_BF over the fullest (1)")
         iterations.set_ylabel(f"iterations in {SAMPLING_PERIOD_S:g} s (1)")
         iterations.set_xlabel("variables (1)")
+        iterations.set_xscale("log")  # the fullest set has several times the variables of the others
+        marks = [mark for mark in (10, 20, 50, 100, 200, 500) if sizes[0] <= mark <= sizes[-1]]
+        iterations.set_xticks(marks, map(str, marks))
+        iterations.minorticks_off()
         legend_outside(figure, loss)
     return figure
