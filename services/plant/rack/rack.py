@@ -8,9 +8,11 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
 
+from coldloop.process.declaration import LAST_TICK
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.range_bits import ModelRange
-from coldloop.process.signals import INPUT_NAMES, LAST_TICK, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, TICK_S
+from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import Caller
 from coldloop.registers.common import pace_subject

@@ -14,10 +14,10 @@ from coldloop.registers.bank import BusyError, Caller, IllegalValueError, Regist
 from coldloop.registers.common import Identity, ServiceState, SessionPace
 from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.declaration import Block
+from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import (
     HISTORY_ROWS,
     LOAD_ROWS,
-    PLANT_MAP,
     STATION_ROWS,
     Actuators,
     LiveLoad,
@@ -331,7 +331,7 @@ class RackRegisters:
     def _show_applied(self) -> None:
         """Put what is applied into the registers of the outputs; the seal keeps others from completing it by a part."""
         rack, outputs = self.rack, self.rack.outputs
-        self.bank.put_sealed(Actuators(rack.tick, *outputs.u, rack.session.number, outputs.holder, outputs.generation))
+        self.bank.put_sealed(Actuators(rack.tick, outputs.u, rack.session.number, outputs.holder, outputs.generation))
 
     def _note_lease(self, event: LeaseEvent, who: str) -> None:
         self.rack.journal.note(self.rack.tick, EventKind.LEASE, event, who=who)

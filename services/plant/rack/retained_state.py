@@ -6,10 +6,11 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from coldloop.process.declaration import LAST_TICK
 from coldloop.process.load_profile import LOAD_SPAN
-from coldloop.process.signals import LAST_TICK
 from coldloop.registers.codec import check_record
 from coldloop.registers.common import SessionPace
+from coldloop.registers.maps import PLANT_MAP
 from coldloop.safety.retained import RetainedFile, RetainedStateError
 from coldloop.session.time_base import TimeBase
 
@@ -44,7 +45,7 @@ class RetainedPlantState(BaseModel):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        check_record(SessionPace.shown(self.session, self.pace))
+        check_record(SessionPace.shown(self.session, self.pace), PLANT_MAP)
         tick = self.program.get("tick", 0)
         if not isinstance(tick, int) or not 0 <= tick <= LAST_TICK:
             raise ValueError(f"no session has a tick {tick!r}")
