@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from rig.figures.plot import COLOURS, DASHES
+from rig.figures.plot import COLOURS, DASHES, legend_above
 from rig.studies.drawing import panels
 
 PANELS = (
@@ -41,10 +41,10 @@ def main() -> None:
                 place.set_yscale("log")
                 place.set_ylim(logarithmic)
             place.set_ylabel(label)
-            place.legend(loc="upper right", ncols=len(names), fontsize=7)
+            legend_above(place)
         axes[-1].set_xlabel("plant time (h)")
         figure.align_ylabels(axes)
-        figure.savefig(options.figure, dpi=130)
+        figure.savefig(options.figure, dpi=260)
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ SHORTENED = {
     r"^(coldloop run(?!.*--attach|.*my_load).*)--duration \S+": r"\1--duration 10s",
     r"^coldloop chaos (kill|freeze)": r"coldloop chaos short_plan.toml",
     r"^(coldloop chaos .*)--duration \S+": r"\1--duration 20s",
-    r"^(coldloop --process .* run)": r"\1 --duration 10s",
+    r"^(coldloop --process \S+ run)": r"\1 --duration 10s",
     r"^scripts/run": r"scripts/run --duration 10s",
     r"^scripts/test\b": r"scripts/test --help",
 }
