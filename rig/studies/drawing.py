@@ -24,7 +24,6 @@ from rig.figures.plot import (
     STYLE,
     draw_tau_u,
     label_marks,
-    legend_above,
     limit,
 )
 from rig.studies.intervals import Interval
