@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 from coldloop.errors import UsageError
 from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.options import check_load, configuration, fixed_updating_period, positive_count
+from rig.terminal import fitted, width
 
 if TYPE_CHECKING:
     from optimizer_plc.qp.problem import PredictiveProblem
@@ -76,7 +77,7 @@ def execute(options: argparse.Namespace) -> int:
         raise UsageError("--load: says whether an adaptive period pays on a PLC; name one with --plc")
     if options.took and not options.export:
         raise UsageError("--took: is of an export's self-test; name its folder with --export")
-    sys.stdout.write(_shown(options))
+    sys.stdout.write(fitted(_shown(options), width()))
     return 0
 
 

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 from rig.cli.commands.options import positive_count
+from rig.terminal import fitted, width
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -49,5 +50,5 @@ def execute(options: argparse.Namespace) -> int:
             raise UsageError(f"{out}: {error.strerror}; name a file that can be written with --out") from None
         return f"{described(made)}written to {out}\n"
 
-    sys.stdout.write(text_of_child(options.file, work, options.limit))
+    sys.stdout.write(fitted(text_of_child(options.file, work, options.limit), width()))
     return 0
