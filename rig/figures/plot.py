@@ -19,13 +19,16 @@ from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, SAMPLING_PERIOD_S
 
 Series = NDArray[np.floating]
 
-INK, ACCENT, THIRD, BAND = "#1f3b57", "#c8553d", "#5b8e7d", "#b8c4ce"
-COLOURS: Final = (INK, ACCENT, THIRD, "#8a6fae", "#b08d2f", "#4d4d4d")
-"""Of curves that are drawn over each other."""
-MODE_COLOURS: Final = {"mpc": INK, "rest": "#7f9cb8", "hold": "#d9a441", "classical": ACCENT, "manual": THIRD}
+INK, ACCENT, THIRD, BAND = "#0072b2", "#d55e00", "#009e73", "#b8c4ce"
+COLOURS: Final = (INK, ACCENT, THIRD, "#cc79a7", "#e69f00", "#000000")
+"""Of curves that are drawn over each other (Okabe and Ito, which people with colour blindness tell apart)."""
+DASHES: Final = dict(zip(COLOURS, ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2))), strict=True))
+"""Of the same curves, where a page is printed without colours."""
+MODE_COLOURS: Final = {"mpc": INK, "rest": "#56b4e9", "hold": "#e69f00", "classical": ACCENT, "manual": THIRD}
 STYLE: Final[Any] = {
     "font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False, "axes.spines.right": False,
     "legend.frameon": False, "legend.fontsize": 8, "svg.hashsalt": "coldloop", "axes.formatter.useoffset": False,
+    "pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "none",  # text that journals take and editors find
 }  # fmt: skip
 BANDED: Final = {one.name: one.unit for one in PROCESS.banded}
 """Outputs that are drawn, those that have a band, and their units."""
