@@ -115,7 +115,7 @@ def _drawing(file: ProcessFile, folder: Path) -> str:
 
 
 def _process(file: ProcessFile, linear: Linearised) -> Process:
-    load = file.load
+    load, disturbances = file.load, {one.name for one in file.disturbances}
     return Process(
         name=file.name, tick_s=file.tick_s, ticks_per_sample=file.ticks_per_sample,
         inputs=tuple(
@@ -134,14 +134,10 @@ def _process(file: ProcessFile, linear: Linearised) -> Process:
         ),
         decision_instants=file.prediction.decision_instants,
         constraint_instants=file.prediction.constraint_instants,
-        constants=_constants(file, linear), disturbances=_measured(file),
+        constants=_constants(file, linear),
+        disturbances=tuple(one.name for one in file.outputs if one.edges is None and one.name in disturbances),
         iterations=iteration_shares(_sizes(file, len(linear.states))), bath=file.bath,
     )  # fmt: skip
-
-
-def _measured(file: ProcessFile) -> tuple[str, ...]:
-    named = {one.name for one in file.disturbances}
-    return tuple(one.name for one in file.outputs if one.name in named and one.edges is None)
 
 
 def _with_sensors(file: ProcessFile) -> ProcessFile:

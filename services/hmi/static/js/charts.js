@@ -175,8 +175,8 @@ function nameBand(u, { band, bandName }) {
   ctx.font = `${10 * size}px system-ui, sans-serif`; ctx.textAlign = "right";
   const write = (text, y) => {
     const right = bbox.left + bbox.width - 4 * size, width = ctx.measureText(text).width;
-    ctx.fillStyle = colour("panel"); ctx.fillRect(right - width - 2 * size, y - 9 * size, width + 4 * size, 12 * size);
-    ctx.fillStyle = colour("muted"); ctx.fillText(text, right, y);
+    ctx.globalAlpha = 0.6; ctx.fillStyle = colour("panel"); ctx.fillRect(right - width - 2 * size, y - 9 * size, width + 4 * size, 12 * size);
+    ctx.globalAlpha = 1; ctx.fillStyle = colour("muted"); ctx.fillText(text, right, y); // the curve is seen below it
   };
   if (high < bbox.top) write(`▲ ${name} to ${numberText(band[1], 7)}`, bbox.top + 11 * size);
   else if (bandName && low > bbox.top) write(name, high + 11 * size);
