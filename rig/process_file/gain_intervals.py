@@ -1,0 +1,42 @@
+"""Joint intervals of the gains that a record shows: by records drawn anew from its model and what that leaves of it."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from coldloop.process.lti_model import discretise
+from rig.process_file.identified import Identified, Record, identified, simulated
+
+Array = NDArray[np.float64]
+
+LEVEL: Final = 0.99
+"""Probability with which all gains are in their intervals."""
+DRAWS: Final = 30
+
+
+def gains_after(found: Identified, horizon_s: float) -> Array:
+    """Return what 1 of each input, held, does to the outputs after a horizon: shape (p, m)."""
+    result: Array = found.C @ discretise(found.A, found.B, np.zeros(len(found.A)), horizon_s).B
+    return result
+
+
+def half_widths(record: Record, found: Identified, horizon_s: float) -> Array:
+    """Return half the widths of the intervals of the gains, shape (p, m), jointly by Bonferroni's inequality.
+
+    In each draw what the model leaves of the record is shifted in time and has a random sign, which keeps how errors
+    follow one another and each other output's, and a model of the same order is identified.
+    """
+    y = simulated(found.A, found.B, found.C, np.zeros((len(found.C), found.B.shape[1])), record)
+    random = np.random.default_rng(1)
+    left = record.outputs - y
+    fewer = left.shape[0] - found.A.shape[0] * (1 + found.B.shape[1]) - 1
+    left *= np.sqrt(left.shape[0] / max(fewer, 1))
+    best, errors = gains_after(found, horizon_s), []
+    for _ in range(DRAWS):
+        noise = np.roll(left, random.integers(1, len(left)), axis=0) * random.choice([-1.0, 1.0])
+        errors.append(gains_after(identified(record._replace(outputs=y + noise), len(found.A)), horizon_s) - best)
+    quantile = stdtrit(DRAWS - 1, 1.0 - (1.0 - LEVEL) / (2 * best.size))
+    widths: Array = quantile * np.sqrt((np.array(errors) ** 2).mean(axis=0))
+    return widths
