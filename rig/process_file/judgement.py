@@ -179,7 +179,11 @@ def _inverse_responses(made: Made) -> list[str]:
     if (poles.real < -NOTHING).all():
         ends = m.D - m.C[:, :n] @ np.linalg.solve(made.own_A, m.B[:n])
     found = []
-    for i, j in ((m.output_names.index(one.name), j) for one in process.banded for j in range(len(m.input_names))):
+    seen = np.abs(moves).max(axis=0) * [one.high - one.low for one in process.inputs]
+    for one, j in ((one, j) for one in process.banded for j in range(len(m.input_names))):
+        i = m.output_names.index(one.name)
+        if seen[i, j] < one.noise:
+            continue
         share = moves[:, i, j] / (ends[i, j] or np.inf)
         far = np.flatnonzero(np.abs(share) > INVERSE)
         if far.size and share[far[0]] < 0.0:
