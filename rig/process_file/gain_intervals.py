@@ -15,7 +15,7 @@ LEVEL: Final = 0.99
 """Probability with which all gains are in their intervals."""
 DRAWS: Final = 30
 WIDER: Final = 1.35
-"""Factor for what draws from a fitted model lack: it follows slow noise. Found over 200 draws of noise of known plants."""
+"""Factor for slow noise, which a fitted model follows and its draws lack: found over 200 records of a known plant."""
 
 
 def gains_after(found: Identified, horizon_s: float) -> Array:
