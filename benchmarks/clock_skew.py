@@ -10,7 +10,8 @@ from typing import NamedTuple
 from coldloop.config import load_configuration
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.signals import TICK_S
-from coldloop.registers.control_plc import CONTROL_MAP, PlantLinkState, PlantLinkStatus, Status
+from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus, Status
+from coldloop.registers.maps import CONTROL_MAP
 from coldloop.service.start import run_event_loop
 from plant.load import find_load
 from plant.own_model import own_header

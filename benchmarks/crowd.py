@@ -22,8 +22,8 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.signals import TICK_S
 from coldloop.registers.common import ServerStatistics
-from coldloop.registers.control_plc import CONTROL_MAP, Process
-from coldloop.registers.plant import PLANT_MAP
+from coldloop.registers.control_plc import ProcessNow
+from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
 from coldloop.registers.safety import WatchdogStatus
 from plant.load import find_load
 from rig.cosim.local_services import LocalServices
@@ -34,7 +34,7 @@ from rig.settings import Settings
 
 OURS = 4
 """Connections of the optimiser and of the rig, and one to spare for the look at the statistics."""
-BLOCK = CONTROL_MAP.block_of(Process)
+BLOCK = CONTROL_MAP.block_of(ProcessNow)
 POLL = struct.pack(">HHHBBHH", 1, 0, 6, 1, 3, BLOCK.address, BLOCK.end - BLOCK.address)
 ANSWER_BYTES = 9 + 2 * (BLOCK.end - BLOCK.address)
 OURSELVES, STRANGER = "127.0.0.1", "127.0.0.2"
@@ -115,7 +115,7 @@ async def measure(options: argparse.Namespace, clients: int, logs: Path) -> tupl
     return recorder.link, met
 
 
-async def start_crowd(options: argparse.Namespace, port: int) -> asyncio.subprocess.Process:
+async def start_crowd(options: argparse.Namespace, port: int) -> asyncio.subprocess.ProcessNow:
     """Start the crowd as a separate process; it ends before the run does."""
     arguments = [
         sys.executable, __file__, "--port", str(port), "--clients", str(options.clients), "--rate", str(options.rate),

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.lti_model import load
-from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
+from coldloop.registers.maps import PLANT_MAP
+from coldloop.registers.plant import Actuators, Measurement
 from coldloop.service.start import run_event_loop
 from plant.load import find_load
 from rig.cosim.local_services import LocalServices
@@ -22,7 +23,7 @@ async def bare_exchanges(port: int, count: int) -> float:
     """Return exchanges a second with a rack that answers without moving: they are of another session than its own."""
     client = RegisterClient(PLANT_MAP, host="127.0.0.1", port=port, timeout_s=5.0)
     await client.connect(10.0)
-    nothing = Actuators(0, 43.0, 75.0, 36.0, session=0xFFFF_FFFF)
+    nothing = Actuators(0, (43.0, 75.0, 36.0), session=0xFFFF_FFFF)
     start = time.perf_counter()
     for _ in range(count):
         await client.exchange(nothing, Measurement)

@@ -28,7 +28,9 @@ def save_wrong_model(right: Path, wrong: Path) -> None:
     """Write the model of the same plant with its inputs moved by `MOVED_INPUTS`; of another process with less gain."""
     model, helium = load(right), load_helium()
     if model.process:
-        replace(model, B=GAIN * model.B, D=GAIN * model.D, B_tick=GAIN * model.B_tick).save(wrong)
+        replace(model, B=GAIN * model.B, D=GAIN * model.D, B_tick=GAIN * model.B_tick, declaration_digest="").save(
+            wrong
+        )
         return
     box = box_of(model)
     rest = find_equilibrium(model.u0 + np.array(MOVED_INPUTS), float(model.y0[L1]), box, helium)

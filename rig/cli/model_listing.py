@@ -9,7 +9,7 @@ from coldloop.errors import ModelFileError, printable
 from coldloop.process.cold_box import L1, T5
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel, load
-from coldloop.process.signals import STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
+from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
 from optimizer_plc.qp.design import ControlDesign
 from plant.cold_box.capacity import LOOP_MARGIN, held_loads
 from plant.cold_box.diagnosis import operating_point

@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 
 from coldloop.modbus.requests import MAX_READ_WORDS
 from coldloop.registers.control_plc import Operator
-from coldloop.registers.declaration import Block, Kind, Register, RegisterMap, fields_of
+from coldloop.registers.declaration import Block, Kind, Register, RegisterMap
 from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.service.event_text import alarm_word
 from rig.cli.commands.options import HostPort
@@ -57,7 +57,7 @@ def _named(register_map: RegisterMap) -> Iterator[Tag]:
 
 
 def _tags(block: Block, row: int, prefix: str) -> Iterator[Tag]:
-    texts = {name for name, field in fields_of(block.record).items() if field.is_text}
+    texts = {name for name, field in block.fields.items() if field.is_text}
     for register in block.registers(row):
         if register.name.partition(".")[0] not in texts:
             yield Tag(_NOT_IN_NAMES.sub("_", f"{prefix}_{register.name}"), block.name, register)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from coldloop.process.lti_model import load
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import SequenceRow
+from coldloop.registers.maps import CONTROL_MAP
 from coldloop.registers.plant import PlantSample
 from control_plc.guard import OutputGuard
 from optimizer_plc.computing_settings import EstimatorKind
@@ -58,7 +59,7 @@ def run_ideal_loop(
     estimator, belief = estimator_of(prediction, kalman), no_belief(prediction.n_states)
     solver = DaqpSolver(program.daqp)
     plant = plant_maker(header, settings.plant)(scenario.load, scenario.seed)
-    applied = as_transmitted(SequenceRow(*model.u0.tolist()))
+    applied = as_transmitted(SequenceRow(tuple(model.u0.tolist())), CONTROL_MAP).u
     guard = OutputGuard(settings.limits, applied)
     z = problem.hold(np.zeros(len(applied)))
     recorder.begin()
@@ -74,11 +75,11 @@ def run_ideal_loop(
             z = solver.solve(qp, guess, (1,)).z
             if solved is not None:
                 solved(qp, guess, z)
-            wanted = SequenceRow(*problem.inputs(z, 1)[0].tolist())
+            wanted = tuple(problem.inputs(z, 1)[0].tolist())
         applied = guard.admit(tick, wanted, update=instant)
         if instant:
             begin_prediction(belief)
             predict(estimator, belief, np.array(applied) - model.u0, ticks)
         plant.apply(applied)
-        recorder.sample(PlantSample(tick, watts, tuple(applied), y, x))
+        recorder.sample(PlantSample(tick, watts, applied, y, x))
         plant.advance()

@@ -10,8 +10,9 @@ from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import load as load_model
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Update, Verdict
+from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.plant import LoadStep, Measurement, PlantSample, StationSample, inputs_of
+from coldloop.registers.plant import LoadStep, Measurement, PlantSample, StationSample
 from control_plc.program import ControlProgram
 from control_plc.program import make_program as make_control_program
 from optimizer_plc.program import OptimizerProgram
@@ -58,24 +59,26 @@ class Programs(NamedTuple):
             self.control.optimizer_seen()  # an optimiser that idles goes on to send heartbeats
         update = self._scan(listener)
         if update is not None:
-            self.control.accept_plan(as_transmitted(self.optimizer.plan(as_transmitted(update))))
+            self.control.accept_plan(
+                as_transmitted(self.optimizer.plan(as_transmitted(update, CONTROL_MAP)), CONTROL_MAP)
+            )
 
     def _deliver(self, listener: Listener) -> None:
         sequence = self.optimizer.solve()
         answer = self.control.offer(sequence)
         self.optimizer.answered(late=False)
-        listener.update(as_transmitted(self.optimizer.report(Verdict(answer.verdict))))
+        listener.update(as_transmitted(self.optimizer.report(Verdict(answer.verdict)), OPTIMIZER_MAP))
 
     def _scan(self, listener: Listener) -> Update | None:
         plant = self.plant
-        actuators = as_transmitted(self.control.begin_scan())
-        u = inputs_of(actuators)
+        actuators = as_transmitted(self.control.begin_scan(), PLANT_MAP)
+        u = actuators.u
         plant.apply(u)
         measurement = as_transmitted(
-            Measurement(plant.tick, plant.load, plant.measure(), plant.state, actuators.session)
+            Measurement(plant.tick, plant.load, plant.measure(), plant.state, actuators.session, u), PLANT_MAP
         )
         if plant.station is not None:
-            listener.station(as_transmitted(plant.station))
+            listener.station(as_transmitted(plant.station, PLANT_MAP))
         listener.sample(PlantSample(plant.tick, measurement.load, u, measurement.y, measurement.x))
         plant.advance()
         return self.control.end_scan(measurement)
@@ -87,7 +90,7 @@ def load_table(load: LoadProfile) -> LoadProfile:
     Raises:
         LoadFileError: The table does not take it.
     """
-    steps = [as_transmitted(LoadStep(*step)) for step in zip(load.times, load.watts, strict=True)]
+    steps = [as_transmitted(LoadStep(*step), PLANT_MAP) for step in zip(load.times, load.watts, strict=True)]
     low, high = LOAD_SPAN
     if not all(low <= step.watts <= high for step in steps):
         raise LoadFileError(f"a load is outside {low:g} to {high:g} {LOAD_UNIT}")

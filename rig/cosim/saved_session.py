@@ -10,6 +10,7 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Operator, OperatorMode
+from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import LOAD_ROWS, LiveLoad, LoadStatus, LoadStep, PlantSession
 from coldloop.registers.seal import sealed
 from rig.cosim.session_client import SessionClient
@@ -69,7 +70,7 @@ async def restore_session(rig: SessionClient, saved: SavedSession | None, sessio
         if saved.operator.mode != OperatorMode.AUTO:
             await rig.control.write(saved.operator)
         tick = (await rig.plant.read(Identity)).tick
-        await rig.plant.write(sealed(LiveLoad(0, saved.load.watts[0])))
+        await rig.plant.write(sealed(LiveLoad(0, saved.load.watts[0]), PLANT_MAP))
         coming = LoadProfile(saved.load.times, saved.load.watts)
         await LoadStream(rig.plant, session, coming, begin=tick + lead_ticks(saved.pace)).feed(tick)
     except LinkError as error:

@@ -14,9 +14,10 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.operating.load_stream import LoadStream, write_table
 from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Grant, LadderStatus, Mode, Status
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
-from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, STATION_ROWS, PlantSession
+from coldloop.registers.control_plc import ControlSession, Grant, LadderStatus, Mode, Status
+from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
+from coldloop.registers.optimizer_plc import OptimizerSession
+from coldloop.registers.plant import HISTORY_ROWS, STATION_ROWS, PlantSession
 from plant.own_model import own_header
 from rig.cosim.answer_time import QUIET_S
 from rig.cosim.endpoints import RigEndpoints

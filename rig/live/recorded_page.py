@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from coldloop.config import load_configuration
 from coldloop.process.load_profile import LOAD_COLUMN
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, TICK_S
+from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.audit import EventKind
-from coldloop.registers.control_plc import Cause, Mode, Process
-from coldloop.registers.declaration import fields_of
+from coldloop.registers.control_plc import Cause, Mode, ProcessNow
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, UpdatingRuleStatus
 from coldloop.registers.plant import SensorFaultKind, StationSample
 from coldloop.registers.safety import Alarm
@@ -115,7 +115,7 @@ class RecordedPage:
         cause = _CAUSES.get(self._causes[tick], int(Cause.NONE))
         suspect, faulty = self._doubts[max(0, bisect_right(self._doubts, tick, key=lambda one: one[0]) - 1)][1:]
         doubts = Doubts(suspect, bad=self._bad_sensors[tick], simulated=faulty)
-        return ReplayFrame(Process(tick, load, u, y), mode, cause, self._since[tick], doubts, self._station_at(tick))
+        return ReplayFrame(ProcessNow(tick, load, u, y), mode, cause, self._since[tick], doubts, self._station_at(tick))
 
     @cached_property
     def _doubts(self) -> list[tuple[int, int, int]]:
@@ -161,7 +161,7 @@ def _bits(names: str) -> int:
 
 
 def _optimization(row: Mapping[str, Any]) -> Optimization:
-    names = [name for name in fields_of(Optimization) if name != "tau_u"]
+    names = [name for name in Optimization._fields if name != "tau_u"]
     values: dict[str, Any] = {name: 0.0 if row[name] is None else row[name] for name in names}
     return Optimization(**values, tau_u=round(row["tau_u_s"] / TICK_S))
 

@@ -12,7 +12,7 @@ from coldloop.process.load_profile import LOAD_UNIT
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import CONTROLLED, OUTPUT_NAMES, OUTPUT_UNITS, TICK_S
 from coldloop.registers.common import Identity, SessionPace
-from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode, Process
+from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode, ProcessNow
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmState
@@ -90,7 +90,7 @@ async def _control(client: CommandClient) -> ControlStatus:
     rows = await client.read_rows(Alarm, 0, len(AlarmKind))
     alarms = tuple(_alarm(kind, row) for kind, row in zip(AlarmKind, rows, strict=True) if row.state not in QUIET)
     return ControlStatus(
-        await client.read(LadderStatus), await client.read(Operator), (await client.read(Process)).y, alarms
+        await client.read(LadderStatus), await client.read(Operator), (await client.read(ProcessNow)).y, alarms
     )
 
 

@@ -12,7 +12,8 @@ from coldloop.process.loaded import FILE as PROCESS_FILE
 from coldloop.process.loaded import PROCESS
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus
-from coldloop.registers.plant import PLANT_MAP, Measurement
+from coldloop.registers.maps import PLANT_MAP
+from coldloop.registers.plant import Measurement
 from rig.cosim.kept_up import keep_up, say
 from rig.cosim.local_services import KeptService, LocalServices
 from rig.cosim.session_client import SessionClient

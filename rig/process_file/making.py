@@ -1,5 +1,7 @@
 """A process file made into a model file: the linear model, and the process as programs are loaded with it."""
 
+import hashlib
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 from coldloop.errors import UsageError
 from coldloop.process.declaration import NO_LOAD, Band, Input, Load, Loop, Output, Process, State
 from coldloop.process.lti_model import LtiModel, discretise
+from plant.own.maker import file_digest
 from rig.plc_sizing.problem_sizes import ProblemSizes, iteration_shares
 from rig.process_file.bath import check_bath
 from rig.process_file.courses import courses_of, forecasts_of
@@ -18,6 +21,7 @@ from rig.process_file.fmu_model import with_units
 from rig.process_file.linear_model import Linearised
 from rig.process_file.linearised import linearised
 from rig.process_file.mimic import drawing_of
+from rig.process_file.source import installed_source
 
 Array = NDArray[np.float64]
 
@@ -76,10 +80,31 @@ def made_from(path: Path) -> Made:
         output_units=tuple(one.unit for one in process.outputs),
         load_name=process.load.name, load_unit=process.load.unit, parameters_digest=linear.digest, plant=linear.kind,
         note=f"made from {path.name}", plant_parameters=linear.parameters | played, process=process.document(),
+        declaration_digest=declaration_digest(read_process_file(path), path.parent),
     )  # fmt: skip
     if process.bath is not None:
         check_bath(file, model, process.bath)
     return Made(model, process, linear, len(file.disturbances))
+
+
+def declaration_digest(file: ProcessFile, folder: Path) -> str:
+    """Return the SHA-256 of what a process file says, and of all files that it names: the same on all machines.
+
+    The matrices that are made from it may differ in their last bits by the versions of Python and NumPy.
+    """
+    named: dict[str, str] = {}
+
+    def look(value: object) -> None:
+        for each in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+            look(each)
+        if isinstance(value, str) and value and (place := folder / value.partition(":")[0]).is_file():
+            named[place.name] = file_digest(place)
+
+    said = file.model_dump(mode="json")
+    look(said)
+    if file.plant.installed:
+        named[file.plant.installed] = hashlib.sha256(installed_source(file.plant.installed)[0].encode()).hexdigest()
+    return hashlib.sha256(json.dumps([said, named], sort_keys=True).encode()).hexdigest()
 
 
 def _drawing(file: ProcessFile, folder: Path) -> str:

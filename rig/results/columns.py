@@ -8,21 +8,13 @@ import pyarrow as pa
 
 from coldloop.process.load_profile import LOAD_COLUMN
 from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import (
-    INPUT_NAMES,
-    OUTPUT_NAMES,
-    OUTPUT_UNITS,
-    STATE_NAMES,
-    STATE_UNITS,
-    STATION_SIGNAL_NAMES,
-    STATION_SIGNAL_UNITS,
-    TICK_UNIT,
-)
+from coldloop.process.signals import OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS, TICK_UNIT
+from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS
 from coldloop.registers.audit import Event
 from coldloop.registers.control_plc import Verdict
-from coldloop.registers.declaration import fields_of
+from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.plant import Actuators, ModelRangeStatus, PlantSample, StationMode, StationSample, inputs_of
+from coldloop.registers.plant import ModelRangeStatus, PlantSample, StationMode, StationSample
 from rig.results.driving import SHOWN
 
 FORMAT: Final = 2
@@ -48,16 +40,20 @@ class Column(NamedTuple):
 _TICK: Final = Column("tick", pa.int64(), "1", f"Tick since the start of the session, of {TICK_UNIT}")
 _TIME: Final = Column("time_s", pa.float64(), "s", "Plant time since the start of the session")
 _TAU_U: Final = Column("tau_u_s", pa.float64(), "s", "Updating period t_{i+1} - t_i")
-_UPDATE: Final = fields_of(Optimization)
-_EVENT: Final = fields_of(Event)
+_UPDATE: Final = OPTIMIZER_MAP.block_of(Optimization).fields
+_EVENT: Final = CONTROL_MAP.block_of(Event).fields
 
-MODEL_RANGE_COLUMN: Final = Column("model_range", pa.int32(), "1", fields_of(ModelRangeStatus)["outside"].description)
+MODEL_RANGE_COLUMN: Final = Column(
+    "model_range", pa.int32(), "1", PLANT_MAP.block_of(ModelRangeStatus).fields["outside"].description
+)
 
 PHYSICAL_COLUMNS: Final = (
-    Column(LOAD_COLUMN, pa.float32(), PROCESS.load.unit or "1", fields_of(PlantSample)["load"].description),
+    Column(
+        LOAD_COLUMN, pa.float32(), PROCESS.load.unit or "1", PLANT_MAP.block_of(PlantSample).fields["load"].description
+    ),
     *(
-        Column(name, pa.float32(), field.unit, f"{field.description}; applied from this tick on")
-        for name, field in zip(INPUT_NAMES, inputs_of(tuple(fields_of(Actuators).values())), strict=True)
+        Column(one.name, pa.float32(), one.unit, f"{one.description}; applied from this tick on")
+        for one in PROCESS.inputs
     ),
     *(
         Column(name, pa.float32(), unit, f"Output {name}: with the noise of its sensor, without a sensor fault")
@@ -136,15 +132,16 @@ FILES: Final = {
     "events.parquet": ("One row an event of the journals: modes, alarms, commands", EVENTS),
 }
 
+_STATION: Final = PLANT_MAP.block_of(StationSample).fields
 STATION: Final = (
     _TICK,
     _TIME,
     *(
-        Column(name, pa.float32(), unit, fields_of(StationSample)["signals"].description)
+        Column(name, pa.float32(), unit, _STATION["signals"].description)
         for name, unit in zip(STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, strict=True)
     ),
-    Column("mode", pa.int32(), "1", fields_of(StationSample)["mode"].description, StationMode),
-    Column("alarms", pa.int32(), "1", fields_of(StationSample)["alarms"].description),
+    Column("mode", pa.int32(), "1", _STATION["mode"].description, StationMode),
+    Column("alarms", pa.int32(), "1", _STATION["alarms"].description),
 )
 STATION_FILE: Final = "station.parquet"
 STATION_FILES: Final = {

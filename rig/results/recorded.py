@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, STATION_SIGNAL_NAMES
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample, StationSample

@@ -22,7 +22,8 @@ from coldloop.parsing import parsed_json
 from coldloop.process.cold_box import COLD_BOX, L1, T5
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.signals import STATION_SIGNAL_NAMES, TICK_S
+from coldloop.process.signals import TICK_S
+from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.service.start import main as start_service
 from optimizer_plc.solvers import make_solver
 from rig.cosim.linear_plant import LinearRig

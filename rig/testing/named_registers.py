@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from coldloop.errors import UnfitValueError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.endpoints import Endpoint
-from coldloop.registers.declaration import Block, RegisterMap, fields_of
+from coldloop.registers.declaration import Block, RegisterMap
 
 Call = Callable[[Coroutine[Any, Any, Any]], Any]
 Record = tuple[Any, ...]
@@ -66,10 +66,20 @@ class NamedRegisters:
     def write_block(self, block: str, *, row: int = 0, **values: Any) -> None:  # noqa: ANN401 as the registers are
         """Write a block in one request, with its CRC if it has one; registers that are not named keep what was read."""
         where = self._block(block)
-        names = [name for name in fields_of(where.record) if name != "crc" or not where.sealed]
-        unknown = [name for name in values if name not in names]
+        names = [name for name in where.fields if name != "crc" or not where.sealed]
+        own = [element for field in where.fields.values() if field.each for element in field.elements]
+        unknown = [name for name in values if name not in (*names, *own)]
         if unknown:
-            raise UsageError(f"block '{block}' has no register '{unknown[0]}'; it has {', '.join(names)}")
+            raise UsageError(f"block '{block}' has no register '{unknown[0]}'; it has {', '.join((*names, *own))}")
+        for name, field in where.fields.items():  # registers of their own names are given by these, or as one array
+            single = {element: values.pop(element) for element in field.elements if field.each and element in values}
+            if single:
+                known = (
+                    single
+                    if len(single) == len(field.elements)
+                    else {**dict(zip(field.elements, getattr(self._record(where, row), name), strict=True)), **single}
+                )
+                values[name] = tuple(known[element] for element in field.elements)
         if len(values) == len(names):
             record = where.record(**values, **({"crc": 0} if where.sealed else {}))
         else:
@@ -100,7 +110,8 @@ class NamedRegisters:
 
 
 def _places_of(block: Block) -> Iterator[tuple[str, _Place]]:
-    for name, field in fields_of(block.record).items():
+    for name, field in block.fields.items():
         yield f"{block.name}.{name}", _Place(block, name, None)
+        before = block.name if field.each else f"{block.name}.{name}"
         for index, element in enumerate(field.elements):
-            yield f"{block.name}.{name}.{element}", _Place(block, name, index)
+            yield f"{before}.{element}", _Place(block, name, index)

@@ -18,7 +18,7 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S
 from coldloop.process.whole_ticks import whole_ticks
-from coldloop.registers.control_plc import SequenceRow
+from coldloop.safety.sequence import Inputs
 
 
 class PiSettings(BaseModel):
@@ -171,9 +171,7 @@ class ClassicalLoops:
         for _, _, loop in self._loops:
             loop.restart()
 
-    def wanted(
-        self, tick: int, y: Sequence[float], applied: SequenceRow, *, without: Collection[int] = ()
-    ) -> SequenceRow:
+    def wanted(self, tick: int, y: Sequence[float], applied: Inputs, *, without: Collection[int] = ()) -> Inputs:
         """Return the inputs wanted at `tick`, from the newest outputs y and the inputs applied until now.
 
         A loop whose output is among those to do `without` is left: its input stays.
@@ -190,7 +188,7 @@ class ClassicalLoops:
         for output, actuator, loop in self._loops:
             measured = math.nan if output in without else y[output]
             inputs[actuator] = loop.execute(measured, applied[actuator], elapsed_s)
-        return SequenceRow(*inputs)
+        return tuple(inputs)
 
     def _is_due(self, tick: int) -> bool:
         seen, self._seen = self._seen, tick

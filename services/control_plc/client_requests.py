@@ -102,7 +102,7 @@ class Clients:
             raise IllegalValueError("a plan needs a CRC: it decides when inputs change")
 
     def _judge_operator(self, record: Operator, _row: int, _caller: Caller) -> None:
-        for name, value, low, high in zip(INPUT_NAMES, record[1:], self._limits.low, self._limits.high, strict=True):
+        for name, value, low, high in zip(INPUT_NAMES, record.u, self._limits.low, self._limits.high, strict=True):
             if not low <= value <= high:
                 raise IllegalValueError(f"setpoint of {name} = {value:g} is outside {low:g}..{high:g}")
 
@@ -208,7 +208,7 @@ class Clients:
         before = self._program.operator
         if operator.mode != before.mode:
             self._note(EventKind.OPERATOR_MODE, operator.mode, who)
-        for place, (value, last) in enumerate(zip(operator[1:], before[1:], strict=True)):
+        for place, (value, last) in enumerate(zip(operator.u, before.u, strict=True)):
             if abs(value - last) > TRACKED:
                 self._note(EventKind.SETPOINT, place, who, value=value)
         self._program.operate(operator)
@@ -221,7 +221,7 @@ class Clients:
         self._program.journal.note(now, kind, subject, cause, value=value, who=who)
 
     def _offer(self, header: SequenceHeader) -> None:
-        rows = [self._bank.get(SequenceRow, row) for row in range(header.length)]
+        rows = [self._bank.get(SequenceRow, row).u for row in range(header.length)]
         answer = self._program.offer(InputSequence(header, rows))
         self._bank.put_sealed(answer)
         if answer.verdict != Verdict.ACCEPTED:

@@ -18,7 +18,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from coldloop.process.limits import InputLimits
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import BATH, CONTROLLED, INPUT_NAMES, OUTPUT_NAMES, TICK_S
-from coldloop.registers.control_plc import CoolDownStep, SequenceRow
+from coldloop.registers.control_plc import CoolDownStep
+from coldloop.safety.sequence import Inputs
 
 LEVEL, TEMPERATURE, TURBINE_OUTLET = (
     map(OUTPUT_NAMES.index, (BATH.level, BATH.temperature, BATH.turbine_outlet)) if BATH else (0, 0, 0)
@@ -118,7 +119,7 @@ class CoolDown:
             self._settled_since = tick if inside else None
         return inside and (tick - (self._settled_since or 0)) * TICK_S >= self._settings.settled_s
 
-    def wanted(self, by_loops: SequenceRow) -> SequenceRow:
+    def wanted(self, by_loops: Inputs) -> Inputs:
         """Return the wanted inputs, where the closed loops want `by_loops`; the output guard moves towards them."""
         row = list(by_loops)
         if self.step in (CoolDownStep.TURBINE, CoolDownStep.BATH):
@@ -129,4 +130,4 @@ class CoolDown:
             row[HEATER] = self._limits.low[HEATER]
         if TURBINE_OUTLET in self.open_loops:
             row[TURBINE_VALVE] = self._inputs[TURBINE_VALVE]
-        return SequenceRow(*row)
+        return tuple(row)

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 from coldloop.kernels.single_precision import neighbour, single
 from coldloop.process.limits import InputLimits
-from coldloop.registers.control_plc import SequenceRow, Verdict
+from coldloop.registers.control_plc import Verdict
+from coldloop.safety.sequence import Inputs
 from control_plc.output_limits import admit, beginning, in_range, judge, plain, resume
 
 
@@ -15,15 +16,15 @@ class OutputGuard:
     leap of the tick ends no window.
     """
 
-    def __init__(self, limits: InputLimits, applied: SequenceRow) -> None:
+    def __init__(self, limits: InputLimits, applied: Inputs) -> None:
         self.limits = plain(limits)
         self.state = beginning(self.limits, list(map(_inside, applied, limits.low, limits.high)))
         self._twin = beginning(self.limits, applied)
-        self.applied = SequenceRow(*self.state.applied)
+        self.applied = tuple(self.state.applied)
         self._tick = self._lag = 0
         """The last tick, and by how much our time is behind it."""
 
-    def begin_at(self, tick: int, applied: SequenceRow, passed: int | None = None) -> None:
+    def begin_at(self, tick: int, applied: Inputs, passed: int | None = None) -> None:
         """Restart at `tick` from the outputs applied there (`output_limits.resume`).
 
         `passed`: ticks since the last scan by another clock, None without one.
@@ -32,16 +33,16 @@ class OutputGuard:
         self._lag += leap - max(0, leap if passed is None else min(leap, passed))
         self._tick, tick = tick, tick - self._lag
         resume(self.state, self.limits, tick, applied)
-        self.applied = SequenceRow(*self.state.applied)
+        self.applied = tuple(self.state.applied)
 
-    def admit(self, tick: int, wanted: SequenceRow, *, update: bool) -> SequenceRow:
+    def admit(self, tick: int, wanted: Inputs, *, update: bool) -> Inputs:
         """Return what may be applied at `tick`, and remember it as applied."""
         self._tick = tick
         admit(self.state, self.limits, tick - self._lag, wanted, update)
-        self.applied = SequenceRow(*self.state.applied)
+        self.applied = tuple(self.state.applied)
         return self.applied
 
-    def judge(self, rows: Sequence[SequenceRow], first_tick: int, meanwhile: Sequence[SequenceRow | None]) -> Verdict:
+    def judge(self, rows: Sequence[Inputs], first_tick: int, meanwhile: Sequence[Inputs | None]) -> Verdict:
         """Judge a sequence as it would be played: the guard would let all of it pass, or it is refused.
 
         Args:
@@ -58,7 +59,7 @@ class OutputGuard:
         )
         return Verdict.ACCEPTED if passes else Verdict.RATE_EXCEEDED
 
-    def out_of_range(self, rows: Sequence[SequenceRow]) -> bool:
+    def out_of_range(self, rows: Sequence[Inputs]) -> bool:
         """Return whether a row holds a value that is not finite or outside the bounds."""
         return not all(in_range(self.limits, row) for row in set(rows))
 

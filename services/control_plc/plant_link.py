@@ -21,7 +21,7 @@ from typing import Final
 
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import LinkCause, PlantLinkState
-from coldloop.registers.plant import Actuators, Measurement, OutputVerdict, inputs_of
+from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import AlarmKind
 from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
@@ -201,7 +201,7 @@ class PlantLink:
             self._enter(*REFUSED_OUTPUTS.get(answer.verdict, OUTPUTS_REJECTED))
         elif answer.session != sent.session:
             self._enter(PlantLinkState.OTHER_MASTER, LinkCause.WRONG_SESSION)
-        elif answer.u != inputs_of(sent) or answer.holder != self.holder or answer.generation != self.generation:
+        elif answer.u != sent.u or answer.holder != self.holder or answer.generation != self.generation:
             self._enter(PlantLinkState.JOINING, LinkCause.CHANGED)
         elif stopped:
             self._enter(PlantLinkState.FROZEN, LinkCause.STOPPED)

@@ -7,9 +7,10 @@ Scans can be missed and time can leap, so everything here goes by ticks, never b
 from collections.abc import Sequence
 from enum import IntEnum
 
-from coldloop.process.signals import LAST_NUMBER, TICKS_PER_SAMPLE
-from coldloop.registers.control_plc import SEQUENCE_ROWS, Acknowledgement, Plan, SequenceRow, Update, Verdict
-from coldloop.safety.sequence import InputSequence, checksum
+from coldloop.process.declaration import LAST_NUMBER
+from coldloop.process.signals import TICKS_PER_SAMPLE
+from coldloop.registers.control_plc import SEQUENCE_ROWS, Acknowledgement, Plan, Update, Verdict
+from coldloop.safety.sequence import Inputs, InputSequence, checksum
 from control_plc.guard import OutputGuard
 
 
@@ -111,7 +112,7 @@ class SequencePlayer:
             self.deadline_misses += 1
         self._missed = self.next_update_tick
 
-    def row(self, tick: int) -> SequenceRow | None:
+    def row(self, tick: int) -> Inputs | None:
         """Return the row to be played at this tick, if any."""
         playing = self._playing
         if playing is None or not 0 <= tick - playing.header.first_tick < len(playing.rows):
@@ -272,7 +273,7 @@ class SequencePlayer:
             return Verdict.WRONG_TICK
         return self._judge_rows(rows, header.first_tick, earliest)
 
-    def _judge_rows(self, rows: Sequence[SequenceRow], first_tick: int, earliest: int) -> Verdict:
+    def _judge_rows(self, rows: Sequence[Inputs], first_tick: int, earliest: int) -> Verdict:
         if not rows:
             return Verdict.NO_ANSWER
         if self._guard.out_of_range(rows):

@@ -25,14 +25,13 @@ from coldloop.registers.control_plc import (
     Operator,
     OperatorMode,
     Plan,
-    Process,
-    SequenceRow,
+    ProcessNow,
     Update,
     Verdict,
 )
 from coldloop.registers.plant import MAX_STATE, Actuators, Measurement
 from coldloop.registers.safety import Alarm, AlarmKind
-from coldloop.safety.sequence import InputSequence
+from coldloop.safety.sequence import Inputs, InputSequence
 from coldloop.safety.watchdog import Watchdog
 from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
@@ -76,10 +75,10 @@ class ControlProgram:
         self._point = point
         self._section = section
         self.alarm_settings = section.alarms
-        self._initial = SequenceRow(*point.inputs)
+        self._initial = tuple(point.inputs)
         if OutputGuard(limits, self._initial).out_of_range([self._initial]):
             raise ConfigurationError(
-                f"limits: the inputs {self._initial[:]} of the operating point are outside; widen low and high, or "
+                f"limits: the inputs {self._initial} of the operating point are outside; widen low and high, or "
                 "give another model.file"
             )
         self._loops = ClassicalLoops(section.classical, limits, point.outputs)
@@ -101,7 +100,7 @@ class ControlProgram:
     def reset_operating_mode(self) -> None:
         """Let those drive whom the configuration names: no operator has said anything."""
         classical = self._section.driver is ControlStrategy.CLASSICAL
-        self.operator = Operator(OperatorMode.CLASSICAL if classical else OperatorMode.AUTO, *self._initial)
+        self.operator = Operator(OperatorMode.CLASSICAL if classical else OperatorMode.AUTO, self._initial)
 
     def recall(self, operator: Operator, alarms: Sequence[Alarm], watchdog: int, tick: int) -> None:
         """Take over what operators had said before a restart, and the alarms; the session is resumed later.
@@ -141,8 +140,8 @@ class ControlProgram:
             cool_down: Its step then.
         """
         self.operator = operator
-        self._begin(session, tick, SequenceRow(*applied), updates=updates, cool_down=cool_down)
-        ours = playing is not None and SequenceRow(*applied) in playing.rows[: max(0, tick - playing.header.first_tick)]
+        self._begin(session, tick, tuple(applied), updates=updates, cool_down=cool_down)
+        ours = playing is not None and tuple(applied) in playing.rows[: max(0, tick - playing.header.first_tick)]
         self.player.resume(playing if ours else None, tick)
         self.ladder = Ladder(self._section.ladder.hold_ticks, Mode.HOLD, Cause.RESTARTED, tick)
         self._note_mode(tick)
@@ -151,14 +150,14 @@ class ControlProgram:
         self,
         session: int,
         tick: int,
-        applied: SequenceRow,
+        applied: Inputs,
         *,
         updates: int,
         cool_down: CoolDownStep = CoolDownStep.FINISHED,
     ) -> None:
         self.session = session
         self.tick = tick
-        self.process: Process | None = None
+        self.process: ProcessNow | None = None
         self.optimizer_present = True
         self.shortage = 0.0
         """Of the last plan, as the next."""
@@ -207,7 +206,7 @@ class ControlProgram:
         return self._process_alarms.has_noted(self.suspects)
 
     @property
-    def applied(self) -> SequenceRow:
+    def applied(self) -> Inputs:
         """The inputs being applied."""
         return self.guard.applied
 
@@ -254,9 +253,9 @@ class ControlProgram:
         row = self.player.row(tick)
         self._climb(tick, row)
         applied = self.guard.admit(tick, self._wanted(tick, row), update=began)
-        return Actuators(tick, *applied, self.session)
+        return Actuators(tick, applied, self.session)
 
-    def _climb(self, tick: int, row: SequenceRow | None) -> None:
+    def _climb(self, tick: int, row: Inputs | None) -> None:
         """Let the ladder choose the mode of this scan."""
         before = self.ladder.mode
         changed = self.ladder.step(
@@ -283,16 +282,16 @@ class ControlProgram:
     def _note_mode(self, tick: int) -> None:
         self.journal.note(tick, EventKind.MODE, self.ladder.mode, self.ladder.cause)
 
-    def _wanted(self, tick: int, row: SequenceRow | None) -> SequenceRow:
+    def _wanted(self, tick: int, row: Inputs | None) -> Inputs:
         """Return the outputs requested in the mode of the ladder."""
         mode = self.ladder.mode
         if mode is Mode.MANUAL:
-            return SequenceRow(*self.operator[1:])
+            return self.operator.u
         if mode is Mode.CLASSICAL and self.process is not None and not self._handing_over(tick):
             return self._of_the_loops(tick, self.process.y)
         return self.guard.applied if row is None else row
 
-    def _of_the_loops(self, tick: int, y: Sequence[float]) -> SequenceRow:
+    def _of_the_loops(self, tick: int, y: Sequence[float]) -> Inputs:
         without = {*self.sensors.unusable, *self.cool_down.open_loops}
         wanted = self._loops.wanted(tick, y, self.guard.applied, without=without)
         return self.cool_down.wanted(wanted) if self.cool_down.is_active else wanted
@@ -326,12 +325,12 @@ class ControlProgram:
 
     def end_scan(self, measurement: Measurement) -> Update | None:
         """Take the measurement of this tick; return the update if it was latched here."""
-        applied = tuple(self.guard.applied)
+        applied = self.guard.applied
         others = measurement.x, (measurement.load,)
         y = tuple(self.sensors.check(self.tick, measurement.y, applied, *others, standing=self.cool_down.standing))
         if self.cool_down.observe(self.tick, y):
             self.journal.note(self.tick, EventKind.COOL_DOWN, self.cool_down.step)
-        self.process = Process(self.tick, measurement.load, applied, y)
+        self.process = ProcessNow(self.tick, measurement.load, applied, y)
         self._unknown = not (LOAD_SPAN[0] <= measurement.load <= LOAD_SPAN[1] and _are_states(measurement.x))
         self._let_play(usable=self._usable)
         latched = None
@@ -378,7 +377,7 @@ class ControlProgram:
             self._set_back(tick)
         self.tick = self.alarms.now = tick
         self._in_scan = False
-        self.guard.begin_at(self.tick, SequenceRow(*applied), passed)
+        self.guard.begin_at(self.tick, tuple(applied), passed)
 
     def _set_back(self, tick: int) -> None:
         if self.tick - tick > SET_BACK_TICKS:
@@ -435,9 +434,9 @@ class ControlProgram:
     def track(self) -> bool:
         """Let the manual setpoints follow the applied inputs for a bumpless change; return whether they moved."""
         applied = self.guard.applied
-        if self.operator.mode == OperatorMode.MANUAL or self.operator[1:] == applied[:]:
+        if self.operator.mode == OperatorMode.MANUAL or self.operator.u == applied:
             return False
-        self.operator = Operator(self.operator.mode, *applied)
+        self.operator = Operator(self.operator.mode, applied)
         return True
 
     def operate(self, operator: Operator) -> None:

@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
-from coldloop.registers.control_plc import CONTROL_MAP, LadderStatus, PlantLinkStatus, Process, Status
+from coldloop.registers.control_plc import LadderStatus, PlantLinkStatus, ProcessNow, Status
+from coldloop.registers.maps import CONTROL_MAP
 from coldloop.registers.safety import AlarmKind, AlarmState
 from coldloop.safety.writer_lease import WriterLease
 from coldloop.service.event_text import alarm_word, log_event
@@ -147,7 +148,7 @@ class ControlPublication:
 
     def snapshot(self) -> Mapping[str, object]:
         """Return what telemetry publishes."""
-        status, process = self._bank.get(Status), self._bank.get(Process)
+        status, process = self._bank.get(Status), self._bank.get(ProcessNow)
         alarms = {
             alarm_word(kind).replace(" ", "_"): AlarmState(alarm.state).name.lower()
             for kind, alarm in zip(AlarmKind, self._program.alarms.rows, strict=True)

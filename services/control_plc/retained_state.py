@@ -10,10 +10,12 @@ from typing import Annotated, Any, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from coldloop.process.signals import INPUT_NAMES, LAST_NUMBER, LAST_TICK
+from coldloop.process.declaration import LAST_NUMBER, LAST_TICK
+from coldloop.process.signals import INPUT_NAMES
 from coldloop.registers.codec import check_record
 from coldloop.registers.common import SessionPace
-from coldloop.registers.control_plc import SEQUENCE_ROWS, CoolDownStep, Operator, SequenceHeader, SequenceRow
+from coldloop.registers.control_plc import SEQUENCE_ROWS, CoolDownStep, Operator, SequenceHeader
+from coldloop.registers.maps import CONTROL_MAP
 from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.safety.retained import RetainedFile, RetainedStateError
 from coldloop.safety.retained_writer import RetainedStateWriter
@@ -59,9 +61,9 @@ class RetainedControlState(BaseModel):
     @model_validator(mode="after")
     def _possible(self) -> Self:
         for record in (SessionPace.shown(self.session, self.pace), self.operator, *self.alarms):
-            check_record(record)
+            check_record(record, CONTROL_MAP)
         if self.playing is not None:
-            check_record(self.playing[0])
+            check_record(self.playing[0], CONTROL_MAP)
         return self
 
     @classmethod
@@ -83,7 +85,7 @@ class RetainedControlState(BaseModel):
             return None
         header, text = self.playing
         try:
-            rows = [SequenceRow(*values) for values in ROW.iter_unpack(base64.b64decode(text))]
+            rows = list(ROW.iter_unpack(base64.b64decode(text)))
         except (ValueError, struct.error):
             return None
         return InputSequence(header, rows) if checksum(header, rows) == header.crc else None

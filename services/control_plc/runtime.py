@@ -17,14 +17,16 @@ from coldloop.config import selected
 from coldloop.errors import LinkError, PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
+from coldloop.process.declaration import LAST_TICK
 from coldloop.process.model_file import read_header
-from coldloop.process.signals import LAST_TICK, TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import SessionPace
 from coldloop.registers.configuration import publish_configuration
-from coldloop.registers.control_plc import CONTROL_MAP, ControlSession
-from coldloop.registers.plant import PLANT_MAP, Measurement
+from coldloop.registers.control_plc import ControlSession
+from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
+from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import AlarmKind, WatchdogTime
 from coldloop.service.logs import dropped
 from coldloop.service.metrics_server import MetricsServer

@@ -7,7 +7,7 @@ with its own rack. Time is the rack's: after a break the program resumes at the 
 from collections.abc import Callable
 
 from coldloop.errors import BUSY, DamagedAnswerError, ImplausibleAnswerError, LinkError, RequestRefusedError
-from coldloop.process.signals import LAST_TICK
+from coldloop.process.declaration import LAST_TICK
 from coldloop.registers.control_plc import LinkCause, Update
 from coldloop.registers.plant import Actuators, Measurement
 from control_plc.plant_link import PlantLink

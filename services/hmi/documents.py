@@ -12,10 +12,10 @@ from coldloop import __version__
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S
 from coldloop.registers.audit import EventKind
+from coldloop.registers.codec import blank
 from coldloop.registers.control_plc import Mode
-from coldloop.registers.maps import MAPS
+from coldloop.registers.maps import MAPS, OPTIMIZER_MAP
 from coldloop.registers.optimizer_plc import (
-    BANDED_OUTPUTS,
     INPUT_SAMPLES,
     PREDICTED_SAMPLES,
     ModelDeviation,
@@ -48,6 +48,7 @@ MARKED: Final = {
 BEGUN: Final = word(EventKind.SESSION)
 MOST_MARKS: Final = 1000
 EARLIER_PREDICTIONS: Final = 12
+BANDED: Final = tuple(one.name for one in PROCESS.banded)
 BEFORE_TICKS: Final = round(2 * SAMPLING_PERIOD_S / TICK_S)
 
 
@@ -157,7 +158,9 @@ def state_document(model: Model, changed: Iterable[str] | None = None) -> Docume
         "time_s": model.tick * TICK_S,
         "services": services_document(model),
         "plant": plant_document(model),
-        "deviation": deviation(model.record("optimizer_plc", ModelDeviation) or ModelDeviation(), model.doubts.suspect),
+        "deviation": deviation(
+            model.record("optimizer_plc", ModelDeviation) or blank(ModelDeviation, OPTIMIZER_MAP), model.doubts.suspect
+        ),
         "commands": model.commands,
         "stale": stale + not_current,
         "quality": dict(qualities(model.doubts, stale)),
@@ -211,7 +214,7 @@ def prediction_document(prediction: Prediction) -> Document:
     return {
         "update": prediction.update,
         "time": [start + sample * SAMPLING_PERIOD_S for sample in PREDICTED_SAMPLES],
-        **{name: list(map(rounded, ahead)) for name, ahead in zip(BANDED_OUTPUTS, outputs_of(prediction), strict=True)},
+        **{name: list(map(rounded, ahead)) for name, ahead in zip(BANDED, outputs_of(prediction), strict=True)},
         "input_time": [start + sample * SAMPLING_PERIOD_S for sample in INPUT_SAMPLES],
         **{name: [rounded(value) for value in one] for name, one in zip(INPUT_NAMES, inputs, strict=True)},
     }
@@ -236,7 +239,7 @@ def trend_document(model: Model, names: Sequence[str], start: int, end: int, poi
         "predictions": [prediction_document(one) for one in _some(shown)],
         "planned": model.is_planned,
         "gaps": [[max(gap.start, start) * TICK_S, min(gap.end, end) * TICK_S] for gap in gaps],
-        "bands": _ranges(BANDED_OUTPUTS, limits.output_low, limits.output_high),
+        "bands": _ranges(BANDED, limits.output_low, limits.output_high),
         "bounds": _ranges(INPUT_NAMES, limits.input_low, limits.input_high),
     }
 

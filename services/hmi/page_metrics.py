@@ -5,8 +5,7 @@ from collections.abc import Iterator
 from prometheus_client.core import Metric
 
 from coldloop.process.signals import OUTPUT_NAMES
-from coldloop.registers.declaration import fields_of
-from coldloop.registers.maps import MAPS
+from coldloop.registers.maps import MAPS, OPTIMIZER_MAP
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.service.event_text import alarm_word
 from coldloop.service.metrics import block_families, build_family, gauge
@@ -67,6 +66,6 @@ def _alarms(model: Model) -> Iterator[Metric]:
 
 
 def _update(update: Optimization) -> Iterator[Metric]:
-    for (name, field), value in zip(fields_of(Optimization).items(), update, strict=True):
+    for (name, field), value in zip(OPTIMIZER_MAP.block_of(Optimization).fields.items(), update, strict=True):
         unit = f" ({field.unit})" if field.unit else ""
         yield gauge(f"coldloop_update_{name}", f"Last update: {field.description}{unit}", value)

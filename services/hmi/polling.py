@@ -14,7 +14,7 @@ from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.audit import EVENT_ROWS, Event, JournalPage
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.configuration import ConfigurationDigest, ConfigurationLine, configuration_of, lines_of
-from coldloop.registers.control_plc import LadderStatus, Operator, PlantLinkStatus, Process, Status
+from coldloop.registers.control_plc import LadderStatus, Operator, PlantLinkStatus, ProcessNow, Status
 from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, ControlLinkStatus, Optimization, Prediction
 from coldloop.registers.plant import LoadStatus, SensorFault, StationStatus
@@ -27,7 +27,7 @@ log = logging.getLogger("coldloop.hmi")
 
 FAST: Final[dict[str, tuple[type[tuple[Any, ...]], ...]]] = {
     "plant": (Identity, SessionPace, LoadStatus),
-    "control_plc": (LadderStatus, Process, Status, PlantLinkStatus, Operator),
+    "control_plc": (LadderStatus, ProcessNow, Status, PlantLinkStatus, Operator),
     "optimizer_plc": (ControlLinkStatus,),
 }
 """Records that are read in each look; the mode is read before the process that is drawn with it."""

@@ -29,7 +29,7 @@ async def read_premises(clients: Clients, command: commands.Command) -> Premises
             found["active"] = word_of(Mode, Mode.MPC if mode == Mode.REST else mode)  # between two sequences
         case commands.SetSetpoint():
             place, operator = INPUT_NAMES.index(command.input), await check_manual(clients["control_plc"])
-            found[f"setpoint of {command.input}"] = value_text(operator[1 + place], INPUT_UNITS[place])
+            found[f"setpoint of {command.input}"] = value_text(operator.u[place], INPUT_UNITS[place])
         case commands.SetLoad() | commands.PlayLoad():
             load = await clients["plant"].read(LoadStatus)
             until = f"changing until {commands.clock_text(load.last_tick * TICK_S)}"  # by itself

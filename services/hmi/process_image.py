@@ -11,8 +11,9 @@ from typing import Any, Final, NamedTuple, TypeVar, cast
 
 from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import Event
+from coldloop.registers.codec import blank
 from coldloop.registers.common import Identity, SessionPace
-from coldloop.registers.control_plc import LadderStatus, Mode, Plan, Process
+from coldloop.registers.control_plc import LadderStatus, Mode, Plan, ProcessNow
 from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Prediction, UpdatingRuleStatus
 from coldloop.registers.plant import StationStatus
@@ -120,7 +121,7 @@ class Model:
                 self.changed.add(name)
         if isinstance(record, Identity):
             self._identity(service, record)
-        elif isinstance(record, Process):
+        elif isinstance(record, ProcessNow):
             is_after_gap = source.was_silent or self._is_silent(source) or self.is_stopped(service)
             source.was_silent = False
             self._moved(source, record.tick)
@@ -228,12 +229,12 @@ class Model:
     @property
     def limits(self) -> OperatingLimits:
         """Bands, bounds and rates."""
-        return self.record("optimizer_plc", OperatingLimits) or OperatingLimits()
+        return self.record("optimizer_plc", OperatingLimits) or blank(OperatingLimits, MAPS["optimizer_plc"])
 
     @property
     def tick(self) -> int:
         """Tick of the process that is shown."""
-        process = self.record("control_plc", Process)
+        process = self.record("control_plc", ProcessNow)
         return process.tick if process else 0
 
     def age_s(self, service: str) -> float | None:

@@ -13,7 +13,6 @@ from aiohttp import BasicAuth, hdrs, web
 
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, TICK_S
-from coldloop.registers.optimizer_plc import BANDED_OUTPUTS
 from coldloop.service.metrics import exposition
 from coldloop.service.metrics_server import CONTENT_TYPE
 from hmi.assets import JSON, StreamCompression, compressed_answer, html_file, kept_answer, static_files, takes_gzip
@@ -35,9 +34,10 @@ from hmi.process_image import JournalEntry, Model
 from hmi.settings import HmiSection
 from hmi.trends import NAMES, STATION_NAMES
 
+BANDED: Final = tuple(one.name for one in PROCESS.banded)
 POINTS: Final = 800
 MOST_POINTS: Final = 4000
-MOST_NAMES: Final = 8 + 1 + len(PROCESS.disturbances) + len(INPUT_NAMES) + len(BANDED_OUTPUTS) + len(STATION_NAMES)
+MOST_NAMES: Final = 8 + 1 + len(PROCESS.disturbances) + len(INPUT_NAMES) + len(PROCESS.banded) + len(STATION_NAMES)
 """Signals of one trend: what the page draws without being asked, and eight pens."""
 ROWS_AT_ONCE: Final = 500
 """Rows of a table that are made and sent at a time."""
@@ -130,7 +130,7 @@ class Reading:
             HTTPBadRequest: They are not numbers, or there is no such signal.
         """
         asked = [name for name in query.get("names", "").split(",") if name]
-        names = list(dict.fromkeys(asked or (*BANDED_OUTPUTS, "load")))
+        names = list(dict.fromkeys(asked or (*BANDED, "load")))
         unknown = [name for name in names if name not in NAMES]
         if unknown:
             raise web.HTTPBadRequest(reason=f"unknown trend {printable(unknown[0])}")

@@ -10,9 +10,10 @@ from typing import Any, Final, NamedTuple, Protocol
 from aiohttp import web
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from coldloop.process.signals import STATION_VALVE_NAMES, TICK_S
+from coldloop.process.signals import TICK_S
+from coldloop.process.station import STATION_VALVE_NAMES
 from coldloop.registers.common import Identity, SessionPace
-from coldloop.registers.control_plc import LadderStatus, Process
+from coldloop.registers.control_plc import LadderStatus, ProcessNow
 from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, UpdatingRuleStatus
 from coldloop.registers.plant import LoadStatus, StationSample, StationStatus
@@ -32,7 +33,7 @@ MOST_AT_ONCE: Final = 400
 class ReplayFrame(NamedTuple):
     """One tick of a run."""
 
-    process: Process
+    process: ProcessNow
     mode: int
     cause: int
     since: int

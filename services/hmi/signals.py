@@ -7,7 +7,7 @@ import re
 from functools import cache
 from typing import Any, Final, NamedTuple
 
-from coldloop.registers.declaration import Block, Kind, RegisterMap, fields_of
+from coldloop.registers.declaration import Block, Kind, RegisterMap
 from coldloop.registers.maps import MAPS
 from coldloop.registers.text import from_words
 from hmi.process_view import decimals_by_unit
@@ -54,7 +54,7 @@ def shown_blocks(register_map: RegisterMap) -> list[Block]:
 
 
 def _texts(block: Block) -> set[str]:
-    return {name for name, field in fields_of(block.record).items() if field.is_text}
+    return {name for name, field in block.fields.items() if field.is_text}
 
 
 @cache
@@ -89,13 +89,12 @@ def values_of(service: str, block: Block, record: tuple[Any, ...]) -> dict[str, 
     values: dict[str, float | int | str] = {}
     texts = _texts(block)
     prefix = f"{service}.{block.name}."
-    for (name, field), value in zip(fields_of(block.record).items(), record, strict=True):
+    for (name, field), value in zip(block.fields.items(), record, strict=True):
         if name in texts:
             values[prefix + name] = from_words(value)
         elif field.elements:
-            values.update(
-                (f"{prefix}{name}.{element}", one) for element, one in zip(field.elements, value, strict=True)
-            )
+            before = prefix if field.each else f"{prefix}{name}."
+            values.update((before + element, one) for element, one in zip(field.elements, value, strict=True))
         else:
             values[prefix + name] = value
     return values

@@ -8,8 +8,9 @@ from itertools import pairwise
 from typing import Final, NamedTuple
 
 from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
-from coldloop.registers.control_plc import Mode, Process
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, TICK_S
+from coldloop.process.station import STATION_SIGNAL_NAMES
+from coldloop.registers.control_plc import Mode, ProcessNow
 from hmi.quality import SOUND, Doubts, Quality
 
 STATION_NAMES: Final = ("P12", "P11") if PROCESS.has_station else ()
@@ -75,7 +76,7 @@ class TrendStore:
             del column[:]
 
     def add(
-        self, process: Process, mode: int, doubts: Doubts = SOUND, station: tuple[float, ...] = NO_STATION, *,
+        self, process: ProcessNow, mode: int, doubts: Doubts = SOUND, station: tuple[float, ...] = NO_STATION, *,
         is_after_gap: bool = False,
     ) -> None:  # fmt: skip
         """Add a sample; one that is not newer than the last one is left out.

@@ -9,7 +9,6 @@ from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.requests import MAX_READ_WRITE_WORDS
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import (
-    CONTROL_MAP,
     Acknowledgement,
     AwaitUpdate,
     Heartbeat,
@@ -20,6 +19,7 @@ from coldloop.registers.control_plc import (
     Update,
     Verdict,
 )
+from coldloop.registers.maps import CONTROL_MAP
 from coldloop.registers.optimizer_plc import ControlLinkState
 from coldloop.safety.sequence import InputSequence
 from coldloop.session.time_base import TimeBase
@@ -163,7 +163,7 @@ class ControlClient:
         return Verdict(answer.verdict)
 
     async def _commit(self, sequence: InputSequence) -> Acknowledgement:
-        header, rows = sequence
+        header, rows = sequence.header, list(map(SequenceRow, sequence.rows))
         await self._client.write_rows(rows[ROWS_WITH_HEADER:], start=ROWS_WITH_HEADER)
         try:
             return await self._client.exchange(header, Acknowledgement, rows=rows[:ROWS_WITH_HEADER])

@@ -16,7 +16,7 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
-from coldloop.registers.control_plc import Plan, SequenceHeader, SequenceRow, Update, Verdict
+from coldloop.registers.control_plc import Plan, SequenceHeader, Update, Verdict
 from coldloop.registers.optimizer_plc import (
     INPUT_SAMPLES,
     PREDICTED_SAMPLES,
@@ -216,7 +216,7 @@ class OptimizerProgram:
         """Return the last answer as the control PLC takes it."""
         now, sent, rows = self._now, self._sent, self.state.sent.rows
         length = int(sent["length"])
-        inputs = [SequenceRow(*row) for row in rows[:length:TICKS_PER_SAMPLE].tolist()]
+        inputs = list(map(tuple, rows[:length:TICKS_PER_SAMPLE].tolist()))
         header = SequenceHeader(
             number=int(sent["number"]),
             update=int(now["update"]),
@@ -245,7 +245,7 @@ class OptimizerProgram:
         shown = outputs[[min(sample, horizon) - 1 for sample in PREDICTED_SAMPLES]]
         planned = inputs[[min(sample, horizon) - 1 for sample in INPUT_SAMPLES]]
         return Prediction(
-            int(self._now["update"]), int(header["first_tick"]), *map(tuple, shown.T.tolist()),
+            int(self._now["update"]), int(header["first_tick"]), tuple(shown.T.ravel().tolist()),
             tuple(planned.ravel().tolist()),
         )  # fmt: skip
 

@@ -7,12 +7,12 @@ from coldloop.process.signals import TICK_S
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.registers.audit import EventKind, JournalQuery
 from coldloop.registers.bank import Caller, IllegalValueError, RegisterBank
-from coldloop.registers.codec import WordOrder
+from coldloop.registers.codec import WordOrder, blank
 from coldloop.registers.common import Identity, ServiceState, SessionPace, pace_subject
 from coldloop.registers.declaration import Block
+from coldloop.registers.maps import OPTIMIZER_MAP
 from coldloop.registers.optimizer_plc import (
     HISTORY_ROWS,
-    OPTIMIZER_MAP,
     OperatingLimits,
     Optimization,
     OptimizerSession,
@@ -43,7 +43,7 @@ class OptimizerPublication:
     ) -> None:
         self.bank = RegisterBank(OPTIMIZER_MAP, order)
         self.bank.put(limits)
-        self.bank.put_sealed(Prediction())
+        self.bank.put_sealed(blank(Prediction, OPTIMIZER_MAP))
         self.bank.judged_by(self._judge, OptimizerSession)
         self.bank.judged_by(self._judge_pace, SessionPace)
         self.pace = TimeBase(realtime=False, factor=1.0)
@@ -113,7 +113,7 @@ class OptimizerPublication:
         self.pace = pace
         self.bank.put(SessionPace.shown(session, pace))
         self.bank.put(rule)
-        self.bank.put_sealed(Prediction())
+        self.bank.put_sealed(blank(Prediction, OPTIMIZER_MAP))
         self._shown.show()
         self._show_identity(0)
 

@@ -8,9 +8,9 @@ from pydantic import ValidationError
 
 from coldloop.config import explained
 from coldloop.errors import ModelFileError
+from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.model_file import COLD_BOX, ModelHeader, read_header
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from plant.cold_box.model import parameters_digest
 from plant.cold_box.physics import ColdBox
 from plant.cold_box.plant_file import LISTING, BoxParameters

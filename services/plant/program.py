@@ -8,7 +8,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from coldloop.process.cold_box import COLD_BOX
+from coldloop.process.declaration import Process
 from coldloop.registers.plant import StationSample, StationStatus, Surroundings
 from plant.numeric import RealArray
 
@@ -32,14 +33,14 @@ class MeasurementNoise:
     """Standard deviation of each output, in its unit; shape (outputs,)."""
     seed: int
     """Seed of the PCG64 generator, 0 or more."""
-    biases: tuple[float, ...] = (0.0,) * len(OUTPUT_NAMES)
-    """What each output shows too much, in its unit; shape (outputs,)."""
+    biases: tuple[float, ...] = ()
+    """What each output shows too much, in its unit; shape (outputs,), or none."""
 
     def __post_init__(self) -> None:
-        if len(self.deviations) != len(OUTPUT_NAMES) or not all(0.0 <= sigma < inf for sigma in self.deviations):
-            raise ValueError(f"noise needs {len(OUTPUT_NAMES)} standard deviations, finite and not negative")
-        if len(self.biases) != len(OUTPUT_NAMES) or not all(map(isfinite, self.biases)):
-            raise ValueError(f"noise needs {len(OUTPUT_NAMES)} biases, all finite")
+        if not all(0.0 <= sigma < inf for sigma in self.deviations):
+            raise ValueError("noise needs standard deviations that are finite and not negative")
+        if len(self.biases) not in {0, len(self.deviations)} or not all(map(isfinite, self.biases)):
+            raise ValueError(f"noise needs {len(self.deviations)} biases, all finite, or none")
 
 
 class PlantProgram:
@@ -50,6 +51,7 @@ class PlantProgram:
         u0: Inputs held until the first `apply`.
         load: The load over time.
         noise: Noise on the measurements; None measures exactly.
+        process: Whose plant it is.
 
     Raises:
         ValueError: an argument of wrong length, or not finite.
@@ -62,16 +64,18 @@ class PlantProgram:
         u0: Sequence[float],
         load: HeatLoad,
         noise: MeasurementNoise | None = None,
+        process: Process = COLD_BOX,
     ) -> None:
+        self.process = process
         self.tick = 0
-        self._x = _vector(x0, STATE_NAMES, "states")
-        self._u = _vector(u0, INPUT_NAMES, "inputs")
+        self._x = _vector(x0, process.states, "states")
+        self._u = _vector(u0, process.inputs, "inputs")
         self._load = load
         self._noise = noise
-        nothing = (0.0,) * len(OUTPUT_NAMES)
-        self.biases = np.array(noise.biases if noise else nothing)
+        nothing = (0.0,) * len(process.outputs)
+        self.biases = _vector(noise.biases or nothing if noise else nothing, process.outputs, "biases")
         """What each output shows too much, shape (outputs,)."""
-        self.deviations = np.array(noise.deviations if noise else nothing)
+        self.deviations = _vector(noise.deviations if noise else nothing, process.outputs, "standard deviations")
         """Standard deviation of the noise on each output, shape (outputs,)."""
         self._generator = np.random.Generator(np.random.PCG64(noise.seed if noise else 0))
         self._measured = self._sample(self._read(self.load))
@@ -98,10 +102,10 @@ class PlantProgram:
             ValueError: it is not of this plant.
         """
         self.tick = tick
-        self._x = _vector(x, STATE_NAMES, "states")
-        self._u = _vector(u, INPUT_NAMES, "inputs")
+        self._x = _vector(x, self.process.states, "states")
+        self._u = _vector(u, self.process.inputs, "inputs")
         self._generator.bit_generator.state = noise_state
-        self._measured = tuple(_vector(y, OUTPUT_NAMES, "outputs").tolist())
+        self._measured = tuple(_vector(y, self.process.outputs, "outputs").tolist())
 
     def retained(self) -> dict[str, Any]:
         """Return what `resume` needs, as plain data."""
@@ -122,7 +126,7 @@ class PlantProgram:
         Those used are gone: the tick afterwards shows how many they were.
         """
         before, start = self._generator.bit_generator.state, self.tick
-        outputs = len(OUTPUT_NAMES)
+        outputs = len(self.process.outputs)
         count = ticks if self._noise else 0
         yield self._generator.standard_normal((count, outputs))
         if count and self.tick - start < count:
@@ -177,7 +181,7 @@ class PlantProgram:
         Raises:
             ValueError: not a finite number for each input.
         """
-        self._u = _vector(u, INPUT_NAMES, "inputs")
+        self._u = _vector(u, self.process.inputs, "inputs")
 
     def advance(self) -> None:
         """Go one tick forward."""
@@ -191,7 +195,7 @@ class PlantProgram:
         return tuple(y.tolist())
 
 
-def _vector(values: Sequence[float], names: tuple[str, ...], what: str) -> RealArray:
-    if len(values) != len(names) or not all(isfinite(value) for value in values):
-        raise ValueError(f"expected {len(names)} finite {what}, not {list(values)}")
+def _vector(values: Sequence[float], signals: Sequence[object], what: str) -> RealArray:
+    if len(values) != len(signals) or not all(isfinite(value) for value in values):
+        raise ValueError(f"expected {len(signals)} finite {what}, not {list(values)}")
     return np.array(values, dtype=np.float64)

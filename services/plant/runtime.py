@@ -11,7 +11,6 @@ import time
 from coldloop import __version__
 from coldloop.errors import ColdloopError
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
-from coldloop.process.signals import TICK_S
 from coldloop.registers.bank import Caller
 from coldloop.registers.common import SessionPace
 from coldloop.registers.declaration import Block
@@ -88,7 +87,7 @@ class PlantRuntime:
         factor = rack.session.pace.factor * self._clock_rate
         position = rack.tick if self._position is None else self._position
         self._position = None
-        self._schedule = Schedule(time.monotonic() - position * TICK_S / factor, factor)
+        self._schedule = Schedule(time.monotonic() - position * rack.tick_s / factor, factor, rack.tick_s)
         self._clock = asyncio.get_running_loop().create_task(self._run_clock(self._schedule), name="plant clock")
         self._clock.add_done_callback(self._clock_ended)
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from coldloop.process.cold_box import L1, T5
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from coldloop.process.cold_box import INPUT_NAMES, L1, OUTPUT_NAMES, STATE_NAMES, T5
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.plant import PlantSample

@@ -14,8 +14,9 @@ from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.modbus.settings import ServerSettings
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import CONTROL_MAP, Grant
+from coldloop.registers.control_plc import Grant
 from coldloop.registers.declaration import Block
+from coldloop.registers.maps import CONTROL_MAP
 from rig.chaos.faults import Delay, Direction, Drop, Duplicate, Freeze, Reset, Truncate
 from rig.chaos.proxy import MOST_FROZEN, LinkProxy
 

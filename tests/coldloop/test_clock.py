@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from coldloop.process.cold_box import TICK_S
 from coldloop.session.clock import BIN_S, BINS, LatenessRecord, Pacer, Schedule
 
 LONGEST_S = BINS * BIN_S
@@ -38,7 +39,7 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> FakeClock:
 def test_a_tick_is_due_a_quarter_of_a_second_over_the_factor_after_the_one_before(
     start: float, factor: float, tick: int
 ) -> None:
-    schedule = Schedule(start, factor)
+    schedule = Schedule(start, factor, TICK_S)
     assert schedule.due(0) == start
     assert schedule.due(tick) == pytest.approx(start + tick * 0.25 / factor)
     assert schedule.due(tick + 1) >= schedule.due(tick)
@@ -73,7 +74,7 @@ def test_what_is_later_than_the_last_bin_is_not_hidden() -> None:
 
 
 def test_a_pacer_sleeps_until_the_tick_and_records_how_late_it_woke(fake: FakeClock) -> None:
-    pacer = Pacer(Schedule(1000.0, 0.5), fake)
+    pacer = Pacer(Schedule(1000.0, 0.5, TICK_S), fake)
 
     async def story() -> list[float]:
         return [await pacer.until(tick) for tick in (0, 1, 2, 4)]
@@ -84,7 +85,7 @@ def test_a_pacer_sleeps_until_the_tick_and_records_how_late_it_woke(fake: FakeCl
 
 
 def test_a_pacer_that_is_late_lets_others_run_and_does_not_stretch_time(fake: FakeClock) -> None:
-    pacer = Pacer(Schedule(1000.0, 1.0), fake)
+    pacer = Pacer(Schedule(1000.0, 1.0, TICK_S), fake)
     fake.now = 1001.0
 
     async def story() -> list[float]:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, EventKind, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.control_plc import CONTROL_MAP
+from coldloop.registers.maps import CONTROL_MAP
 from coldloop.registers.text import from_words
 from coldloop.service.journal import ANY_SUBJECT, KEPT, LOOKED_AT, Journal, JournalPublication
 

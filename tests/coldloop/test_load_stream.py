@@ -7,6 +7,7 @@ import pytest
 from coldloop.errors import LinkError, PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
 from coldloop.operating.load_stream import LoadStream
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.plant import LoadAhead, LoadStatus
 from plant.rack.load_schedule import MOST_UPCOMING, LoadSchedule
@@ -16,7 +17,7 @@ class FakePlant:
     """The plant's load behind a client; it refuses as the plant does."""
 
     def __init__(self) -> None:
-        self.load = LoadSchedule(LoadProfile((0,), (400.0,)))
+        self.load = LoadSchedule(LoadProfile((0,), (400.0,)), COLD_BOX.load)
         self.tick = 0
         self.loses_answers = False
 

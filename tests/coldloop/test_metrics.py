@@ -10,7 +10,8 @@ import pytest
 
 from coldloop.errors import PortInUseError
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
+from coldloop.registers.maps import PLANT_MAP
+from coldloop.registers.plant import Actuators, Measurement
 from coldloop.service.metrics import bank_families, exposition, gauge
 from coldloop.service.metrics_server import MOST_OPEN, MetricsServer
 from coldloop.service.metrics_settings import MetricsSettings
@@ -18,8 +19,8 @@ from coldloop.service.metrics_settings import MetricsSettings
 
 def bank() -> RegisterBank:
     one = RegisterBank(PLANT_MAP)
-    one.put(Measurement(7, 400.0, tuple(float(i) for i in range(22)), (0.0,) * 28, 1))
-    one.put(Actuators(7, 43.0, 75.0, 36.0, 1))
+    one.put(Measurement(7, 400.0, tuple(float(i) for i in range(22)), (0.0,) * 28, 1, (0.0,) * 3))
+    one.put(Actuators(7, (43.0, 75.0, 36.0), 1))
     return one
 
 

@@ -5,11 +5,13 @@ import zlib
 import pytest
 
 from coldloop.registers.codec import WordOrder, codec_of
-from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
-from coldloop.registers.seal import CRC_BYTES, Seal, seal_of, sealed, sealed_bytes
+from coldloop.registers.maps import PLANT_MAP
+from coldloop.registers.plant import Actuators, Measurement
+from coldloop.registers.seal import CRC_BYTES, Seal, seal_of, sealed_bytes
+from tests.harness.records import sealed
 
 MEASUREMENT = PLANT_MAP.block_of(Measurement)
-RECORD = Measurement(7, 385.0, (1.0,) * 22, (2.0,) * 28, 1)
+RECORD = Measurement(7, 385.0, (1.0,) * 22, (2.0,) * 28, 1, (0.0,) * 3)
 
 
 @pytest.mark.parametrize("bits", [0x7FA00000, 0x7F800001, 0xFFA12345, 0x7FC00000])
@@ -26,6 +28,6 @@ def test_the_seal_of_a_record_with_any_nan_is_intact(bits: int) -> None:
 @pytest.mark.parametrize("order", WordOrder)
 def test_a_record_that_is_sealed_while_it_is_encoded_is_that_which_was_sealed_before(order: WordOrder) -> None:
     codec = codec_of(PLANT_MAP.block_of(Actuators), order)
-    record = Actuators(7, 43.5, 75.25, 36.1, 0x1234_5678, holder=0xDEAD_BEEF, crc=99)
+    record = Actuators(7, (43.5, 75.25, 36.1), 0x1234_5678, holder=0xDEAD_BEEF, crc=99)
     assert sealed_bytes(codec, record) == codec.encode(sealed(record))
     assert seal_of(codec, sealed_bytes(codec, record)) is Seal.INTACT

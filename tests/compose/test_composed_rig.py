@@ -12,7 +12,8 @@ import pytest
 from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.common import Identity, SessionPace
-from coldloop.registers.plant import PLANT_MAP, Actuators, LoadStep
+from coldloop.registers.maps import PLANT_MAP
+from coldloop.registers.plant import Actuators, LoadStep
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -121,7 +122,7 @@ def test_who_comes_by_the_published_ports_is_an_operator_and_nothing_else(rig: "
             await client.connect(5.0)
             await client.write_rows([LoadStep(0, 385.0)])
             with pytest.raises(RequestRefusedError):
-                await client.write(Actuators(0, 50.0, 50.0, 50.0, 1))
+                await client.write(Actuators(0, (50.0, 50.0, 50.0), 1))
         finally:
             client.close()
 

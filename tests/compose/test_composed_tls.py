@@ -10,7 +10,8 @@ import pytest
 
 from coldloop.modbus.settings import TlsSettings
 from coldloop.modbus.tls import client_context
-from coldloop.registers.plant import PLANT_MAP, Actuators, LoadStep
+from coldloop.registers.maps import PLANT_MAP
+from coldloop.registers.plant import Actuators, LoadStep
 from tests.compose.browser import assert_an_operator_changes_the_load
 
 if TYPE_CHECKING:

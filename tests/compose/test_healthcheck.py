@@ -17,10 +17,10 @@ from coldloop.modbus.settings import ServerSettings, TlsSettings
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity, ServiceState
-from coldloop.registers.control_plc import CONTROL_MAP, ControlSession
+from coldloop.registers.control_plc import ControlSession
 from coldloop.registers.declaration import RegisterMap
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
-from coldloop.registers.plant import PLANT_MAP, PlantSession
+from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
+from coldloop.registers.plant import PlantSession
 from rig.cli.certificates import Authority
 from tests.harness.process_files import made
 from tests.harness.processes import END_S, Processes

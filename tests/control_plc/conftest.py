@@ -8,17 +8,17 @@ from coldloop.process.cold_box import L1, T5
 from coldloop.process.limits import InputLimits
 from coldloop.process.model_file import read_header
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
-from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import Acknowledgement, Plan, SequenceHeader, SequenceRow, Update, Verdict
+from coldloop.registers.control_plc import Acknowledgement, Plan, SequenceHeader, Update, Verdict
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.registers.safety import AlarmKind, AlarmState
 from coldloop.safety.sequence import InputSequence, with_checksum
 from control_plc.program import ControlProgram, OperatingPoint
 from control_plc.settings import ControlSection
+from tests.harness.records import Row, as_transmitted
 
 MODEL = 0xC01D1005
 HEADER = read_header(DEFAULT_MODEL_FILE)
-INITIAL = SequenceRow(43.0, 75.0, 36.0)
+INITIAL = Row(43.0, 75.0, 36.0)
 HOLD_TICKS = 12
 """Of a hold that is short."""
 
@@ -50,14 +50,14 @@ class Bench:
         self.readings: dict[int, float] = {}
         """What single sensors show instead."""
 
-    def scan(self) -> tuple[SequenceRow, Update | None]:
+    def scan(self) -> tuple[Row, Update | None]:
         """Do one scan; return what was applied and the update if one was latched."""
         actuators = self.program.begin_scan()
-        return SequenceRow(*actuators[1:4]), self.program.end_scan(self.measurement(actuators))
+        return Row(*actuators.u), self.program.end_scan(self.measurement(actuators))
 
     def measurement(self, actuators: Actuators) -> Measurement:
         x = (0.0 if self.frozen else float(actuators.tick), *[float(i) for i in range(1, 28)])
-        return Measurement(actuators.tick, self.load, self.outputs(), x, actuators.session)
+        return Measurement(actuators.tick, self.load, self.outputs(), x, actuators.session, actuators.u)
 
     def outputs(self) -> tuple[float, ...]:
         tick = self.program.tick
@@ -70,7 +70,7 @@ class Bench:
             y[output] = reading
         return tuple(y)
 
-    def scans(self, number: int) -> list[SequenceRow]:
+    def scans(self, number: int) -> list[Row]:
         return [self.scan()[0] for _ in range(number)]
 
     def plan(self, ticks: int, load_step: float = 0.0) -> bool:
@@ -80,7 +80,7 @@ class Bench:
         plan = Plan(update.update, update.tick + ticks, load_step, self.shortage, self.suspects)
         return self.program.accept_plan(plan)
 
-    def sequence(self, rows: Sequence[SequenceRow], **changed: int) -> InputSequence:
+    def sequence(self, rows: Sequence[Row], **changed: int) -> InputSequence:
         """Return an answer to the last update, with header fields changed before its checksum is taken."""
         update = self.program.player.update
         assert update is not None
@@ -97,7 +97,7 @@ class Bench:
         )
         return with_checksum(header._replace(**changed), [as_transmitted(row) for row in rows])
 
-    def play(self, rows: Sequence[SequenceRow], ticks: int) -> list[SequenceRow]:
+    def play(self, rows: Sequence[Row], ticks: int) -> list[Row]:
         """Plan an update `ticks` after the last one, answer it, and scan up to it; return what was applied."""
         assert self.plan(ticks)
         offered = self.offer(self.sequence(rows))
@@ -114,13 +114,13 @@ def alarm(bench: Bench, kind: AlarmKind) -> AlarmState:
     return AlarmState(bench.program.alarms.rows[kind].state)
 
 
-def moved(cv155: float = 0.0, ncr22: float = 0.0, cv156: float = 0.0) -> SequenceRow:
+def moved(cv155: float = 0.0, ncr22: float = 0.0, cv156: float = 0.0) -> Row:
     """Return the initial inputs, moved."""
-    return SequenceRow(INITIAL.cv155 + cv155, INITIAL.ncr22 + ncr22, INITIAL.cv156 + cv156)
+    return Row(INITIAL.cv155 + cv155, INITIAL.ncr22 + ncr22, INITIAL.cv156 + cv156)
 
 
 @pytest.fixture(scope="session")
-def at() -> Callable[..., SequenceRow]:
+def at() -> Callable[..., Row]:
     return moved
 
 

@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.registers.audit import EventKind
-from coldloop.registers.control_plc import Mode, Operator, OperatorMode, SequenceRow
+from coldloop.registers.control_plc import Mode, Operator, OperatorMode
 from coldloop.registers.safety import Alarm, AlarmKind, CapacityCause
+from tests.harness.records import Row
 
 if TYPE_CHECKING:
     from tests.control_plc.conftest import Bench
 
-At = Callable[..., SequenceRow]
+At = Callable[..., Row]
 
 
 def after(bench: "Bench", at: At, shortages: list[float]) -> Alarm:
@@ -62,7 +63,7 @@ def test_a_shortage_that_does_not_last_is_none(bench: "Bench", at: At) -> None:
 def test_it_returns_when_others_drive(bench: "Bench", at: At) -> None:
     bench.steady = bench.moving = True
     assert after(bench, at, [40.0] * 14).active
-    bench.program.operate(Operator(OperatorMode.CLASSICAL, *bench.program.applied))
+    bench.program.operate(Operator(OperatorMode.CLASSICAL, tuple(bench.program.applied)))
     bench.scans(2 + 4 * 30)
     assert bench.program.mode is Mode.CLASSICAL
     assert not bench.program.alarms.rows[AlarmKind.CAPACITY].active

@@ -7,14 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.process.cold_box import L1, T5
+from coldloop.process.cold_box import L1, T5, TICK_S
 from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import read_header
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
-from coldloop.process.signals import TICK_S
-from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import Mode, SequenceRow
+from coldloop.registers.control_plc import Mode
 from coldloop.registers.plant import Measurement
 from control_plc.classical import ClassicalLoops, ClassicalSettings, LevelLoop, PiController, PiSettings
 from control_plc.program import ControlProgram, make_program
@@ -22,11 +20,12 @@ from control_plc.settings import ControlSection, ControlStrategy
 from plant.kinds import make_program as make_plant
 from plant.load import find_load
 from plant.settings import SensorSettings
+from tests.harness.records import Row, as_transmitted
 
 NCR22, CV156 = 1, 2
 
 HEADER = read_header(DEFAULT_MODEL_FILE)
-REST = SequenceRow(*HEADER.u0)
+REST = Row(*HEADER.u0)
 PERIOD = 20
 
 
@@ -48,7 +47,7 @@ def outputs(level: float = 0.0, temperature: float = 0.0) -> tuple[float, ...]:
 
 
 def measured(tick: int, y: tuple[float, ...]) -> Measurement:
-    return as_transmitted(Measurement(tick, HEADER.w0, y, HEADER.x0, 1))
+    return as_transmitted(Measurement(tick, HEADER.w0, y, HEADER.x0, 1, (0.0,) * 3))
 
 
 def classical_program(limits: InputLimits | None = None, **section: object) -> ControlProgram:
@@ -179,7 +178,7 @@ def test_the_loops_drive_from_the_first_measurement_on_and_no_update_is_latched(
     applied = []
     for tick in range(60):
         actuators = program.begin_scan()
-        applied.append(SequenceRow(*actuators[1:4]))
+        applied.append(Row(*actuators.u))
         assert program.end_scan(measured(tick, outputs(level=1.0))) is None
         assert program.mode is Mode.CLASSICAL
         assert not program.awaiting_plan
@@ -197,7 +196,7 @@ def test_a_new_session_begins_as_the_first_did() -> None:
         program.restart(session)
         applied = []
         for tick in range(50):
-            applied.append(program.begin_scan()[1:4])
+            applied.append(program.begin_scan().u)
             program.end_scan(measured(tick, outputs(level=0.01 * tick, temperature=-0.02 * tick)))
         sessions.append(applied)
     assert sessions[0] == sessions[1]
@@ -220,7 +219,7 @@ def test_whatever_the_sensors_tell_bounds_and_rates_are_kept(
     program = classical_program(limits, classical={"period_s": period_s, "level": {"gain": level_gain}})
     applied = []
     for tick in range(7 * len(readings)):
-        applied.append(program.begin_scan()[1:4])
+        applied.append(program.begin_scan().u)
         level, temperature = readings[tick // 7]
         program.end_scan(measured(tick, outputs(level, temperature)))
     for tick, row in enumerate(applied):
@@ -236,7 +235,7 @@ def test_the_loops_hold_the_plant_by_themselves_on_load_a() -> None:
     program = classical_program()
     level, temperature = [], []
     for _ in range(14400):
-        u = as_transmitted(program.begin_scan())[1:4]
+        u = as_transmitted(program.begin_scan()).u
         plant.apply(u)
         y = plant.measure()
         level.append(y[L1])

@@ -5,18 +5,18 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.process.cold_box import L1, T1, T5
+from coldloop.process.cold_box import L1, OUTPUT_NAMES, T1, T5
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import OUTPUT_NAMES
-from coldloop.registers.control_plc import Cause, CoolDownStep, Mode, Operator, OperatorMode, SequenceRow
+from coldloop.registers.control_plc import Cause, CoolDownStep, Mode, Operator, OperatorMode
 from control_plc.cool_down import CoolDown, CoolDownSettings
 from control_plc.ladder import Ladder, LadderInputs
+from tests.harness.records import Row
 
 if TYPE_CHECKING:
     from tests.control_plc.conftest import Bench
 
 INPUTS = (43.0, 75.0, 36.0)
-BY_LOOPS = SequenceRow(50.0, 20.0, 30.0)
+BY_LOOPS = Row(50.0, 20.0, 30.0)
 
 
 def outputs(level: float, bath: float, exhaust: float) -> list[float]:
@@ -93,8 +93,8 @@ def test_a_control_plc_that_is_restarted_goes_on_from_the_step_it_had_reached(
     """Once one that was restarted while the bath filled invited the optimiser."""
     bench = new_bench(InputLimits())
     bench.steady = True
-    program, applied = bench.program, SequenceRow(*INPUTS)
-    program.resume(1, 500, applied, updates=0, operator=Operator(OperatorMode.AUTO, *applied), cool_down=reached)
+    program, applied = bench.program, Row(*INPUTS)
+    program.resume(1, 500, applied, updates=0, operator=Operator(OperatorMode.AUTO, tuple(applied)), cool_down=reached)
     bench.readings = {L1: 30.0}
     bench.scans(5)
     assert program.cool_down.step is reached

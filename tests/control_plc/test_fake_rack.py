@@ -14,20 +14,18 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from coldloop.errors import DamagedAnswerError, LinkError, PeerUnreachableError, RequestRefusedError
+from coldloop.process.cold_box import TICK_S
 from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
-from coldloop.process.signals import TICK_S
 from coldloop.registers.bank import BusyError, Caller
-from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import (
     Operator,
     OperatorMode,
     Plan,
     PlantLinkState,
     SequenceHeader,
-    SequenceRow,
     Verdict,
 )
 from coldloop.registers.declaration import Role
@@ -45,6 +43,7 @@ from control_plc.scan_cycle import ScanCycle
 from control_plc.settings import ControlSection
 from plant.rack.rack import Rack, Session
 from plant.settings import SafeAction, WatchdogSettings
+from tests.harness.records import Row, as_transmitted
 
 HEADER = read_header(DEFAULT_MODEL_FILE)
 SECTION = ControlSection.model_validate({"ladder": {"hold_s": 3.0, "optimizer_timeout_s": 8.0}})
@@ -327,7 +326,7 @@ class RackLink(RuleBasedStateMachine):
         for _ in range(turns):
             try:
                 self.fake.write(
-                    Actuators(self.fake.rack.tick, *u, self.fake.rack.session.number, holder), other, ours=False
+                    Actuators(self.fake.rack.tick, tuple(u), self.fake.rack.session.number, holder), other, ours=False
                 )
             except LinkError:
                 assert held
@@ -355,7 +354,7 @@ class RackLink(RuleBasedStateMachine):
     @rule(mode=st.sampled_from(OperatorMode), share=st.tuples(*[st.floats(0.0, 1.0)] * 3))
     def an_operator_chooses_the_mode(self, mode: OperatorMode, share: tuple[float, ...]) -> None:
         u = [low + part * (high - low) for part, low, high in zip(share, LIMITS.low, LIMITS.high, strict=True)]
-        self.program.operate(as_transmitted(Operator(mode, *u)))
+        self.program.operate(as_transmitted(Operator(mode, tuple(u))))
 
     # -- the optimiser -------------------------------------------------------------------------------------------------
 
@@ -365,9 +364,7 @@ class RackLink(RuleBasedStateMachine):
         update = player.update
         if update is None or not self.program.accept_plan(Plan(update.update, update.tick + ticks)):
             return
-        row = SequenceRow(
-            *[u + part * rate for u, part, rate in zip(self.program.applied, share, LIMITS.rate, strict=True)]
-        )
+        row = Row(*[u + part * rate for u, part, rate in zip(self.program.applied, share, LIMITS.rate, strict=True)])
         self.number += 1
         header = SequenceHeader(self.number, update.update, update.tick + ticks, length, ticks, HEADER.short_digest, 0)
         sequence = with_checksum(header, [as_transmitted(row)] * length)
@@ -409,7 +406,7 @@ class RackLink(RuleBasedStateMachine):
             return
         self.medium.delayed.clear()
         self.fake.passes(60.0 if self.fake.rack.watchdog.time else 15.0)
-        self.program.operate(Operator(OperatorMode.AUTO, *HEADER.u0))
+        self.program.operate(Operator(OperatorMode.AUTO, tuple(HEADER.u0)))
         if self.program.session != self.session:
             self.program.restart(self.session)
             self.link.begin()

@@ -6,15 +6,16 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from coldloop.process.limits import InputLimits, RateReference
-from coldloop.registers.control_plc import SequenceRow, Verdict
+from coldloop.registers.control_plc import Verdict
 from control_plc.guard import OutputGuard
+from tests.harness.records import Row
 
-INITIAL = SequenceRow(43.0, 75.0, 36.0)
+INITIAL = Row(43.0, 75.0, 36.0)
 TICKS_PER_SAMPLE = 20
 
 anything = st.floats(allow_nan=True, allow_infinity=True)
 near = st.floats(-20.0, 180.0)
-rows = st.builds(SequenceRow, *[st.one_of(near, near, anything)] * 3)
+rows = st.builds(Row, *[st.one_of(near, near, anything)] * 3)
 scans = st.lists(st.tuples(rows, st.booleans(), st.integers(1, 30)), min_size=1, max_size=60)
 each_reference = pytest.mark.parametrize("reference", RateReference)
 
@@ -37,7 +38,7 @@ def single(value: float) -> float:
     return float(struct.unpack(">f", struct.pack(">f", value))[0])
 
 
-def check(limits: InputLimits, initial: SequenceRow, history: list[tuple[SequenceRow, bool, int]]) -> None:
+def check(limits: InputLimits, initial: Row, history: list[tuple[Row, bool, int]]) -> None:
     """Ask for each row for some ticks, the first of them perhaps an update; compare with the rule, told anew.
 
     A window begins at an update, or 20 ticks after it began. What may be applied in it is what was applied before it,
@@ -68,7 +69,7 @@ def check(limits: InputLimits, initial: SequenceRow, history: list[tuple[Sequenc
 @settings(max_examples=4 * settings.default.max_examples)
 @given(history=scans)
 def test_whatever_is_asked_every_output_is_inside_its_bounds_and_its_rate_window(
-    reference: RateReference, history: list[tuple[SequenceRow, bool, int]]
+    reference: RateReference, history: list[tuple[Row, bool, int]]
 ) -> None:
     check(InputLimits(rate_reference=reference), INITIAL, history)
 
@@ -76,28 +77,28 @@ def test_whatever_is_asked_every_output_is_inside_its_bounds_and_its_rate_window
 @settings(max_examples=4 * settings.default.max_examples)
 @given(limits=odd_limits(), history=scans, share=st.floats(0.0, 1.0))
 def test_rates_that_single_precision_cannot_represent_are_kept_too(
-    limits: InputLimits, history: list[tuple[SequenceRow, bool, int]], share: float
+    limits: InputLimits, history: list[tuple[Row, bool, int]], share: float
 ) -> None:
     middle = [
         single(low + (0.1 + 0.8 * share) * (high - low)) for low, high in zip(limits.low, limits.high, strict=True)
     ]
-    check(limits, SequenceRow(*middle), history)
+    check(limits, Row(*middle), history)
 
 
 def test_bounds_that_single_precision_cannot_represent_are_kept_too() -> None:
     limits = InputLimits(low=(20.1, 0.3, 20.2), high=(59.9, 149.9, 60.2))
     for start, target in ((limits.low, -1e3), (limits.high, 1e3)):
-        guard = OutputGuard(limits, SequenceRow(*[single(bound) for bound in start]))
+        guard = OutputGuard(limits, Row(*[single(bound) for bound in start]))
         for tick in range(40):
             for value, low, high in zip(
-                guard.admit(tick, SequenceRow(*[target] * 3), update=False), limits.low, limits.high, strict=True
+                guard.admit(tick, Row(*[target] * 3), update=False), limits.low, limits.high, strict=True
             ):
                 assert low <= value <= high
 
 
 @given(history=scans)
 def test_with_elapsed_rates_the_outputs_never_drift_faster_than_the_rate(
-    history: list[tuple[SequenceRow, bool, int]],
+    history: list[tuple[Row, bool, int]],
 ) -> None:
     limits = InputLimits(rate_reference=RateReference.ELAPSED)
     guard = OutputGuard(limits, INITIAL)
@@ -114,7 +115,7 @@ def test_with_elapsed_rates_the_outputs_never_drift_faster_than_the_rate(
 
 @each_reference
 @given(target=rows)
-def test_a_value_that_can_be_reached_is_reached_and_then_held(reference: RateReference, target: SequenceRow) -> None:
+def test_a_value_that_can_be_reached_is_reached_and_then_held(reference: RateReference, target: Row) -> None:
     limits = InputLimits(rate=(5.0, 20.0, 5.0), rate_reference=reference)
     guard = OutputGuard(limits, INITIAL)
     for tick in range(20 * 10):
@@ -124,8 +125,8 @@ def test_a_value_that_can_be_reached_is_reached_and_then_held(reference: RateRef
         assert value == pytest.approx(reachable, rel=1e-6)
 
 
-def at(first: float) -> SequenceRow:
-    return SequenceRow(first, *INITIAL[1:])
+def at(first: float) -> Row:
+    return Row(first, *INITIAL[1:])
 
 
 @pytest.mark.parametrize("idle", [0, 3, 4, 7])
@@ -156,36 +157,36 @@ def test_a_move_at_the_end_of_what_is_played_limits_what_follows() -> None:
 @pytest.mark.parametrize("fault", [math.nan, math.inf, -math.inf])
 def test_a_value_that_is_no_number_holds_what_was_applied_before_the_window(fault: float) -> None:
     guard = OutputGuard(InputLimits(), INITIAL)
-    guard.admit(0, SequenceRow(43.25, 80.0, 36.0), update=True)
-    assert guard.admit(5, SequenceRow(fault, 81.0, fault), update=True) == (43.25, 81.0, 36.0)
+    guard.admit(0, Row(43.25, 80.0, 36.0), update=True)
+    assert guard.admit(5, Row(fault, 81.0, fault), update=True) == (43.25, 81.0, 36.0)
 
 
 def test_per_update_rates_allow_the_full_step_at_every_update_and_elapsed_rates_a_share_of_it() -> None:
-    far = SequenceRow(60.0, 150.0, 60.0)
+    far = Row(60.0, 150.0, 60.0)
     reached = {}
     for reference in RateReference:
         guard = OutputGuard(InputLimits(rate_reference=reference), INITIAL)
         for tick in range(21):
             guard.admit(tick, far, update=tick > 0 and tick % 5 == 0)
-        reached[reference] = guard.applied.ncr22 - INITIAL.ncr22
+        reached[reference] = guard.applied[1] - INITIAL.ncr22
     assert reached[RateReference.PER_UPDATE] == pytest.approx(5 * 10.0)
     assert reached[RateReference.ELAPSED] == pytest.approx(10.0 + 4 * 2.5)
 
 
 def test_breaks_that_follow_one_another_do_not_give_a_full_rate_each() -> None:
     limits = InputLimits()
-    guard = OutputGuard(limits, SequenceRow(43.0, 75.0, 36.0))
-    wanted = SequenceRow(60.0, 150.0, 60.0)
+    guard = OutputGuard(limits, Row(43.0, 75.0, 36.0))
+    wanted = Row(60.0, 150.0, 60.0)
     for tick in range(1, 20):
         guard.begin_at(tick, guard.admit(tick, wanted, update=False))
-    assert guard.applied.cv155 == pytest.approx(43.5)
-    assert guard.applied.ncr22 == pytest.approx(85.0)
+    assert guard.applied[0] == pytest.approx(43.5)
+    assert guard.applied[1] == pytest.approx(85.0)
 
 
 def test_what_is_applied_outside_an_open_window_begins_a_new_one() -> None:
-    guard = OutputGuard(InputLimits(), SequenceRow(43.0, 75.0, 36.0))
-    guard.begin_at(5, SequenceRow(50.0, 75.0, 36.0))
-    assert guard.admit(6, SequenceRow(43.0, 75.0, 36.0), update=False).cv155 == pytest.approx(49.5)
+    guard = OutputGuard(InputLimits(), Row(43.0, 75.0, 36.0))
+    guard.begin_at(5, Row(50.0, 75.0, 36.0))
+    assert guard.admit(6, Row(43.0, 75.0, 36.0), update=False)[0] == pytest.approx(49.5)
 
 
 @settings(max_examples=2 * settings.default.max_examples)
@@ -198,11 +199,11 @@ def test_from_anywhere_at_all_outputs_come_into_their_bounds_within_the_rate(
     applied: tuple[float, ...], wanted: tuple[float, ...], reference: RateReference
 ) -> None:
     limits = InputLimits(rate_reference=reference)
-    guard = OutputGuard(limits, SequenceRow(43.0, 75.0, 36.0))
-    guard.begin_at(1000, SequenceRow(*applied))
+    guard = OutputGuard(limits, Row(43.0, 75.0, 36.0))
+    guard.begin_at(1000, Row(*applied))
     before = guard.applied
     for tick in range(1001, 1001 + 20 * 30, 20):
-        after = guard.admit(tick, SequenceRow(*wanted), update=False)
+        after = guard.admit(tick, Row(*wanted), update=False)
         for i, value in enumerate(after):
             assert abs(value - before[i]) <= limits.rate[i] + 1e-5
             if limits.low[i] <= before[i] <= limits.high[i]:
@@ -219,7 +220,7 @@ def test_from_anywhere_at_all_outputs_come_into_their_bounds_within_the_rate(
 @example(jitter=[-3] * 19 + [3] * 14 + [-3] * 30)
 def test_a_rack_whose_tick_wavers_moves_no_output_further_than_a_calm_one(jitter: list[int]) -> None:
     """In calm two windows meet within 5 s: an output may move by its rate at the end of one, and again in the next."""
-    limits, wanted = InputLimits(), SequenceRow(60.0, 150.0, 60.0)
+    limits, wanted = InputLimits(), Row(60.0, 150.0, 60.0)
     guard, told, moves = OutputGuard(limits, INITIAL), 0, [INITIAL]
     for now, off in enumerate(jitter, start=100):
         if now + off != told + 1:

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from coldloop.process.limits import InputLimits
-from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import Mode, SequenceRow, Verdict
+from coldloop.registers.control_plc import Mode, Verdict
 from coldloop.registers.safety import AlarmKind, AlarmState
 from tests.control_plc.conftest import HOLD_TICKS, alarm
+from tests.harness.records import Row, as_transmitted
 
 if TYPE_CHECKING:
     from tests.control_plc.conftest import Bench
 
-At = Callable[..., SequenceRow]
+At = Callable[..., Row]
 NewBench = Callable[..., "Bench"]
 
 
@@ -30,7 +30,7 @@ def test_the_optimiser_comes_back_through_a_handshake_from_the_input_being_appli
     assert update is not None
     assert update.playing == 0
     assert rig.plan(18)
-    start = SequenceRow(*update.u)
+    start = Row(*update.u)
     assert start != at(0.2), "the loops have moved the inputs"
     first = start._replace(cv155=start.cv155 + 0.3)
     assert rig.offer(rig.sequence([first] * 20)).verdict == Verdict.ACCEPTED
@@ -77,7 +77,7 @@ def test_an_optimiser_whose_answers_are_refused_gets_its_handshake_after_the_pau
     while program.mode is not Mode.MPC and program.tick < began + 400:
         update = program.player.update
         assert update is not None
-        first = SequenceRow(*update.u)
+        first = Row(*update.u)
         assert rig.plan(period)
         rig.scans(10)
         rig.offer(rig.sequence([first._replace(cv156=first.cv156 - 0.1)] * 40))
@@ -116,7 +116,7 @@ class LoopsAtWork:
         self._wanted = self.program._loops.wanted  # noqa: SLF001
         monkeypatch.setattr(self.program._loops, "wanted", self._work)  # noqa: SLF001
 
-    def _work(self, tick: int, *arguments: Any, **named: Any) -> SequenceRow:  # noqa: ANN401 - as they are
+    def _work(self, tick: int, *arguments: Any, **named: Any) -> Row:  # noqa: ANN401 - as they are
         self.ticks.append(tick)
         return self._wanted(tick, *arguments, **named)
 

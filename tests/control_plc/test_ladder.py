@@ -7,21 +7,20 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.process.cold_box import L1, T5
+from coldloop.process.cold_box import INPUT_NAMES, L1, OUTPUT_NAMES, T5
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES
 from coldloop.registers.audit import EventKind
-from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import Cause, Heartbeat, Mode, Operator, OperatorMode, SequenceRow, Update, Verdict
+from coldloop.registers.control_plc import Cause, Heartbeat, Mode, Operator, OperatorMode, Update, Verdict
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from control_plc.program import ControlProgram
 from tests.control_plc.conftest import HOLD_TICKS, alarm, section
+from tests.harness.records import Row, as_transmitted
 
 if TYPE_CHECKING:
     from tests.control_plc.conftest import Bench
 
-At = Callable[..., SequenceRow]
+At = Callable[..., Row]
 NewBench = Callable[..., "Bench"]
 
 AT_REST = (43.0, 75.0, 36.0)
@@ -33,7 +32,7 @@ def modes(program: ControlProgram) -> list[tuple[Mode, Cause]]:
     ]
 
 
-def steps(rows: Iterable[SequenceRow]) -> list[float]:
+def steps(rows: Iterable[Row]) -> list[float]:
     """Largest step of each input between consecutive ticks."""
     pairs = list(pairwise(rows))
     return [max(abs(later[i] - earlier[i]) for earlier, later in pairs) for i in range(3)]
@@ -64,13 +63,13 @@ def test_an_operator_takes_over_without_a_bump_and_gives_back_without_one(
     applied = rig.scans(3)
     program = rig.program
     stale = rig.sequence([at(0.2)] * 20)
-    program.operate(Operator(mode, *applied[-1]))
+    program.operate(Operator(mode, tuple(applied[-1])))
     applied += rig.scans(40)
     assert program.mode is (Mode.CLASSICAL if mode is OperatorMode.CLASSICAL else Mode.MANUAL)
     assert program.ladder.cause is Cause.OPERATOR
     assert not program.awaiting_plan
     assert rig.offer(stale).verdict == Verdict.NOT_INVITED
-    program.operate(Operator(OperatorMode.AUTO, *applied[-1]))
+    program.operate(Operator(OperatorMode.AUTO, tuple(applied[-1])))
     taken, update = rig.scan()
     applied.append(taken)
     assert update is not None, "the optimiser is invited at once"
@@ -83,8 +82,8 @@ def test_an_operator_takes_over_without_a_bump_and_gives_back_without_one(
 
 
 def test_manual_setpoints_are_clamped_and_approached_within_the_rate(rig: "Bench") -> None:
-    rig.program.operate(Operator(OperatorMode.MANUAL, 100.0, 1000.0, 0.0))
-    applied = [SequenceRow(*AT_REST), *rig.scans(20 * 60)]
+    rig.program.operate(Operator(OperatorMode.MANUAL, (100.0, 1000.0, 0.0)))
+    applied = [Row(*AT_REST), *rig.scans(20 * 60)]
     assert applied[19].cv155 == pytest.approx(43.5)
     assert applied[-1].cv155 == 60.0
     assert applied[-1].ncr22 == 150.0
@@ -271,7 +270,7 @@ def test_what_the_optimiser_does_without_is_an_alarm_while_it_drives(rig: "Bench
     rig.scan()
     row = program.alarms.rows[AlarmKind.SENSOR_SUSPECT]
     assert (row.active, row.cause, row.times) == (1, L1, 2)
-    program.operate(Operator(OperatorMode.CLASSICAL, *AT_REST))
+    program.operate(Operator(OperatorMode.CLASSICAL, tuple(AT_REST)))
     rig.scans(2)
     assert alarm(rig, AlarmKind.SENSOR_SUSPECT) is AlarmState.RETURNED
     events = [(each.subject, each.cause) for each in program.journal.since(0) if each.kind == EventKind.SENSOR]
@@ -302,7 +301,7 @@ def test_an_image_that_stands_still_as_a_whole_is_an_old_one_unless_the_plant_ma
     bench.steady = bench.frozen = True
     bench.scans(200)
     assert bool(bench.program.bad_sensors) is not rests
-    bench.program.operate(Operator(OperatorMode.MANUAL, 43.1, 75.0, 36.0))
+    bench.program.operate(Operator(OperatorMode.MANUAL, (43.1, 75.0, 36.0)))
     bench.scans(100)
     assert bench.program.bad_sensors == 2**22 - 1, "the inputs have moved, and nothing else"
     assert alarm(bench, AlarmKind.SENSOR_BAD) is AlarmState.UNACKNOWLEDGED
@@ -314,7 +313,7 @@ def test_an_image_that_stands_still_as_a_whole_is_an_old_one_unless_the_plant_ma
 def test_a_state_that_is_no_number_is_not_worked_with(rig: "Bench") -> None:
     program = rig.program
     program.begin_scan()
-    bad = Measurement(program.tick, rig.load, rig.outputs(), (math.nan,) * 28, 1)
+    bad = Measurement(program.tick, rig.load, rig.outputs(), (math.nan,) * 28, 1, (0.0,) * 3)
     assert program.end_scan(bad) is None
     assert not program.awaiting_plan
     _, update = rig.scan()
@@ -327,7 +326,7 @@ def test_a_state_that_is_no_number_is_not_worked_with(rig: "Bench") -> None:
 def test_after_a_restart_the_session_goes_on_from_what_is_applied(rig: "Bench", at: At) -> None:
     program = rig.program
     applied = as_transmitted(at(0.4, -8.0))
-    program.resume(7, 500, applied, updates=31, operator=Operator(OperatorMode.AUTO, *applied))
+    program.resume(7, 500, applied, updates=31, operator=Operator(OperatorMode.AUTO, tuple(applied)))
     row, update = rig.scan()
     assert row == applied
     assert update is not None
@@ -339,7 +338,7 @@ def test_after_a_restart_the_session_goes_on_from_what_is_applied(rig: "Bench", 
 
 def test_outputs_that_a_safe_state_left_outside_the_bounds_are_brought_back_within_the_rate(rig: "Bench") -> None:
     rig.program.rejoin(100, (10.0, 75.0, 36.0))
-    applied = [SequenceRow(10.0, 75.0, 36.0), *rig.scans(20 * 25)]
+    applied = [Row(10.0, 75.0, 36.0), *rig.scans(20 * 25)]
     assert applied[-1].cv155 >= 20.0
     assert steps(applied)[0] <= 0.5
 
@@ -394,10 +393,10 @@ def test_a_sensor_that_fails_now_and_then_is_not_bridged_for_ever(rig: "Bench") 
 
 def test_an_operator_who_gives_back_the_loops_to_nobody_sees_the_alarm(rig: "Bench") -> None:
     program = rig.program
-    program.operate(Operator(OperatorMode.CLASSICAL, *AT_REST))
+    program.operate(Operator(OperatorMode.CLASSICAL, tuple(AT_REST)))
     rig.scans(5)
     assert (program.ladder.cause, alarm(rig, AlarmKind.MODE)) == (Cause.OPERATOR, AlarmState.NORMAL)
-    program.operate(Operator(OperatorMode.AUTO, *AT_REST))
+    program.operate(Operator(OperatorMode.AUTO, tuple(AT_REST)))
     rig.scan()
     assert (program.mode, alarm(rig, AlarmKind.MODE)) == (Mode.CLASSICAL, AlarmState.UNACKNOWLEDGED)
 
@@ -406,7 +405,7 @@ def test_manual_begins_with_what_is_applied(rig: "Bench", at: At) -> None:
     rig.play([at(0.4, 8.0)] * 40, ticks=2)
     rig.scans(3)
     assert rig.program.track()
-    assert rig.program.operator[1:] == rig.program.applied[:]
+    assert rig.program.operator.u == rig.program.applied
     rig.program.operate(rig.program.operator._replace(mode=OperatorMode.MANUAL))
     assert set(rig.scans(40)) == {as_transmitted(at(0.4, 8.0))}
     assert not rig.program.track()

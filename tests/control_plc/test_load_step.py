@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import SequenceRow, Verdict
+from coldloop.registers.control_plc import Verdict
+from tests.harness.records import Row, as_transmitted
 
 if TYPE_CHECKING:
     from tests.control_plc.conftest import Bench
 
-At = Callable[..., SequenceRow]
+At = Callable[..., Row]
 
 
 def test_a_load_step_latches_an_update_and_what_is_played_goes_on(bench: "Bench", at: At) -> None:

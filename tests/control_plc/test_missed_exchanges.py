@@ -6,16 +6,17 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.registers.codec import WordOrder, codec_of
-from coldloop.registers.control_plc import CONTROL_MAP, Cause, Mode, Status, Verdict
+from coldloop.registers.control_plc import Cause, Mode, Status, Verdict
+from coldloop.registers.maps import CONTROL_MAP
 from coldloop.registers.safety import AlarmKind
+from tests.harness.records import Row
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from coldloop.registers.control_plc import SequenceRow
     from tests.control_plc.conftest import Bench
 
-    At = Callable[..., SequenceRow]
+    At = Callable[..., Row]
 
 
 def test_an_exchange_that_fails_at_the_first_tick_of_a_sequence_is_neither_a_miss_nor_late(

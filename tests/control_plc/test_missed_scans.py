@@ -9,20 +9,20 @@ import pytest
 
 from coldloop.process.cold_box import L1, T5
 from coldloop.process.limits import InputLimits
-from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import Mode, Operator, OperatorMode, SequenceRow, Verdict
+from coldloop.registers.control_plc import Mode, Operator, OperatorMode, Verdict
 from coldloop.session.time_base import TimeBase
 from control_plc.guard import OutputGuard
 from control_plc.retained_state import ControlStateStore, RetainedControlState
+from tests.harness.records import Row, as_transmitted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from tests.control_plc.conftest import Bench
 
-    At = Callable[..., SequenceRow]
+    At = Callable[..., Row]
 
-U0 = SequenceRow(43.0, 75.0, 36.0)
+U0 = Row(43.0, 75.0, 36.0)
 
 
 def skip(bench: "Bench", ticks: int) -> None:
@@ -30,7 +30,7 @@ def skip(bench: "Bench", ticks: int) -> None:
     bench.program.rejoin(bench.program.tick + ticks, bench.program.applied)
 
 
-def fail_exchange(bench: "Bench", applied: SequenceRow) -> None:
+def fail_exchange(bench: "Bench", applied: Row) -> None:
     """Begin a scan whose exchange fails, and go on at the same tick from what the rack applies."""
     bench.program.begin_scan()
     bench.program.interrupt()
@@ -53,10 +53,10 @@ def test_a_bad_level_is_bridged_for_its_time_with_one_scan_in_four_ticks(bench: 
 def test_the_classical_loops_execute_once_a_period_whatever_scans_are_missed(bench: "Bench", missed: int) -> None:
     bench.steady = True
     bench.level = -0.5
-    bench.program.operate(Operator(OperatorMode.CLASSICAL, *U0))
+    bench.program.operate(Operator(OperatorMode.CLASSICAL, tuple(U0)))
     bench.scan()
     skip(bench, 2)  # never again at a multiple of the period with 3 ticks missed
-    heater = [bench.program.applied.ncr22]
+    heater = [bench.program.applied[1]]
     began = bench.program.tick
     while bench.program.tick - began < 200:
         heater.append(bench.scan()[0].ncr22)
@@ -130,14 +130,14 @@ def test_a_tick_back_changes_nothing_of_what_is_played(bench: "Bench", at: "At")
 
 def test_the_guard_never_takes_over_what_is_no_number() -> None:
     guard = OutputGuard(InputLimits(), U0)
-    guard.begin_at(7, SequenceRow(math.nan, math.inf, 36.0))
+    guard.begin_at(7, Row(math.nan, math.inf, 36.0))
     assert guard.applied == U0
-    assert guard.admit(7, SequenceRow(math.nan, 80.0, -math.inf), update=True) == SequenceRow(43.0, 80.0, 36.0)
+    assert guard.admit(7, Row(math.nan, 80.0, -math.inf), update=True) == Row(43.0, 80.0, 36.0)
 
 
 def test_no_input_moves_by_more_than_its_rate_within_the_slew_time_however_many_sequences_begin() -> None:
     guard = OutputGuard(InputLimits(slew_s=1.0), U0)
-    applied = [guard.admit(tick, U0._replace(ncr22=150.0), update=True).ncr22 for tick in range(12)]
+    applied = [guard.admit(tick, U0._replace(ncr22=150.0), update=True)[1] for tick in range(12)]
     for tick in range(12):
         for later in range(tick + 1, min(12, tick + 4)):
             assert applied[later] - applied[tick] <= 10.0

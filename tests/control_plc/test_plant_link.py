@@ -36,7 +36,7 @@ def read_twice(link: PlantLink, shown: Measurement, now: float | None = None) ->
 
 
 def outputs(tick: int = 5) -> Actuators:
-    return Actuators(tick, *U, 1, HOLDER, 3)
+    return Actuators(tick, tuple(U), 1, HOLDER, 3)
 
 
 @pytest.fixture
@@ -121,7 +121,7 @@ def test_only_finite_readings_of_this_session_lead_back(
 )  # fmt: skip
 def test_what_one_reading_says_is_not_gone_on_from(link: PlantLink, lie: dict[str, object]) -> None:
     """In lock-step, where no time passes: the lie comes first, or between two that are true, and nobody is alarmed."""
-    link.addressed(outputs()._replace(cv155=43.5))
+    link.addressed(outputs()._replace(u=(43.5, *U[1:])))
     link.missed_scans()
     for shown in (reading(**lie), reading(), reading(**lie), reading()):
         assert not read_back(link, shown)

@@ -5,17 +5,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from coldloop.process.declaration import LAST_NUMBER
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import LAST_NUMBER
-from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import Mode, Plan, SequenceRow, Update, Verdict
+from coldloop.registers.control_plc import Mode, Plan, Update, Verdict
 from control_plc.guard import OutputGuard
 from control_plc.player import SequencePlayer
+from tests.harness.records import Row, as_transmitted
 
 if TYPE_CHECKING:
     from tests.control_plc.conftest import Bench
 
-At = Callable[..., SequenceRow]
+At = Callable[..., Row]
 
 
 def test_a_session_begins_with_the_initial_inputs_and_an_update_at_tick_0(
@@ -69,7 +69,7 @@ def test_the_update_at_the_first_tick_of_a_sequence_tells_both_inputs(bench: "Be
 
 def test_updates_are_numbered_from_0_again_after_the_last_number() -> None:
     limits = InputLimits()
-    player = SequencePlayer(OutputGuard(limits, SequenceRow(43.0, 75.0, 36.0)), 0, updates=LAST_NUMBER)
+    player = SequencePlayer(OutputGuard(limits, Row(43.0, 75.0, 36.0)), 0, updates=LAST_NUMBER)
     empty = Update(1, 0, 0, 0, 385.0, (43.0,) * 3, (43.0,) * 3, (0.0,) * 22, (0.0,) * 28)
     assert [player.latch(empty).update for _ in range(2)] == [LAST_NUMBER, 0]
 

@@ -17,13 +17,13 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.model_file import read_header
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.bank import ANYBODY, RefusedAccessError
-from coldloop.registers.codec import as_transmitted, codec_of
-from coldloop.registers.control_plc import CONTROL_MAP, Operator, OperatorMode, PlantLinkState
-from coldloop.registers.declaration import Block, Role, fields_of
+from coldloop.registers.codec import codec_of
+from coldloop.registers.control_plc import Operator, OperatorMode, PlantLinkState
+from coldloop.registers.declaration import Block, Role
 from coldloop.registers.domain import DomainError
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
-from coldloop.registers.plant import PLANT_MAP, Measurement
-from coldloop.registers.seal import sealed, sealed_bytes
+from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
+from coldloop.registers.plant import Measurement
+from coldloop.registers.seal import sealed_bytes
 from coldloop.safety.lease import SIMPLE_CLIENT
 from coldloop.service.journal import Journal
 from control_plc.plant_link import PlantLink
@@ -32,6 +32,7 @@ from control_plc.runtime import ControlPlc
 from control_plc.scan_cycle import ScanCycle
 from control_plc.settings import ControlSection, ControlSettings
 from plant.rack.outputs import AppliedOutputs
+from tests.harness.records import as_transmitted, sealed
 from tests.link.poison import values_of
 
 HEADER: Final = read_header(DEFAULT_MODEL_FILE)
@@ -63,7 +64,7 @@ class Poison(NamedTuple):
             changed = bytearray(raw)
             changed[bit // 8] ^= 1 << bit % 8
             return self._sealed(bytes(changed), block)
-        places = list(fields_of(block.record).items())[: -1 if block.sealed else None]
+        places = list(block.fields.items())[: -1 if block.sealed else None]
         number = self.place % len(places)
         _, field = places[number]
         values = values_of(field)
@@ -92,7 +93,7 @@ class Site:
         program = self.program = make_program(HEADER, ControlSection(), InputLimits())
         self.link = PlantLink(program.alarms, Journal(), 77)
         self.cycle = ScanCycle(program, self.link, lambda _: False)
-        cv155, ncr22, cv156 = as_transmitted(Operator(0, *HEADER.u0))[1:]
+        cv155, ncr22, cv156 = as_transmitted(Operator(0, tuple(HEADER.u0))).u
         self.outputs = AppliedOutputs((cv155, ncr22, cv156))  # it does not limit: what is sent is what moves
         self.tick = 0
         self.applied = [self.outputs.u]
@@ -104,7 +105,7 @@ class Site:
     def scan(self, poison: Poison | None = None) -> None:
         """Do what the control PLC does in one tick of the rack."""
         high = self.tick // TURNS % 2
-        self.program.operate(Operator(OperatorMode.MANUAL, *(SETPOINTS[high])))
+        self.program.operate(Operator(OperatorMode.MANUAL, tuple(SETPOINTS[high])))
         asked = self.cycle.begin()
         if asked is not None:
             self.outputs.offer(as_transmitted(sealed(asked)), ANYBODY, session=1, tick=self.tick, realtime=True)
@@ -177,7 +178,7 @@ def test_whatever_a_server_says_is_a_record_of_its_declaration_or_a_bad_answer(d
         record = codec.decode_checked(raw)
     except DomainError:
         return
-    for value, field in zip(record, fields_of(block.record).values(), strict=True):
+    for value, field in zip(record, block.fields.values(), strict=True):
         if field.values is not None and any(raw):
             field.values(value)
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.process.signals import TICK_S
+from coldloop.process.cold_box import TICK_S
 from control_plc.rack_clock import MAX_CORRECTION, PHASE, RackClock
 
 

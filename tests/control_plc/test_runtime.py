@@ -18,7 +18,6 @@ from coldloop.registers.audit import EVENT_ROWS, Event
 from coldloop.registers.bank import ANYBODY, Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import (
-    CONTROL_MAP,
     Cause,
     ControlSession,
     CoolDownStep,
@@ -30,9 +29,9 @@ from coldloop.registers.control_plc import (
     PlantLinkStatus,
 )
 from coldloop.registers.declaration import Block
-from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement, OutputVerdict
+from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
+from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
-from coldloop.registers.seal import sealed
 from coldloop.safety.retained import RetainedFile
 from control_plc.certificate_watch import EXPIRES_SOON, UNREADABLE
 from control_plc.program import ControlProgram
@@ -42,6 +41,7 @@ from control_plc.sessions import ADOPT_AFTER_S
 from control_plc.settings import ControlSettings
 from rig.cli.certificates import Authority
 from rig.cosim.ports import ReservedPorts
+from tests.harness.records import sealed
 
 WITHIN_S = 60.0
 HEADER = read_header(DEFAULT_MODEL_FILE)
@@ -79,7 +79,7 @@ class SmallRack:
             asked = self.bank.get(Actuators)
             if asked.session == self.session:
                 self.written.append(asked)
-                self._show(asked.holder, asked[1:4], OutputVerdict.ACCEPTED)
+                self._show(asked.holder, asked.u, OutputVerdict.ACCEPTED)
             else:
                 self._show(0, (43.0, 75.0, 36.0), OutputVerdict.WRONG_SESSION)
 
@@ -210,7 +210,7 @@ async def test_no_number_of_a_start_or_of_an_event_is_given_out_twice(tmp_path: 
     for start in (1, 2, 3):
         async with running(control_plc={"retain": {"file": tmp_path / "state"}}) as plc:
             await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.SEARCHING)
-            ask(plc, Operator(OperatorMode.CLASSICAL, 43.0, 75.0, 36.0))
+            ask(plc, Operator(OperatorMode.CLASSICAL, (43.0, 75.0, 36.0)))
             events = [plc.bank.get(Event, row) for row in range(EVENT_ROWS)]
             assert {event.boot for event in events if event.number > len(given)} == {start}
             given += sorted((event.number, event.boot) for event in events if event.number > len(given))
@@ -224,7 +224,7 @@ async def test_what_an_operator_says_before_the_rack_is_found_holds(tmp_path: Pa
         ask(plc, ControlSession(4, 0, 1.0))
         await until(lambda: plc.sessions.running)
         ask(plc, AlarmCommand(AlarmKind.CLOCK_SKEW, AlarmAction.SHELVE, 600))
-    for asked in (Operator(OperatorMode.MANUAL, 43.0, 75.0, 36.0), None):
+    for asked in (Operator(OperatorMode.MANUAL, (43.0, 75.0, 36.0)), None):
         async with running(SmallRack(4), control_plc=settings) as plc:
             if asked is not None:
                 ask(plc, asked)
@@ -243,7 +243,7 @@ async def test_a_session_is_gone_on_with_after_several_starts_without_the_rack(t
         await until(lambda: plc.sessions.running)
     for _ in range(2):
         async with running(control_plc=settings) as plc:
-            ask(plc, Operator(OperatorMode.CLASSICAL, 43.0, 75.0, 36.0))
+            ask(plc, Operator(OperatorMode.CLASSICAL, (43.0, 75.0, 36.0)))
     async with running(SmallRack(4), control_plc=settings) as plc:
         await until(lambda: plc.sessions.running)
         assert plc.bank.get(Operator).mode == OperatorMode.CLASSICAL

@@ -7,14 +7,14 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from coldloop.process.limits import InputLimits, RateReference
-from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import Acknowledgement, SequenceRow, Verdict
+from coldloop.registers.control_plc import Acknowledgement, Verdict
 from coldloop.safety.sequence import InputSequence
+from tests.harness.records import Row, as_transmitted
 
 if TYPE_CHECKING:
     from tests.control_plc.conftest import Bench
 
-At = Callable[..., SequenceRow]
+At = Callable[..., Row]
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def wrong(bench: "Bench", at: At, fault: str) -> InputSequence:
         "a first tick after the planned one": {"first_tick": 13, "tau_u": 9},
         "another updating period": {"tau_u": 7},
     }
-    row_faults: dict[str, SequenceRow] = {
+    row_faults: dict[str, Row] = {
         "a valve below its range": at(cv156=-16.1),
         "a valve above its range": at(cv155=17.1),
         "a heater below its range": at(ncr22=-75.5),
@@ -248,7 +248,7 @@ def test_what_is_accepted_is_what_is_applied(
         assert bench.plan(ticks)
         rows, row, share = [], now, limits.rate_share(ticks)
         for move in wanted:  # one move in every 20 ticks, some of them a little more than the rate
-            row = SequenceRow(*[u + share * rate * part for u, rate, part in zip(row, limits.rate, move, strict=True)])
+            row = Row(*[u + share * rate * part for u, rate, part in zip(row, limits.rate, move, strict=True)])
             rows += [row] * 20
             share = 1.0
         sequence = bench.sequence(rows)

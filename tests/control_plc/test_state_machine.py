@@ -13,7 +13,6 @@ from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.model_file import read_header
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.audit import EventKind
-from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import (
     Cause,
     Heartbeat,
@@ -22,7 +21,6 @@ from coldloop.registers.control_plc import (
     OperatorMode,
     Plan,
     SequenceHeader,
-    SequenceRow,
     Verdict,
 )
 from coldloop.registers.plant import Measurement
@@ -32,13 +30,14 @@ from coldloop.session.time_base import TimeBase
 from control_plc.program import ControlProgram, make_program
 from control_plc.retained_state import ControlStateStore, RetainedControlState
 from control_plc.settings import ControlSection
+from tests.harness.records import Row, as_transmitted
 
 HEADER = read_header(DEFAULT_MODEL_FILE)
 SECTION = ControlSection.model_validate(
     {"ladder": {"hold_s": 3.0, "optimizer_timeout_s": 8.0}, "sensors": {"bridged_s": 2.0}}
 )
 WINDOW = 20
-SAFE_STATE = SequenceRow(30.0, 50.0, 40.0)
+SAFE_STATE = Row(30.0, 50.0, 40.0)
 SLACK = (4e-6, 1e-5, 4e-6)
 """Half a unit of the last place of what is applied, twice."""
 
@@ -63,11 +62,11 @@ class Link(RuleBasedStateMachine):
         self.ticks: list[int] = [-1]
         self.began: list[int] = []
         """Places in the trace at which a sequence began, or a restart forgot the window."""
-        self.trace: list[SequenceRow] = [SequenceRow(*HEADER.u0)]
+        self.trace: list[Row] = [Row(*HEADER.u0)]
         """Every value that has reached the actuators, tick by tick."""
         self.promised: InputSequence | None = None
         """An accepted sequence that nothing has voided."""
-        self.accepted_rows: set[SequenceRow] = set()
+        self.accepted_rows: set[Row] = set()
         self.scan()
 
     def new_program(self) -> ControlProgram:
@@ -79,7 +78,7 @@ class Link(RuleBasedStateMachine):
         program = self.program
         due = self.promised is not None and self.promised.header.first_tick == program.tick
         actuators = program.begin_scan()
-        applied = SequenceRow(*actuators[1:4])
+        applied = Row(*actuators.u)
         if due and self.promised is not None:
             assert applied == self.promised.rows[0], "an accepted sequence begins at its tick"
             assert program.mode in (Mode.MPC, Mode.REST)
@@ -95,7 +94,7 @@ class Link(RuleBasedStateMachine):
         for output, reading in self.readings.items():
             y[output] = reading
         before = program.player.update
-        program.end_scan(Measurement(program.tick, self.load, tuple(y), HEADER.x0, program.session))
+        program.end_scan(Measurement(program.tick, self.load, tuple(y), HEADER.x0, program.session, (0.0,) * 3))
         self.scanned = True
         if program.player.update is not before:
             self.promised = None  # a load step, a bad sensor: the update that it answered is over
@@ -155,7 +154,7 @@ class Link(RuleBasedStateMachine):
         first = player.next_update_tick
         rows = [
             as_transmitted(
-                SequenceRow(*[u + excess * m * r for u, m, r in zip(applied, move, self.limits.rate, strict=True)])
+                Row(*[u + excess * m * r for u, m, r in zip(applied, move, self.limits.rate, strict=True)])
             )
             for move in moves
         ]  # fmt: skip
@@ -201,7 +200,7 @@ class Link(RuleBasedStateMachine):
         setpoints=st.tuples(st.floats(0, 100), st.floats(0, 1000), st.floats(0, 100)),
     )
     def an_operator_writes(self, mode: OperatorMode, setpoints: tuple[float, ...]) -> None:
-        self.program.operate(as_transmitted(Operator(mode, *setpoints)))
+        self.program.operate(as_transmitted(Operator(mode, tuple(setpoints))))
         if mode is not OperatorMode.AUTO:
             self.promised = None
 

@@ -17,7 +17,8 @@ from typing import NamedTuple
 import pytest
 
 from coldloop.modbus.client import RegisterClient
-from coldloop.registers.control_plc import CONTROL_MAP, LadderStatus, Mode
+from coldloop.registers.control_plc import LadderStatus, Mode
+from coldloop.registers.maps import CONTROL_MAP
 from rig import cli
 from tests.conftest import Coldloop, draw_nothing
 from tests.harness.processes import Process, Processes

@@ -5,7 +5,8 @@ import struct
 from pathlib import Path
 
 from coldloop.registers.common import MAGIC
-from coldloop.registers.control_plc import CONTROL_MAP, Verdict
+from coldloop.registers.control_plc import Verdict
+from coldloop.registers.maps import CONTROL_MAP
 from coldloop.registers.safety import AlarmKind
 from coldloop.service.event_text import word
 from control_plc.alarm_settings import PASSING, AlarmSettings

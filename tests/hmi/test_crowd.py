@@ -11,7 +11,7 @@ from pathlib import Path
 import aiohttp
 import pytest
 
-from coldloop.registers.control_plc import Process
+from coldloop.registers.control_plc import ProcessNow
 from hmi.audit import KEPT, LARGEST_FILE, MOST_KINDS, OLDER_FILES, REPEATS_S, Audit
 from hmi.page_server import PageServer, PageSite
 from hmi.process_image import Model
@@ -179,8 +179,8 @@ async def test_a_table_has_each_signal_once_and_all_its_rows() -> None:
     model = Model(Clock(), 7200)
     rows = 3 * ROWS_AT_ONCE + 1
     for tick in range(rows):
-        model.trends.add(Process(tick, 400.0, (43.0, 75.0, 36.0), (1.5,) * 22), 1)
-        model.put("control_plc", Process(tick, 400.0, (43.0, 75.0, 36.0), (1.5,) * 22))
+        model.trends.add(ProcessNow(tick, 400.0, (43.0, 75.0, 36.0), (1.5,) * 22), 1)
+        model.put("control_plc", ProcessNow(tick, 400.0, (43.0, 75.0, 36.0), (1.5,) * 22))
     page = PageServer(HmiSection(port=0), PageSite(model))
     await page.start()
     async with aiohttp.ClientSession() as browser:

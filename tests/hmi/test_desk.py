@@ -19,7 +19,7 @@ from coldloop.operating.commands import (
     duration_text,
 )
 from coldloop.operating.execution import lead_ticks
-from coldloop.process.signals import TICK_S
+from coldloop.process.cold_box import TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
 from coldloop.registers.plant import LoadAhead, LoadStatus
@@ -82,7 +82,7 @@ class Desk:
         pace = SessionPace(1, 1, 1.0, 0)
         self.model.put("plant", pace)
         self.plant = Peer(Identity(session=1, tick=1000), pace, LoadStatus(watts=400.0, free=4096))
-        auto = Operator(OperatorMode.AUTO, 43.0, 75.0, 36.0)
+        auto = Operator(OperatorMode.AUTO, (43.0, 75.0, 36.0))
         self.control = Peer(Identity(session=1, tick=1000), auto, LadderStatus(Mode.MPC, Cause.NONE, 0, 1, 0, 0))
         self.optimizer = Peer(Identity(session=1))
         self.desk = OperatorDesk({}, self.model, self.clock, training=False)
@@ -279,12 +279,12 @@ SESSION = Identity(session=2, tick=0)
 @pytest.mark.parametrize(
     ("command", "service", "change", "part"),
     [
-        (SETPOINT, "control", Operator(OperatorMode.MANUAL, 46.0, 75.0, 36.0), "setpoint of CV155: 43 %, now 46 %"),
+        (SETPOINT, "control", Operator(OperatorMode.MANUAL, (46.0, 75.0, 36.0)), "setpoint of CV155: 43 %, now 46 %"),
         (SETPOINT, "control", SESSION, "session: 1, now 2"),
         (
             SetMode(kind="mode", mode="auto"),
             "control",
-            Operator(OperatorMode.AUTO, 43.0, 75.0, 36.0),
+            Operator(OperatorMode.AUTO, (43.0, 75.0, 36.0)),
             "manual, now auto",
         ),
         (LOAD, "plant", LoadStatus(watts=410.0), "heat load: 400 W, now 410 W"),
@@ -296,7 +296,7 @@ async def test_a_confirmation_ends_when_its_premises_change(
     desk: Desk, command: Command, service: str, change: tuple[Any, ...], part: str
 ) -> None:
     peer: Peer = getattr(desk, service)
-    desk.control.records[Operator] = Operator(OperatorMode.MANUAL, 43.0, 75.0, 36.0)
+    desk.control.records[Operator] = Operator(OperatorMode.MANUAL, (43.0, 75.0, 36.0))
     token, *_ = await desk.desk.prepare(command, "anna")
     peer.records[type(change)] = change
     with pytest.raises(PremisesChangedError, match=part) as changed:

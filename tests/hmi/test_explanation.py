@@ -13,14 +13,15 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from coldloop.process.cold_box import T5
-from coldloop.process.signals import OUTPUT_NAMES
-from coldloop.registers.codec import as_transmitted
+from coldloop.process.cold_box import OUTPUT_NAMES, T5
+from coldloop.registers.codec import blank
 from coldloop.registers.control_plc import Verdict
+from coldloop.registers.maps import OPTIMIZER_MAP
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, UpdatingRuleKind, UpdatingRuleStatus
 from hmi.explanation import Branch, Explanation, explain, increments_of
 from hmi.sentences import deviation, sentence
 from optimizer_plc.rules import Algorithm1, Observation, algorithm_1, assess
+from tests.harness.records import as_transmitted
 
 getcontext().prec = 40
 
@@ -275,16 +276,19 @@ def test_a_slope_where_k_rounds_to_one_is_not_told_as_the_slope_of_k() -> None:
     assert "dK/dn" not in text
 
 
+NO_DEVIATION = blank(ModelDeviation, OPTIMIZER_MAP)
+
+
 def test_a_plant_that_differs_from_its_model_is_described_the_most_notable_first() -> None:
     y = [0.0] * 22
     y[T5], y[1], y[P1] = 0.31, -4.9, -0.0151
-    found = ModelDeviation(load=31.0, u=(-4.1, 0.0, 0.2), y=tuple(y))
+    found = NO_DEVIATION._replace(load=31.0, u=(-4.1, 0.0, 0.2), y=tuple(y))
     assert deviation(found) == "needs 4.1 % more of CV155, T5 +0.31 K, P1 -0.0151 bar, needs 0.2 % less of CV156"
-    assert deviation(ModelDeviation(load=31.0)) == ""
-    everything = ModelDeviation(u=(1.0, 1.0, 1.0), y=(1.0,) * 22)
+    assert deviation(NO_DEVIATION._replace(load=31.0)) == ""
+    everything = NO_DEVIATION._replace(u=(1.0, 1.0, 1.0), y=(1.0,) * 22)
     assert deviation(everything).count(",") == 3
     surprise = [1.0] * 22
     surprise[T5] = 4.23
     further = "T5 4.2 times further from its prediction than expected"
-    assert deviation(ModelDeviation(surprise=tuple(surprise))) == further
+    assert deviation(NO_DEVIATION._replace(surprise=tuple(surprise))) == further
     assert deviation(found._replace(surprise=tuple(surprise))).endswith(f"less of CV156, {further}")

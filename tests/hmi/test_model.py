@@ -10,10 +10,10 @@ import pytest
 
 from coldloop.errors import LinkError
 from coldloop.modbus.endpoints import Endpoint
-from coldloop.process.signals import OUTPUT_NAMES
+from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind, JournalPage
 from coldloop.registers.common import Identity, SessionPace
-from coldloop.registers.control_plc import LadderStatus, Mode, Plan, Process
+from coldloop.registers.control_plc import LadderStatus, Mode, Plan, ProcessNow
 from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmPriority, AlarmState
@@ -46,8 +46,8 @@ def model(clock: Clock) -> Model:
     return one
 
 
-def process(tick: int, level: float = 60.0) -> Process:
-    return Process(tick, 400.0, (43.0, 75.0, 36.0), (level, *(0.0,) * 21))
+def process(tick: int, level: float = 60.0) -> ProcessNow:
+    return ProcessNow(tick, 400.0, (43.0, 75.0, 36.0), (level, *(0.0,) * 21))
 
 
 def test_descriptions_that_number_their_meanings_become_words_and_others_do_not() -> None:

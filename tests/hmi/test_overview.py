@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES
+from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES
 from tests.harness.waiting import eventually
 from tests.hmi.conftest import SERVICES, Site, Witness
 

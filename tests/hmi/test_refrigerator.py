@@ -9,7 +9,8 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from coldloop.process.signals import OUTPUT_NAMES, STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
+from coldloop.process.cold_box import OUTPUT_NAMES
+from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
 from coldloop.registers.maps import MAPS
 from coldloop.registers.plant import StationAlarm, StationStatus
 from hmi.assets import STATIC

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from coldloop.process.signals import OUTPUT_NAMES
+from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind
 from hmi.explanation import Branch
 from hmi.process_image import JournalEntry, Model

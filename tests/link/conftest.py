@@ -18,16 +18,10 @@ from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.audit import EVENT_ROWS, Event, EventKind
 from coldloop.registers.codec import WordOrder, codec_of
 from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import (
-    CONTROL_MAP,
-    ControlSession,
-    Operator,
-    OperatorMode,
-    PlantLinkState,
-    PlantLinkStatus,
-)
+from coldloop.registers.control_plc import ControlSession, Operator, OperatorMode, PlantLinkState, PlantLinkStatus
 from coldloop.registers.declaration import RegisterMap
-from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, LoadStep, Measurement, PlantSample, PlantSession
+from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
+from coldloop.registers.plant import HISTORY_ROWS, LoadStep, Measurement, PlantSample, PlantSession
 from coldloop.registers.safety import Alarm, AlarmKind, LeaseState, LeaseStatus, WatchdogTime
 from tests.harness.processes import Process, Processes
 from tests.harness.treated_link import TreatedLink
@@ -229,7 +223,7 @@ class Control:
 
     async def drive(self, cv155: float, ncr22: float, cv156: float) -> None:
         """Let an operator drive."""
-        await self.client.write(Operator(OperatorMode.MANUAL, cv155, ncr22, cv156))
+        await self.client.write(Operator(OperatorMode.MANUAL, (cv155, ncr22, cv156)))
 
     async def answers(self) -> bool:
         """Tell whether it is there."""

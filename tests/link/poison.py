@@ -8,9 +8,10 @@ from collections.abc import Callable, Iterator
 from typing import Any, Final
 
 from coldloop.registers.codec import RecordCodec, codec_of
-from coldloop.registers.declaration import Block, Field, Kind, RegisterMap, fields_of
+from coldloop.registers.declaration import Block, Field, Kind, RegisterMap
 from coldloop.registers.seal import Seal, seal_of, sealed_bytes
 from rig.chaos.faults import Direction
+from tests.harness.records import map_of
 
 READS: Final = (3, 23)
 HEAD: Final = 9
@@ -48,7 +49,7 @@ def values_of(field: Field) -> tuple[float, ...]:
 
 def poisons(record: type[tuple[Any, ...]]) -> Iterator[tuple[str, Change]]:
     """Yield what each field of a record but its seal can be changed into, with words for it; of arrays one element."""
-    for place, (name, field) in enumerate(fields_of(record).items()):
+    for place, (name, field) in enumerate(map_of(record).block_of(record).fields.items()):
         if name == "crc":
             continue
         for value in values_of(field):
@@ -100,7 +101,7 @@ class PoisonedReads:
                 yield block, HEAD + 2 * (block.address + row * block.row_words - first)
 
     def _poisoned(self, frame: bytes, block: Block, begin: int) -> bytes:
-        codec, fields = codec_of(block), fields_of(block.record)
+        codec, fields = codec_of(block), block.fields
         name = self._draw.choice([name for name in fields if name != "crc"])
         change = _setting(list(fields).index(name), fields[name], self._draw.choice(values_of(fields[name])))
         record = change(codec.decode(frame, begin))

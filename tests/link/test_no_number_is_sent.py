@@ -17,9 +17,10 @@ from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import ControlSession, Grant, LinkCause, PlantLinkState
 from coldloop.registers.declaration import Block
-from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement, OutputVerdict
+from coldloop.registers.maps import PLANT_MAP
+from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import AlarmKind
-from coldloop.registers.seal import sealed
+from tests.harness.records import sealed
 from tests.harness.waiting import until
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ class FakeRack:
 
     def _measurement(self) -> Measurement:
         self.reads += 1
-        u, holder = (self.taken[-1][1:4], self.taken[-1].holder) if self.taken else (HEADER.u0, 0)
+        u, holder = (self.taken[-1].u, self.taken[-1].holder) if self.taken else (HEADER.u0, 0)
         verdict = OutputVerdict.ACCEPTED if self.taken else OutputVerdict.NONE
         truth = Measurement(self.tick, HEADER.w0, HEADER.y0, HEADER.x0, 1, u, holder, 1, verdict)
         return sealed(self.shows(truth))
@@ -110,7 +111,7 @@ async def test_while_a_read_back_is_no_number_nothing_is_sent_and_afterwards_it_
         assert (await control.alarm(AlarmKind.PLANT_LOST)).active
         rack.shows = lambda measured: measured
         await until(lambda: sent(before + 100))
-        assert all(math.isfinite(number) for outputs in rack.taken for number in outputs[1:4])
+        assert all(math.isfinite(number) for outputs in rack.taken for number in outputs.u)
         for first, second in pairwise(rack.taken):
-            steps = zip(first[1:4], second[1:4], InputLimits().rate, strict=True)
+            steps = zip(first.u, second.u, InputLimits().rate, strict=True)
             assert all(abs(new - old) <= rate for old, new, rate in steps)

@@ -11,7 +11,8 @@ from coldloop.process.model_file import read_header
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, CoolDownStep, LadderStatus, LinkCause, Mode, PlantLinkState
-from coldloop.registers.plant import PLANT_MAP, Actuators
+from coldloop.registers.maps import PLANT_MAP
+from coldloop.registers.plant import Actuators
 from coldloop.registers.safety import AlarmKind, WatchdogTime
 from coldloop.safety.retained import RetainedFile
 from control_plc.retained_state import OWNER
@@ -91,7 +92,7 @@ async def test_a_control_plc_that_was_restarted_goes_on_from_where_a_simple_clie
 
             async def moved() -> bool:
                 present = await rack.measurement()
-                await simple.write(PLANT_MAP, Actuators(present.tick, *MOVED, rack.session))
+                await simple.write(PLANT_MAP, Actuators(present.tick, tuple(MOVED), rack.session))
                 await simple.write(PLANT_MAP, WatchdogTime(0))  # they are to stay there
                 return present.u == MOVED
 

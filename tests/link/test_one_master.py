@@ -10,7 +10,8 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.registers.audit import EventKind
 from coldloop.registers.common import ServerStatistics
 from coldloop.registers.control_plc import LinkCause, PlantLinkState, PlantLinkStatus, Status
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, ControlLinkState, ControlLinkStatus
+from coldloop.registers.maps import OPTIMIZER_MAP
+from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
 from coldloop.registers.safety import AlarmKind, LeaseState, LeaseStatus
 from tests.link.conftest import SAFE_STATE
 

@@ -5,9 +5,10 @@ import contextlib
 from statistics import median
 from typing import TYPE_CHECKING
 
-from coldloop.process.signals import TICK_S
+from coldloop.process.cold_box import TICK_S
 from coldloop.registers.common import Identity
-from coldloop.registers.plant import PLANT_MAP, Actuators
+from coldloop.registers.maps import PLANT_MAP
+from coldloop.registers.plant import Actuators
 from coldloop.registers.safety import AlarmKind
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ async def test_at_a_rate_that_nobody_can_follow_rack_and_control_plc_answer_and_
     async with field(racing) as site, wire_when_up(site.rack, wire) as simple:
         control, rack = site.control(), site.rack
         await rack.begin(factor=10_000.0)
-        await simple.write(PLANT_MAP, Actuators(0, *OPERATING_POINT, rack.session))
+        await simple.write(PLANT_MAP, Actuators(0, tuple(OPERATING_POINT), rack.session))
         await control.begin(rack.session, factor=10_000.0)
         async with asyncio.timeout(PATIENCE_S):
             for client in (rack.client, control.client):

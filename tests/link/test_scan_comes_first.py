@@ -97,7 +97,7 @@ async def test_a_control_plc_whose_logs_nobody_reads_scans_and_answers_after_man
         control, rack = await site.joined(stderr=full_pipe), site.rack
         for number in range(60):
             mode = (OperatorMode.MANUAL, OperatorMode.CLASSICAL)[number % 2]
-            await control.client.write(Operator(mode, 43.0 + 0.01 * number, 75.0, 36.0))
+            await control.client.write(Operator(mode, (43.0 + 0.01 * number, 75.0, 36.0)))
             await rack.passes(1)
         await site.follows(control)
         assert len(await control.events(EventKind.OPERATOR_MODE)) == 60

@@ -10,8 +10,9 @@ from pydantic import ValidationError
 from coldloop.modbus.access import caller_at
 from coldloop.modbus.settings import AccessSettings
 from coldloop.registers.codec import codec_of
-from coldloop.registers.control_plc import CONTROL_MAP, Grant, Operator, Plan, SequenceHeader, SequenceRow
+from coldloop.registers.control_plc import Grant, Operator, Plan, SequenceHeader, SequenceRow
 from coldloop.registers.declaration import Role
+from coldloop.registers.maps import CONTROL_MAP
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import Running, Serve, Wire
@@ -77,7 +78,7 @@ async def test_a_reader_reads_and_whatever_it_writes_is_refused_and_not_stored(
         pdu = bytes.fromhex(request_hex)
         assert await wire.ask(pdu) == bytes((pdu[0] | 0x80, 1))
         assert running.bank.get(Grant) == Grant(0)
-        assert running.bank.get(Operator) == Operator(0, 0.0, 0.0, 0.0)
+        assert running.bank.get(Operator) == Operator(0, (0.0, 0.0, 0.0))
         assert running.written == []
         assert running.server.counters.access_refused == 1
         assert kinds == ["access_refused"]

@@ -14,7 +14,7 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.settings import TlsSettings
 from coldloop.modbus.tls import certificate_days_left, first_expiry, server_context
-from coldloop.registers.control_plc import CONTROL_MAP
+from coldloop.registers.maps import CONTROL_MAP
 from rig.cli.certificates import Authority, Pair, revoked_now
 
 if TYPE_CHECKING:

@@ -11,12 +11,13 @@ import pytest
 
 from coldloop.errors import PeerUnreachableError, RequestRefusedError, UnfitValueError
 from coldloop.modbus.client import RegisterClient
-from coldloop.registers.codec import WordOrder, as_transmitted
+from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import CONTROL_MAP, Grant
+from coldloop.registers.control_plc import Grant
 from coldloop.registers.declaration import RegisterMap
-from coldloop.registers.plant import PLANT_MAP, Actuators, LoadStep, Measurement, PlantSample, PlantSession
-from coldloop.registers.seal import sealed
+from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
+from coldloop.registers.plant import Actuators, LoadStep, Measurement, PlantSample, PlantSession
+from tests.harness.records import as_transmitted, sealed
 
 if TYPE_CHECKING:
     from coldloop.registers.bank import Caller
@@ -24,9 +25,11 @@ if TYPE_CHECKING:
     from tests.modbus.conftest import Running, Serve
 
 PATIENCE_S = 60.0
-ACTUATORS = sealed(Actuators(tick=7, cv155=50.0, ncr22=100.0, cv156=60.0, session=1))
+ACTUATORS = sealed(Actuators(tick=7, u=(50.0, 100.0, 60.0), session=1))
 MEASUREMENT = sealed(
-    as_transmitted(Measurement(7, 40.5, tuple(float(i) for i in range(22)), tuple(i / 3 for i in range(28)), 1))
+    as_transmitted(
+        Measurement(7, 40.5, tuple(float(i) for i in range(22)), tuple(i / 3 for i in range(28)), 1, (0.0,) * 3)
+    )
 )
 
 
@@ -82,7 +85,7 @@ async def test_requests_of_several_tasks_do_not_mix(serve: "Serve") -> None:
 async def test_a_refusal_says_who_refused_what(serve: "Serve") -> None:
     async with serve() as running, client_of(running.server.port) as client:
         with pytest.raises(RequestRefusedError) as refusal:
-            await client.write(ACTUATORS._replace(cv155=101.0))
+            await client.write(ACTUATORS._replace(u=(101.0, 100.0, 60.0)))
         assert refusal.value.exception_code == 3
         assert str(refusal.value) == (
             f"plant at 127.0.0.1:{running.server.port} refused function 16 on block 'actuators': "
@@ -90,7 +93,7 @@ async def test_a_refusal_says_who_refused_what(serve: "Serve") -> None:
         )
         with pytest.raises(RequestRefusedError, match="exception 2"):
             await client.write(MEASUREMENT)
-        assert running.bank.get(Actuators) == Actuators(0, 0.0, 0.0, 0.0, 0)
+        assert running.bank.get(Actuators) == Actuators(0, (0.0, 0.0, 0.0), 0)
 
 
 async def test_nobody_listens(free_port: int) -> None:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.process.cold_box import T5
-from coldloop.process.signals import OUTPUT_NAMES
+from coldloop.process.cold_box import OUTPUT_NAMES, T5
 from coldloop.registers.common import Identity
-from coldloop.registers.plant import PLANT_MAP, Measurement
+from coldloop.registers.maps import PLANT_MAP
+from coldloop.registers.plant import Measurement
 from tests.conftest import install
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ MEASURED = Measurement(
     y=tuple(KELVIN if position == T5 else 1.0 for position in range(len(OUTPUT_NAMES))),
     x=(0.0,) * 28,
     session=1,
+    u=(0.0,) * 3,
 )
 
 LIBMODBUS_PROGRAM = r"""

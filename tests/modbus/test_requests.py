@@ -5,12 +5,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.registers.plant import PLANT_MAP, Actuators, PlantSession
+from coldloop.registers.maps import PLANT_MAP
+from coldloop.registers.plant import Actuators, PlantSession
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import Serve
 
-ACTUATORS = Actuators(tick=7, cv155=50.0, ncr22=100.0, cv156=60.0, session=1)
+ACTUATORS = Actuators(tick=7, u=(50.0, 100.0, 60.0), session=1)
 LAST, BEYOND = f"{PLANT_MAP.end - 1:04x}", f"{PLANT_MAP.end:04x}"
 """Address of the last register of the map, and of the one behind it."""
 SESSION = PlantSession(session=1, realtime=0, factor=1.0, seed=2, load_steps=3)

@@ -14,7 +14,8 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.settings import TlsSettings
 from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import CONTROL_MAP, AwaitUpdate, Grant, SequenceRow
+from coldloop.registers.control_plc import AwaitUpdate, Grant, SequenceRow
+from coldloop.registers.maps import CONTROL_MAP
 from rig.cli.certificates import Authority
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ async def test_the_role_in_the_certificate_counts_and_not_the_address(
         assert (await wire.ask(WRITE_GRANT))[0] == grant
         assert (await wire.ask(WRITE_ROW))[0] == row
         assert running.bank.get(Grant) == Grant(9 if grant == 16 else 0)
-        assert running.bank.get(SequenceRow).cv155 == (10.0 if row == 16 else 0.0)
+        assert running.bank.get(SequenceRow).u[0] == (10.0 if row == 16 else 0.0)
         assert running.server.counters.access_refused == 1
         assert f"CN=client-{role}" in caplog.messages[0]
         assert f'role="{role}"' in caplog.messages[0]
@@ -150,11 +151,11 @@ async def test_our_client_reads_and_writes_by_its_role(serve: "Serve", pki: "Pki
     async with serve(CONTROL_MAP, tls=pki.server) as running:
         client = client_of(running, files)
         await client.connect(1.0)
-        await client.write_rows([SequenceRow(float(row), 0.0, 0.0) for row in range(100)])
+        await client.write_rows([SequenceRow((float(row), 0.0, 0.0)) for row in range(100)])
         assert (await client.exchange(AwaitUpdate(1, 2), Identity)).map_digest == CONTROL_MAP.digest
         with pytest.raises(RequestRefusedError, match=r"exception 1, .*not for the role of this client"):
             await client.write(Grant(1))
-        assert [row.cv155 for row in await client.read_rows(SequenceRow, 0, 100)] == list(range(100))
+        assert [row.u[0] for row in await client.read_rows(SequenceRow, 0, 100)] == list(range(100))
         client.close()
 
 

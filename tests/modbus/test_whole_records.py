@@ -18,11 +18,12 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.refusals import RefusalLog
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
 from coldloop.registers.codec import WordOrder, codec_of
-from coldloop.registers.control_plc import CONTROL_MAP, Heartbeat
-from coldloop.registers.declaration import Block, Field, Kind, Register, RegisterMap, fields_of
-from coldloop.registers.maps import MAPS
-from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement, PlantSession
-from coldloop.registers.seal import Seal, seal_of, sealed
+from coldloop.registers.control_plc import Heartbeat
+from coldloop.registers.declaration import Block, Field, Kind, Register, RegisterMap
+from coldloop.registers.maps import CONTROL_MAP, MAPS, PLANT_MAP
+from coldloop.registers.plant import Actuators, Measurement, PlantSession
+from coldloop.registers.seal import Seal, seal_of
+from tests.harness.records import sealed
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import Plug, Serve
@@ -53,11 +54,11 @@ def within(value: float, field: Field) -> bool:
 def is_right(block: Block, raw: bytes) -> bool:
     """Tell whether these bytes are a record that may be stored."""
     codec = codec_of(block)
-    values = dict(zip(fields_of(block.record), codec.decode(raw), strict=True))
+    values = dict(zip(block.fields, codec.decode(raw), strict=True))
     ranges = all(
-        within(value, field)
-        for name, field in fields_of(block.record).items()
-        for value in (values[name] if field.elements else (values[name],))
+        within(value, one)
+        for name, field in block.fields.items()
+        for value, (_, one) in zip(values[name] if field.elements else (values[name],), field.registers, strict=True)
     )
     return ranges and not (block.sealed and seal_of(codec, raw) is Seal.BROKEN)
 
@@ -65,8 +66,8 @@ def is_right(block: Block, raw: bytes) -> bool:
 def starting_record(block: Block, kind: str) -> tuple[Any, ...]:
     """Return what is there before the write: what a server starts with, or a valid record."""
     if kind == "zeros":
-        return block.record(*[spread(0, field) for field in fields_of(block.record).values()])
-    low = block.record(*[spread(field.low or 0, field) for field in fields_of(block.record).values()])
+        return block.record(*[spread(0, field) for field in block.fields.values()])
+    low = block.record(*[spread(field.low or 0, field) for field in block.fields.values()])
     return sealed(low) if kind == "sealed" and block.sealed else low
 
 
@@ -198,7 +199,7 @@ async def test_a_broken_seal_is_refused_with_03_and_an_absent_one_is_a_simple_cl
     serve: "Serve", order: WordOrder, function: int
 ) -> None:
     block = PLANT_MAP.block_of(Actuators)
-    good = sealed(Actuators(5, 43.0, 75.0, 36.0, session=1))
+    good = sealed(Actuators(5, (43.0, 75.0, 36.0), session=1))
     codec = codec_of(block, order)
     async with serve(order=order) as running:
         wire = await running.connect()
@@ -208,7 +209,7 @@ async def test_a_broken_seal_is_refused_with_03_and_an_absent_one_is_a_simple_cl
             flipped[bit // 8] ^= 1 << bit % 8
             assert await wire.ask(requests_with(function, block, bytes(flipped))) == bytes((function | 0x80, 3))
         assert running.written == []
-        assert running.bank.get(Actuators) == Actuators(0, 0.0, 0.0, 0.0, 0)
+        assert running.bank.get(Actuators) == Actuators(0, (0.0, 0.0, 0.0), 0)
         for record in (good, good._replace(tick=6, crc=0)):
             assert (await wire.ask(requests_with(function, block, codec.encode(record))))[0] == function
             assert running.bank.get(Actuators) == record
@@ -221,7 +222,7 @@ async def test_a_signalling_nan_in_a_sealed_record_is_a_bad_sensor_and_no_damage
     serve: "Serve", order: WordOrder
 ) -> None:
     block = PLANT_MAP.block_of(Measurement)
-    record = Measurement(7, 40.5, (1.5,) * 22, (2.5,) * 28, 1, verdict=1)
+    record = Measurement(7, 40.5, (1.5,) * 22, (2.5,) * 28, 1, (0.0,) * 3, verdict=1)
     high = codec_of(block).encode(record)
     signalling = bytes.fromhex("7fa00001")
     raw = sealed_raw(high.replace(struct.pack(">f", 1.5), signalling, 1))
@@ -232,7 +233,7 @@ async def test_a_signalling_nan_in_a_sealed_record_is_a_bad_sensor_and_no_damage
         arrived = await client.read(Measurement)
         assert math.isnan(arrived.y[0])
         assert arrived.y[1:] == record.y[1:]
-        exchanged = await client.exchange(Actuators(7, 43.0, 75.0, 36.0, session=1), Measurement)
+        exchanged = await client.exchange(Actuators(7, (43.0, 75.0, 36.0), session=1), Measurement)
         assert math.isnan(exchanged.y[0])
         running.bank._memory[2 * block.address + 3] ^= 1  # noqa: SLF001
         with pytest.raises(DamagedAnswerError, match="block 'measurement' arrived damaged, or is not sealed there"):
@@ -267,7 +268,7 @@ async def test_a_second_writer_is_refused_with_06_counted_as_such_and_stores_not
         client = RegisterClient(PLANT_MAP, host="127.0.0.1", port=running.server.port, timeout_s=60.0)
         for refused in range(1, 4):
             with pytest.raises(RequestRefusedError, match="exception 6, another client holds the lease") as refusal:
-                await client.exchange(Actuators(7, 43.0, 75.0, 36.0, session=1), Measurement)
+                await client.exchange(Actuators(7, (43.0, 75.0, 36.0), session=1), Measurement)
             assert refusal.value.exception_code == 6
             assert running.server.counters.second_writer == refused
         assert kinds == ["second_writer"] * 3

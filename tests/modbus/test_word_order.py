@@ -25,4 +25,4 @@ async def test_with_the_low_word_first(serve: "Serve", request_hex: str, answer_
         wire = await running.connect()
         answer = await wire.ask(bytes.fromhex(request_hex))
         assert answer == bytes.fromhex(answer_hex)
-        assert running.bank.get(Actuators).cv155 == (50.0 if answer[0] == 0x10 else 0.0)
+        assert running.bank.get(Actuators).u[0] == (50.0 if answer[0] == 0x10 else 0.0)

@@ -17,7 +17,6 @@ from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import (
-    CONTROL_MAP,
     Acknowledgement,
     AwaitUpdate,
     Heartbeat,
@@ -29,15 +28,15 @@ from coldloop.registers.control_plc import (
     Verdict,
 )
 from coldloop.registers.declaration import Block, RegisterMap
+from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
-from coldloop.registers.plant import PLANT_MAP
-from coldloop.registers.seal import sealed
 from coldloop.safety.lease import Lease
 from coldloop.safety.sequence import InputSequence, checksum
 from optimizer_plc.runtime import OptimizerPlc
 from optimizer_plc.settings import OptimizerSettings
 from rig.chaos.faults import Direction
 from rig.chaos.proxy import reset
+from tests.harness.records import sealed
 from tests.harness.treated_link import TreatedLink
 
 WITHIN_S = 60.0
@@ -127,7 +126,7 @@ class PlayedControlPlc:
                 await self._latched.wait()
 
     def _judge(self, header: SequenceHeader) -> None:
-        rows = [self.bank.get(SequenceRow, row) for row in range(header.length)]
+        rows = [self.bank.get(SequenceRow, row).u for row in range(header.length)]
         intact = checksum(*InputSequence(header, rows)) == header.crc
         verdict = self.verdicts.pop(0) if self.verdicts else Verdict.ACCEPTED if intact else Verdict.BAD_CRC
         self.headers.append(header)

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.process.signals import LAST_NUMBER
+from coldloop.process.declaration import LAST_NUMBER
 from coldloop.registers.control_plc import Update
 from tests.link.poison import Change, poisons
 

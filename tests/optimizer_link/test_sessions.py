@@ -13,10 +13,11 @@ from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.audit import Event, EventKind, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.bank import Caller, IllegalValueError, RefusedAccessError
-from coldloop.registers.codec import WordOrder
+from coldloop.registers.codec import WordOrder, blank
 from coldloop.registers.common import SessionPace
 from coldloop.registers.declaration import Role
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OperatingLimits, OptimizerSession
+from coldloop.registers.maps import OPTIMIZER_MAP
+from coldloop.registers.optimizer_plc import OperatingLimits, OptimizerSession
 from coldloop.registers.text import from_words
 from optimizer_plc.budget import BudgetSettings, PlcBudget
 from optimizer_plc.publication import OptimizerPublication
@@ -31,7 +32,7 @@ UPDATING_PERIOD = BLOCK.end - 1
 
 def shown(power: float = 1.0, tau_1_s: float = 0.25) -> OptimizerPublication:
     budget = PlcBudget(BudgetSettings(power=power), tau_1_s)
-    return OptimizerPublication(WordOrder.HIGH_FIRST, budget, OperatingLimits(), 1, 1)
+    return OptimizerPublication(WordOrder.HIGH_FIRST, budget, blank(OperatingLimits, OPTIMIZER_MAP), 1, 1)
 
 
 @asynccontextmanager

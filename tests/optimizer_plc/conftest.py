@@ -13,7 +13,6 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_file import read_header
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
-from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.plant import Measurement
 from coldloop.safety.sequence import InputSequence
@@ -29,6 +28,7 @@ from optimizer_plc.solvers import Answer, Solver, make_solver
 from plant.cold_box.physics import REFERENCE
 from plant.cold_box.program import ColdBoxProgram
 from plant.load import find_load
+from tests.harness.records import as_transmitted
 from tests.harness.reference_qp import solved_by_daqp
 
 Array = NDArray[np.float64]
@@ -137,8 +137,8 @@ def recorded_jumps(model: LtiModel, hour: str, minutes: float) -> list[Jump]:
                 jumps.append(recorder.started)
             answer = control.offer(InputSequence(header, [as_transmitted(row) for row in rows]))
             assert answer.verdict == Verdict.ACCEPTED
-        plant.apply(as_transmitted(control.begin_scan())[1:4])
-        measurement = as_transmitted(Measurement(plant.tick, plant.load, plant.measure(), plant.state, 1))
+        plant.apply(as_transmitted(control.begin_scan()).u)
+        measurement = as_transmitted(Measurement(plant.tick, plant.load, plant.measure(), plant.state, 1, (0.0,) * 3))
         plant.advance()
         update = control.end_scan(measurement)
         if update is not None:

@@ -10,9 +10,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from coldloop.process.cold_box import L1
+from coldloop.process.cold_box import L1, OUTPUT_NAMES
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import OUTPUT_NAMES
 from optimizer_plc.computing_settings import Arithmetic, EstimatorKind, EstimatorSettings
 from optimizer_plc.estimator import (
     Belief,

@@ -11,10 +11,9 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
-from coldloop.process.cold_box import T5
+from coldloop.process.cold_box import OUTPUT_NAMES, T5
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import OUTPUT_NAMES
 from optimizer_plc.computing_settings import SIGNALS, EstimatorKind, EstimatorSettings
 from optimizer_plc.estimator import (
     begin_prediction,

@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coldloop.process.cold_box import T5
+from coldloop.process.cold_box import OUTPUT_NAMES, T5, TICKS_PER_SAMPLE
 from coldloop.process.declaration import Forecast
 from coldloop.process.limits import InputLimits
 from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import OUTPUT_NAMES, TICKS_PER_SAMPLE
 from optimizer_plc.computing_settings import EstimatorSettings
 from optimizer_plc.estimator import estimator_of
 from optimizer_plc.forecasts import Forecasts

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coldloop.process.cold_box import TICK_S
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import TICK_S
 from coldloop.registers.control_plc import Update, Verdict
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.decisions import PROVEN

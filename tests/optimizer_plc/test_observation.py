@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 import optimizer_plc.program
 from coldloop.kernels.compiled import kernel
+from coldloop.process.cold_box import TICK_S
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import TICK_S
 from coldloop.registers.control_plc import Plan, Update
 from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
 from coldloop.safety.sequence import InputSequence

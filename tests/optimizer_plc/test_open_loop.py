@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coldloop.process.cold_box import L1
-from coldloop.process.signals import OUTPUT_NAMES, TICK_S
+from coldloop.process.cold_box import L1, OUTPUT_NAMES, TICK_S
 from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
 from optimizer_plc.open_loop import has_moved, is_expected_to_move, none_apart, note_movement

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coldloop.process.cold_box import L1, T5
-from coldloop.process.signals import OUTPUT_NAMES, OUTPUT_UNITS, TICK_S
+from coldloop.process.cold_box import L1, OUTPUT_NAMES, OUTPUT_UNITS, T5, TICK_S
 from optimizer_plc.computing_settings import Arithmetic, PlausibilitySettings
 from optimizer_plc.estimator import Belief, Estimator, begin_prediction, correct, estimator_of, no_belief, predict
 from optimizer_plc.plausibility import MISSING, USED, new_readings, suspects_of, wanders_off

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from coldloop.process.cold_box import INPUT_NAMES
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import INPUT_NAMES
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.scheme import Constants, shortage
 from optimizer_plc.settings import ProgramSettings

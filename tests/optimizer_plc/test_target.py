@@ -11,10 +11,9 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from coldloop.process.cold_box import L1, T5
+from coldloop.process.cold_box import L1, OUTPUT_NAMES, T5
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import OUTPUT_NAMES
 from optimizer_plc.computing_settings import Arithmetic, EstimatorSettings
 from optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
 from optimizer_plc.qp.arithmetic import DOUBLE, Real, real_of

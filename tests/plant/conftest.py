@@ -16,8 +16,9 @@ from coldloop.registers.audit import EVENT_ROWS, Event, EventKind
 from coldloop.registers.bank import ALL_ROLES, Caller, RefusedAccessError
 from coldloop.registers.codec import codec_of
 from coldloop.registers.declaration import Role
-from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
-from coldloop.registers.seal import Seal, seal_of, sealed
+from coldloop.registers.maps import PLANT_MAP
+from coldloop.registers.plant import Actuators, Measurement
+from coldloop.registers.seal import Seal, seal_of
 from plant.cold_box.physics import REFERENCE, ColdBox, derivative, outputs
 from plant.helium.properties import Helium, load_helium
 from plant.integrator import advance
@@ -25,6 +26,7 @@ from plant.kinds import plant_maker
 from plant.numeric import RealArray
 from plant.rack.registers import RackRegisters
 from plant.settings import PlantSettings
+from tests.harness.records import sealed
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
@@ -135,7 +137,7 @@ class RackClient:
     def outputs(self, *u: float, **changed: int) -> Actuators:
         """Return outputs for the present tick, by default with what has been read back."""
         rack = self._rack.registers.rack
-        outputs = Actuators(rack.tick, *u, rack.session.number, self.number)._replace(**changed)
+        outputs = Actuators(rack.tick, tuple(u), rack.session.number, self.number)._replace(**changed)
         return outputs if not self.number else sealed(outputs)
 
     def exchange(self, outputs: Actuators) -> Measurement | Refused:

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.plant import StationAlarm, StationMode, Surroundings
 from plant.refrigerator.equipment import (
     ADMISSION,

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.process.cold_box import L1, T5
+from coldloop.process.cold_box import L1, OUTPUT_NAMES, T5
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import OUTPUT_NAMES, STATION_SIGNAL_NAMES
+from coldloop.process.station import STATION_SIGNAL_NAMES
 from plant.helium.entropy import entropy, supply_entropy
 from plant.helium.properties import GAS_CONSTANT, load_helium
 from plant.refrigerator.diagnosis import refrigerator_operating_point

@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import LOAD_SPAN, LoadProfile
 from coldloop.registers.plant import LoadStep
 from plant.rack.load_schedule import MOST_UPCOMING, LoadSchedule
@@ -11,7 +12,7 @@ from plant.rack.load_schedule import MOST_UPCOMING, LoadSchedule
 
 def schedule(*steps: tuple[int, float]) -> LoadSchedule:
     times, watts = zip(*(steps or ((0, 385.0),)), strict=True)
-    return LoadSchedule(LoadProfile(times, watts))
+    return LoadSchedule(LoadProfile(times, watts), COLD_BOX.load)
 
 
 def write(load: LoadSchedule, now: int, *steps: tuple[int, float]) -> None:
@@ -61,7 +62,7 @@ def test_a_load_of_any_length_passes_through() -> None:
 
 def test_what_is_retained_goes_on_with_the_same_load() -> None:
     load = schedule((0, 385.0), (10, 300.0), (20, 500.0))
-    kept = LoadSchedule(load.from_tick(12))
+    kept = LoadSchedule(load.from_tick(12), COLD_BOX.load)
     assert [kept.value(tick) for tick in range(12, 25)] == [load.value(tick) for tick in range(12, 25)]
 
 

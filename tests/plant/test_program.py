@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import OUTPUT_NAMES
 from plant.cold_box.physics import REFERENCE
 from plant.cold_box.program import ColdBoxProgram
 from plant.program import MeasurementNoise, PlantProgram
@@ -126,9 +126,9 @@ def test_a_wrong_load_profile_is_refused(times: tuple[int, ...], watts: tuple[fl
 
 
 @pytest.mark.parametrize("deviations", [(0.1,), (-0.1,) * 22, (float("inf"),) * 22])
-def test_wrong_noise_is_refused(deviations: tuple[float, ...]) -> None:
+def test_wrong_noise_is_refused(model: LtiModel, deviations: tuple[float, ...]) -> None:
     with pytest.raises(ValueError, match="standard deviations"):
-        MeasurementNoise(deviations, 1)
+        program(model, noise=MeasurementNoise(deviations, 1))
 
 
 @pytest.mark.parametrize("wrong", [{"x0": [1.0]}, {"u0": [43.0, float("nan"), 36.0]}, {"tick_s": 0.0}, {"tick_s": 0.6}])

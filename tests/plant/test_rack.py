@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.process.cold_box import L1, T5
-from coldloop.process.signals import LAST_TICK
+from coldloop.process.declaration import LAST_TICK
 from coldloop.registers.audit import EventKind
 from coldloop.registers.common import SessionPace
 from coldloop.registers.plant import (
@@ -23,7 +23,7 @@ from coldloop.registers.plant import (
     SensorFaultKind,
 )
 from coldloop.registers.safety import WatchdogState, WatchdogStatus, WatchdogTime
-from coldloop.registers.seal import sealed
+from tests.harness.records import sealed
 
 if TYPE_CHECKING:
     from tests.plant.conftest import RackOnTheBus
@@ -72,7 +72,7 @@ def test_outputs_that_are_not_for_now_are_not_taken_and_the_answer_says_why(
     assert (answer.verdict, answer.u, answer.generation) == (verdict, U, 1)
     assert rack.tick == 1
     applied = plc.read(Actuators)
-    assert applied[1:4] == U, "what is applied is read back, not what was refused"
+    assert applied.u == U, "what is applied is read back, not what was refused"
     assert plc.send(44.0, 70.0, 37.0).verdict == OutputVerdict.ACCEPTED
 
 
@@ -80,7 +80,7 @@ def test_damaged_outputs_are_refused_and_a_simple_client_need_not_seal(switch_on
     rack = switch_on()
     plc = rack.client("control PLC", 77)
     plc.send(*U)
-    assert plc.exchange(plc.outputs(50.0, 80.0, 36.0)._replace(cv155=50.5)) == (3,)
+    assert plc.exchange(plc.outputs(50.0, 80.0, 36.0)._replace(u=(50.5, 80.0, 36.0))) == (3,)
     shown = rack.shown()
     assert (shown.u, shown.verdict, shown.tick) == (U, OutputVerdict.ACCEPTED, 1), "nothing has happened"
     plc.closes()
@@ -264,7 +264,7 @@ def test_outputs_hold_or_go_to_the_safe_state_when_the_control_plc_is_silent(
     assert (shown.u, shown.generation) == (expected, 1 + (expected == SAFE))
     status = plc.read(WatchdogStatus)
     assert (status.time, status.state, status.trips) == (20, WatchdogState.EXPIRED, 1)
-    assert plc.read(Actuators)[1:4] == expected
+    assert plc.read(Actuators).u == expected
     assert [event.tick for event in rack.events(EventKind.WATCHDOG_EXPIRED)] == [20]
     assert plc.send(*U).u == U
     assert plc.read(WatchdogStatus).state == WatchdogState.RUNNING

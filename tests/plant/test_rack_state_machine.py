@@ -118,13 +118,13 @@ class RackMachine(RuleBasedStateMachine):
         assert (verdict == OutputVerdict.WRONG_SESSION) == (sent.session != answer.session)
         assert (verdict == OutputVerdict.STALE) == (sent.session == answer.session and not timely)
         if verdict == OutputVerdict.ACCEPTED:
-            assert (answer.u, answer.holder) == (sent[1:4], writer.connection.number)
+            assert (answer.u, answer.holder) == (sent.u, writer.connection.number)
             assert sent.generation in (0, answer.generation)
             assert not sent.generation or before.u in writer.believed, "it did not know what was applied"
             return
         if verdict == OutputVerdict.LIMITED:
             assert self.limited
-            assert answer.u != sent[1:4]
+            assert answer.u != sent.u
             moves = [abs(after - base) for after, base in zip(answer.u, self.beginning[1], strict=True)]
             assert all(move <= rate + 1e-4 for move, rate in zip(moves, RATE, strict=True))
             assert answer.generation > before.generation, "its writer does not know what is applied"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from coldloop.process.signals import OUTPUT_NAMES
+from coldloop.process.cold_box import OUTPUT_NAMES
 from plant.cold_box.equilibrium import Equilibrium
 from plant.cold_box.model import build_model
 from plant.helium.properties import (

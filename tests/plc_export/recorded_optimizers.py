@@ -7,11 +7,11 @@ from typing import Final
 import numpy as np
 
 from coldloop.config import load_configuration
-from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Update
 from rig.plc_export.kernels.recorded_problems import SINGLE
 from rig.plc_export.kernels.recorded_updates import GoldenUpdate, UpdateRecorder
 from rig.settings import Settings
+from tests.harness.records import as_transmitted
 
 PROGRAM: Final = "optimizer_plc.program."
 OPTIMISERS: Final = {

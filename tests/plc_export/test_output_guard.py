@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.process.limits import InputLimits, RateReference
-from coldloop.registers.control_plc import SequenceRow, Verdict
+from coldloop.registers.control_plc import Verdict
 from control_plc.guard import OutputGuard
 from control_plc.output_limits import begin
 from rig.plc_export.c.guard_files import GuardExport
@@ -22,6 +22,7 @@ from rig.plc_export.kernels.counted import counted_guard, counted_longest
 from rig.plc_export.kernels.golden_calls import Call, GoldenCall, Judgement, golden_calls
 from rig.plc_export.kernels.guard_program import GuardKernels
 from rig.plc_export.structured_text.guard_files import GuardText
+from tests.harness.records import Row
 from tests.plc_export import matiec
 from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, SANITIZED, STRICT, compiled, output, write
 from tests.plc_export.st_interpreter import Machine
@@ -36,7 +37,7 @@ NUMBER = {
     "st": re.compile(r"LREAL#\d\.\d{16}E[+-]\d\d"),
 }
 LARGEST = float(np.finfo(np.float32).max)
-MIDDLE = SequenceRow(43.0, 75.0, 36.0)
+MIDDLE = Row(43.0, 75.0, 36.0)
 
 needs_a_compiler = pytest.mark.skipif(not COMPILERS, reason=NO_COMPILER)
 each_limits = pytest.mark.parametrize("limits", LIMITS.values(), ids=LIMITS)
@@ -79,15 +80,15 @@ def test_golden_calls_are_answered_as_by_the_guard_of_the_control_plc(limits: In
 def answered(guard: OutputGuard, call: GoldenCall) -> tuple[tuple[float, ...], Judgement]:
     """Return what the guard applies after a call, and what it says."""
     judgement = Judgement.ACCEPTED
-    given = SequenceRow(*call.given)
+    given = Row(*call.given)
     if call.call is Call.SCAN:
         guard.admit(call.tick, given, update=call.update)
     elif call.call is Call.RESUME:
         guard.begin_at(call.tick, given)
     else:
-        rows = [SequenceRow(*row) for row in call.rows]
+        rows = [Row(*row) for row in call.rows]
         held = call.first_tick - call.tick - len(call.meanwhile)
-        meanwhile = [*(SequenceRow(*row) for row in call.meanwhile), *[None] * held]
+        meanwhile = [*(Row(*row) for row in call.meanwhile), *[None] * held]
         verdict = guard.judge(rows, call.first_tick, meanwhile)
         good = Judgement.ACCEPTED if verdict is Verdict.ACCEPTED else Judgement.RATE_EXCEEDED
         judgement = Judgement.OUT_OF_RANGE if guard.out_of_range(rows) else good
@@ -197,7 +198,7 @@ def test_whatever_is_asked_the_guard_in_c_has_the_bits_of_ours(
     theirs, ours, tick = loaded(name), OutputGuard(LIMITS[name], MIDDLE), 0
     assert theirs.guard_restart(floats(*MIDDLE))
     for what, row, flag, ticks in course:
-        wanted = SequenceRow(*row)
+        wanted = Row(*row)
         if what == "resume":
             tick += ticks
             assert theirs.guard_resume(tick, floats(*row))
@@ -311,7 +312,7 @@ def test_before_a_restart_and_for_what_cannot_be_nothing_is_done() -> None:
 
 
 def test_operations_are_those_counted_by_hand() -> None:
-    kernels, moved = GuardKernels(InputLimits()), SequenceRow(43.25, 74.0, 36.0625)
+    kernels, moved = GuardKernels(InputLimits()), Row(43.25, 74.0, 36.0625)
     calls = [GoldenCall(Call.RESTART, 0, MIDDLE, MIDDLE), GoldenCall(Call.SCAN, 1, MIDDLE, MIDDLE),
              GoldenCall(Call.SCAN, 2, moved, moved),
              GoldenCall(Call.JUDGE, 3, moved, moved, first_tick=3, rows=(moved, moved))]  # fmt: skip

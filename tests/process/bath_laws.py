@@ -15,7 +15,6 @@ from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import load
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES
-from coldloop.registers.control_plc import SequenceRow
 from control_plc.cool_down import CoolDown, CoolDownSettings
 from control_plc.sensors import may_stand
 from optimizer_plc.computing_settings import SIGNALS
@@ -25,6 +24,7 @@ from optimizer_plc.qp.prediction import state_weights
 from optimizer_plc.qp.target import bounds_at, find_target, least_warm_load, loads_held
 from optimizer_plc.scheme import FEED_TEMPERATURE, TEMPERATURE, most_open, problem_at, shortage
 from optimizer_plc.settings import ProgramSettings
+from tests.harness.records import Row
 
 Array = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ def cool_down(courses: list[dict[str, float]], by_loops: list[float]) -> list[li
     found = []
     for tick, y in enumerate(courses):
         sequence.observe(tick, measured(y))
-        found.append([sequence.step, *sequence.wanted(SequenceRow(*by_loops))])
+        found.append([sequence.step, *sequence.wanted(Row(*by_loops))])
     return found
 
 

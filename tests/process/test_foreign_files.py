@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Final
@@ -105,7 +106,7 @@ def test_a_number_is_a_matrix_of_one(matrices: dict[str, Any], tmp_path: Path) -
     found = []
     for given in (SQUARE, matrices):
         (tmp_path / "m.json").write_text(json.dumps(given), encoding="utf-8")
-        found.append(made(tmp_path, MATRICES).model)
+        found.append(replace(made(tmp_path, MATRICES).model, declaration_digest=""))
     assert found[0].digest == found[1].digest
 
 

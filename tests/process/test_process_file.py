@@ -14,6 +14,7 @@ from scipy import signal
 from coldloop.errors import ColdloopError
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
+from coldloop.process.model_file import read_header
 from rig.process_file.declaration import LagSection
 from rig.process_file.judgement import described
 from rig.process_file.linearised import lag_model
@@ -427,3 +428,15 @@ def test_what_is_wrong_with_a_file_as_a_whole_is_said_of_this_file_and_without_i
         assert "{" not in str(refused.value)
     file.write_text(text, encoding="utf-8-sig")
     assert made_from(file).process.name == "heater"
+
+
+def test_services_know_a_process_by_what_is_declared_and_not_by_the_last_bits_of_its_matrices(tmp_path: Path) -> None:
+    model = made(tmp_path).model
+    other = replace(model, F_tick=np.nextafter(model.F_tick, 1.0), A=np.nextafter(model.A, 1.0))
+    other.save(tmp_path / "other.json")
+    assert other.digest != model.digest
+    assert read_header(tmp_path / "other.json").short_digest == other.short_digest == model.short_digest
+    comment = made(tmp_path, "# the same\n" + ONE_BY_ONE).model
+    assert comment.short_digest == model.short_digest
+    for text, plant in ((ONE_BY_ONE.replace("10.0\n[[o", "11.0\n[[o"), HEATER), (ONE_BY_ONE, HEATER + "\n")):
+        assert made(tmp_path, text, plant).model.short_digest != model.short_digest

@@ -7,21 +7,23 @@ from typing import Any
 import pytest
 from hypothesis import strategies as st
 
-from coldloop.registers.declaration import Block, Field, Kind, fields_of
-from coldloop.registers.seal import sealed
+from coldloop.registers.declaration import Block, Field, Kind
+from tests.harness.records import sealed
 
 Records = Callable[[Block], st.SearchStrategy[tuple[Any, ...]]]
 
 
 def values_of(field: Field) -> st.SearchStrategy[Any]:
     """Return the values that the declaration of a field allows, rounded as the bus rounds them."""
-    number: st.SearchStrategy[Any]
+    numbers = [number_of(one) for _, one in field.registers]
+    return st.tuples(*numbers) if field.elements else numbers[0]
+
+
+def number_of(field: Field) -> st.SearchStrategy[Any]:
     if field.kind is Kind.F32:
         low, high = (None if bound is None else single(bound) for bound in (field.low, field.high))
-        number = st.floats(low, high, width=32, allow_nan=False, allow_infinity=False)
-    else:
-        number = st.integers(int(field.low or 0), int(field.high or 2 ** (16 * field.kind.words) - 1))
-    return st.tuples(*[number] * len(field.elements)) if field.elements else number
+        return st.floats(low, high, width=32, allow_nan=False, allow_infinity=False)
+    return st.integers(int(field.low or 0), int(field.high or 2 ** (16 * field.kind.words) - 1))
 
 
 def single(value: float) -> float:
@@ -31,7 +33,7 @@ def single(value: float) -> float:
 @pytest.fixture(scope="session")
 def records() -> Records:
     def records_of(block: Block) -> st.SearchStrategy[tuple[Any, ...]]:
-        rows = st.tuples(*map(values_of, fields_of(block.record).values())).map(lambda row: block.record(*row))
+        rows = st.tuples(*map(values_of, block.fields.values())).map(lambda row: block.record(*row))
         return rows.map(sealed) if block.sealed else rows
 
     return records_of

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from coldloop.registers.bank import IllegalAddressError, IllegalValueError, RefusedAccessError, RegisterBank
 from coldloop.registers.codec import WordOrder, codec_of
 from coldloop.registers.common import IDENTITY_BLOCK
-from coldloop.registers.control_plc import CONTROL_MAP, SequenceRow
+from coldloop.registers.control_plc import SequenceRow
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
-from coldloop.registers.plant import PLANT_MAP, Actuators, LoadStep, PlantSession
+from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
+from coldloop.registers.plant import Actuators, LoadStep, PlantSession
 
 if TYPE_CHECKING:
     from tests.registers.conftest import Records
@@ -80,7 +80,7 @@ def test_a_write_takes_32_bit_values_whole_or_not_at_all(first: int, count: int)
 def test_a_float_that_is_no_number_is_refused_even_without_a_range(control: RegisterBank, value: float) -> None:
     with pytest.raises(IllegalValueError, match=r"sequence\.ncr22 is not a finite number"):
         control.write(500, struct.pack(">3f", 1.0, value, 1.0))
-    assert control.get(SequenceRow) == SequenceRow(0.0, 0.0, 0.0)
+    assert control.get(SequenceRow) == SequenceRow((0.0, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(("address", "count"), [(CONTROL_MAP.end, 1), (CONTROL_MAP.end - 1, 2), (0xFFFF, 2)])
@@ -120,7 +120,7 @@ def test_a_range_with_one_end_is_checked_and_named() -> None:
 def test_the_ends_of_a_range_belong_to_it() -> None:
     bank = RegisterBank(PLANT_MAP)
     bank.write(100, struct.pack(">Ifff", 1, 0.0, 1000.0, 100.0))
-    assert bank.get(Actuators) == Actuators(1, 0.0, 1000.0, 100.0, 0)
+    assert bank.get(Actuators) == Actuators(1, (0.0, 1000.0, 100.0), 0)
     bank.put(PlantSession(session=1, realtime=0, factor=1.0, seed=2, load_steps=3))
     bank.write(403, struct.pack(">f", 0.01))  # in single precision this is less than 0.01
 

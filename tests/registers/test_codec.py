@@ -5,12 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coldloop.registers.codec import WordOrder, as_transmitted, codec_of
+from coldloop.registers.codec import WordOrder, codec_of
 from coldloop.registers.common import IDENTITY_BLOCK, MAGIC, Identity
-from coldloop.registers.control_plc import CONTROL_MAP, Grant
+from coldloop.registers.control_plc import Grant
 from coldloop.registers.declaration import Block
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
-from coldloop.registers.plant import PLANT_MAP, LoadStep, Measurement
+from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
+from coldloop.registers.plant import LoadStep, Measurement
+from tests.harness.records import as_transmitted
 
 if TYPE_CHECKING:
     from tests.registers.conftest import Records
@@ -78,4 +79,4 @@ def test_a_value_that_fits_no_register_is_an_error(record: tuple[float, ...]) ->
 def test_an_array_of_the_wrong_length_is_an_error() -> None:
     block = BLOCKS["plant: measurement"]
     with pytest.raises(struct.error):
-        codec_of(block).encode(Measurement(0, 0.0, (1.0,) * 21, (1.0,) * 28, 1))
+        codec_of(block).encode(Measurement(0, 0.0, (1.0,) * 21, (1.0,) * 28, 1, (0.0,) * 3))

@@ -16,7 +16,7 @@ from coldloop.registers.configuration import (
     lines_of,
     publish_configuration,
 )
-from coldloop.registers.plant import PLANT_MAP
+from coldloop.registers.maps import PLANT_MAP
 from plant.settings import SHOWN, PlantSection, PlantSettings, SensorSettings
 
 

@@ -4,10 +4,9 @@ import pytest
 
 from coldloop.modbus.requests import MAX_READ_WORDS, MAX_READ_WRITE_WORDS
 from coldloop.registers.common import IDENTITY_BLOCK, Identity
-from coldloop.registers.control_plc import CONTROL_MAP
 from coldloop.registers.declaration import Block, Kind, RegisterMap, Role, f32, f32_array, fields_of, u16, u32
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
-from coldloop.registers.plant import PLANT_MAP, Measurement
+from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
+from coldloop.registers.plant import Measurement
 
 MAPS = (PLANT_MAP, CONTROL_MAP, OPTIMIZER_MAP)
 each_map = pytest.mark.parametrize("register_map", MAPS, ids=lambda register_map: register_map.service)
@@ -83,7 +82,7 @@ class TestAMap:
 class TestEveryMapOfTheHouse:
     @each_map
     def test_begins_with_the_same_corner(self, register_map: RegisterMap) -> None:
-        assert register_map.blocks[0] is IDENTITY_BLOCK
+        assert register_map.blocks[0] == IDENTITY_BLOCK
 
     @each_map
     def test_has_rows_that_one_request_reads_or_writes(self, register_map: RegisterMap) -> None:

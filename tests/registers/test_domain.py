@@ -4,14 +4,16 @@ import math
 
 import pytest
 
+from coldloop.process.declaration import LAST_NUMBER, LAST_TICK
 from coldloop.process.model_file import read_header
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
-from coldloop.process.signals import LAST_NUMBER, LAST_TICK
 from coldloop.registers.codec import check_record, codec_of
-from coldloop.registers.control_plc import CONTROL_MAP, LatchedUpdate, Status, Update
+from coldloop.registers.control_plc import LatchedUpdate, Status, Update
 from coldloop.registers.domain import DomainError
-from coldloop.registers.plant import MAX_AGE, PLANT_MAP, Measurement
+from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
+from coldloop.registers.plant import MAX_AGE, Measurement
 from coldloop.registers.safety import Alarm
+from tests.harness.records import map_of
 
 HEADER = read_header(DEFAULT_MODEL_FILE)
 MEASURED = Measurement(7, HEADER.w0, HEADER.y0, HEADER.x0, 3, HEADER.u0, 5, 1, 1, 0, 0.5)
@@ -67,7 +69,7 @@ def test_registers_that_nobody_has_written_are_read() -> None:
 @pytest.mark.parametrize("record", [Alarm(state=9), Alarm(times=-1), Alarm(raised=2**32), LatchedUpdate(1, 2**32)])
 def test_a_record_of_a_file_is_checked_as_one_of_the_bus(record: tuple[int, ...]) -> None:
     with pytest.raises(DomainError):
-        check_record(record)
+        check_record(record, map_of(type(record)))
 
 
 def test_the_numbers_of_an_enumeration_end_with_it() -> None:

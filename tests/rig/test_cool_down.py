@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coldloop.process.cold_box import L1, T5
+from coldloop.process.cold_box import L1, STATE_NAMES, T5
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
-from coldloop.process.signals import STATE_NAMES, STATION_SIGNAL_NAMES
+from coldloop.process.station import STATION_SIGNAL_NAMES
 from plant.helium.properties import load_helium
 from plant.integrator import plain_tuples
 from plant.kinds import plant_maker

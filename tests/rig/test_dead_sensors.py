@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coldloop.process.cold_box import L1, T5
+from coldloop.process.cold_box import L1, OUTPUT_NAMES, T5
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.control_plc import Plan, Update
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.qp.design import ControlDesign

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from coldloop.process.cold_box import L1
-from coldloop.process.signals import OUTPUT_NAMES
+from coldloop.process.cold_box import L1, OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.plant import SensorFaultKind

@@ -19,9 +19,9 @@ from coldloop.modbus.settings import AccessSettings, TlsSettings
 from coldloop.registers.audit import Event, EventKind, JournalQuery
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import CONTROL_MAP, Mode
+from coldloop.registers.control_plc import Mode
 from coldloop.registers.declaration import Block, RegisterMap
-from coldloop.registers.plant import PLANT_MAP
+from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
 from coldloop.registers.safety import AlarmKind
 from coldloop.service.journal import KEPT, Journal, JournalPublication
 from rig.cli.commands.events import COLUMNS

@@ -17,8 +17,7 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import CONTROL_MAP
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
+from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP
 from coldloop.registers.safety import LeaseState, LeaseStatus
 from rig import cli
 from rig.cli.plc_folder import export_plc

@@ -13,11 +13,10 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
 
-from coldloop.process.cold_box import L1
+from coldloop.process.cold_box import INPUT_NAMES, L1, OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_file import read_header
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
 from plant.cold_box.model import build_model
 from plant.cold_box.physics import REFERENCE
 from plant.components.valve import Valve

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from coldloop.process.cold_box import L1
-from coldloop.process.signals import OUTPUT_UNITS
+from coldloop.process.cold_box import L1, OUTPUT_UNITS
 from coldloop.registers.audit import EventKind
 from optimizer_plc.qp.design import ControlDesign
 from plant.load import find_load

@@ -13,21 +13,15 @@ from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.common import Identity, SessionPace
-from coldloop.registers.control_plc import (
-    CONTROL_MAP,
-    ControlSession,
-    LadderStatus,
-    Mode,
-    PlantLinkState,
-    PlantLinkStatus,
-)
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
-from coldloop.registers.plant import PLANT_MAP, LiveLoad, LoadAhead, LoadStatus, LoadStep, PlantSession
+from coldloop.registers.control_plc import ControlSession, LadderStatus, Mode, PlantLinkState, PlantLinkStatus
+from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
+from coldloop.registers.optimizer_plc import OptimizerSession
+from coldloop.registers.plant import LiveLoad, LoadAhead, LoadStatus, LoadStep, PlantSession
 from coldloop.registers.safety import AlarmKind, WatchdogStatus
-from coldloop.registers.seal import sealed
 from rig.cosim.journal_reader import JournalReader
 from rig.cosim.local_services import LocalServices
 from rig.settings import Settings
+from tests.harness.records import sealed
 
 pytestmark = pytest.mark.usefixtures("processes", "realtime")
 

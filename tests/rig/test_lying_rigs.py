@@ -27,9 +27,9 @@ from coldloop.registers.configuration import (
     ConfigurationLine,
     publish_configuration,
 )
-from coldloop.registers.control_plc import CONTROL_MAP, LadderStatus, Operator
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
-from coldloop.registers.plant import PLANT_MAP, LoadStatus
+from coldloop.registers.control_plc import LadderStatus, Operator
+from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
+from coldloop.registers.plant import LoadStatus
 from coldloop.registers.text import to_words
 from plant.own_model import own_header
 from rig.cosim.wiring import SERVICES
@@ -262,7 +262,7 @@ def test_status_shows_what_answers_and_names_what_does_not(absent: str, fake: Fa
 
 
 def test_what_a_command_would_write_back_is_within_its_range(fake: FakeRig, ask: "Callable[..., Outcome]") -> None:
-    fake.banks["control_plc"].put(Operator(2, float("nan"), 0.0, 0.0))
+    fake.banks["control_plc"].put(Operator(2, (float("nan"), 0.0, 0.0)))
     assert_one_line(ask("set", "setpoint", "ncr22", "45"), "cv155 is not a finite number")
     fake.banks["plant"].put(SessionPace(1, 1, float("inf"), 0))
     assert_one_line(ask("set", "pause"), "factor is not a finite number")

@@ -9,7 +9,6 @@ import pyarrow.parquet
 import pytest
 
 import optimizer_plc.program
-from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Update, Verdict
 from optimizer_plc.estimator import Estimator
 from optimizer_plc.program import OptimizerProgram
@@ -21,6 +20,7 @@ from rig.runs.running import make_scenario
 from rig.settings import Settings
 from rig.studies.study import StudyResult
 from tests.conftest import Coldloop
+from tests.harness.records import as_transmitted
 
 Break = Callable[[float], None]
 OVERFLOW = 1e300

@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.modbus.client import RegisterClient
-from coldloop.process.cold_box import LEVEL_BAND, T5_BAND
+from coldloop.process.cold_box import LEVEL_BAND, OUTPUT_NAMES, T5_BAND, TICK_S, TICKS_PER_SAMPLE
 from coldloop.process.limits import InputLimits
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.signals import OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import MAGIC, Identity
-from coldloop.registers.control_plc import CONTROL_MAP, LadderStatus, Mode, Status, Verdict
+from coldloop.registers.control_plc import LadderStatus, Mode, Status, Verdict
+from coldloop.registers.maps import CONTROL_MAP
 from coldloop.registers.safety import LeaseState, LeaseStatus
 from rig import cli
 from rig.cosim.endpoints import REQUIRED

@@ -13,10 +13,11 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.process.limits import InputLimits
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Mode, Plan, Process, Status, Verdict
+from coldloop.registers.control_plc import ControlSession, Mode, Plan, ProcessNow, Status, Verdict
 from coldloop.registers.declaration import RegisterMap
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
-from coldloop.registers.plant import PLANT_MAP, LoadStep, PlantSession
+from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
+from coldloop.registers.optimizer_plc import OptimizerSession
+from coldloop.registers.plant import LoadStep, PlantSession
 from control_plc.settings import ControlSection, LadderSettings
 from rig.cosim.answer_time import QUIET_S
 from rig.cosim.scenario import Scenario
@@ -100,7 +101,7 @@ async def start_real_time(bus: "Bus", factor: float, *, session: int = 1, optimi
 async def test_a_killed_optimiser_leaves_the_plant_held_and_a_new_one_takes_over_again(
     on_the_bus: "OnTheBus", processes: harness.Processes
 ) -> None:
-    def start_optimiser() -> harness.Process:
+    def start_optimiser() -> harness.ProcessNow:
         return processes.service("optimizer_plc", port=bus.endpoints.optimizer_plc.port, settings=bus.settings)
 
     async with on_the_bus(ENDLESS_HOLD, services=("plant", "control_plc")) as bus:
@@ -116,8 +117,8 @@ async def test_a_killed_optimiser_leaves_the_plant_held_and_a_new_one_takes_over
 
             held = await until(status, lambda now: now.mode == Mode.HOLD and now.remaining == 0)
             assert held.deadline_misses > 0
-            first = await plc.read(Process)
-            later = await until(lambda: plc.read(Process), lambda now: now.tick >= first.tick + 20)
+            first = await plc.read(ProcessNow)
+            later = await until(lambda: plc.read(ProcessNow), lambda now: now.tick >= first.tick + 20)
             assert first.u == later.u
             assert in_bounds(later.u)
             assert later.y != first.y
@@ -125,14 +126,14 @@ async def test_a_killed_optimiser_leaves_the_plant_held_and_a_new_one_takes_over
             start_optimiser()
             back = await until(status, lambda now: now.mode == Mode.MPC and now.accepted >= held.accepted + 5)
             assert back.update > held.update
-            assert in_bounds((await plc.read(Process)).u)
+            assert in_bounds((await plc.read(ProcessNow)).u)
 
 
 async def test_without_an_optimiser_the_operating_inputs_hold_from_the_start(on_the_bus: "OnTheBus") -> None:
     async with on_the_bus(ENDLESS_HOLD, services=("plant", "control_plc")) as bus:
         await start_real_time(bus, factor=100.0, optimizer=False)
         async with client(CONTROL_MAP, bus.endpoints.control_plc.port) as plc:
-            process = await until(lambda: plc.read(Process), lambda now: now.tick >= 40)
+            process = await until(lambda: plc.read(ProcessNow), lambda now: now.tick >= 40)
             assert process.u == (43.0, 75.0, 36.0)
             assert (await plc.read(Status)).mode == Mode.HOLD
 
@@ -141,7 +142,7 @@ async def test_the_silence_of_an_optimiser_counts_as_a_miss_whenever_it_begins(o
     async with on_the_bus(services=("plant", "control_plc")) as bus:
         await start_real_time(bus, factor=100.0, optimizer=False)
         async with client(CONTROL_MAP, bus.endpoints.control_plc.port) as plc:
-            await until(lambda: plc.read(Process), lambda now: now.tick >= 100)  # five of the longest periods
+            await until(lambda: plc.read(ProcessNow), lambda now: now.tick >= 100)  # five of the longest periods
             assert (await plc.read(Status)).deadline_misses > 0
 
 

@@ -15,15 +15,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from coldloop.errors import UsageError
+from coldloop.process.cold_box import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
 from coldloop.process.lti_model import load
-from coldloop.process.signals import (
-    INPUT_NAMES,
-    INPUT_UNITS,
-    OUTPUT_NAMES,
-    OUTPUT_UNITS,
-    STATE_NAMES,
-    STATE_UNITS,
-)
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
 from coldloop.whole_file import whole_file

@@ -13,7 +13,8 @@ import pytest
 
 from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
-from coldloop.registers.control_plc import CONTROL_MAP, Operator, OperatorMode
+from coldloop.registers.control_plc import Operator, OperatorMode
+from coldloop.registers.maps import CONTROL_MAP
 from rig import cli
 from rig.live.link_cuts import CUT_FILES, CuttableLinks
 from rig.live.started_rigs import running_rig, state_folder
@@ -138,7 +139,7 @@ def test_a_setpoint_beyond_the_bounds_is_refused_by_the_control_plc_itself(up: s
         control = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=int(up) + 1, timeout_s=PATIENCE_S)
         before = await control.read(Operator)
         with pytest.raises(RequestRefusedError) as refusal:
-            await control.write(Operator(mode, 80.0, before.ncr22, before.cv156))
+            await control.write(Operator(mode, (80.0, *before.u[1:])))
         assert refusal.value.exception_code == 3
         assert (await control.read(Operator)).mode == before.mode
         control.close()

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pytest
 from matplotlib.figure import Figure
 
-from coldloop.process.signals import INPUT_NAMES
+from coldloop.process.cold_box import INPUT_NAMES
 from rig.figures.plot import DRAWN, Bounds, RunCurves, draw_run, label_marks
 from rig.figures.run_plot import curves_of
 from rig.results.run_folder import RunFolder, _in_force

@@ -7,18 +7,16 @@ import re
 import struct
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import pytest
 
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import IDENTITY_BLOCK
-from coldloop.registers.control_plc import CONTROL_MAP
-from coldloop.registers.declaration import Block, RegisterMap, f32, record
-from coldloop.registers.declaration import fields_of as fields_of_record
-from coldloop.registers.maps import MAPS
-from coldloop.registers.plant import PLANT_MAP, Measurement
+from coldloop.registers.declaration import Block, RegisterMap, f32
+from coldloop.registers.maps import CONTROL_MAP, MAPS, PLANT_MAP
+from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import AlarmKind
 from coldloop.service.metrics import metric_name
 from rig.cli.tag_exports import exported, runs
@@ -55,8 +53,9 @@ def fields_of(one: dict[str, Any]) -> dict[str, Any]:
 def test_names_that_would_be_the_same_end_with_their_addresses() -> None:
     """Letters of other alphabets, and capitals, which some of these programs do not tell apart."""
 
-    fields = {name: Annotated[float, f32("a state")] for name in ("\u03b1", "\u03b2", "level", "Level", "T")}
-    States = record("States", __name__, "states", fields)
+    States = NamedTuple(
+        "States", [(name, Annotated[float, f32("a state")]) for name in ("\u03b1", "\u03b2", "level", "Level", "T")]
+    )
     tags = exported(RegisterMap("plant", 1, (IDENTITY_BLOCK, Block("x", 100, States, ""))))
     names = [tag.name for tag in tags if tag.block == "x"]
     assert names == ["x___100", "x___102", "x_level_104", "x_Level_106", "x_T"]
@@ -87,7 +86,7 @@ def test_a_node_red_flow_is_whole_and_its_tables_decode_what_the_server_sends(co
     reader = next(node for node in readers if node["name"] == "measurement" and int(node["adr"]) <= T5_ADDRESS)
     bank = RegisterBank(PLANT_MAP, WordOrder.HIGH_FIRST)
     y = tuple(float(value) for value in range(22))
-    bank.put(Measurement(7, 400.0, y, (0.0,) * 28, 1))
+    bank.put(Measurement(7, 400.0, y, (0.0,) * 28, 1, (0.0,) * 3))
     raw = bank.read(int(reader["adr"]), int(reader["quantity"]))
     code = nodes[reader["wires"][0][0]]["func"]
     table = json.loads(code[code.index("tags = ") + 7 : code.index(";\n")])
@@ -121,7 +120,7 @@ def test_the_dashboard_of_the_docs_is_the_one_that_is_made_and_its_metrics_are_t
         metric_name(service, block.name, field)
         for service, register_map in MAPS.items()
         for block in register_map.blocks
-        for field in fields_of_record(block.record)
+        for field in block.fields
     }
     assert asked <= served
     assert len(asked) == 9

@@ -11,7 +11,8 @@ from coldloop.errors import LinkError
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.common import Identity
-from coldloop.registers.plant import PLANT_MAP, PlantSession
+from coldloop.registers.maps import PLANT_MAP
+from coldloop.registers.plant import PlantSession
 from rig.cosim.scenario import Scenario
 
 if TYPE_CHECKING:

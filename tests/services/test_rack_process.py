@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.common import Identity
-from coldloop.registers.plant import PLANT_MAP, Actuators, LoadStep, Measurement, OutputVerdict, PlantSession
+from coldloop.registers.maps import PLANT_MAP
+from coldloop.registers.plant import Actuators, LoadStep, Measurement, OutputVerdict, PlantSession
 
 if TYPE_CHECKING:
     from tests.harness.processes import Process
@@ -24,7 +25,7 @@ async def connected(process: "Process") -> RegisterClient:
 async def test_a_clock_that_cannot_be_followed_keeps_nobody_waiting(start: "Start") -> None:
     process = start("plant", "session.autostart=true", "session.mode=realtime", "session.factor=10000")
     rack = await connected(process)
-    begun = await rack.exchange(Actuators(0, *U, session=1), Measurement)
+    begun = await rack.exchange(Actuators(0, tuple(U), session=1), Measurement)
     assert begun.verdict == OutputVerdict.ACCEPTED
     async with asyncio.timeout(PATIENCE_S):
         for _ in range(20):
@@ -42,7 +43,7 @@ async def test_sessions_in_real_time_begin_again_and_again(start: "Start") -> No
     await rack.write_rows([LoadStep(0, 385.0)])
     for session in (1, 1, 2, 2):
         await rack.write(PlantSession(session, 1, 400.0, 1, 1))
-        await rack.exchange(Actuators(0, *U, session=session), Measurement)
+        await rack.exchange(Actuators(0, tuple(U), session=session), Measurement)
         while (await rack.read(Measurement)).tick < 20:
             pass
     assert (await rack.read(Identity)).session == 2

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from coldloop.process.signals import CONTROLLED, TICKS_PER_SAMPLE
-from coldloop.registers.control_plc import Mode, OperatorMode, Process, SequenceHeader, SequenceRow, Update
+from coldloop.registers.control_plc import Mode, OperatorMode, ProcessNow, SequenceHeader, Update
 from coldloop.registers.safety import AlarmKind, CapacityCause
 from coldloop.safety.sequence import InputSequence, with_checksum
 from control_plc.alarm_settings import BANDS
@@ -93,7 +93,7 @@ def restore_guard(program: ControlProgram, g: Any) -> None:  # noqa: ANN401 a re
     state.moves[:], state.before[:] = g["moves"][:slots].tolist(), g["before"][:slots].tolist()
     state.start, state.moved, state.oldest = int(g["start"]), int(g["moved"]), int(g["oldest"])
     state.share = float(g["share"])
-    program.guard.applied = SequenceRow(*state.applied)
+    program.guard.applied = tuple(state.applied)
 
 
 def restore_scan(program: ControlProgram, s: Any, trace: Trace) -> None:  # noqa: ANN401 a record
@@ -103,7 +103,7 @@ def restore_scan(program: ControlProgram, s: Any, trace: Trace) -> None:  # noqa
     u, y, x = (tuple(values[row].tolist()) for values in (trace.u, trace.y, trace.x))
     load, sensors = float(trace.load[row]), program.sensors
     program.tick, program.alarms.now = last + 1, last
-    program.process = Process(last, load, u, y)
+    program.process = ProcessNow(last, load, u, y)
     for name in ("unchanged", "rests", "inputs", "inputs_moved"):
         getattr(sensors, name)[:] = s[name].tolist()
     sensors.image.inputs, sensors.image.count = tuple(s["image_inputs"].tolist()), int(s["image_count"])
@@ -132,7 +132,7 @@ def played_sequence(s: Any, update: int, rows: Array, model_digest: int) -> Inpu
         number=int(s["number"]), update=update, first_tick=int(s["first_tick"]), length=length, tau_u=int(s["tau_u"]),
         model_digest=model_digest, crc=0,
     )  # fmt: skip
-    return with_checksum(header, [SequenceRow(*row) for row in rows[:length].tolist()])
+    return with_checksum(header, list(map(tuple, rows[:length].tolist())))
 
 
 def sequence_rows(sequence: InputSequence) -> Array:

@@ -11,7 +11,6 @@ from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import MAGIC, Identity, ServiceState, SessionPace
 from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.control_plc import (
-    CONTROL_MAP,
     Acknowledgement,
     AwaitUpdate,
     Heartbeat,
@@ -22,9 +21,9 @@ from coldloop.registers.control_plc import (
     Update,
 )
 from coldloop.registers.declaration import RegisterMap
+from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP
 from coldloop.registers.optimizer_plc import (
     HISTORY_ROWS,
-    OPTIMIZER_MAP,
     ControlLinkStatus,
     Optimization,
     OptimizerSession,

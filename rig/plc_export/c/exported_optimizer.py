@@ -17,8 +17,7 @@ from coldloop.errors import UsageError
 from coldloop.kernels.cache_folder import find_cache_folder
 from coldloop.parsing import parsed_json
 from coldloop.process.lti_model import load as load_model
-from coldloop.registers.control_plc import CONTROL_MAP
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
+from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP
 from coldloop.text_file import held_file, read_bytes
 from optimizer_plc.settings import SHOWN
 from rig.settings import Settings

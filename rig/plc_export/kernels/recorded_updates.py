@@ -7,6 +7,7 @@ from coldloop.process.lti_model import load as load_model
 from coldloop.process.signals import TICK_S
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Plan, Update
+from coldloop.registers.maps import CONTROL_MAP
 from coldloop.safety.sequence import InputSequence
 from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.program import OptimizerProgram
@@ -67,7 +68,7 @@ class _ListeningOptimizer(OptimizerProgram):
     def plan(self, update: Update) -> Plan:
         """Keep the update and its plan."""
         plan = super().plan(update)
-        self.heard.append(GoldenUpdate(self._begun, update, as_transmitted(plan), None))
+        self.heard.append(GoldenUpdate(self._begun, update, as_transmitted(plan, CONTROL_MAP), None))
         self._begun = -1
         return plan
 

@@ -4,8 +4,9 @@ from collections.abc import Iterator
 from itertools import groupby
 from typing import Final
 
-from coldloop.registers.control_plc import CONTROL_MAP, Acknowledgement, Plan, SequenceHeader, SequenceRow, Update
+from coldloop.registers.control_plc import Acknowledgement, Plan, SequenceHeader, SequenceRow, Update
 from coldloop.registers.declaration import Block, Register
+from coldloop.registers.maps import CONTROL_MAP
 from rig.text_tables import markdown_table
 
 HEADER: Final = ("block", "register", "type", "unit", "field", "variable")

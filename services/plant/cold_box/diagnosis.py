@@ -11,10 +11,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.cold_box import T5
+from coldloop.process.cold_box import STATE_NAMES, STATE_UNITS, T5
 from coldloop.process.model_range import COLDEST_CELLS_K, SATURATION_BAR, WARMEST_CELL_K, model_range
 from coldloop.process.range_bits import ModelRange
-from coldloop.process.signals import STATE_NAMES, STATE_UNITS
 from plant.cold_box.equilibrium import Equilibrium, NoEquilibriumError, first_guess, relaxed, rest_near
 from plant.cold_box.linearisation import state_and_load_jacobian, state_scales
 from plant.cold_box.physics import PA_PER_BAR, ColdBox, derivative, outputs, streams

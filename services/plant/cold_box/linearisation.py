@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coldloop.process.signals import OUTPUT_NAMES
+from coldloop.process.cold_box import OUTPUT_NAMES
 from plant.cold_box.physics import ColdBox, derivative, outputs
 from plant.helium.properties import Helium
 from plant.numeric import Array, RealArray

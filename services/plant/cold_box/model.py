@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from coldloop.process import signals as process
+from coldloop.process import cold_box as process
 from coldloop.process.lti_model import LtiModel, discretise
 from plant.cold_box import physics as cold_box
 from plant.cold_box.equilibrium import Equilibrium, find_equilibrium

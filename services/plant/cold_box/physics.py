@@ -33,7 +33,7 @@ from plant.helium.properties import Helium, saturation, supply_enthalpy_and_dens
 from plant.numeric import Array, at_least
 
 LOAD_NAME, LOAD_UNIT = "NCR22_HL", "W"
-CELLS = (8, 6, 12)  # of NEF1, NEF2, NEF34; the states are named in coldloop.process.signals
+CELLS = (8, 6, 12)  # of NEF1, NEF2, NEF34; the states are named in coldloop.process.cold_box
 PA_PER_BAR = 1e5
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from coldloop.errors import ModelFileError
-from coldloop.process.signals import STATE_NAMES, TICK_S
+from coldloop.process.declaration import Process
 from plant.numeric import RealArray
 from plant.own.disturbances import NO_DISTURBANCES, Disturbances, DisturbedPlant
 from plant.own.fmu_file import Fmu, Port
@@ -114,6 +114,7 @@ class FmuPlant(DisturbedPlant):
         load: The load over time.
         disturbances: Others than the load.
         noise: Noise on the measurements; None measures exactly.
+        process: Whose plant it is.
     """
 
     def __init__(
@@ -125,12 +126,13 @@ class FmuPlant(DisturbedPlant):
         load: HeatLoad,
         disturbances: Disturbances = NO_DISTURBANCES,
         noise: MeasurementNoise | None = None,
+        process: Process,
     ) -> None:
         self._simulation = simulation
         self._keeps_state = keeps_state
-        self._hidden = np.zeros(len(STATE_NAMES) - len(disturbances.courses))
+        self._hidden = np.zeros(len(process.states) - len(disturbances.courses))
         x0 = np.append(self._shown(), disturbances.at(0))
-        super().__init__(disturbances, x0=x0.tolist(), u0=u0, load=load, noise=noise)
+        super().__init__(disturbances, x0=x0.tolist(), u0=u0, load=load, noise=noise, process=process)
 
     def _shown(self) -> RealArray:
         """Return the states; zeros where the FMU hides them."""
@@ -161,20 +163,22 @@ class FmuPlant(DisturbedPlant):
             raise ValueError(str(error)) from error
 
 
-def fmu_maker(fmu: Fmu, wiring: Wiring, u0: Sequence[float], w0: Sequence[float]) -> Callable[[], FmuSimulation]:
+def fmu_maker(
+    fmu: Fmu, wiring: Wiring, u0: Sequence[float], w0: Sequence[float], tick_s: float
+) -> Callable[[], FmuSimulation]:
     """Return what makes the FMU at rest at its operating point; the way there is simulated once where it keeps states.
 
     Raises:
         ColdloopError: It does not get there.
     """
-    first = FmuSimulation(fmu, wiring, TICK_S)
+    first = FmuSimulation(fmu, wiring, tick_s)
     first.rest(np.array(u0), np.array(w0))
     at_rest = first.saved() if fmu.keeps_state else None
     if at_rest is None:
         log.info("the FMU cannot save its state: after a restart of this service no session is resumed")
 
     def make() -> FmuSimulation:
-        made = FmuSimulation(fmu, wiring, TICK_S)
+        made = FmuSimulation(fmu, wiring, tick_s)
         if at_rest is None:
             made.rest(np.array(u0), np.array(w0))
         else:

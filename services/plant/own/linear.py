@@ -6,7 +6,6 @@ import numpy as np
 
 from coldloop.kernels.compiled import inlined, kernel
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import OUTPUT_NAMES
 from plant.numeric import RealArray
 from plant.own.disturbances import NO_DISTURBANCES, Disturbances
 from plant.program import HeatLoad, MeasurementNoise, PlantProgram
@@ -73,14 +72,14 @@ class LinearPlant(PlantProgram):
         parts: dict[str, Any] = {name: getattr(model, name) for name in Matrices._fields}
         self.constants = Matrices(**{name: part if name == "w0" else part.copy() for name, part in parts.items()})
         self.disturbances = disturbances
-        super().__init__(x0=model.x0.tolist(), u0=model.u0.tolist(), load=load, noise=noise)
+        super().__init__(x0=model.x0.tolist(), u0=model.u0.tolist(), load=load, noise=noise, process=model.declared)
 
     def _read(self, w: float) -> RealArray:
-        y = np.empty(len(OUTPUT_NAMES))
+        y = np.empty(len(self.constants.y0))
         read_linear(self.constants, self._x, self._u, w, y)
         return y
 
     def _step(self, w: float) -> tuple[RealArray, RealArray]:
-        x, y = self._x.copy(), np.empty(len(OUTPUT_NAMES))
+        x, y = self._x.copy(), np.empty(len(self.constants.y0))
         advance_linear(self.constants, x, self._u, w, self.disturbances.at(self.tick + 1), y)
         return x, y

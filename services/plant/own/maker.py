@@ -11,7 +11,6 @@ from coldloop.kernels.first_use import kernels_of
 from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import ModelHeader
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from plant.own.disturbances import Disturbances
 from plant.own.linear import LinearPlant
 from plant.own.python_class import HiddenPythonPlant, PythonPlant, equations_of
@@ -34,7 +33,9 @@ def check_signals(header: ModelHeader) -> None:
     Raises:
         ModelFileError: It is not, or its FMU is another file than it was made from.
     """
-    if (header.state_names, header.input_names, header.output_names) != (STATE_NAMES, INPUT_NAMES, OUTPUT_NAMES):
+    if (header.state_names, header.input_names, header.output_names) != (
+        PROCESS.state_names, PROCESS.input_names, PROCESS.output_names
+    ):  # fmt: skip
         raise ModelFileError(
             f"{header.file}: a model of another process than COLDLOOP_PROCESS names; name the same for both"
         )
@@ -68,6 +69,7 @@ def own_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlan
     Raises:
         ModelFileError: The plant cannot be made.
     """
+    process = header.declared
     disturbances = Disturbances.of(header.plant_parameters.get("disturbances", ()))
     w0 = (header.w0, *header.x0[len(header.x0) - len(disturbances.courses) :])
     if header.plant == FMU:
@@ -80,24 +82,25 @@ def own_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlan
 
         def make(load: HeatLoad, seed: int) -> PlantProgram:
             return kind(
-                equations, x0=header.x0, u0=header.u0, load=load, disturbances=disturbances, noise=noise_of_seed(seed)
-            )
+                equations, x0=header.x0, u0=header.u0, load=load, disturbances=disturbances, noise=noise_of_seed(seed),
+                process=process,
+            )  # fmt: skip
 
     elif header.plant == TRANSFER_FUNCTIONS:
         lags = lags_of(header.plant_parameters["lags"])
 
         def make(load: HeatLoad, seed: int) -> PlantProgram:
-            with kernels_of(f"the {PROCESS.name}", about_s=3):
+            with kernels_of(f"the {process.name}", about_s=3):
                 return TransferFunctionPlant(
                     lags, y0=header.y0, u0=header.u0, w0=w0, load=load, disturbances=disturbances,
-                    noise=noise_of_seed(seed),
+                    noise=noise_of_seed(seed), process=process,
                 )  # fmt: skip
 
     else:
         model = load_model(header.file)
 
         def make(load: HeatLoad, seed: int) -> PlantProgram:
-            with kernels_of(f"the {PROCESS.name}", about_s=3):
+            with kernels_of(f"the {process.name}", about_s=3):
                 return LinearPlant(model, load, noise_of_seed(seed), disturbances)
 
     return make
@@ -110,12 +113,12 @@ def _fmu_plant_maker(
     from plant.own.fmu_file import Fmu  # noqa: PLC0415
 
     fmu = Fmu(_fmu_of(header))
-    at_rest = fmu_maker(fmu, Wiring(**header.plant_parameters["wiring"]), header.u0, w0)
+    at_rest = fmu_maker(fmu, Wiring(**header.plant_parameters["wiring"]), header.u0, w0, header.declared.tick_s)
 
     def make(load: HeatLoad, seed: int) -> PlantProgram:
         return FmuPlant(
             at_rest(), keeps_state=fmu.keeps_state, u0=header.u0, load=load, disturbances=disturbances,
-            noise=noise_of_seed(seed),
+            noise=noise_of_seed(seed), process=header.declared,
         )  # fmt: skip
 
     return make

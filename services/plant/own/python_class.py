@@ -10,7 +10,7 @@ import numpy as np
 
 from coldloop.errors import ModelFileError
 from coldloop.foreign import foreign
-from coldloop.process.signals import TICK_S
+from coldloop.process.declaration import Process
 from plant.numeric import RealArray
 from plant.own.disturbances import NO_DISTURBANCES, Disturbances, DisturbedPlant, outside
 from plant.program import HeatLoad, MeasurementNoise
@@ -115,6 +115,7 @@ class PythonPlant(DisturbedPlant):
         load: The load over time.
         disturbances: Others than the load.
         noise: Noise on the measurements; None measures exactly.
+        process: Whose plant it is.
     """
 
     def __init__(
@@ -126,10 +127,11 @@ class PythonPlant(DisturbedPlant):
         load: HeatLoad,
         disturbances: Disturbances = NO_DISTURBANCES,
         noise: MeasurementNoise | None = None,
+        process: Process,
     ) -> None:
         self._equations = equations
         self.whose = f"the plant's class {type(equations).__name__}"
-        super().__init__(disturbances, x0=x0, u0=u0, load=load, noise=noise)
+        super().__init__(disturbances, x0=x0, u0=u0, load=load, noise=noise, process=process)
 
     def _seen(self, x: RealArray, w: RealArray) -> RealArray:
         return np.asarray(self._equations.outputs(x, self._u, outside(w)), dtype=np.float64)
@@ -138,7 +140,7 @@ class PythonPlant(DisturbedPlant):
         return self._seen(self._own, w)
 
     def _own_step(self, w: RealArray) -> tuple[RealArray, RealArray]:
-        x = runge_kutta(self._equations, self._own, self._u, outside(w), TICK_S)
+        x = runge_kutta(self._equations, self._own, self._u, outside(w), self.process.tick_s)
         return x, self._seen(x, w)
 
 
@@ -162,7 +164,7 @@ class HiddenPythonPlant(PythonPlant):
         return self._seen(self._hidden, w)
 
     def _own_step(self, w: RealArray) -> tuple[RealArray, RealArray]:
-        self._hidden = runge_kutta(self._equations, self._hidden, self._u, outside(w), TICK_S)
+        self._hidden = runge_kutta(self._equations, self._hidden, self._u, outside(w), self.process.tick_s)
         return self._own, self._seen(self._hidden, w)
 
     def _saved(self) -> dict[str, Any]:

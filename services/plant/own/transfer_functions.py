@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICK_S
+from coldloop.process.declaration import Process
 from plant.numeric import RealArray
 from plant.own.disturbances import NO_DISTURBANCES, Disturbances, DisturbedPlant
 from plant.program import HeatLoad, MeasurementNoise
@@ -94,6 +93,7 @@ class TransferFunctionPlant(DisturbedPlant):
         load: The load over time.
         disturbances: Others than the load, which are the last states.
         noise: Noise on the measurements; None measures exactly.
+        process: Whose plant it is.
     """
 
     def __init__(
@@ -106,23 +106,24 @@ class TransferFunctionPlant(DisturbedPlant):
         load: HeatLoad,
         disturbances: Disturbances = NO_DISTURBANCES,
         noise: MeasurementNoise | None = None,
+        process: Process,
     ) -> None:
-        count = len(disturbances.courses)
-        sources = (*INPUT_NAMES, PROCESS.load.name, *STATE_NAMES[len(STATE_NAMES) - count :])
-        delays = [round(lag.delay_s / TICK_S) for lag in lags]
+        own = len(process.states) - len(disturbances.courses)
+        sources = (*process.input_names, process.load.name, *process.state_names[own:])
+        delays = [round(lag.delay_s / process.tick_s) for lag in lags]
         self.constants = LagTable(
-            places=np.array([OUTPUT_NAMES.index(lag.output) for lag in lags]),
+            places=np.array([process.output_names.index(lag.output) for lag in lags]),
             sources=np.array([sources.index(lag.source) for lag in lags]),
             delays=np.array(delays),
-            decay=np.exp([-TICK_S / lag.time_constant_s for lag in lags]),
+            decay=np.exp([-process.tick_s / lag.time_constant_s for lag in lags]),
             gain=np.array([lag.gain for lag in lags]),
             about=np.array([*u0, *w0]),
             y0=np.array(y0),
             measured=np.flatnonzero(disturbances.measured),
         )
         self.memory = LagMemory(np.zeros(len(lags)), np.zeros((len(sources), max(delays) + 1)))
-        x0 = [*[0.0] * (len(STATE_NAMES) - count), *w0[1:]]
-        super().__init__(disturbances, x0=x0, u0=u0, load=load, noise=noise)
+        x0 = [*[0.0] * own, *w0[1:]]
+        super().__init__(disturbances, x0=x0, u0=u0, load=load, noise=noise, process=process)
 
     def _warm_up(self) -> None:
         memory, self.memory = self.memory, LagMemory(*(part.copy() for part in self.memory))
@@ -130,7 +131,7 @@ class TransferFunctionPlant(DisturbedPlant):
         self.memory = memory
 
     def _room(self) -> RealArray:
-        return np.empty(len(OUTPUT_NAMES) - sum(self.disturbances.measured))
+        return np.empty(len(self.process.outputs) - sum(self.disturbances.measured))
 
     def _own_outputs(self, w: RealArray) -> RealArray:  # noqa: ARG002 nothing acts at once
         y = self._room()

@@ -3,17 +3,16 @@
 import math
 from collections.abc import Iterator, Sequence
 
-from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.plant import SensorFault, SensorFaultKind
 
 HEALTHY = SensorFault(SensorFaultKind.NONE, 0.0)
 
 
 class SensorFaults:
-    """The faults of all outputs, and what each faulty sensor shows."""
+    """The faults of so many outputs, and what each faulty sensor shows."""
 
-    def __init__(self) -> None:
-        self._faults = [HEALTHY] * len(OUTPUT_NAMES)
+    def __init__(self, outputs: int) -> None:
+        self._faults = [HEALTHY] * outputs
         self._shown: dict[int, float] = {}
 
     def take(self, faults: Sequence[SensorFault], y: Sequence[float]) -> Iterator[tuple[int, SensorFault]]:

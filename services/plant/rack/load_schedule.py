@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Final
 
-from coldloop.process.load_profile import LOAD_SPAN, LoadProfile
-from coldloop.process.loaded import PROCESS
+from coldloop.process.declaration import Load
+from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.plant import LOAD_ROWS, LoadStatus, LoadStep
 
 MOST_UPCOMING: Final = 2 * LOAD_ROWS
@@ -20,9 +20,15 @@ FORGET_AT: Final = 256
 
 
 class LoadSchedule:
-    """Steps of the load by tick, each held until the next one."""
+    """Steps of the load by tick, each held until the next one.
 
-    def __init__(self, profile: LoadProfile) -> None:
+    Args:
+        profile: What is known at first.
+        load: What a load of the process may be.
+    """
+
+    def __init__(self, profile: LoadProfile, load: Load) -> None:
+        self._load = load
         self._times = list(profile.times)
         self._watts = list(profile.watts)
 
@@ -46,10 +52,10 @@ class LoadSchedule:
         for before, step in pairwise(steps):
             if step.tick <= before.tick:
                 raise ValueError(f"tick {step.tick} does not come after {before.tick}")
+        (low, high), unit = self._load.stored_span, self._load.unit
         for step in steps:
-            if not LOAD_SPAN[0] <= step.watts <= LOAD_SPAN[1]:
-                unit = PROCESS.load.unit
-                raise ValueError(f"{step.watts:g} {unit} is outside {LOAD_SPAN[0]:g} to {LOAD_SPAN[1]:g} {unit}")
+            if not low <= step.watts <= high:
+                raise ValueError(f"{step.watts:g} {unit} is outside {low:g} to {high:g} {unit}")
         kept = max(0, bisect_left(self._times, steps[0].tick) - 1 - self._place(now))
         if kept + len(steps) > MOST_UPCOMING:
             raise ValueError(f"{kept} of at most {MOST_UPCOMING} steps are scheduled already: write these later")

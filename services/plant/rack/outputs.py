@@ -4,7 +4,7 @@ from typing import Final
 
 from coldloop.kernels.single_precision import single
 from coldloop.registers.bank import Caller
-from coldloop.registers.plant import Actuators, OutputVerdict, inputs_of
+from coldloop.registers.plant import Actuators, OutputVerdict
 from coldloop.safety.lease import SIMPLE_CLIENT
 
 STALE_TICKS: Final = 8
@@ -77,7 +77,7 @@ class AppliedOutputs:
             self._begin_generation()
         if asked.generation not in (0, self.generation):
             return OutputVerdict.CHANGED
-        wanted = inputs_of(asked)
+        wanted = asked.u
         self.u, self.holder = self._within_reach(wanted), asked.holder
         taken = self.u == wanted
         if not taken:

@@ -8,9 +8,11 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
 
+from coldloop.process.cold_box import COLD_BOX
+from coldloop.process.declaration import LAST_TICK, Process
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.range_bits import ModelRange
-from coldloop.process.signals import INPUT_NAMES, LAST_TICK, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
+from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import Caller
 from coldloop.registers.common import pace_subject
@@ -70,6 +72,7 @@ class Rack:
         journal: Takes the events.
         rate: Largest change of the outputs in one tick; None does not limit.
         generation: Number of the first generation of outputs.
+        process: Whose plant it simulates.
     """
 
     def __init__(
@@ -82,7 +85,9 @@ class Rack:
         journal: Journal,
         rate: Inputs | None = None,
         generation: int = 1,
+        process: Process = COLD_BOX,
     ) -> None:
+        self.process = process
         self._rate = rate
         self._safety = watchdog
         self._u0 = u0
@@ -93,17 +98,22 @@ class Rack:
         self._set_up(session)
 
     def _set_up(self, session: Session) -> None:
-        self.load = LoadSchedule(session.load)
+        self.load = LoadSchedule(session.load, self.process.load)
         self._program = self._make_plant(self.load, session.seed)
         self.session = session
         self._load_by = ""
         """Who writes steps of the load ahead."""
-        self.faults = SensorFaults()
+        self.faults = SensorFaults(len(self.process.outputs))
         self.watchdog.set(self.watchdog.time, 0)
         self.model_range = ModelRangeStatus(self._program.model_range, self._program.tick)
         """What of the simulation is outside its property tables, and since when."""
         self.moving = False
         """The plant is due to move: in lock-step by one tick, in real time by the clock from now on."""
+
+    @property
+    def tick_s(self) -> float:
+        """Length of a tick, s of plant time."""
+        return self.process.tick_s
 
     @property
     def tick(self) -> int:
@@ -126,7 +136,7 @@ class Rack:
         pace = self.session.pace
         if not self.watchdog.time:
             return UNWATCHED_SILENCE_S
-        return self.watchdog.time * TICK_S / (pace.factor if pace.realtime else 1.0)
+        return self.watchdog.time * self.tick_s / (pace.factor if pace.realtime else 1.0)
 
     # -- sessions ------------------------------------------------------------------------------------------------------
 
@@ -146,7 +156,7 @@ class Rack:
                 one that the plant cannot resume; nothing has changed.
         """
         load = LoadProfile(state.times, state.watts)
-        schedule = LoadSchedule(load)
+        schedule = LoadSchedule(load, self.process.load)
         _try_a_tick(self._make_plant(schedule, state.seed), state)
         program = self._make_plant(schedule, state.seed)
         program.resume(**state.program)
@@ -318,8 +328,8 @@ class Rack:
             "session": self.session.number,
             "tick": program.tick,
             "load_w": program.load,
-            "inputs": dict(zip(INPUT_NAMES, self.outputs.u, strict=True)),
-            "outputs": dict(zip(OUTPUT_NAMES, program.measure(), strict=True)),
+            "inputs": dict(zip(self.process.input_names, self.outputs.u, strict=True)),
+            "outputs": dict(zip(self.process.output_names, program.measure(), strict=True)),
             "model_range": [part.name.lower() for part in ModelRange(self.model_range.outside) if part.name],
             **({} if station is None else {"station": station_snapshot(station)}),
         }

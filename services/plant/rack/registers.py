@@ -8,7 +8,6 @@ from collections.abc import Callable
 from coldloop.config import selected
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import ModelHeader
-from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind, JournalQuery
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
 from coldloop.registers.common import Identity, ServiceState, SessionPace
@@ -17,7 +16,6 @@ from coldloop.registers.declaration import Block
 from coldloop.registers.plant import (
     HISTORY_ROWS,
     LOAD_ROWS,
-    PLANT_MAP,
     STATION_ROWS,
     Actuators,
     LiveLoad,
@@ -31,6 +29,7 @@ from coldloop.registers.plant import (
     SensorFault,
     StationStatus,
     Surroundings,
+    plant_map,
 )
 from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 from coldloop.registers.text import from_words
@@ -73,11 +72,11 @@ class RackRegisters:
         now: Callable[[], float] = time.monotonic,
         utc: Callable[[], float] = time.time,
     ) -> None:
-        self._model_digest = header.short_digest
+        self._model_digest, process = header.short_digest, header.declared
         self._age = age
-        self.bank = RegisterBank(PLANT_MAP, settings.plant.word_order)
+        self.bank = RegisterBank(plant_map(process), settings.plant.word_order)
         publish_configuration(self.bank, selected(settings, SHOWN))
-        self._store = PlantStateStore(settings.plant.retain.file, header.short_digest)
+        self._store = PlantStateStore(settings.plant.retain.file, header.short_digest, process)
         self.rack, resumed = self._switched_on(
             settings, header, make_plant, utc, first_generation or secrets.randbelow(2**31) + 1
         )
@@ -121,6 +120,7 @@ class RackRegisters:
         rack = Rack(
             section.watchdog, header.u0, make_plant, session, journal=journal,
             rate=settings.limits.rate if section.rate_limited else None, generation=generation,
+            process=header.declared,
         )  # fmt: skip
         if state is None or not state.session:
             return rack, False
@@ -227,7 +227,7 @@ class RackRegisters:
         asked = self.bank.get(PlantSession)
         pace = TimeBase(bool(asked.realtime), asked.factor)
         self.rack.start(Session(asked.session, pace, self._load_of(asked), asked.seed), who)
-        for output in range(len(OUTPUT_NAMES)):
+        for output in range(len(self.rack.process.outputs)):
             self.bank.put(HEALTHY, output)
         self.bank.put(LiveLoad(0, self.rack.load.value(0)))
         self.bank.put(self.rack.surroundings or Surroundings())
@@ -238,7 +238,7 @@ class RackRegisters:
         self.rack.set_watchdog(self.bank.get(WatchdogTime).time, who)
 
     def _set_faults(self, who: str) -> None:
-        self.rack.set_faults([self.bank.get(SensorFault, row) for row in range(len(OUTPUT_NAMES))], who)
+        self.rack.set_faults([self.bank.get(SensorFault, row) for row in range(len(self.rack.process.outputs))], who)
 
     def _note_load(self, who: str) -> None:
         row = self._written_row
@@ -308,8 +308,8 @@ class RackRegisters:
     def _identity(self) -> Identity:
         rack = self.rack
         return Identity(
-            map_digest=PLANT_MAP.digest,
-            map_version=PLANT_MAP.version,
+            map_digest=self.bank.map.digest,
+            map_version=self.bank.map.version,
             state=ServiceState.RUNNING if rack.session.number else ServiceState.READY,
             model_digest=self._model_digest,
             session=rack.session.number,
@@ -331,7 +331,7 @@ class RackRegisters:
     def _show_applied(self) -> None:
         """Put what is applied into the registers of the outputs; the seal keeps others from completing it by a part."""
         rack, outputs = self.rack, self.rack.outputs
-        self.bank.put_sealed(Actuators(rack.tick, *outputs.u, rack.session.number, outputs.holder, outputs.generation))
+        self.bank.put_sealed(Actuators(rack.tick, outputs.u, rack.session.number, outputs.holder, outputs.generation))
 
     def _note_lease(self, event: LeaseEvent, who: str) -> None:
         self.rack.journal.note(self.rack.tick, EventKind.LEASE, event, who=who)

@@ -6,10 +6,11 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from coldloop.process.load_profile import LOAD_SPAN
-from coldloop.process.signals import LAST_TICK
+from coldloop.process.declaration import LAST_TICK, Process
 from coldloop.registers.codec import check_record
 from coldloop.registers.common import SessionPace
+from coldloop.registers.domain import DomainError
+from coldloop.registers.plant import LoadStep, plant_map
 from coldloop.safety.retained import RetainedFile, RetainedStateError
 from coldloop.session.time_base import TimeBase
 
@@ -37,14 +38,13 @@ class RetainedPlantState(BaseModel):
     """Its time-out, in ticks."""
     times: tuple[Annotated[int, Field(ge=0, le=LAST_TICK)], ...]
     """Ticks of the load's steps."""
-    watts: tuple[Annotated[float, Field(ge=LOAD_SPAN[0], le=LOAD_SPAN[1])], ...]
+    watts: tuple[float, ...]
     seed: Count
     program: dict[str, Any]
     """What `PlantProgram.resume` takes."""
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        check_record(SessionPace.shown(self.session, self.pace))
         tick = self.program.get("tick", 0)
         if not isinstance(tick, int) or not 0 <= tick <= LAST_TICK:
             raise ValueError(f"no session has a tick {tick!r}")
@@ -54,8 +54,9 @@ class RetainedPlantState(BaseModel):
 class PlantStateStore:
     """Keeps the state in a file, if one is configured; what cannot be trusted or written is logged."""
 
-    def __init__(self, file: Path | None, model_digest: int) -> None:
+    def __init__(self, file: Path | None, model_digest: int, process: Process) -> None:
         self._file = RetainedFile(file, OWNER, model_digest) if file else None
+        self._process = process
         self.active = file is not None
         self.refused = False
         """A previous state exists and is not used."""
@@ -66,12 +67,24 @@ class PlantStateStore:
             return None
         try:
             content = self._file.load()
-            return None if content is None else RetainedPlantState.model_validate(content)
+            return None if content is None else self._possible(RetainedPlantState.model_validate(content))
         except RetainedStateError as error:
             self.refuse(str(error))
         except ValidationError as error:
             self.refuse(error.errors()[0]["msg"])
+        except DomainError as error:
+            self.refuse(str(error))
         return None
+
+    def _possible(self, state: RetainedPlantState) -> RetainedPlantState:
+        """Return a state if registers can have its pace and its load.
+
+        Raises:
+            DomainError: They cannot.
+        """
+        for record in (SessionPace.shown(state.session, state.pace), *map(LoadStep, state.times, state.watts)):
+            check_record(record, plant_map(self._process))
+        return state
 
     def refuse(self, reason: str) -> None:
         """Discard the previous state: set its file aside and log the reason."""

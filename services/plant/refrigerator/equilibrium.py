@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from coldloop.process.signals import OUTPUT_NAMES
+from coldloop.process.cold_box import OUTPUT_NAMES
 from plant.cold_box.equilibrium import Equilibrium, NoEquilibriumError
 from plant.components.gas_volume import GasVolume, gas_mass
 from plant.components.nitrogen_bath import LIQUID_DENSITY

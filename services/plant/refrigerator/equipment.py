@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import TICK_S
+from coldloop.process.cold_box import TICK_S
 from plant.cold_box.physics import ColdBox
 from plant.components.heat_exchanger import HeatExchanger
 from plant.numeric import RealArray

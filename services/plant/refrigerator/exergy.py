@@ -9,7 +9,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from coldloop.process.signals import OUTPUT_NAMES, STATION_SIGNAL_NAMES
+from coldloop.process.cold_box import OUTPUT_NAMES
+from coldloop.process.station import STATION_SIGNAL_NAMES
 from plant.helium.entropy import entropy, supply_entropy
 from plant.helium.properties import Helium, saturation, supply_enthalpy_and_density, vapour_enthalpy_and_cp
 from plant.refrigerator.equilibrium import AMBIENT, Rest

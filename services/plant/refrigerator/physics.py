@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process import signals as process
+from coldloop.process import cold_box, station
 from plant.cold_box.physics import REFERENCE, ColdBox, Streams, cold_box_of, evaluate
 from plant.components.actuator import opening_rate
 from plant.components.cell_account import WILD, widest_move
@@ -61,20 +61,20 @@ from plant.refrigerator.precooler import (
     precooler_of,
 )
 
-BOX_STATES: Final = len(process.STATE_NAMES)
+BOX_STATES: Final = len(cold_box.STATE_NAMES)
 STATION: Final = BOX_STATES + len(PRECOOLER_STATES)
 """Index of the station's first state; CV167 is before it."""
 VALVES: Final = STATION + STATION_STATES.index("CV956")
 """Index of the first of the station's valves, in the order of `COMMAND_NAMES`."""
 COIL: Final = BOX_STATES + PRECOOLER_STATES.index("T_nef5")
 """Index of the last state of the high-pressure passes."""
-STATE_NAMES: Final = (*process.STATE_NAMES, *PRECOOLER_STATES, *STATION_STATES)
-STATE_UNITS: Final = (*process.STATE_UNITS, *PRECOOLER_STATE_UNITS, *STATION_STATE_UNITS)
-COMMAND_NAMES: Final = process.STATION_VALVE_NAMES
+STATE_NAMES: Final = (*cold_box.STATE_NAMES, *PRECOOLER_STATES, *STATION_STATES)
+STATE_UNITS: Final = (*cold_box.STATE_UNITS, *PRECOOLER_STATE_UNITS, *STATION_STATE_UNITS)
+COMMAND_NAMES: Final = station.STATION_VALVE_NAMES
 DISTURBANCE_NAMES: Final = ("NCR22_HL", "T_ambient", "leak", "nitrogen", "NC1", "NC2")
 """Heat load (W), ambient temperature (K), leak at 16 bar (kg/s); 0 or 1: nitrogen in the tank, compressors to run."""
 
-SIGNAL_NAMES: Final = process.STATION_SIGNAL_NAMES
+SIGNAL_NAMES: Final = station.STATION_SIGNAL_NAMES
 SIGNALS: Final = len(SIGNAL_NAMES)
 PA_PER_BAR: Final = 1e5
 

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from coldloop.process.signals import INPUT_NAMES, TICK_S
+from coldloop.process.cold_box import INPUT_NAMES, TICK_S
 from plant.helium.properties import load_helium
 from plant.integrator import plain_tuples
 from plant.numeric import RealArray

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coldloop.process.signals import TICK_S
+from coldloop.process.cold_box import TICK_S
 from coldloop.registers.plant import StationAlarm, StationMode
 from plant.refrigerator.compression_station import CompressionStation
 from plant.refrigerator.equipment import EquipmentLaw

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are
 
-from coldloop.process.signals import OUTPUT_NAMES, TICK_S
+from coldloop.process.cold_box import OUTPUT_NAMES, TICK_S
 from plant.numeric import RealArray
 from plant.refrigerator.physics import SIGNAL_NAMES, STATE_NAMES
 from plant.refrigerator.station_settings import LqWeights

@@ -10,7 +10,7 @@ from math import sqrt
 from typing import Any, Final, NamedTuple
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import TICK_S
+from coldloop.process.cold_box import TICK_S
 from coldloop.registers.plant import StationMode
 from plant.components.gas_valve import CHOKED
 from plant.components.valve import Valve

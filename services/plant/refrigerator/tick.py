@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.cold_box import P1, V1
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, TICK_S
+from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, P1, TICK_S, V1
 from plant.components.passes import COLUMNS
 from plant.helium.properties import Helium, helium_of
 from plant.numeric import RealArray

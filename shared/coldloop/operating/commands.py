@@ -6,9 +6,10 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 
 from coldloop.errors import LoadFileError, UsageError
 from coldloop.number_text import value_text
+from coldloop.process.declaration import LAST_TICK
 from coldloop.process.load_profile import LOAD_SPAN, LOAD_UNIT, LOAD_WORD, LoadProfile, load_profile_of
 from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, LAST_TICK, OUTPUT_NAMES, TICK_S
+from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
 from coldloop.registers.plant import SensorFaultKind
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmKind
 from coldloop.service.event_text import alarm_word, word

@@ -27,7 +27,7 @@ from coldloop.process.load_profile import LOAD_UNIT, LoadProfile
 from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
-from coldloop.registers.maps import MAPS
+from coldloop.registers.maps import MAPS, PLANT_MAP
 from coldloop.registers.plant import LiveLoad, LoadStatus, SensorFault, SensorFaultKind
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.registers.seal import sealed
@@ -149,11 +149,11 @@ async def set_setpoint(clients: Clients, command: SetSetpoint) -> str:
     """Write one setpoint; the others stay as they are."""
     client, place = clients["control_plc"], INPUT_NAMES.index(command.input)
     operator = await check_manual(client)
-    values = [command.value if i == place else present for i, present in enumerate(operator[1:])]
-    await client.write(Operator(operator.mode, *values))
+    values = [command.value if i == place else present for i, present in enumerate(operator.u)]
+    await client.write(Operator(operator.mode, tuple(values)))
     back, unit = await client.read(Operator), INPUT_UNITS[place]
-    was = f"was {value_text(operator[1 + place], unit)}"
-    now = f"setpoint of {command.input} {value_text(back[1 + place], unit)}"
+    was = f"was {value_text(operator.u[place], unit)}"
+    now = f"setpoint of {command.input} {value_text(back.u[place], unit)}"
     return f"{now} ({was}); approached within the rate limit"
 
 
@@ -167,7 +167,7 @@ async def set_load(clients: Clients, command: SetLoad) -> str:
     before, now = await client.read(LoadStatus), (await client.read(Identity)).tick
     if 0 < command.tick <= now:
         raise UsageError(f"plant time is {now * TICK_S:g} s already: name a later one")
-    await client.write(sealed(LiveLoad(command.tick, command.watts)))
+    await client.write(sealed(LiveLoad(command.tick, command.watts), PLANT_MAP))
     status = await client.read(LoadStatus)
     for _ in range(0 if command.tick else round(EFFECT_S / LOOK_S)):
         if math.isclose(status.watts, command.watts, rel_tol=1e-6):

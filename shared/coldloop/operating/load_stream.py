@@ -7,6 +7,7 @@ from coldloop.errors import LinkError, PeerUnreachableError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.load_profile import LOAD_UNIT, LoadProfile
 from coldloop.process.signals import TICK_S
+from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import AHEAD_STEPS, LOAD_ROWS, LoadAhead, LoadStatus, LoadStep
 from coldloop.registers.seal import sealed
 
@@ -88,7 +89,7 @@ class LoadStream:
         record = LoadAhead.first_of(self._session, self._times[some], self._watts[some])
         self._unanswered = record.length
         try:
-            await self._plant.write(sealed(record))
+            await self._plant.write(sealed(record, PLANT_MAP))
         except LinkError as error:
             if not self._sent:
                 raise

@@ -114,4 +114,11 @@ COLD_BOX: Final = Process(
 )
 
 L1, V1, T1, T2, T5, P1 = map([output.name for output in COLD_BOX.outputs].index, ("L1", "V1", "T1", "T2", "T5", "P1"))
-"""Places of its outputs: for its plants, its studies and its tests. Services ask the process."""
+"""Places of its outputs: for its plants, its studies and its tests, as what follows. Services ask the process."""
+
+TICK_S: Final = COLD_BOX.tick_s
+TICKS_PER_SAMPLE: Final = COLD_BOX.ticks_per_sample
+SAMPLING_PERIOD_S: Final = COLD_BOX.sampling_period_s
+INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES = COLD_BOX.input_names, COLD_BOX.output_names, COLD_BOX.state_names
+INPUT_UNITS, OUTPUT_UNITS, STATE_UNITS = COLD_BOX.input_units, COLD_BOX.output_units, COLD_BOX.state_units
+CONTROLLED: Final = COLD_BOX.controlled

@@ -5,13 +5,22 @@ declared in `coldloop.process.cold_box`; others come with their model file, from
 Needs the standard library only.
 """
 
+import json
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Self, get_args, get_type_hints
 
 VARIABLE: Final = "COLDLOOP_PROCESS"
 """Of the environment: the model file that a program is loaded with."""
+
+LAST_TICK: Final = 2**32 - 2**16 - 1
+"""Last tick of a session, after 34 years: what is planned from there still fits a register."""
+
+LAST_NUMBER: Final = LAST_TICK
+"""Largest number of an update, or of a sequence."""
 
 Range = tuple[float, float]
 
@@ -125,6 +134,12 @@ class Load:
     bar: Range | None = None
     """Ends of its bar on the operator's page; its span where they are not given."""
 
+    @property
+    def stored_span(self) -> Range:
+        """Its span as registers have it, in single precision."""
+        low, high = struct.unpack("2f", struct.pack("2f", *self.span))
+        return low, high
+
 
 @dataclass(frozen=True, kw_only=True)
 class Forecast:
@@ -213,9 +228,9 @@ NO_LOAD: Final = Load(name="no load", unit="", span=(0.0, 1.0), walk=1e-6)
 """The load of a process that has none."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Process:
-    """A process with its time, its signals and its control problem.
+    """A process with its time, its signals and its control problem: a value, equal to any of the same content.
 
     Raises:
         ValueError: Names are used twice, or a loop or a bath names signals that there are not.
@@ -309,6 +324,69 @@ class Process:
                 raise ValueError(f"bath: {name or 'an empty name'} is no {what}")
             if names.count(name) > 1:
                 raise ValueError(f"bath: {name} is named twice")
+
+    @cached_property
+    def _content(self) -> str:
+        return json.dumps(self.document(), sort_keys=True)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Process) and self._content == other._content
+
+    def __hash__(self) -> int:
+        return hash(self._content)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Process.of, (self.document(),)
+
+    @cached_property
+    def input_names(self) -> tuple[str, ...]:
+        """In the order of the inputs, which is that of u."""
+        return tuple(one.name for one in self.inputs)
+
+    @cached_property
+    def input_units(self) -> tuple[str, ...]:
+        """In the same order."""
+        return tuple(one.unit for one in self.inputs)
+
+    @cached_property
+    def output_names(self) -> tuple[str, ...]:
+        """In the order of the outputs, which is that of y."""
+        return tuple(one.name for one in self.outputs)
+
+    @cached_property
+    def output_units(self) -> tuple[str, ...]:
+        """In the same order."""
+        return tuple(one.unit for one in self.outputs)
+
+    @cached_property
+    def state_names(self) -> tuple[str, ...]:
+        """In the order of the states, which is that of x."""
+        return tuple(one.name for one in self.states)
+
+    @cached_property
+    def state_units(self) -> tuple[str, ...]:
+        """In the same order."""
+        return tuple(one.unit for one in self.states)
+
+    @cached_property
+    def controlled(self) -> tuple[int, ...]:
+        """Places of the outputs that have a band."""
+        return tuple(place for place, one in enumerate(self.outputs) if one.band is not None)
+
+    @cached_property
+    def sampling_period_s(self) -> float:
+        """Sampling period of the prediction model, s of plant time; the longest updating period."""
+        return self.ticks_per_sample * self.tick_s
+
+    @property
+    def tick_unit(self) -> str:
+        """Unit of what is counted in ticks."""
+        return f"{self.tick_s:g} s"
+
+    @property
+    def span_of_inputs(self) -> Range:
+        """No input is outside."""
+        return min(one.span[0] for one in self.inputs), float(max(one.span[1] for one in self.inputs))
 
     @property
     def has_station(self) -> bool:

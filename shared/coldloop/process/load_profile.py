@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import LoadFileError
+from coldloop.process.declaration import LAST_TICK
 from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import LAST_TICK, TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.table import TIME, Table, read_table, table_of
 
 LOAD_SPAN: Final[tuple[float, float]] = struct.unpack("2f", struct.pack("2f", *PROCESS.load.span))

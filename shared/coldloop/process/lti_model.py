@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import ModelFileError
-from coldloop.process.loaded import PROCESS
+from coldloop.process.cold_box import COLD_BOX as THE_COLD_BOX
+from coldloop.process.declaration import Process
 from coldloop.process.model_file import (
     COLD_BOX,
     FORMAT,
@@ -20,12 +21,11 @@ from coldloop.process.model_file import (
     short_digest_of,
     write_document,
 )
-from coldloop.process.signals import STATE_NAMES
 
 RealArray: TypeAlias = NDArray[np.float64]
 
 UNNAMED: dict[str, Any] = {
-    "plant": COLD_BOX, "note": "", "plant_parameters": {}, "plant_rest": {}, "process": {},
+    "plant": COLD_BOX, "note": "", "plant_parameters": {}, "plant_rest": {}, "process": {}, "declaration_digest": "",
 }  # fmt: skip
 """What a model file leaves out."""
 MATRICES = ("A", "B", "F", "C", "D", "G", "A_tick", "B_tick", "F_tick")
@@ -101,6 +101,8 @@ class LtiModel:
     """`coldloop.process.declaration.Process` as plain data; none is the cold box."""
     plant_rest: dict[str, Any] = field(default_factory=dict)
     """Where a refrigerator is at rest, and the gains of its pressure controller; none are those that are shipped."""
+    declaration_digest: str = ""
+    """SHA-256 of the process file that it was made from, and of the files that this names; empty: of none."""
 
     def __post_init__(self) -> None:
         n, m, p = len(self.state_names), len(self.input_names), len(self.output_names)
@@ -132,13 +134,22 @@ class LtiModel:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the content, in hexadecimal: the model's identity on the bus."""
+        """SHA-256 of the content, in hexadecimal: of each bit of the matrices."""
         return digest_of(self._document())
 
     @property
+    def declared(self) -> Process:
+        """The process that the plant is.
+
+        Raises:
+            KeyError, TypeError, ValueError: The model says something else there.
+        """
+        return Process.of(self.process) if self.process else THE_COLD_BOX
+
+    @property
     def short_digest(self) -> int:
-        """The first 32 bits of the digest, as they stand in the registers."""
-        return short_digest_of(self.digest)
+        """What services compare: the first 32 bits of the declaration's digest, or of the model's where it has none."""
+        return short_digest_of(self.declaration_digest or self.digest)
 
     def save(self, path: Path) -> None:
         """Write the model as JSON with its digest; the file appears whole or not at all (OSError if it cannot)."""
@@ -198,9 +209,13 @@ def load(path: Path) -> LtiModel:
         model = LtiModel(**described, **arrays)
     except (KeyError, TypeError, ValueError) as error:
         raise ModelFileError(f"{path}: {error} in the model file; {REMEDY}") from error
-    if len(model.state_names) < len(STATE_NAMES):
+    try:
+        process = model.declared
+    except (KeyError, TypeError, ValueError) as error:
+        raise ModelFileError(f"{path}: process: {error}; {REMEDY}") from error
+    if len(model.state_names) < len(process.states):
         raise ModelFileError(
-            f"{path}: {len(model.state_names)} states in the model file, a {PROCESS.name} has {len(STATE_NAMES)}; "
+            f"{path}: {len(model.state_names)} states in the model file, a {process.name} has {len(process.states)}; "
             f"{REMEDY}"
         )
     return model

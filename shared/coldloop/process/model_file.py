@@ -11,6 +11,8 @@ from typing import Any
 
 from coldloop.errors import ModelFileError
 from coldloop.parsing import parsed_json
+from coldloop.process.cold_box import COLD_BOX as THE_COLD_BOX
+from coldloop.process.declaration import Process
 from coldloop.text_file import read_bytes
 from coldloop.whole_file import whole_text
 
@@ -56,11 +58,22 @@ class ModelHeader:
     """Where it was read from."""
     plant_rest: dict[str, Any] = field(default_factory=dict)
     """Where a refrigerator is at rest, and the gains of its pressure controller; none are those that are shipped."""
+    declaration_digest: str = ""
+    """SHA-256 of the process file that it was made from, and of the files that this names; empty: of none."""
+
+    @property
+    def declared(self) -> Process:
+        """The process that the plant is.
+
+        Raises:
+            KeyError, TypeError, ValueError: The file says something else there.
+        """
+        return Process.of(self.process) if self.process else THE_COLD_BOX
 
     @property
     def short_digest(self) -> int:
-        """The first 32 bits of the digest, as they stand in the registers."""
-        return short_digest_of(self.digest)
+        """What services compare: the first 32 bits of the declaration's digest, or of the model's where it has none."""
+        return short_digest_of(self.declaration_digest or self.digest)
 
 
 def read_header(path: Path) -> ModelHeader:
@@ -79,6 +92,7 @@ def header_of(document: dict[str, Any], path: Path) -> ModelHeader:
         described |= {name: tuple(str(text) for text in document[name]) for name in LISTS_OF_TEXT}
         described |= {name: tuple(float(number) for number in document[name]) for name in VECTORS}
         described |= {"plant": str(document.get("plant", COLD_BOX)), "note": str(document.get("note", ""))}
+        described["declaration_digest"] = str(document.get("declaration_digest", ""))
         described |= {name: _sections(document, name) for name in ("plant_parameters", "plant_rest")}
         described["process"] = dict(document.get("process", {}))
         header = ModelHeader(w0=float(document["w0"]), file=path, **described)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.range_bits import ModelRange
-from coldloop.process.signals import STATION_SIGNAL_NAMES
+from coldloop.process.station import STATION_SIGNAL_NAMES
 
 SATURATION_BAR: Final = (0.3, 2.25)
 """Of bath and return; helium's critical point is at 2.28 bar."""

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar, cast
 
 from coldloop.registers.codec import RecordCodec, ValueCodec, WordOrder, codec_of
-from coldloop.registers.declaration import Block, Field, Kind, RegisterMap, Role, fields_of
+from coldloop.registers.declaration import Block, Field, Kind, RegisterMap, Role
 from coldloop.registers.domain import Domain, DomainError
 from coldloop.registers.seal import Seal, seal_of, sealed_bytes
 
@@ -107,14 +107,12 @@ class RegisterBank:
             self._writable[block.address : block.end] = b"\1" * size
         if block.sealed and block.writer is None:  # no seal is damage to those who read, also before there is anything
             self.put_sealed(codec_of(block, self.order).decode(bytes(2 * size)))
-        fields = fields_of(block.record)
         for row in range(block.rows):
-            for register in block.registers(row):
+            for register, (_, field) in zip(block.registers(row), block.elements, strict=True):
                 if register.kind.words == 2:
                     self._halves[register.address] = FIRST_HALF
                     self._halves[register.address + 1] = SECOND_HALF
                 if block.writer is not None:
-                    field = fields[register.name.split(".")[0]]
                     self._checks.append((register.address, register.kind, field, f"{block.name}.{register.name}"))
 
     def get(self, record: type[R], row: int = 0) -> R:

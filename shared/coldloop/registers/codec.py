@@ -6,7 +6,7 @@ from enum import StrEnum
 from functools import cache
 from typing import Any, TypeVar, cast
 
-from coldloop.registers.declaration import Block, fields_of
+from coldloop.registers.declaration import Block, RegisterMap
 from coldloop.registers.domain import DomainError, domain_of
 
 R = TypeVar("R", bound=tuple[Any, ...])
@@ -58,8 +58,8 @@ class RecordCodec:
     def __init__(self, block: Block, order: WordOrder) -> None:
         self._values = ValueCodec(block.letters, order)
         self._record = block.record
-        self._domain = domain_of(block.record)
-        self._arrays = [len(field.elements) for field in fields_of(block.record).values()]
+        self._domain = domain_of(block)
+        self._arrays = [len(field.elements) for field in block.fields.values()]
         self._flat = not any(self._arrays)
         self.size = self._values.size
 
@@ -142,21 +142,22 @@ def codec_of(block: Block, order: WordOrder = WordOrder.HIGH_FIRST) -> RecordCod
     return RecordCodec(block, order)
 
 
-@cache
-def _wire_codec(record: type[tuple[Any, ...]]) -> RecordCodec:
-    return RecordCodec(Block("wire", 0, record, ""), WordOrder.HIGH_FIRST)
-
-
-def check_record(record: tuple[Any, ...]) -> None:
-    """Check a record that has not come by the bus, but from a file.
+def check_record(record: tuple[Any, ...], of: RegisterMap) -> None:
+    """Check a record of a map that has not come by the bus, but from a file.
 
     Raises:
         DomainError: A value is not one that its register can have.
     """
-    _wire_codec(type(record)).check(record)
+    codec_of(of.block_of(type(record))).check(record)
 
 
-def as_transmitted(record: R) -> R:
-    """Return `record` as its reader sees it after a journey over the bus: every float rounded to single precision."""
-    codec = _wire_codec(type(record))
+def as_transmitted(record: R, of: RegisterMap) -> R:
+    """Return a record of a map as its reader sees it after a journey over the bus: each float in single precision."""
+    codec = codec_of(of.block_of(type(record)))
     return cast("R", codec.decode(codec.encode(record)))
+
+
+def blank(record: type[R], of: RegisterMap) -> R:
+    """Return the record of a map whose registers are all 0."""
+    block = of.block_of(record)
+    return cast("R", codec_of(block).decode(bytes(2 * block.row_words)))

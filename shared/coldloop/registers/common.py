@@ -3,8 +3,7 @@
 from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
-from coldloop.process.signals import TICK_UNIT
-from coldloop.registers.declaration import Block, f32, u16, u32
+from coldloop.registers.declaration import Block, f32, in_ticks, u16, u32
 from coldloop.session.time_base import TimeBase
 
 MAGIC: Final = 123.456
@@ -26,7 +25,7 @@ class Identity(NamedTuple):
     state: Annotated[int, u16("0 ready, 1 running", values=ServiceState)] = ServiceState.READY
     model_digest: Annotated[int, u32("First 32 bits of the digest of the prediction model in use")] = 0
     session: Annotated[int, u32("Present session")] = 0
-    tick: Annotated[int, u32("Present tick of plant time, counted from the start of the session", unit=TICK_UNIT)] = 0
+    tick: Annotated[int, in_ticks(u32("Present tick of plant time, counted from the start of the session"))] = 0
     heartbeat: Annotated[int, u16("Rises with every tick or update, and wraps")] = 0
 
 

@@ -1,25 +1,29 @@
 """Register map of the control PLC: the optimiser's side of the link, and what operators see."""
 
 from enum import IntEnum
-from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, Self
+from functools import cache
+from typing import Annotated, Final, NamedTuple
 
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import (
-    INPUT_NAMES,
-    INPUT_UNITS,
-    LAST_NUMBER,
-    LAST_TICK,
-    OUTPUT_NAMES,
-    OUTPUT_UNITS,
-    STATE_NAMES,
-    STATE_UNITS,
-    TICK_UNIT,
-)
+from coldloop.process.declaration import LAST_NUMBER, LAST_TICK, Process
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
-from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, placed, record, u16, u32
-from coldloop.registers.plant import MAX_STATE, NOUN, SPAN_OF_INPUTS
+from coldloop.registers.declaration import (
+    Block,
+    RegisterMap,
+    Role,
+    each_input,
+    f32,
+    in_ticks,
+    of_inputs,
+    of_load,
+    of_outputs,
+    of_states,
+    placed,
+    u16,
+    u32,
+)
+from coldloop.registers.plant import MAX_STATE
 from coldloop.registers.safety import Alarm, AlarmCommand, AlarmKind, LeaseStatus, WatchdogStatus, WatchdogTime
 
 SEQUENCE_ROWS: Final = 240
@@ -151,13 +155,13 @@ class LinkCause(IntEnum):
     """The rack limited the change of its outputs to the rate of one tick."""
 
 
-class Process(NamedTuple):
+class ProcessNow(NamedTuple):
     """The process at the last scan."""
 
     tick: Annotated[int, u32("Tick of the scan")]
-    load: Annotated[float, f32(f"{NOUN} {PROCESS.load.name}", unit=PROCESS.load.unit, finite=False)]
-    u: Annotated[tuple[float, ...], f32_array("Input being applied", INPUT_NAMES, INPUT_UNITS)]
-    y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS)]
+    load: Annotated[float, of_load("{noun} {name}", finite=False)]
+    u: Annotated[tuple[float, ...], of_inputs("Input being applied")]
+    y: Annotated[tuple[float, ...], of_outputs("Measured output")]
 
 
 class Status(NamedTuple):
@@ -205,41 +209,19 @@ class Update(NamedTuple):
     playing: Annotated[
         int, u32("Number of the sequence being played from this instant on; 0 is none", high=LAST_NUMBER)
     ]
-    load: Annotated[
-        float,
-        f32(f"{NOUN} {PROCESS.load.name}", unit=PROCESS.load.unit, low=PROCESS.load.span[0], high=PROCESS.load.span[1]),
-    ]
-    u_before: Annotated[
-        tuple[float, ...],
-        f32_array(
-            "Input applied until this instant", INPUT_NAMES, INPUT_UNITS, low=SPAN_OF_INPUTS[0], high=SPAN_OF_INPUTS[1]
-        ),
-    ]
-    u: Annotated[
-        tuple[float, ...],
-        f32_array(
-            "Input applied from this instant on",
-            INPUT_NAMES,
-            INPUT_UNITS,
-            low=SPAN_OF_INPUTS[0],
-            high=SPAN_OF_INPUTS[1],
-        ),
-    ]
+    load: Annotated[float, of_load("{noun} {name}", in_span=True)]
+    u_before: Annotated[tuple[float, ...], of_inputs("Input applied until this instant", in_span=True)]
+    u: Annotated[tuple[float, ...], of_inputs("Input applied from this instant on", in_span=True)]
     y: Annotated[
         tuple[float, ...],
-        f32_array(
+        of_outputs(
             "Output measured at this instant; not a number where the measurement is bad",
-            OUTPUT_NAMES,
-            OUTPUT_UNITS,
             low=-MAX_STATE,
             high=MAX_STATE,
             finite=False,
         ),
     ]
-    x: Annotated[
-        tuple[float, ...],
-        f32_array("Simulated state, not measured", STATE_NAMES, STATE_UNITS, low=-MAX_STATE, high=MAX_STATE),
-    ]
+    x: Annotated[tuple[float, ...], of_states("Simulated state, not measured", low=-MAX_STATE, high=MAX_STATE)]
     crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none")] = 0
 
 
@@ -258,18 +240,10 @@ class Plan(NamedTuple):
     next_update_tick: Annotated[int, u32("Tick of the next updating instant t_{i+1}")]
     load_step: Annotated[
         float,
-        f32(
-            "An update is latched at once when the load has moved by more than this; 0 is never",
-            unit=PROCESS.load.unit,
-            low=0,
-        ),
+        of_load("An update is latched at once when the load has moved by more than this; 0 is never", low=0),
     ] = 0.0
     shortage: Annotated[
-        float,
-        f32(
-            "Estimated load above what can be held; negative: below what is needed; 0 is neither",
-            unit=PROCESS.load.unit,
-        ),
+        float, of_load("Estimated load above what can be held; negative: below what is needed; 0 is neither")
     ] = 0.0
     suspects: Annotated[
         int,
@@ -314,32 +288,11 @@ class LatchedUpdate(NamedTuple):
     crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
 
 
-if TYPE_CHECKING:
+class Operator(NamedTuple):
+    """What an operator wants. Setpoints count in manual mode; they are clamped and rate-limited."""
 
-    class Operator(tuple[Any, ...]):
-        """What an operator wants: the mode, and a setpoint for each input."""
-
-        __slots__ = ()
-
-        mode: int
-
-        def __new__(cls, mode: int, *inputs: float) -> Self: ...  # noqa: D102
-        def _replace(self, **fields: float) -> Self: ...
-
-else:
-    Operator = record(
-        "Operator", __name__,
-        "What an operator wants. Setpoints count in manual mode; they are clamped and rate-limited.",
-        {
-            "mode": Annotated[int, u16("0 auto, 1 classical loops, 2 manual", high=2, values=OperatorMode)],
-            **{
-                one.register: Annotated[
-                    float, f32(f"Setpoint: {one.description}", unit=one.unit, low=one.span[0], high=one.span[1])
-                ]
-                for one in PROCESS.inputs
-            },
-        },
-    )  # fmt: skip
+    mode: Annotated[int, u16("0 auto, 1 classical loops, 2 manual", high=2, values=OperatorMode)]
+    u: Annotated[tuple[float, ...], each_input("Setpoint: {}")]
 
 
 class SequenceHeader(NamedTuple):
@@ -352,26 +305,15 @@ class SequenceHeader(NamedTuple):
     update: Annotated[int, u32("Update that the sequence answers")]
     first_tick: Annotated[int, u32("First tick at which it is valid, t_{i+1}")]
     length: Annotated[int, u16("Rows in use", high=SEQUENCE_ROWS)]
-    tau_u: Annotated[int, u16("Updating period t_{i+1} - t_i that it was computed in", unit=TICK_UNIT)]
+    tau_u: Annotated[int, in_ticks(u16("Updating period t_{i+1} - t_i that it was computed in"))]
     model_digest: Annotated[int, u32("First 32 bits of the digest of the prediction model")]
     crc: Annotated[int, u32("CRC-32 of the header before this field and of the rows in use, as big-endian words")]
 
 
-if TYPE_CHECKING:
+class SequenceRow(NamedTuple):
+    """Inputs of one tick."""
 
-    class SequenceRow(tuple[float, ...]):
-        """Inputs of one tick, a field each."""
-
-        __slots__ = ()
-
-        def __new__(cls, *inputs: float) -> Self: ...  # noqa: D102
-        def _replace(self, **inputs: float) -> Self: ...
-
-else:
-    SequenceRow = record(
-        "SequenceRow", __name__, "Inputs of one tick.",
-        {one.register: Annotated[float, f32(one.description, unit=one.unit)] for one in PROCESS.inputs},
-    )  # fmt: skip
+    u: Annotated[tuple[float, ...], each_input("{}", in_span=False)]
 
 
 class PlantLinkStatus(NamedTuple):
@@ -415,43 +357,41 @@ class ControlSession(NamedTuple):
 class Grant(NamedTuple):
     """How far the control PLC may go in lock-step."""
 
-    until_tick: Annotated[int, u32("The control PLC scans every tick before this one", unit=TICK_UNIT)]
+    until_tick: Annotated[int, in_ticks(u32("The control PLC scans every tick before this one"))]
 
 
-CONTROL_MAP: Final = RegisterMap(
-    service="control_plc",
-    version=4,
-    blocks=placed(
-        (
-            IDENTITY_BLOCK,
-            Block("status", 30, Status, "Sequence player and scan cycle"),
-            Block("ladder", 50, LadderStatus, "The fail-safe ladder"),
-            STATISTICS_BLOCK,
-            Block("process", 100, Process, "The process at the last scan"),
-            Block("update", 200, Update, "Latched at the last updating instant", sealed=True),
-            Block("plant link", 330, PlantLinkStatus, "Link to the rack, and the clocks of both"),
-            Block("optimiser lease", 360, LeaseStatus, "Who may write as the optimiser"),
-            Block("await update", 400, AwaitUpdate, "Makes a read of the latch wait", Role.OPTIMIZER, sealed=True),
-            Block("plan", 408, Plan, "Decided updating period", Role.OPTIMIZER, sealed=True),
-            Block("acknowledgement", 420, Acknowledgement, "Answer to the last sequence", sealed=True),
-            Block("heartbeat", 430, Heartbeat, "Heartbeat of the optimiser", Role.OPTIMIZER, sealed=True),
-            Block("watchdog", 440, WatchdogStatus, "Watches the optimiser"),
-            Block("watchdog time", 446, WatchdogTime, "Sets that watchdog", Role.OPERATOR),
-            Block("session", 450, ControlSession, "Start of a session", Role.OPERATOR),
-            Block("grant", 460, Grant, "Ticks granted in lock-step", Role.OPERATOR),
-            Block("latched update", 462, LatchedUpdate, "The newest update", sealed=True),
-            Block("operator", 470, Operator, "Operating mode and manual setpoints", Role.OPERATOR),
-            Block("alarm command", 480, AlarmCommand, "Command for an alarm", Role.OPERATOR),
-            Block("sequence header", 488, SequenceHeader, "Commits the sequence in the buffer", Role.OPTIMIZER),
-            Block("sequence", 500, SequenceRow, "Spare buffer for a sequence", Role.OPTIMIZER, SEQUENCE_ROWS),
-            Block("pace", 1950, SessionPace, "Time base of the present session", Role.OPERATOR),
-            Block("alarms", 2000, Alarm, "One row for each alarm", rows=len(AlarmKind)),
-            Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
-            Block("journal page", 45010, JournalPage, "State of the journal"),
-            Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
-            Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
-            CONFIGURATION_BLOCK,
-            CONFIGURATION_LINES_BLOCK,
-        )
-    ),
-)
+@cache
+def control_map(process: Process) -> RegisterMap:
+    """Return the map of the control PLC of a process."""
+    blocks = (
+        IDENTITY_BLOCK,
+        Block("status", 30, Status, "Sequence player and scan cycle"),
+        Block("ladder", 50, LadderStatus, "The fail-safe ladder"),
+        STATISTICS_BLOCK,
+        Block("process", 100, ProcessNow, "The process at the last scan"),
+        Block("update", 200, Update, "Latched at the last updating instant", sealed=True),
+        Block("plant link", 330, PlantLinkStatus, "Link to the rack, and the clocks of both"),
+        Block("optimiser lease", 360, LeaseStatus, "Who may write as the optimiser"),
+        Block("await update", 400, AwaitUpdate, "Makes a read of the latch wait", Role.OPTIMIZER, sealed=True),
+        Block("plan", 408, Plan, "Decided updating period", Role.OPTIMIZER, sealed=True),
+        Block("acknowledgement", 420, Acknowledgement, "Answer to the last sequence", sealed=True),
+        Block("heartbeat", 430, Heartbeat, "Heartbeat of the optimiser", Role.OPTIMIZER, sealed=True),
+        Block("watchdog", 440, WatchdogStatus, "Watches the optimiser"),
+        Block("watchdog time", 446, WatchdogTime, "Sets that watchdog", Role.OPERATOR),
+        Block("session", 450, ControlSession, "Start of a session", Role.OPERATOR),
+        Block("grant", 460, Grant, "Ticks granted in lock-step", Role.OPERATOR),
+        Block("latched update", 462, LatchedUpdate, "The newest update", sealed=True),
+        Block("operator", 470, Operator, "Operating mode and manual setpoints", Role.OPERATOR),
+        Block("alarm command", 480, AlarmCommand, "Command for an alarm", Role.OPERATOR),
+        Block("sequence header", 488, SequenceHeader, "Commits the sequence in the buffer", Role.OPTIMIZER),
+        Block("sequence", 500, SequenceRow, "Spare buffer for a sequence", Role.OPTIMIZER, SEQUENCE_ROWS),
+        Block("pace", 1950, SessionPace, "Time base of the present session", Role.OPERATOR),
+        Block("alarms", 2000, Alarm, "One row for each alarm", rows=len(AlarmKind)),
+        Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
+        Block("journal page", 45010, JournalPage, "State of the journal"),
+        Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
+        Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
+        CONFIGURATION_BLOCK,
+        CONFIGURATION_LINES_BLOCK,
+    )
+    return RegisterMap(service="control_plc", version=4, blocks=placed(process, blocks))

@@ -1,19 +1,22 @@
 """How a register is declared.
 
-A *record* is a `NamedTuple` whose fields are annotated with what the bus needs to know of them. A *block* gives a
-record its place in the address space and its writer; a *map* is all blocks of one server. Tables, accessors, checks
-and documentation follow from these three.
+A *record* is a `NamedTuple` whose fields are annotated with what the bus needs to know of them, some of it by the
+process: names, units, ranges and the sizes of arrays. A *block* gives a record its place in the address space and its
+writer; a *map* is all blocks of one server, for one process. Tables, accessors, checks and documentation follow from
+these three.
 """
 
 import hashlib
 import json
 import struct
-from collections import namedtuple
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, StrEnum
 from functools import cache, cached_property
-from typing import Any, NamedTuple, cast, get_type_hints
+from typing import NamedTuple, TypeAlias, cast, get_type_hints
+
+from coldloop.process.cold_box import COLD_BOX
+from coldloop.process.declaration import Process
 
 
 class Kind(Enum):
@@ -58,6 +61,17 @@ class Field:
     """The elements are the words of a text (`registers.text`)."""
     finite: bool = True
     """No NaN and no infinity; where they are allowed, the user of the value checks it."""
+    each: tuple["Field", ...] = ()
+    """Of an array whose elements are registers of their own names, meanings and ranges: their declarations."""
+
+    @property
+    def registers(self) -> Iterator[tuple[str, "Field"]]:
+        """The registers of the field: what is behind its name in theirs, and the declaration of each."""
+        if self.each:
+            yield from zip(self.elements, self.each, strict=True)
+            return
+        for place, element in enumerate(self.elements or ("",)):
+            yield element, replace(self, unit=self.units[place]) if self.units else self
 
     @property
     def words(self) -> int:
@@ -115,31 +129,95 @@ def f32_array(
     return Field(Kind.F32, description, "", low, high, elements, units, finite=finite)
 
 
-def record(name: str, module: str, description: str, declared: Mapping[str, Any], defaults: Sequence[Any] = ()) -> Any:  # noqa: ANN401 a class
-    """Return a record class whose fields depend on the process: `declared` are their annotations, in order.
+Declared: TypeAlias = Field | Callable[[Process], Field]
+"""A declaration, or what it is for a process."""
 
-    Args:
-        name: Of the class.
-        module: In which it stands under that name.
-        description: Of the class.
-        declared: Annotation of each field, as in a `NamedTuple`.
-        defaults: Of the last fields.
-    """
-    make: Any = namedtuple  # noqa: PYI024 the fields vary
-    made = make(name, list(declared), defaults=defaults, module=module)
-    made.__doc__, made.__annotations__ = description, dict(declared)
-    return made
+
+def in_ticks(field: Field) -> Declared:
+    """Declare a number of ticks."""
+    return lambda process: replace(field, unit=process.tick_unit)
+
+
+def of_load(description: str, *, in_span: bool = False, low: float | None = None, finite: bool = True) -> Declared:
+    """Declare a value in the unit of the load: `{noun}` and `{word}` are what the load is called, `{name}` its name."""
+
+    def declared(process: Process) -> Field:
+        load = process.load
+        least, largest = load.span if in_span else (low, None)
+        words = description.format(noun=load.noun, name=load.name, word=load.word or load.name)
+        return f32(words[0].upper() + words[1:], unit=load.unit, low=least, high=largest, finite=finite)
+
+    return declared
+
+
+def of_inputs(description: str, *, in_span: bool = False, finite: bool = True) -> Declared:
+    """Declare a value for each input; `in_span`: none is outside of all their spans."""
+
+    def declared(process: Process) -> Field:
+        low, high = process.span_of_inputs if in_span else (None, None)
+        return f32_array(description, process.input_names, process.input_units, low=low, high=high, finite=finite)
+
+    return declared
+
+
+def each_input(description: str, *, in_span: bool = True) -> Declared:
+    """Declare a register for each input, of its own name, span and meaning, which `{}` stands for."""
+
+    def declared(process: Process) -> Field:
+        inputs = process.inputs
+        return Field(
+            Kind.F32, description.format("Input"), elements=tuple(one.register for one in inputs),
+            units=process.input_units,
+            each=tuple(
+                f32(description.format(one.description), unit=one.unit, low=one.span[0] if in_span else None,
+                    high=one.span[1] if in_span else None)
+                for one in inputs
+            ),
+        )  # fmt: skip
+
+    return declared
+
+
+def of_outputs(
+    description: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    finite: bool = True,
+    unit: str | None = None,
+) -> Declared:
+    """Declare a value for each output, in its unit or in this one."""
+    return lambda process: f32_array(
+        description, process.output_names,
+        process.output_units if unit is None else (unit,) * len(process.outputs), low=low, high=high, finite=finite,
+    )  # fmt: skip
+
+
+def of_states(
+    description: str, *, low: float | None = None, high: float | None = None, finite: bool = True
+) -> Declared:
+    """Declare a value for each state of the model."""
+    return lambda process: f32_array(
+        description, process.state_names, process.state_units, low=low, high=high, finite=finite
+    )
+
+
+def of_banded(description: str) -> Declared:
+    """Declare a value for each output that has a band."""
+    return lambda process: f32_array(
+        description, tuple(one.name for one in process.banded), tuple(one.unit for one in process.banded)
+    )
 
 
 @cache
-def fields_of(record: type[tuple[object, ...]]) -> dict[str, Field]:
-    """Return the declared fields of a record class, in their order."""
+def fields_of(record: type[tuple[object, ...]], process: Process = COLD_BOX) -> dict[str, Field]:
+    """Return the declared fields of a record class for a process, in their order."""
     declared: dict[str, Field] = {}
     for name, hint in get_type_hints(record, include_extras=True).items():
-        metadata = [item for item in getattr(hint, "__metadata__", ()) if isinstance(item, Field)]
+        metadata = [item for item in getattr(hint, "__metadata__", ()) if isinstance(item, Field) or callable(item)]
         if len(metadata) != 1:
             raise TypeError(f"{record.__name__}.{name} needs exactly one register declaration")
-        declared[name] = metadata[0]
+        declared[name] = metadata[0] if isinstance(metadata[0], Field) else metadata[0](process)
     return declared
 
 
@@ -161,7 +239,7 @@ class Register(NamedTuple):
 
 @dataclass(frozen=True)
 class Block:
-    """A record's place in a map: `rows` copies of it one after the other from `address` on."""
+    """A record's place in a map: `rows` copies of it, or one for each output, one after the other from `address` on."""
 
     name: str
     address: int
@@ -171,11 +249,25 @@ class Block:
     rows: int = 1
     sealed: bool = False
     """Each row ends with the CRC-32 of the words before it (`coldloop.registers.seal`)."""
+    process: Process = COLD_BOX
+    """By which sizes, names, units and ranges are."""
+
+    @property
+    def fields(self) -> Mapping[str, Field]:
+        """The declared fields of its record."""
+        return fields_of(self.record, self.process)
+
+    @property
+    def elements(self) -> Iterator[tuple[str, Field]]:
+        """Name and declaration of each register of a row."""
+        for name, declared in self.fields.items():
+            for element, field in declared.registers:
+                yield element if declared.each else f"{name}.{element}" if element else name, field
 
     @cached_property
     def row_words(self) -> int:
         """Words of one row."""
-        return sum(field.words for field in fields_of(self.record).values())
+        return sum(field.words for field in self.fields.values())
 
     @property
     def end(self) -> int:
@@ -185,28 +277,25 @@ class Block:
     @cached_property
     def letters(self) -> str:
         """`struct` letters of one row, without byte order."""
-        return "".join(field.kind.letter * max(1, len(field.elements)) for field in fields_of(self.record).values())
+        return "".join(field.kind.letter * max(1, len(field.elements)) for field in self.fields.values())
 
     def registers(self, row: int = 0) -> Iterator[Register]:
         """Yield the registers of one row."""
         address = self.address + row * self.row_words
-        for name, field in fields_of(self.record).items():
-            for position, element in enumerate(field.elements or ("",)):
-                label = f"{name}.{element}" if element else name
-                unit = field.units[position] if field.units else field.unit
-                yield Register(
-                    self.name, label, address, field.kind, unit, field.low, field.high, self.writer, field.description,
-                    field.values,
-                )  # fmt: skip
-                address += field.kind.words
+        for name, field in self.elements:
+            yield Register(
+                self.name, name, address, field.kind, field.unit, field.low, field.high, self.writer,
+                field.description, field.values,
+            )  # fmt: skip
+            address += field.kind.words
 
 
-def placed(blocks: Iterable[Block]) -> tuple[Block, ...]:
-    """Return blocks at their addresses, or after the one before where the process has made that one longer."""
+def placed(process: Process, blocks: Iterable[Block]) -> tuple[Block, ...]:
+    """Return the blocks of a process, at their addresses, or after a longer one before them."""
     found: list[Block] = []
     for block in blocks:
         end = found[-1].end if found else 0
-        found.append(block if block.address >= end else replace(block, address=end))
+        found.append(replace(block, process=process, address=max(block.address, end)))
     return tuple(found)
 
 

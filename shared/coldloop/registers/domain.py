@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any, Final, NamedTuple
 
-from coldloop.registers.declaration import Field, Kind, fields_of
+from coldloop.registers.declaration import Block, Field, Kind
 
 WIDEST: Final = {Kind.U16: (0, 0xFFFF), Kind.U32: (0, 0xFFFF_FFFF), Kind.F32: (-math.inf, math.inf)}
 """What a register can hold."""
@@ -94,11 +94,7 @@ def _check_value(value: float, field: Field, name: str) -> None:
 
 
 @cache
-def domain_of(record: type[tuple[Any, ...]]) -> Domain:
-    """Return the (shared) domain of a record."""
-    fields, names = [], []
-    for name, field in fields_of(record).items():
-        for element in field.elements or ("",):
-            fields.append(field)
-            names.append(f"{name}.{element}" if element else name)
+def domain_of(block: Block) -> Domain:
+    """Return the (shared) domain of the rows of a block."""
+    names, fields = zip(*block.elements, strict=True)
     return Domain(fields, names)

@@ -1,12 +1,36 @@
 """The register maps of the three services."""
 
 from collections.abc import Mapping
-from typing import Final
+from functools import cache
+from typing import Final, NamedTuple
 
-from coldloop.registers.control_plc import CONTROL_MAP
+from coldloop.process.declaration import Process
+from coldloop.process.loaded import PROCESS
+from coldloop.registers.control_plc import control_map
 from coldloop.registers.declaration import RegisterMap
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
-from coldloop.registers.plant import PLANT_MAP
+from coldloop.registers.optimizer_plc import optimizer_map
+from coldloop.registers.plant import plant_map
 
-MAPS: Final[Mapping[str, RegisterMap]] = {one.service: one for one in (PLANT_MAP, CONTROL_MAP, OPTIMIZER_MAP)}
-"""By service, in the order in which a command is written: those who follow the plant's clock after it."""
+
+class Maps(NamedTuple):
+    """The register maps of a process; commands are written in this order, to those who follow the plant after it."""
+
+    plant: RegisterMap
+    control_plc: RegisterMap
+    optimizer_plc: RegisterMap
+
+    @property
+    def by_service(self) -> Mapping[str, RegisterMap]:
+        """The maps by the names of their services."""
+        return self._asdict()
+
+
+@cache
+def maps_of(process: Process) -> Maps:
+    """Return the register maps of a process."""
+    return Maps(plant_map(process), control_map(process), optimizer_map(process))
+
+
+MAPS: Final[Mapping[str, RegisterMap]] = maps_of(PROCESS).by_service
+"""Of the process that the programs are loaded with, by service."""
+PLANT_MAP, CONTROL_MAP, OPTIMIZER_MAP = maps_of(PROCESS)

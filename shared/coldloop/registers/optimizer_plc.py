@@ -1,24 +1,31 @@
 """Register map of the optimiser PLC: the results of each update, and the settings of a session."""
 
 from enum import IntEnum
-from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, Self
+from functools import cache
+from typing import Annotated, Final, NamedTuple
 
-from coldloop.process.load_profile import LOAD_UNIT, LOAD_WORD
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import (
-    INPUT_NAMES,
-    INPUT_UNITS,
-    OUTPUT_NAMES,
-    OUTPUT_UNITS,
-    SAMPLING_PERIOD_S,
-    TICK_UNIT,
-    TICKS_PER_SAMPLE,
-)
+from coldloop.process.declaration import Process
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
 from coldloop.registers.control_plc import Verdict
-from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, placed, record, u16, u32
+from coldloop.registers.declaration import (
+    Block,
+    Field,
+    Kind,
+    RegisterMap,
+    Role,
+    f32,
+    f32_array,
+    in_ticks,
+    of_banded,
+    of_inputs,
+    of_load,
+    of_outputs,
+    placed,
+    u16,
+    u32,
+)
 
 HISTORY_ROWS: Final = 256
 PREDICTED_SAMPLES: Final = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 80, 100)
@@ -26,12 +33,26 @@ PREDICTED_SAMPLES: Final = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 80, 100)
 INPUT_SAMPLES: Final = (1, 2, 4, 8, 16, 50, 100)
 """Sampling periods ahead at which planned inputs are shown."""
 
-BANDED_OUTPUTS: Final = tuple(one.name for one in PROCESS.banded)
-BAND_UNITS: Final = tuple(one.unit for one in PROCESS.banded)
+
+def _ahead(process: Process, samples: tuple[int, ...]) -> tuple[str, ...]:
+    return tuple(f"{sample * process.sampling_period_s:g}s" for sample in samples)
 
 
-def _ahead(samples: tuple[int, ...]) -> tuple[str, ...]:
-    return tuple(f"{sample * SAMPLING_PERIOD_S:g}s" for sample in samples)
+def _predicted(process: Process) -> Field:
+    """Declare the prediction of each output that has a band."""
+    fields = [
+        (f"{one.name.lower()}.{time}", f32(f"Predicted {one.name}", unit=one.unit))
+        for one in process.banded
+        for time in _ahead(process, PREDICTED_SAMPLES)
+    ]
+    names, each = zip(*fields, strict=True) if fields else ((), ())
+    return Field(Kind.F32, "Predicted output", elements=names, units=tuple(one.unit for one in each), each=each)
+
+
+def _planned(process: Process) -> Field:
+    """Declare the inputs that are planned."""
+    names = tuple(f"{name}.{time}" for time in _ahead(process, INPUT_SAMPLES) for name in process.input_names)
+    return f32_array("Planned input", names, process.input_units * len(INPUT_SAMPLES))
 
 
 class OptimizerSession(NamedTuple):
@@ -41,7 +62,10 @@ class OptimizerSession(NamedTuple):
     realtime: Annotated[int, u16("0 lock-step, 1 real time: answers are delayed as by the PLC", high=1)]
     factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
     updating_period: Annotated[
-        int, u16("Fixed updating period, 2 or more; 0 is adaptive", unit=TICK_UNIT, high=TICKS_PER_SAMPLE)
+        int,
+        lambda process: u16(
+            "Fixed updating period, 2 or more; 0 is adaptive", unit=process.tick_unit, high=process.ticks_per_sample
+        ),
     ]
 
 
@@ -88,7 +112,7 @@ class Optimization(NamedTuple):
 
     update: Annotated[int, u32("Update")]
     tick: Annotated[int, u32("Tick of the updating instant t_i")]
-    tau_u: Annotated[int, u16("Updating period t_{i+1} - t_i", unit=TICK_UNIT)]
+    tau_u: Annotated[int, in_ticks(u16("Updating period t_{i+1} - t_i"))]
     q: Annotated[int, u16("q(t_i): the number of the period that the rule chose in the ladder of periods")]
     iterations: Annotated[int, u16("Iterations done: what fits into that period, or fewer if more change nothing")]
     verdict: Annotated[int, u16("Verdict of the control PLC on the sequence", values=Verdict)]
@@ -104,7 +128,7 @@ class Optimization(NamedTuple):
     mismatch: Annotated[float, f32("D^r of Algorithm 1", finite=False)]
     contraction: Annotated[float, f32("K^r of Algorithm 1", finite=False)]
     gamma: Annotated[float, f32("Γ of Algorithm 1, the gradient that decides the next step in q", finite=False)]
-    load_mismatch: Annotated[float, f32("Estimated load mismatch", unit=LOAD_UNIT, finite=False)]
+    load_mismatch: Annotated[float, of_load("Estimated load mismatch", finite=False)]
 
 
 class UpdatingRuleKind(IntEnum):
@@ -135,121 +159,69 @@ class UpdatingRuleStatus(NamedTuple):
     iteration: Annotated[float, f32("Duration of an iteration", unit="s")] = 0.0
 
 
-NO_BANDS: Final = (0.0,) * len(BANDED_OUTPUTS)
-NO_INPUTS: Final = (0.0,) * len(INPUT_NAMES)
-
-
 class OperatingLimits(NamedTuple):
     """What the optimiser keeps the process within: bands of the constrained outputs, bounds and rates of the inputs."""
 
-    output_low: Annotated[tuple[float, ...], f32_array("Low end of the band", BANDED_OUTPUTS, BAND_UNITS)] = NO_BANDS
-    output_high: Annotated[tuple[float, ...], f32_array("High end of the band", BANDED_OUTPUTS, BAND_UNITS)] = NO_BANDS
-    input_low: Annotated[tuple[float, ...], f32_array("Lowest value", INPUT_NAMES, INPUT_UNITS)] = NO_INPUTS
-    input_high: Annotated[tuple[float, ...], f32_array("Highest value", INPUT_NAMES, INPUT_UNITS)] = NO_INPUTS
-    input_rate: Annotated[
-        tuple[float, ...], f32_array("Largest change in a sampling period", INPUT_NAMES, INPUT_UNITS)
-    ] = NO_INPUTS
+    output_low: Annotated[tuple[float, ...], of_banded("Low end of the band")]
+    output_high: Annotated[tuple[float, ...], of_banded("High end of the band")]
+    input_low: Annotated[tuple[float, ...], of_inputs("Lowest value")]
+    input_high: Annotated[tuple[float, ...], of_inputs("Highest value")]
+    input_rate: Annotated[tuple[float, ...], of_inputs("Largest change in a sampling period")]
 
 
-if TYPE_CHECKING:
+class Prediction(NamedTuple):
+    """What the last delivered sequence is expected to lead to. Behind the horizon: the value at its end."""
 
-    class Prediction(tuple[Any, ...]):
-        """What the last delivered sequence is expected to lead to: an array for each output that has a band."""
-
-        __slots__ = ()
-
-        update: int
-        tick: int
-        u: tuple[float, ...]
-        crc: int
-
-        def __new__(cls, update: int = 0, tick: int = 0, *arrays: tuple[float, ...]) -> Self: ...  # noqa: D102
-
-else:
-    Prediction = record(
-        "Prediction", __name__,
-        "What the last delivered sequence is expected to lead to. Behind the horizon: the value at its end.",
-        {
-            "update": Annotated[int, u32("Update that the prediction belongs to")],
-            "tick": Annotated[int, u32('Tick at which its sequence begins, t_{i+1}; element "5s" is 5 s later')],
-            **{
-                one.name.lower(): Annotated[
-                    tuple[float, ...],
-                    f32_array(
-                        f"Predicted {one.name}", _ahead(PREDICTED_SAMPLES), (one.unit,) * len(PREDICTED_SAMPLES)
-                    ),
-                ]
-                for one in PROCESS.banded
-            },
-            "u": Annotated[
-                tuple[float, ...],
-                f32_array(
-                    "Planned input",
-                    tuple(f"{name}.{time}" for time in _ahead(INPUT_SAMPLES) for name in INPUT_NAMES),
-                    INPUT_UNITS * len(INPUT_SAMPLES),
-                ),
-            ],
-            "crc": Annotated[int, u32("CRC-32 of the registers before")],
-        },
-        defaults=(
-            0, 0, *((0.0,) * len(PREDICTED_SAMPLES),) * len(PROCESS.banded),
-            (0.0,) * (len(INPUT_NAMES) * len(INPUT_SAMPLES)), 0,
-        ),
-    )  # fmt: skip
+    update: Annotated[int, u32("Update that the prediction belongs to")]
+    tick: Annotated[int, u32('Tick at which its sequence begins, t_{i+1}; element "5s" is 5 s later')]
+    y: Annotated[tuple[float, ...], _predicted]
+    """Of one output that has a band after the other, at `PREDICTED_SAMPLES`."""
+    u: Annotated[tuple[float, ...], _planned]
+    crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
 
 
 def outputs_of(prediction: Prediction) -> tuple[tuple[float, ...], ...]:
     """Return the prediction of each output that has a band, at `PREDICTED_SAMPLES`."""
-    return prediction[2 : 2 + len(PROCESS.banded)]
+    samples = len(PREDICTED_SAMPLES)
+    return tuple(prediction.y[start : start + samples] for start in range(0, len(prediction.y), samples))
 
 
 class ModelDeviation(NamedTuple):
     """By how much the plant differs from its model, as the filter estimates it; also 0 where nothing is estimated."""
 
-    load: Annotated[
-        float,
-        f32(f"{LOAD_WORD.capitalize()} beyond what is measured or, unmeasured, usual", unit=LOAD_UNIT, finite=False),
-    ] = 0.0
-    u: Annotated[
-        tuple[float, ...], f32_array("Acts like so much more of the input", INPUT_NAMES, INPUT_UNITS, finite=False)
-    ] = (0.0,) * len(INPUT_NAMES)
-    y: Annotated[
-        tuple[float, ...],
-        f32_array("Constant difference of the reading from the model's", OUTPUT_NAMES, OUTPUT_UNITS, finite=False),
-    ] = (0.0,) * len(OUTPUT_NAMES)
+    load: Annotated[float, of_load("{word} beyond what is measured or, unmeasured, usual", finite=False)]
+    u: Annotated[tuple[float, ...], of_inputs("Acts like so much more of the input", finite=False)]
+    y: Annotated[tuple[float, ...], of_outputs("Constant difference of the reading from the model's", finite=False)]
     surprise: Annotated[
         tuple[float, ...],
-        f32_array(
+        of_outputs(
             "How far the reading was from what prediction and other readings say, over what the filter expects: "
             "root mean square over a minute; about 1 or less is as designed",
-            OUTPUT_NAMES,
-            ("",) * len(OUTPUT_NAMES),
+            unit="",
             finite=False,
         ),
-    ] = (0.0,) * len(OUTPUT_NAMES)
+    ]
 
 
-OPTIMIZER_MAP: Final = RegisterMap(
-    service="optimizer_plc",
-    version=4,
-    blocks=placed(
-        (
-            IDENTITY_BLOCK,
-            Block("session", 30, OptimizerSession, "Settings of the next session", Role.OPERATOR),
-            Block("control link", 40, ControlLinkStatus, "Link to the control PLC"),
-            STATISTICS_BLOCK,
-            Block("pace", 100, SessionPace, "Time base of the present session", Role.OPERATOR),
-            Block("updating rule", 120, UpdatingRuleStatus, "What decides the updating period"),
-            Block("operating limits", 140, OperatingLimits, "Bands of the outputs, bounds and rates of the inputs"),
-            Block("prediction", 200, Prediction, "Predicted result of the last sequence", sealed=True),
-            Block("model deviation", 320, ModelDeviation, "How the plant differs from the prediction model"),
-            Block("history", 16384, Optimization, "The last updates", rows=HISTORY_ROWS),
-            Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
-            Block("journal page", 45010, JournalPage, "State of the journal"),
-            Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
-            Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
-            CONFIGURATION_BLOCK,
-            CONFIGURATION_LINES_BLOCK,
-        )
-    ),
-)
+@cache
+def optimizer_map(process: Process) -> RegisterMap:
+    """Return the map of the optimiser of a process."""
+    blocks = (
+        IDENTITY_BLOCK,
+        Block("session", 30, OptimizerSession, "Settings of the next session", Role.OPERATOR),
+        Block("control link", 40, ControlLinkStatus, "Link to the control PLC"),
+        STATISTICS_BLOCK,
+        Block("pace", 100, SessionPace, "Time base of the present session", Role.OPERATOR),
+        Block("updating rule", 120, UpdatingRuleStatus, "What decides the updating period"),
+        Block("operating limits", 140, OperatingLimits, "Bands of the outputs, bounds and rates of the inputs"),
+        Block("prediction", 200, Prediction, "Predicted result of the last sequence", sealed=True),
+        Block("model deviation", 320, ModelDeviation, "How the plant differs from the prediction model"),
+        Block("history", 16384, Optimization, "The last updates", rows=HISTORY_ROWS),
+        Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
+        Block("journal page", 45010, JournalPage, "State of the journal"),
+        Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
+        Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
+        CONFIGURATION_BLOCK,
+        CONFIGURATION_LINES_BLOCK,
+    )
+    return RegisterMap(service="optimizer_plc", version=4, blocks=placed(process, blocks))

@@ -2,23 +2,12 @@
 
 from collections.abc import Sequence
 from enum import IntEnum, IntFlag
+from functools import cache
 from itertools import accumulate, pairwise
-from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, Self
+from typing import Annotated, Final, NamedTuple
 
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import (
-    INPUT_NAMES,
-    INPUT_UNITS,
-    LAST_TICK,
-    OUTPUT_NAMES,
-    OUTPUT_UNITS,
-    STATE_NAMES,
-    STATE_UNITS,
-    STATION_SIGNAL_NAMES,
-    STATION_SIGNAL_UNITS,
-    STATION_VALVE_NAMES,
-    TICK_UNIT,
-)
+from coldloop.process.declaration import LAST_TICK, Process
+from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, STATION_VALVE_NAMES
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
@@ -27,10 +16,15 @@ from coldloop.registers.declaration import (
     Field,
     RegisterMap,
     Role,
+    each_input,
     f32,
     f32_array,
+    in_ticks,
+    of_inputs,
+    of_load,
+    of_outputs,
+    of_states,
     placed,
-    record,
     u16,
     u16_array,
     u32,
@@ -40,9 +34,6 @@ from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 HISTORY_ROWS: Final = 256
 STATION_ROWS: Final = 128
 LOAD_ROWS: Final = 2048
-NOUN: Final = PROCESS.load.noun
-SPAN_OF_INPUTS: Final = (min(one.span[0] for one in PROCESS.inputs), float(max(one.span[1] for one in PROCESS.inputs)))
-"""No input is outside."""
 MAX_STATE: Final = 1e9
 """No number of a simulated state, in Pa, m3 or K, is further from 0."""
 MAX_AGE: Final = 1e5
@@ -68,51 +59,18 @@ class OutputVerdict(IntEnum):
     """Applied as far as the rate of one tick allows: read them back again."""
 
 
-if TYPE_CHECKING:
+class Actuators(NamedTuple):
+    """Outputs for one tick, of the one control PLC that holds the lease of the rack.
 
-    class Actuators(tuple[Any, ...]):
-        """Outputs for one tick: a field for each input of the process between `tick` and `session`."""
+    The rack judges them whole; its next measurement shows whether they were accepted.
+    """
 
-        __slots__ = ()
-
-        tick: int
-        session: int
-        holder: int
-        generation: int
-        crc: int
-
-        def __new__(cls, tick: int, *rest: float) -> Self: ...  # noqa: D102
-        def _replace(self, **fields: float) -> Self: ...
-
-else:
-    Actuators = record(
-        "Actuators", __name__,
-        """Outputs for one tick, of the one control PLC that holds the lease of the rack.
-
-        The rack judges them whole; its next measurement shows whether they were accepted.
-        """,
-        {
-            "tick": Annotated[
-                int, u32("Tick of these outputs; in lock-step the present one advances the plant", high=LAST_TICK)
-            ],
-            **{
-                one.register: Annotated[
-                    float, f32(one.description, unit=one.unit, low=one.span[0], high=one.span[1])
-                ]
-                for one in PROCESS.inputs
-            },
-            "session": Annotated[int, u32("Session of these outputs")],
-            "holder": Annotated[int, u32("Number chosen by the writer; 0 is a simple client")],
-            "generation": Annotated[int, u32("Generation that was read back; 0 does not compare")],
-            "crc": Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")],
-        },
-        defaults=(0, 0, 0),
-    )  # fmt: skip
-
-
-def inputs_of(asked: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return the outputs of `Actuators`, or what else there is for each field of it, in the order of the inputs."""
-    return asked[1 : 1 + len(INPUT_NAMES)]
+    tick: Annotated[int, u32("Tick of these outputs; in lock-step the present one advances the plant", high=LAST_TICK)]
+    u: Annotated[tuple[float, ...], each_input("{}")]
+    session: Annotated[int, u32("Session of these outputs")]
+    holder: Annotated[int, u32("Number chosen by the writer; 0 is a simple client")] = 0
+    generation: Annotated[int, u32("Generation that was read back; 0 does not compare")] = 0
+    crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
 
 class Measurement(NamedTuple):
@@ -122,14 +80,11 @@ class Measurement(NamedTuple):
     """
 
     tick: Annotated[int, u32("Tick at which these values were read", high=LAST_TICK)]
-    load: Annotated[float, f32(f"{NOUN} {PROCESS.load.name}, which is known", unit=PROCESS.load.unit, finite=False)]
-    y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS, finite=False)]
-    x: Annotated[tuple[float, ...], f32_array("Simulated state, not measured", STATE_NAMES, STATE_UNITS, finite=False)]
+    load: Annotated[float, of_load("{noun} {name}, which is known", finite=False)]
+    y: Annotated[tuple[float, ...], of_outputs("Measured output", finite=False)]
+    x: Annotated[tuple[float, ...], of_states("Simulated state, not measured", finite=False)]
     session: Annotated[int, u32("Session")]
-    u: Annotated[
-        tuple[float, ...],
-        f32_array("Input being applied", INPUT_NAMES, INPUT_UNITS, low=SPAN_OF_INPUTS[0], high=SPAN_OF_INPUTS[1]),
-    ] = (0.0,) * len(INPUT_NAMES)
+    u: Annotated[tuple[float, ...], of_inputs("Input being applied", in_span=True)]
     holder: Annotated[int, u32("Holder of these outputs; 0 is a simple client, safe or initial state")] = 0
     generation: Annotated[
         int,
@@ -182,17 +137,17 @@ class PlantSession(NamedTuple):
 class LoadStep(NamedTuple):
     """One step of the load table, held until the next one."""
 
-    tick: Annotated[int, u32("First tick of the step", unit=TICK_UNIT, high=LAST_TICK)]
-    watts: Annotated[float, f32(NOUN, unit=PROCESS.load.unit, low=PROCESS.load.span[0], high=PROCESS.load.span[1])]
+    tick: Annotated[int, in_ticks(u32("First tick of the step", high=LAST_TICK))]
+    watts: Annotated[float, of_load("{noun}", in_span=True)]
 
 
 class LoadStatus(NamedTuple):
     """The heat load, and what is known of it."""
 
-    watts: Annotated[float, f32(f"{NOUN} now", unit=PROCESS.load.unit)] = 0.0
-    next_tick: Annotated[int, u32("Tick of the next step that is known; 0 is none", unit=TICK_UNIT)] = 0
-    next_watts: Annotated[float, f32(f"{NOUN} from then on", unit=PROCESS.load.unit)] = 0.0
-    last_tick: Annotated[int, u32("Tick of the last step that is known; it is held from there on", unit=TICK_UNIT)] = 0
+    watts: Annotated[float, of_load("{noun} now")] = 0.0
+    next_tick: Annotated[int, in_ticks(u32("Tick of the next step that is known; 0 is none"))] = 0
+    next_watts: Annotated[float, of_load("{noun} from then on")] = 0.0
+    last_tick: Annotated[int, in_ticks(u32("Tick of the last step that is known; it is held from there on"))] = 0
     upcoming: Annotated[int, u16("Known future steps")] = 0
     free: Annotated[int, u16("Further steps that can be accepted now")] = 0
 
@@ -200,10 +155,8 @@ class LoadStatus(NamedTuple):
 class LiveLoad(NamedTuple):
     """Changes the heat load of the session under way; what was known of later ticks is dropped."""
 
-    tick: Annotated[int, u32("First tick, in the future; 0 is the next tick", unit=TICK_UNIT, high=LAST_TICK)] = 0
-    watts: Annotated[float, f32(NOUN, unit=PROCESS.load.unit, low=PROCESS.load.span[0], high=PROCESS.load.span[1])] = (
-        0.0
-    )
+    tick: Annotated[int, in_ticks(u32("First tick, in the future; 0 is the next tick", high=LAST_TICK))] = 0
+    watts: Annotated[float, of_load("{noun}", in_span=True)] = 0.0
     crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
 
@@ -211,11 +164,13 @@ class LoadAhead(NamedTuple):
     """Steps of the heat load that are to come, for loads of any length; what was known from the first on is dropped."""
 
     session: Annotated[int, u32("Session of these steps")] = 0
-    tick: Annotated[int, u32("Tick of the first step, in the future", unit=TICK_UNIT, high=LAST_TICK)] = 0
+    tick: Annotated[int, in_ticks(u32("Tick of the first step, in the future", high=LAST_TICK))] = 0
     length: Annotated[int, u16("Steps in use", low=1, high=AHEAD_STEPS)] = 1
     watts: Annotated[
         tuple[float, ...],
-        f32_array(f"{NOUN} of step", tuple(map(str, range(AHEAD_STEPS))), (PROCESS.load.unit,) * AHEAD_STEPS),
+        lambda process: f32_array(
+            f"{process.load.noun} of step", tuple(map(str, range(AHEAD_STEPS))), (process.load.unit,) * AHEAD_STEPS
+        ),
     ] = (0.0,) * AHEAD_STEPS
     ticks: Annotated[
         tuple[int, ...],
@@ -262,10 +217,10 @@ class PlantSample(NamedTuple):
     """One row of the history: everything physical at one tick. The row of tick n is n modulo the number of rows."""
 
     tick: Annotated[int, u32("Tick of the row")]
-    load: Annotated[float, f32(NOUN, unit=PROCESS.load.unit)]
-    u: Annotated[tuple[float, ...], f32_array("Input applied from this tick on", INPUT_NAMES, INPUT_UNITS)]
-    y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS, finite=False)]
-    x: Annotated[tuple[float, ...], f32_array("Simulated state", STATE_NAMES, STATE_UNITS, finite=False)]
+    load: Annotated[float, of_load("{noun}")]
+    u: Annotated[tuple[float, ...], of_inputs("Input applied from this tick on")]
+    y: Annotated[tuple[float, ...], of_outputs("Measured output", finite=False)]
+    x: Annotated[tuple[float, ...], of_states("Simulated state", finite=False)]
 
 
 class StationMode(IntEnum):
@@ -346,9 +301,7 @@ class StationStatus(NamedTuple):
     commands: Annotated[tuple[float, ...], f32_array("Requested opening of valve", STATION_VALVE_NAMES, ("%",) * 4)] = (
         0.0,
     ) * len(STATION_VALVE_NAMES)
-    acting: Annotated[
-        tuple[float, ...], f32_array("Acting on the cold box, whatever is asked", INPUT_NAMES, INPUT_UNITS)
-    ] = (0.0,) * len(INPUT_NAMES)
+    acting: Annotated[tuple[float, ...], of_inputs("Acting on the cold box, whatever is asked")] = (0.0,) * 3
 
 
 class ModelRangeStatus(NamedTuple):
@@ -390,50 +343,50 @@ class Surroundings(NamedTuple):
 OF_A_REFRIGERATOR: Final = (StationStatus, StationSample, Surroundings, ModelRangeStatus)
 """Records of a compression station and of property tables."""
 
-PLANT_MAP: Final = RegisterMap(
-    service="plant",
-    version=4,
-    unused=() if PROCESS.has_station else OF_A_REFRIGERATOR,
-    blocks=placed(
-        (
-            IDENTITY_BLOCK,
-            STATISTICS_BLOCK,
-            Block("actuators", 100, Actuators, "Outputs of the control PLC", Role.CONTROL, sealed=True),
-            Block("measurement", 200, Measurement, "Inputs of the control PLC", sealed=True),
-            Block("watchdog", 330, WatchdogStatus, "Watches the control PLC; applies the safe state when it expires"),
-            Block("watchdog time", 340, WatchdogTime, "Sets that watchdog", Role.CONTROL),
-            Block("lease", 350, LeaseStatus, "Who may write outputs"),
-            Block("session", 400, PlantSession, "Start of a simulation session", Role.OPERATOR),
-            Block("pace", 410, SessionPace, "Time base of the present session", Role.OPERATOR),
-            Block("load status", 420, LoadStatus, f"The {NOUN.lower()} and its known steps"),
-            Block("live load", 440, LiveLoad, f"{NOUN} from a tick on", Role.OPERATOR, sealed=True),
-            Block(
-                "sensor faults",
-                500,
-                SensorFault,
-                "Faults injected into the measured outputs",
-                Role.OPERATOR,
-                len(OUTPUT_NAMES),
-            ),
-            Block("load ahead", 600, LoadAhead, f"Future steps of the {NOUN.lower()}", Role.OPERATOR, sealed=True),
-            Block("station", 700, StationStatus, "Compression station and nitrogen pre-cooler of a whole refrigerator"),
-            Block(
-                "surroundings",
-                760,
-                Surroundings,
-                "Trips, nitrogen, leak and weather of a whole refrigerator",
-                Role.OPERATOR,
-            ),
-            Block("model range", 780, ModelRangeStatus, "Alarm of the simulation: it has left its property tables"),
-            Block("load table", 1000, LoadStep, f"{NOUN} over the session", Role.OPERATOR, LOAD_ROWS),
-            Block("station history", 9200, StationSample, "The last ticks of the warm part", rows=STATION_ROWS),
-            Block("history", 16384, PlantSample, "The last ticks", rows=HISTORY_ROWS),
-            Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
-            Block("journal page", 45010, JournalPage, "State of the journal"),
-            Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
-            Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
-            CONFIGURATION_BLOCK,
-            CONFIGURATION_LINES_BLOCK,
-        )
-    ),
-)
+
+@cache
+def plant_map(process: Process) -> RegisterMap:
+    """Return the map of the rack of a process."""
+    noun = process.load.noun
+    blocks = (
+        IDENTITY_BLOCK,
+        STATISTICS_BLOCK,
+        Block("actuators", 100, Actuators, "Outputs of the control PLC", Role.CONTROL, sealed=True),
+        Block("measurement", 200, Measurement, "Inputs of the control PLC", sealed=True),
+        Block("watchdog", 330, WatchdogStatus, "Watches the control PLC; applies the safe state when it expires"),
+        Block("watchdog time", 340, WatchdogTime, "Sets that watchdog", Role.CONTROL),
+        Block("lease", 350, LeaseStatus, "Who may write outputs"),
+        Block("session", 400, PlantSession, "Start of a simulation session", Role.OPERATOR),
+        Block("pace", 410, SessionPace, "Time base of the present session", Role.OPERATOR),
+        Block("load status", 420, LoadStatus, f"The {noun.lower()} and its known steps"),
+        Block("live load", 440, LiveLoad, f"{noun} from a tick on", Role.OPERATOR, sealed=True),
+        Block(
+            "sensor faults",
+            500,
+            SensorFault,
+            "Faults injected into the measured outputs",
+            Role.OPERATOR,
+            len(process.outputs),
+        ),
+        Block("load ahead", 600, LoadAhead, f"Future steps of the {noun.lower()}", Role.OPERATOR, sealed=True),
+        Block("station", 700, StationStatus, "Compression station and nitrogen pre-cooler of a whole refrigerator"),
+        Block(
+            "surroundings",
+            760,
+            Surroundings,
+            "Trips, nitrogen, leak and weather of a whole refrigerator",
+            Role.OPERATOR,
+        ),
+        Block("model range", 780, ModelRangeStatus, "Alarm of the simulation: it has left its property tables"),
+        Block("load table", 1000, LoadStep, f"{noun} over the session", Role.OPERATOR, LOAD_ROWS),
+        Block("station history", 9200, StationSample, "The last ticks of the warm part", rows=STATION_ROWS),
+        Block("history", 16384, PlantSample, "The last ticks", rows=HISTORY_ROWS),
+        Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
+        Block("journal page", 45010, JournalPage, "State of the journal"),
+        Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
+        Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
+        CONFIGURATION_BLOCK,
+        CONFIGURATION_LINES_BLOCK,
+    )
+    unused = () if process.has_station else OF_A_REFRIGERATOR
+    return RegisterMap(service="plant", version=4, blocks=placed(process, blocks), unused=unused)

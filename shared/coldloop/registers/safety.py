@@ -3,9 +3,8 @@
 from enum import IntEnum
 from typing import Annotated, Final, NamedTuple, Self
 
-from coldloop.process.signals import TICK_UNIT
 from coldloop.registers.audit import NOBODY, WHO_WORDS
-from coldloop.registers.declaration import text, u16, u32
+from coldloop.registers.declaration import in_ticks, text, u16, u32
 
 
 class WatchdogState(IntEnum):
@@ -19,17 +18,17 @@ class WatchdogState(IntEnum):
 class WatchdogStatus(NamedTuple):
     """A watchdog, in the manner of the WAGO 750's block of watchdog registers."""
 
-    time: Annotated[int, u16("Time-out in use; 0 is off", unit=TICK_UNIT)] = 0
+    time: Annotated[int, in_ticks(u16("Time-out in use; 0 is off"))] = 0
     state: Annotated[int, u16("0 off, 1 running, 2 expired", values=WatchdogState)] = WatchdogState.OFF
-    remaining: Annotated[int, u16("Time until it expires", unit=TICK_UNIT)] = 0
-    lowest: Annotated[int, u16("Shortest remaining time since it was set", unit=TICK_UNIT)] = 0
+    remaining: Annotated[int, in_ticks(u16("Time until it expires"))] = 0
+    lowest: Annotated[int, in_ticks(u16("Shortest remaining time since it was set"))] = 0
     trips: Annotated[int, u16("Times that it has expired")] = 0
 
 
 class WatchdogTime(NamedTuple):
     """Sets a watchdog when written."""
 
-    time: Annotated[int, u16("Time-out; 0 switches the watchdog off, a new value restarts it", unit=TICK_UNIT)]
+    time: Annotated[int, in_ticks(u16("Time-out; 0 switches the watchdog off, a new value restarts it"))]
 
 
 class LeaseState(IntEnum):

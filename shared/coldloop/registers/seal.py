@@ -7,11 +7,10 @@ A seal is checked on the bytes that arrived: decoding changes some of them (a si
 
 import zlib
 from enum import Enum
-from functools import cache
 from typing import Any, TypeVar, cast
 
-from coldloop.registers.codec import RecordCodec, WordOrder, codec_of
-from coldloop.registers.declaration import Block
+from coldloop.registers.codec import RecordCodec, codec_of
+from coldloop.registers.declaration import RegisterMap
 
 S = TypeVar("S", bound=tuple[Any, ...])
 
@@ -35,22 +34,17 @@ def seal_of(codec: RecordCodec, data: bytes | bytearray | memoryview, offset: in
     return Seal.INTACT if crc == _checksum(raw) else Seal.BROKEN
 
 
-def sealed(record: S) -> S:
-    """Return the record with its field `crc`, the last one, filled in."""
-    crc = _checksum(_codec_of_record(type(record)).encode(record))
+def sealed(record: S, of: RegisterMap) -> S:
+    """Return a record of a map with its field `crc`, the last one, filled in."""
+    crc = _checksum(codec_of(of.block_of(type(record))).encode(record))
     return cast("S", record._replace(crc=crc))  # type: ignore[attr-defined] # a NamedTuple
 
 
 def sealed_bytes(codec: RecordCodec, record: tuple[Any, ...]) -> bytes:
-    """Return the bytes of `sealed(record)`, which is encoded once only."""
+    """Return the bytes of `sealed`, which is encoded once only."""
     raw = bytes(codec.canonical(codec.encode(record)))
     return bytes(codec.canonical(raw[:-CRC_BYTES] + _checksum(raw).to_bytes(CRC_BYTES, "big")))  # words back in order
 
 
 def _checksum(raw: bytes | bytearray | memoryview) -> int:
     return zlib.crc32(raw[:-CRC_BYTES]) or 1
-
-
-@cache
-def _codec_of_record(record: type[tuple[Any, ...]]) -> RecordCodec:
-    return codec_of(Block("sealed", 0, record, ""), WordOrder.HIGH_FIRST)

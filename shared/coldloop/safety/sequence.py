@@ -7,13 +7,15 @@ import struct
 import zlib
 from collections.abc import Sequence as Rows
 from itertools import chain
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from coldloop.registers.codec import codec_of
-from coldloop.registers.control_plc import CONTROL_MAP, SequenceHeader, SequenceRow
+from coldloop.registers.control_plc import SequenceHeader
+from coldloop.registers.declaration import Block
 
-_HEADER = codec_of(CONTROL_MAP.block_of(SequenceHeader))
-_ROW_LETTERS = CONTROL_MAP.block_of(SequenceRow).letters
+Inputs: TypeAlias = tuple[float, ...]
+"""Of one tick, in their order."""
+_HEADER = codec_of(Block("sequence header", 0, SequenceHeader, ""))
 _CRC_BYTES = 4
 
 
@@ -21,15 +23,15 @@ class InputSequence(NamedTuple):
     """A header and its rows, one row a tick."""
 
     header: SequenceHeader
-    rows: Rows[SequenceRow]
+    rows: Rows[Inputs]
 
 
-def checksum(header: SequenceHeader, rows: Rows[SequenceRow]) -> int:
+def checksum(header: SequenceHeader, rows: Rows[Inputs]) -> int:
     """Return the CRC-32 of header (without its CRC) and rows, whatever the word order of the link."""
     crc = zlib.crc32(_HEADER.encode(header)[:-_CRC_BYTES])
-    return zlib.crc32(struct.pack(f">{len(_ROW_LETTERS) * len(rows)}f", *chain.from_iterable(rows)), crc)
+    return zlib.crc32(struct.pack(f">{len(rows[0]) * len(rows) if rows else 0}f", *chain.from_iterable(rows)), crc)
 
 
-def with_checksum(header: SequenceHeader, rows: Rows[SequenceRow]) -> InputSequence:
+def with_checksum(header: SequenceHeader, rows: Rows[Inputs]) -> InputSequence:
     """Return the sequence with its CRC filled in."""
     return InputSequence(header._replace(crc=checksum(header, rows)), rows)

@@ -13,7 +13,7 @@ from prometheus_client.registry import Collector
 
 from coldloop import __version__
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.declaration import Block, fields_of
+from coldloop.registers.declaration import Block
 
 _NOT_IN_NAMES: Final = re.compile(r"[^a-zA-Z0-9_]+")
 
@@ -35,7 +35,7 @@ def build_family() -> Metric:
 
 def block_families(service: str, block: Block, record: tuple[Any, ...]) -> Iterator[Metric]:
     """Yield the registers of a record; texts are left out."""
-    for (name, field), value in zip(fields_of(block.record).items(), record, strict=True):
+    for (name, field), value in zip(block.fields.items(), record, strict=True):
         if field.is_text or name == "crc":
             continue
         unit = field.unit or (field.units[0] if len(set(field.units)) == 1 else "")

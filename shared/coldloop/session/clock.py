@@ -1,7 +1,7 @@
 """Plant time against real time.
 
-Plant time is an integer, the tick. Lock-step uses no clock. In real time with factor F a tick lasts
-0.25 s / F, all services follow the monotonic clock, and time is never stretched: what is late is late, and is recorded.
+Plant time is an integer, the tick. Lock-step uses no clock. In real time with factor F a tick lasts its time in the
+plant over F, and all services follow the monotonic clock. Time is never stretched: what is late is late, and recorded.
 """
 
 import time
@@ -9,26 +9,25 @@ from asyncio import sleep
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from coldloop.process.signals import TICK_S
-
 BIN_S = 5e-5
 BINS = 4000
 
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """When ticks are due: tick n at `start` + n * 0.25 s / `factor` of the monotonic clock."""
+    """When ticks are due: tick n at `start` + n * `tick_s` / `factor` of the monotonic clock, s."""
 
     start: float
     factor: float
+    tick_s: float
 
     def due(self, tick: float) -> float:
         """Return when `tick` (or a moment between two) is due."""
-        return self.start + tick * TICK_S / self.factor
+        return self.start + tick * self.tick_s / self.factor
 
     def position(self, now: float) -> float:
         """Return where time is at `now`, in ticks."""
-        return (now - self.start) * self.factor / TICK_S
+        return (now - self.start) * self.factor / self.tick_s
 
 
 class LatenessRecord:

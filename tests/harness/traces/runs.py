@@ -20,7 +20,8 @@ from coldloop.process.load_profile import LOAD_SPAN, LoadProfile
 from coldloop.process.loaded import FILE
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import read_header
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, STATION_SIGNAL_NAMES
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.optimizer_plc import Optimization
 from plant.load import find_load
 from plant.program import PlantProgram
