@@ -27,18 +27,18 @@ def gains_after(found: Identified, horizon_s: float) -> Array:
 def half_widths(record: Record, found: Identified, horizon_s: float) -> Array:
     """Return half the widths of the intervals of the gains, shape (p, m), jointly by Bonferroni's inequality.
 
-    In each draw what the model leaves of the record is shifted in time and has a random sign, which keeps how errors
-    follow one another and each other output's, and a model of the same order is identified.
+    In each draw what a model of the next order leaves of the record is shifted in time and has a random sign, which
+    keeps how errors follow one another and each other output's. The gains of a model of the order found, identified
+    anew, are off those of the former by noise, and by what the lower order cannot show.
     """
-    y = simulated(found.A, found.B, found.C, np.zeros((len(found.C), found.B.shape[1])), record)
-    random = np.random.default_rng(1)
-    left = record.outputs - y
-    fewer = left.shape[0] - found.A.shape[0] * (1 + found.B.shape[1]) - 1
-    left *= np.sqrt(left.shape[0] / max(fewer, 1))
-    best, errors = gains_after(found, horizon_s), []
+    order, count = len(found.A), len(record.outputs)
+    more = identified(record, order + 1)
+    y = simulated(more.A, more.B, more.C, np.zeros((len(more.C), more.B.shape[1])), record)
+    left = (record.outputs - y) * np.sqrt(count / max(count - more.A.size - more.B.size, 1))
+    random, best, errors = np.random.default_rng(1), gains_after(more, horizon_s), []
     for _ in range(DRAWS):
-        noise = np.roll(left, random.integers(1, len(left)), axis=0) * random.choice([-1.0, 1.0])
-        errors.append(gains_after(identified(record._replace(outputs=y + noise), len(found.A)), horizon_s) - best)
+        noise = np.roll(left, random.integers(1, count), axis=0) * random.choice([-1.0, 1.0])
+        errors.append(gains_after(identified(record._replace(outputs=y + noise), order), horizon_s) - best)
     quantile = WIDER * stdtrit(DRAWS - 1, 1.0 - (1.0 - LEVEL) / (2 * best.size))
     widths: Array = quantile * np.sqrt((np.array(errors) ** 2).mean(axis=0))
     return widths

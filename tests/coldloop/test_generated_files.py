@@ -4,7 +4,7 @@ import codecs
 import contextlib
 from keyword import iskeyword
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from coldloop.errors import UsageError
 from coldloop.registers.common import IDENTITY_BLOCK
-from coldloop.registers.declaration import Block, RegisterMap, f32, record
+from coldloop.registers.declaration import Block, RegisterMap, f32
 from coldloop.table import TIME, read_table
 from coldloop.text_file import held_file, read_text
 from rig.cli.tag_exports import exported
@@ -77,8 +77,7 @@ def test_names_in_structured_text_are_told_apart_whatever_capitals(wanted: list[
     )
 )
 def test_tags_are_told_apart_whatever_letters(wanted: set[str]) -> None:
-    fields = {name: Annotated[float, f32("a state")] for name in sorted(wanted)}
-    States = record("States", __name__, "states", fields)
+    States = NamedTuple("States", [(name, Annotated[float, f32("a state")]) for name in sorted(wanted)])  # type: ignore[misc]
     tags = [*exported(RegisterMap("plant", 1, (IDENTITY_BLOCK, Block("x", 100, States, ""))))]
     assert len({tag.name.lower() for tag in tags}) == len(tags)
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Final
 
+import numpy as np
 import pytest
 
 from coldloop.errors import UsageError
@@ -75,7 +76,7 @@ def test_a_self_test_that_fails_as_it_is_gets_one_line(tmp_path: Path) -> None:
 def test_no_change_of_the_solver_and_the_guard_is_missed(
     tmp_path: Path, recorded: GoldenVectors, compiler: tuple[str, str]
 ) -> None:
-    solver = OdeExport(recorded.method, recorded.vectors[0].problem, range(1, ITERATIONS + 1))
+    solver = OdeExport(recorded.method, recorded.vectors[0].problem, np.arange(1, ITERATIONS + 1))
     guard = GuardExport(GuardKernels(InputLimits()), golden_calls(InputLimits()))
     for name, texts in (("solver", solver.files(recorded.vectors)), ("guard", guard.files())):
         (tmp_path / name).mkdir()
