@@ -20,7 +20,7 @@ from coldloop.process.signals import INPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.settings import SHOWN
-from rig.plc_export.c.bit_flips import scored
+from rig.plc_export.c.bit_flips import require_compiler, scored
 from rig.plc_export.c.bus_registers import bus_files
 from rig.plc_export.c.exported_optimizer import FOLDER as OPTIMIZER
 from rig.plc_export.c.exported_optimizer import MANIFEST, manifest_of
@@ -91,6 +91,8 @@ def export_plc(
         UsageError: The folder is not empty or cannot be written to, or no input moves in so many ticks.
     """
     refuse_taken(folder)
+    if score:
+        require_compiler()
     if not PROCESS.forecasts:
         refuse(settings.optimizer_plc.program)
     recorded = record(ticks or TICKS)

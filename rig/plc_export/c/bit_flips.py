@@ -35,14 +35,22 @@ class Flips(TypedDict):
     """Likewise, of bytes between the members of a structure, which no code reads."""
 
 
+def require_compiler() -> None:
+    """Check that programs can be compiled and looked into.
+
+    Raises:
+        UsageError: There is no gcc, or no readelf.
+    """
+    if not (shutil.which("gcc") and shutil.which("readelf")):
+        raise UsageError("--score: needs gcc and readelf: on Debian, install gcc")
+
+
 def scored(texts: Mapping[str, str]) -> dict[str, dict[str, Flips]]:
     """Return what the self-tests of an export in C find, by program and level of optimisation.
 
     Raises:
-        UsageError: There is no gcc, or no readelf; or a self-test fails without a change.
+        UsageError: A self-test fails without a change.
     """
-    if not (shutil.which("gcc") and shutil.which("readelf")):
-        raise UsageError("--score: needs gcc and readelf: on Debian, install gcc")
     with tempfile.TemporaryDirectory() as made:
         found = {}
         for part, inside in PARTS.items():
