@@ -9,13 +9,14 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from rig.figures.plot import COLOURS
+from rig.figures.plot import COLOURS, DASHES, legend_above
 from rig.studies.drawing import panels
 
 PANELS = (
     ("temperature (K)", ("T1", "T2", "T5", "T6", "T9"), (3.0, 400.0)),
     ("L1 (%)", ("L1",), None),
-    ("inputs (%, W)", ("CV155", "NCR22_A", "CV156"), None),
+    ("valves (%)", ("CV155", "CV156"), None),
+    ("heater (W)", ("NCR22_A",), None),
     ("pressure (bar)", ("P12", "P13"), None),
     ("flow (g/s)", ("M12", "M_NC", "M_GN2"), None),
 )
@@ -30,20 +31,20 @@ def main() -> None:
     parser.add_argument("figure", type=Path)
     options = parser.parse_args()
     trace, station = (pq.read_table(options.run / f"{name}.parquet") for name in ("trace", "station"))
-    with panels(len(PANELS), 1, (9.0, 10.0), sharex=True) as (figure, axes):
+    with panels(len(PANELS), 1, 7.5, sharex=True) as (figure, axes):
         for place, (label, names, logarithmic) in zip(axes, PANELS, strict=True):
             for name, colour in zip(names, COLOURS, strict=False):
                 column = (trace if name in trace.column_names else station)[name].to_numpy()[::EVERY]
                 hours = [EVERY * 0.25 / 3600.0 * i for i in range(len(column))]
-                place.plot(hours, column, color=colour, linewidth=0.9, label=name)
+                place.plot(hours, column, color=colour, linestyle=DASHES[colour], linewidth=0.9, label=name)
             if logarithmic:
                 place.set_yscale("log")
                 place.set_ylim(logarithmic)
             place.set_ylabel(label)
-            place.legend(loc="upper right", ncols=len(names), fontsize=7)
+            legend_above(place)
         axes[-1].set_xlabel("plant time (h)")
         figure.align_ylabels(axes)
-        figure.savefig(options.figure, dpi=130)
+        figure.savefig(options.figure, dpi=260)
 
 
 if __name__ == "__main__":

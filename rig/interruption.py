@@ -12,9 +12,13 @@ from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
 from typing import Final, NoReturn, Self
 
+from coldloop.errors import RunInterruptedError
+
 SIGNALS: Final = tuple(
     signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if name in signal.Signals.__members__
 )
+LISTENS_S: Final = 2.0
+"""A run in one process that has not taken a signal after so long is in code that does not return."""
 SHOW_CURSOR: Final = b"\r\033[?25h\n"
 """A progress bar on a terminal hides the cursor."""
 
@@ -25,6 +29,8 @@ class Interruption:
     def __init__(self) -> None:
         self._request: Callable[[signal.Signals], None] | None = None
         self._before: dict[signal.Signals, object] = {}
+        self._number = signal.SIGINT
+        """The last one that was received."""
 
     def __enter__(self) -> Self:
         """Install the handler; outside the main thread nothing is changed."""
@@ -50,11 +56,44 @@ class Interruption:
         finally:
             self._request = None
 
+    @contextlib.contextmanager
+    def in_one_process(self) -> Iterator[None]:
+        """A run without an event loop: until `begun` the system ends it on SIGTERM and SIGHUP, also inside a compiler.
+
+        Raises:
+            RunInterruptedError: It has not taken a signal after `LISTENS_S`, as in code of others.
+        """
+        if not self._before:  # not the command line, or not its main thread
+            yield
+            return
+        before = signal.signal(signal.SIGALRM, self._raise)
+        self._handle(signal.SIG_DFL)
+        try:
+            yield
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, before)
+            self.begun()
+
+    def begun(self) -> None:
+        """Take SIGTERM and SIGHUP back: there is something to keep, and compiling is over."""
+        self._handle(self._received)
+
+    def _handle(self, handler: Callable[[int, FrameType | None], None] | signal.Handlers) -> None:
+        for number in self._before.keys() - {signal.SIGINT}:
+            signal.signal(number, handler)
+
+    def _raise(self, *_: object) -> NoReturn:
+        raise RunInterruptedError(self._number.name, self._number)
+
     def _received(self, number: int, _: FrameType | None) -> None:
         request, self._request = self._request, None
         if request is None:
             end_at_once(number)
-        request(signal.Signals(number))
+        self._number = signal.Signals(number)
+        request(self._number)
+        if signal.getsignal(signal.SIGALRM) == self._raise:
+            signal.setitimer(signal.ITIMER_REAL, LISTENS_S)
 
 
 def end_at_once(number: int) -> NoReturn:

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from coldloop.number_text import ends_text
 from coldloop.process.signals import CONTROLLED, INPUT_NAMES, INPUT_UNITS, TICK_S
 from coldloop.registers.control_plc import Mode
 from coldloop.whole_file import whole_file
@@ -24,6 +25,7 @@ from rig.figures.plot import (
     LABELS,
     THIRD,
     Series,
+    label_marks,
     legend_above,
     view,
     with_unit,
@@ -54,7 +56,7 @@ def plot_chaos(path: Path, trace: ChaosTrace, undisturbed: Recording, design: Co
         axes: list[Axes] = panels
         labels = [LABELS[name] for name in BANDED]
         for place, output, band, label in zip(axes[: len(bands)], CONTROLLED, bands, labels, strict=True):
-            place.axhspan(*band, color=BAND, alpha=0.35, label=f"band {band[0]:g} to {band[1]:g}")
+            place.axhspan(*band, color=BAND, alpha=0.35, label=f"band {ends_text(*band)}")
             place.plot(minutes, undisturbed.y[:, output], color=THIRD, linewidth=0.8, label="undisturbed")
             place.plot(minutes, recording.y[:, output], color=INK, linewidth=1, label="with faults")
             place.set_ylabel(label)
@@ -67,6 +69,7 @@ def plot_chaos(path: Path, trace: ChaosTrace, undisturbed: Recording, design: Co
         _name_faults(axes[0], trace)
         ribbon.set_xlabel("time (min)")
         ribbon.set_xlim(0, trace.ticks * TICK_S / 60)
+        label_marks(figure)
         figure.suptitle(title)
         whole_file(path, lambda draft: figure.savefig(draft, dpi=130, format="png"))
 

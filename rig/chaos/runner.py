@@ -16,7 +16,7 @@ from rig.chaos.sequencer import FaultSequencer, Progress
 from rig.chaos.trace import ChaosTrace
 from rig.cosim.scenario import Scenario
 from rig.cosim.session_client import SessionClient
-from rig.cosim.wiring import START_PATIENCE_S
+from rig.cosim.wiring import START_PATIENCE_S, with_copied_load
 from rig.results.recording import Recorder
 from rig.settings import Settings
 
@@ -40,8 +40,9 @@ async def conduct(
     """
     if any(isinstance(fault, WrongModel) for fault in plan.schedule()):  # not while the clock is running
         await asyncio.to_thread(save_wrong_model, settings.model.file, folder / WRONG_MODEL)
+    copied = with_copied_load(settings, scenario.load, folder)
     async with AsyncExitStack() as stack:
-        proxied = await stack.enter_async_context(ProxiedServices(settings, folder, str(plan.seed)))
+        proxied = await stack.enter_async_context(ProxiedServices(copied, folder, str(plan.seed)))
         services = proxied.services
         client = SessionClient(services.endpoints, settings, tolerant=True)
         stack.callback(client.close)

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from coldloop import __version__
@@ -79,11 +80,17 @@ OF_ANY_PROCESS: Final = ("periods", "compare")
 """Studies that are not."""
 
 
+USES: Final = {"read": Path, "name": str, "folder": Path, "export": str, "write": Path, "into": Path}
+"""Types of options that are paths: a file or a folder to read, a name or a file, sources to run, or what is written."""
+
+
 class OneLineParser(argparse.ArgumentParser):
     """Reports a usage error as one line, and takes no abbreviations of options."""
 
     def __init__(self, *args: Any, **options: Any) -> None:  # noqa: ANN401 as argparse has them
         super().__init__(*args, **{"allow_abbrev": False, **options})
+        for use, kind in USES.items():
+            self.register("type", use, kind)
 
     def error(self, message: str) -> NoReturn:
         """End with exit code 2."""

@@ -11,6 +11,7 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from coldloop.errors import ResultsError, UsageError
 from coldloop.registers.declaration import Role
+from coldloop.text_file import read_bytes
 from coldloop.whole_file import whole_file
 from rig.cli.certificates import Authority, Pair, revoked_now
 from rig.cosim.wiring import SERVICES
@@ -20,6 +21,9 @@ CLIENTS = {**{role.value: role.value for role in Role}, "reader": None}
 """Clients and their roles."""
 CONFIGURATION = "tls.toml"
 REVOCATIONS = "ca.crl"
+OURS = "name the folder of `coldloop certificates`"
+MADE = "name a certificate that `coldloop certificates` has made"
+KEY = "the key of the authority is needed to revoke"
 LOCAL = ("localhost", "127.0.0.1")
 OWNERS = {
     "plant.server.tls": "plant",
@@ -67,9 +71,9 @@ def revoke(out: Path, names: Sequence[str], days: int) -> tuple[int, Path]:
     """
     authority = Authority(Pair(_certificate(out / "ca.crt"), _key(out / "ca.key")))
     try:
-        revoked = list(x509.load_pem_x509_crl((out / REVOCATIONS).read_bytes()))
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{out / REVOCATIONS}: {error}; name the folder of `coldloop certificates`") from None
+        revoked = list(x509.load_pem_x509_crl(read_bytes(out / REVOCATIONS, OURS)))
+    except ValueError as error:
+        raise UsageError(f"{out / REVOCATIONS}: {error}; {OURS}") from None
     present = {each.serial_number for each in revoked}
     certificates = [_certificate(out / f"{name}.crt") for name in names]
     revoked += [revoked_now(each) for each in certificates if each.serial_number not in present]
@@ -81,16 +85,16 @@ def revoke(out: Path, names: Sequence[str], days: int) -> tuple[int, Path]:
 
 def _certificate(file: Path) -> x509.Certificate:
     try:
-        return x509.load_pem_x509_certificate(file.read_bytes())
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{file}: {error}; name a certificate that `coldloop certificates` has made") from None
+        return x509.load_pem_x509_certificate(read_bytes(file, MADE))
+    except ValueError as error:
+        raise UsageError(f"{file}: {error}; {MADE}") from None
 
 
 def _key(file: Path) -> ec.EllipticCurvePrivateKey:
     try:
-        key = load_pem_private_key(file.read_bytes(), password=None)
-    except (OSError, ValueError, TypeError) as error:
-        raise UsageError(f"{file}: {error}; the key of the authority is needed to revoke") from None
+        key = load_pem_private_key(read_bytes(file, KEY), password=None)
+    except (ValueError, TypeError) as error:
+        raise UsageError(f"{file}: {error}; {KEY}") from None
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise UsageError(f"{file}: not a key that `coldloop certificates` has made")
     return key

@@ -216,10 +216,15 @@ async def start_program(
         *command, "--with-parent", env={**others, **configured}, start_new_session=True,
         stdin=asyncio.subprocess.PIPE, stdout=log, stderr=log,
     )  # fmt: skip
+    bound_log(process.pid)
+    return process
+
+
+def bound_log(pid: int) -> None:
+    """Let writes of a process beyond `MOST_LOG_BYTES` of a file fail, where the system can."""
     if sys.platform == "linux":
         with contextlib.suppress(OSError):  # it has ended already
-            resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (MOST_LOG_BYTES, MOST_LOG_BYTES))
-    return process
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, (MOST_LOG_BYTES, MOST_LOG_BYTES))
 
 
 def terminate(process: asyncio.subprocess.Process) -> None:

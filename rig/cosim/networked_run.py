@@ -17,6 +17,7 @@ from rig.cosim.saved_session import restore_session, save_session
 from rig.cosim.scenario import Scenario
 from rig.cosim.session_client import SessionClient
 from rig.cosim.session_recording import SessionUnderWay, find_session, record_session
+from rig.cosim.wiring import with_copied_load
 from rig.results.recording import Recorder
 from rig.results.way import Way
 from rig.settings import Settings
@@ -83,6 +84,7 @@ def _run(job: Job, recorder: Recorder, folder: Path) -> Awaitable[None]:
         return _looked_at(RigEndpoints(*job.endpoints), settings, scenario, recorder)
     if job.way is Way.ATTACHED:
         return _attached(RigEndpoints(*job.endpoints), settings, scenario, recorder)
+    settings = with_copied_load(settings, scenario.load, folder)
     return run_on_localhost(settings, scenario, recorder, folder / "logs", job.optimizer)
 
 

@@ -94,7 +94,7 @@ def draw_comparison(runs: Sequence[RunFolder], labels: Sequence[str]) -> Figure:
         for name, label in LABELS.items():
             axes[name].set_ylabel(label)
             legend_above(axes[name])
-            label_marks(axes[name])
+        label_marks(figure)
         axes["stage_cost"].set_xlabel(f"plant time ({unit})")
         axes["stage_cost"].set_xlim(0, max(float(one["time_s"][-1]) for one in curves) / scale_s)
         figure.align_ylabels(list(axes.values()))

@@ -19,13 +19,16 @@ from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, SAMPLING_PERIOD_S
 
 Series = NDArray[np.floating]
 
-INK, ACCENT, THIRD, BAND = "#1f3b57", "#c8553d", "#5b8e7d", "#b8c4ce"
-COLOURS: Final = (INK, ACCENT, THIRD, "#8a6fae", "#b08d2f", "#4d4d4d")
-"""Of curves that are drawn over each other."""
-MODE_COLOURS: Final = {"mpc": INK, "rest": "#7f9cb8", "hold": "#d9a441", "classical": ACCENT, "manual": THIRD}
+INK, ACCENT, THIRD, BAND = "#0072b2", "#d55e00", "#009e73", "#b8c4ce"
+COLOURS: Final = (INK, ACCENT, THIRD, "#cc79a7", "#e69f00", "#000000")
+"""Of curves that are drawn over each other (Okabe and Ito, which people with colour blindness tell apart)."""
+DASHES: Final = dict(zip(COLOURS, ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2))), strict=True))
+"""Of the same curves, where a page is printed without colours."""
+MODE_COLOURS: Final = {"mpc": INK, "rest": "#56b4e9", "hold": "#e69f00", "classical": ACCENT, "manual": THIRD}
 STYLE: Final[Any] = {
     "font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False, "axes.spines.right": False,
     "legend.frameon": False, "legend.fontsize": 8, "svg.hashsalt": "coldloop", "axes.formatter.useoffset": False,
+    "pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "none",  # text that journals take and editors find
 }  # fmt: skip
 BANDED: Final = {one.name: one.unit for one in PROCESS.banded}
 """Outputs that are drawn, those that have a band, and their units."""
@@ -40,7 +43,7 @@ def with_unit(name: str, unit: str) -> str:
 
 LABELS: Final[Mapping[str, str]] = {
     **({LOAD_COLUMN: with_unit(LOAD_WORD, PROCESS.load.unit)} if PROCESS.has_load else {}),
-    **{one.name: with_unit(one.name, one.unit) for one in PROCESS.disturbances},
+    **{one.name: with_unit(one.name, one.unit) for one in PROCESS.measured_disturbances},
     **{name: with_unit(name, unit) for name, unit in {**BANDED, **MOVED}.items()},
     "tau_u_s": "tau_u (s)",
     "stage_cost": "stage cost (1)",
@@ -123,7 +126,7 @@ def draw_run(curves: RunCurves) -> Figure:
             legend_above(place)
             place.text(LABEL_AT, 1.03, f"({letter})", transform=place.transAxes, fontsize=8, ha="center")
             place.yaxis.set_label_coords(LABEL_AT, 0.5)
-            label_marks(place)
+        label_marks(figure)
         axes[-1].set_xlabel(f"plant time ({unit})")
         axes[-1].set_xlim(float(time[0]), float(time[-1]) if len(time) > 1 else float(time[0]) + 1)
         figure.suptitle(curves.title, y=0.99)
@@ -139,10 +142,11 @@ class MarkLabels(ScalarFormatter):
         return axis_labels(values)
 
 
-def label_marks(axes: Axes) -> None:
-    """Give the marks of the vertical axis their labels, if it is a linear one without words."""
-    if isinstance(axes.yaxis.get_major_formatter(), ScalarFormatter):
-        axes.yaxis.set_major_formatter(MarkLabels())
+def label_marks(figure: Figure) -> None:
+    """Give the marks of all linear axes without words their labels."""
+    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+        if isinstance(axis.get_major_formatter(), ScalarFormatter):
+            axis.set_major_formatter(MarkLabels())
 
 
 def time_unit(time_s: Series) -> tuple[float, str]:

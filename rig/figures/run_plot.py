@@ -5,6 +5,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -12,12 +13,14 @@ from numpy.typing import NDArray
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES
 from coldloop.whole_file import whole_file
-from rig.figures.plot import BANDED, DRAWN, Bounds, RunCurves, draw_run
+from rig.figures.plot import BANDED, DRAWN, STYLE, Bounds, RunCurves, draw_run
 from rig.results.columns import STATION_FILE
 from rig.results.run_folder import Curves, RunFolder
 from rig.results.way import Way
 
 DPI: Final = 130
+LEAST_PIXELS: Final = 900
+"""Width of a figure that is narrow on paper."""
 
 
 def plot_run(folder: Path, formats: Sequence[str]) -> list[Path]:
@@ -45,7 +48,9 @@ def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure in the format of the file's name; nothing in it depends on the time of day."""
     extension = path.suffix.removeprefix(".")
     metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(extension)
-    whole_file(path, lambda draft: figure.savefig(draft, dpi=DPI, format=extension, metadata=metadata))
+    dpi = max(DPI, LEAST_PIXELS / figure.get_figwidth())
+    with mpl.rc_context(STYLE):
+        whole_file(path, lambda draft: figure.savefig(draft, dpi=dpi, format=extension, metadata=metadata))
 
 
 def curves_of(run: RunFolder) -> RunCurves:

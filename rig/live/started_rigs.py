@@ -292,6 +292,8 @@ def detached(ports: Sequence[int], lock: RigLock) -> int:
     Raises:
         ColdloopError: It has ended.
     """
+    from rig.cosim.local_services import bound_log  # noqa: PLC0415 other commands start without it
+
     folder = state_folder(ports[0])
     output = folder / "up.log"
     ended_by: list[signal.Signals] = []
@@ -300,6 +302,7 @@ def detached(ports: Sequence[int], lock: RigLock) -> int:
             [*PYTHON, "-m", "rig", *sys.argv[1:], "--locked", str(lock.descriptor)],
             stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, pass_fds=[lock.descriptor],
         )  # fmt: skip
+        bound_log(process.pid)
         while process.poll() is None and not (ended_by or _is_up(ports[0], process.pid)):
             time.sleep(LOOK_UP_S)
         if ended_by:

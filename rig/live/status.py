@@ -18,6 +18,7 @@ from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmState
 from coldloop.service.event_text import alarm_cause, alarm_word, word_of
 from rig.cosim.answer_time import answered_in_time
+from rig.terminal import Colour, coloured
 
 QUIET: Final = (AlarmState.NORMAL, AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE)
 
@@ -118,9 +119,21 @@ def _tau_u(status: RigStatus) -> str:
     return "-" if status.update is None else f"{status.update.tau_u * TICK_S:g} s"
 
 
+def colour(status: RigStatus) -> Colour:
+    """Return the colour of a state: good is MPC without an alarm, failed is a service that does not answer."""
+    if status.silent or status.control is None:
+        return Colour.FAILED
+    good = status.control.ladder.mode == Mode.MPC and not status.control.alarms
+    return Colour.GOOD if good else Colour.ATTENTION
+
+
 def page(status: RigStatus) -> str:
     """Return the state as a page."""
-    return "".join(f"{name:8} {text}\n" for name, text in _rows(status))
+    state = colour(status)
+    shown = {"mode": state, "alarms": state, "absent": Colour.FAILED}
+    return "".join(
+        f"{name:8} {coloured(text, shown[name]) if name in shown else text}\n" for name, text in _rows(status)
+    )
 
 
 def _rows(status: RigStatus) -> Iterator[tuple[str, str]]:

@@ -17,7 +17,7 @@ from coldloop.registers.plant import Measurement
 from rig.cosim.kept_up import keep_up, say
 from rig.cosim.local_services import KeptService, LocalServices
 from rig.cosim.session_client import SessionClient
-from rig.cosim.wiring import RETAINING, SERVICES, START_PATIENCE_S, retaining
+from rig.cosim.wiring import RETAINING, SERVICES, START_PATIENCE_S, retaining, with_copied_load
 from rig.live.link_cuts import CuttableLinks
 from rig.live.page_process import PageProcess
 from rig.live.private_folder import make_own_folder, make_private
@@ -70,7 +70,7 @@ class UpRig:
         """
         links = self._links
         services = LocalServices(
-            self._settings,
+            with_copied_load(self._settings, self._scenario.load, self.folder),
             make_private(self.folder / "logs"),
             ports=self._ports,
             detours=None if links is None else links.detours,

@@ -134,9 +134,14 @@ def _process(file: ProcessFile, linear: Linearised) -> Process:
         ),
         decision_instants=file.prediction.decision_instants,
         constraint_instants=file.prediction.constraint_instants,
-        constants=_constants(file, linear),
+        constants=_constants(file, linear), disturbances=_measured(file),
         iterations=iteration_shares(_sizes(file, len(linear.states))), bath=file.bath,
     )  # fmt: skip
+
+
+def _measured(file: ProcessFile) -> tuple[str, ...]:
+    named = {one.name for one in file.disturbances}
+    return tuple(one.name for one in file.outputs if one.name in named and one.edges is None)
 
 
 def _with_sensors(file: ProcessFile) -> ProcessFile:

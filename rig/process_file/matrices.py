@@ -1,8 +1,10 @@
 """A plant given as matrices: a file of them, or a state space that a Python file makes."""
 
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 from coldloop.errors import UsageError
 from coldloop.foreign import foreign
 from coldloop.parsing import parsed_json
+from coldloop.text_file import MOST_BYTES, read_bytes
 from plant.own.maker import LINEAR
 from plant.own.python_class import made_by
 from rig.process_file.declaration import ProcessFile
@@ -60,13 +63,16 @@ def from_matrices(file: ProcessFile, folder: Path, given: str) -> Linearised:
 
 def _of_file(path: Path) -> dict[str, Array]:
     try:
+        content = read_bytes(path, REMEDY)
         if path.suffix == ".json":
-            stored: Mapping[str, Any] = dict(parsed_json(path.read_bytes()))
+            stored: Mapping[str, Any] = dict(parsed_json(content))
         else:
-            with np.load(path, allow_pickle=False) as archive:
+            with np.load(BytesIO(content), allow_pickle=False) as archive:
+                if sum(each.file_size for each in archive.zip.infolist()) > MOST_BYTES:
+                    raise ValueError(f"more than {MOST_BYTES} bytes")  # noqa: TRY301 told as the others
                 stored = dict(archive)
         return {name: np.array(stored[name], dtype=np.float64) for name in NAMES if name in stored}
-    except (OSError, ValueError, TypeError, EOFError, RecursionError, MemoryError) as error:
+    except (OSError, ValueError, TypeError, EOFError, RecursionError, MemoryError, BadZipFile) as error:
         raise UsageError(f"{path}: not a readable NPZ or JSON file of matrices ({error}); {REMEDY}") from error
 
 

@@ -95,6 +95,7 @@ class _Inputs(BaseModel):
 
     load: _Input
     model: _Input
+    refrigerator: _Input | None = None
 
 
 class _Configured(BaseModel):

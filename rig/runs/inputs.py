@@ -2,19 +2,17 @@
 
 import hashlib
 import json
-import shutil
 from pathlib import Path
 from typing import Any, Final
 
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.text_file import held_file, read_bytes
-from plant.load import named_families
+from rig.cosim.wiring import INPUTS, LOAD_COPY, with_copied_load
 from rig.settings import Settings
 
-FOLDER: Final = "inputs"
-LOAD_COPY: Final = f"{FOLDER}/load.csv"
-MODEL_COPY: Final = f"{FOLDER}/model.json"
+MODEL_COPY: Final = f"{INPUTS}/model.json"
+REFRIGERATOR_COPY: Final = f"{INPUTS}/refrigerator.json"
 RESTORE: Final = "the run cannot be repeated without it"
 
 
@@ -28,19 +26,23 @@ def copy_inputs(settings: Settings, profile: LoadProfile, folder: Path) -> dict[
 
     A load that has a name is described by the digest of its steps, the model that is shipped by its own digest.
     """
-    (folder / FOLDER).mkdir(exist_ok=True)
+    (folder / INPUTS).mkdir(exist_ok=True)
     name, model_file = settings.plant.load, settings.model.file
     load: dict[str, Any] = {"source": name, "file": None, "profile_sha256": profile_digest(profile)}
-    if Path(name).is_file() and named_families(name) is None:
-        load |= _copied(Path(name), folder, LOAD_COPY)
-    shipped = model_file == DEFAULT_MODEL_FILE
-    model = {"source": "shipped" if shipped else str(model_file), **_copied(model_file, folder, MODEL_COPY)}
-    return {"load": load, "model": model}
+    if with_copied_load(settings, profile, folder) is not settings:
+        load |= {"file": LOAD_COPY, "sha256": file_digest(folder / LOAD_COPY)}
+    model = _copied(model_file, folder, MODEL_COPY)
+    if model_file == DEFAULT_MODEL_FILE:
+        model["source"] = "shipped"
+    rest = settings.plant.refrigerator.file
+    more = {} if rest is None else {"refrigerator": _copied(rest, folder, REFRIGERATOR_COPY)}
+    return {"load": load, "model": model, **more}
 
 
 def _copied(source: Path, folder: Path, name: str) -> dict[str, str]:
-    shutil.copyfile(source, folder / name)
-    return {"file": name, "sha256": file_digest(folder / name)}
+    content = read_bytes(source, RESTORE)
+    (folder / name).write_bytes(content)
+    return {"source": str(source), "file": name, "sha256": hashlib.sha256(content).hexdigest()}
 
 
 def file_digest(path: Path) -> str:
@@ -67,7 +69,9 @@ def changed_inputs(manifest: dict[str, Any], folder: Path) -> list[str]:
     changed = [
         f"{folder / entry['file']}: is not the {name} that the run read"
         for name, entry in manifest["inputs"].items()
-        if entry["file"] is not None and file_digest(held_file(folder, entry["file"], RESTORE)) != entry.get("sha256")
+        if entry
+        and entry["file"] is not None
+        and file_digest(held_file(folder, entry["file"], RESTORE)) != entry.get("sha256")
     ]
     if configuration_digest(manifest["configuration"]) != manifest["hashes"]["configuration_sha256"]:
         changed.append(f"{folder / 'manifest.json'}: the configuration is not the one that the run had")

@@ -70,14 +70,15 @@ def repeat(folder: Path, out: Path | None, *, force: bool) -> tuple[bool, str]:
 def _configuration(run: RunFolder) -> Configuration[Settings]:
     """Return the configuration of a run, with the copies of its inputs instead of the originals."""
     values = dict(run.configuration)
-    for key, entry in (("plant.load", "load"), ("model.file", "model")):
-        copy = run.manifest["inputs"][entry]["file"]
+    copies = {"plant.load": "load", "model.file": "model", "plant.refrigerator.file": "refrigerator"}
+    for key, entry in copies.items():
+        copy = (run.manifest["inputs"].get(entry) or {}).get("file")
         if copy is not None:
             values[key] = str(run.held(copy))
         elif key == "model.file":  # the shipped one
             values.pop(key, None)
-        elif named_families(str(values.get(key))) is None:
-            raise UsageError(f"{run.path / 'manifest.json'}: {key} is no named load, and the folder has no copy of it")
+        elif key in values and named_families(str(values[key])) is None:
+            raise UsageError(f"{run.path / 'manifest.json'}: {key}: the folder has no copy of it")
     options: Mapping[str, tuple[object, str]] = {key: (value, SOURCE) for key, value in values.items()}
     return load_configuration(Settings, environment={}, options=options)
 

@@ -13,6 +13,7 @@ from coldloop.process.lti_model import load as load_model
 from coldloop.process.signals import TICK_S
 from plant.settings import PlantKind
 from rig.cosim.scenario import Scenario
+from rig.cosim.wiring import INPUTS
 from rig.figures.worker import FigureProcess
 from rig.results.columns import ALL_FILES, schema_document
 from rig.results.disk_reserve import DiskReserve
@@ -20,7 +21,6 @@ from rig.results.file_sinks import EventsSink, StationSink, TraceSink, UpdatesSi
 from rig.results.folders import write_json
 from rig.results.indicators import RunEvaluation, StageCost
 from rig.results.recording import Recorder, Sink
-from rig.runs.inputs import FOLDER as INPUTS
 from rig.runs.inputs import copy_inputs
 from rig.runs.manifest import final_manifest, first_manifest
 from rig.settings import Settings

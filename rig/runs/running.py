@@ -6,6 +6,7 @@ from typing import Any
 
 from coldloop.errors import UsageError
 from coldloop.process.lti_model import load as load_model
+from coldloop.registers.plant import PlantSample
 from coldloop.session.settings import TimeMode
 from plant.load import find_load
 from rig.cosim.job import Job, StopRequest
@@ -17,6 +18,14 @@ from rig.results.recording import Recorder, Sink
 from rig.results.way import Way
 from rig.runs.run_files import RunFiles
 from rig.settings import Settings
+
+
+class _FirstTick(Sink):
+    """Lets a signal end a run in good order from its first tick on."""
+
+    def sample(self, _: PlantSample) -> None:
+        """Take a tick."""
+        INTERRUPTION.begun()
 
 
 def make_scenario(settings: Settings, ticks: int | None = None) -> Scenario:
@@ -60,7 +69,7 @@ def run_into(
     """
     stop = StopRequest()
     with INTERRUPTION.passed_to(stop):
-        files = RunFiles(folder, job.effective, job.scenario, job.way, arguments, sinks)
+        files = RunFiles(folder, job.effective, job.scenario, job.way, arguments, [*sinks, _FirstTick()])
         stop.recorder = files.recorder
         error: BaseException | None = stop.error
         try:
@@ -76,7 +85,8 @@ def run_into(
 
 def _drive(job: Job, recorder: Recorder, folder: Path, stop: StopRequest) -> None:
     if job.way is Way.IN_PROCESS:
-        OneProcessRig(job.effective.settings).run(job.scenario, recorder)
+        with INTERRUPTION.in_one_process():
+            OneProcessRig(job.effective.settings).run(job.scenario, recorder)
         return
     from rig.cosim import networked_run  # noqa: PLC0415 a run in one process starts without the bus
 

@@ -1,5 +1,6 @@
 """How the figures of studies are drawn."""
 
+import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,30 +12,45 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from coldloop.number_text import ends_text
 from coldloop.process.limits import InputLimits
 from coldloop.process.signals import TICK_S
 from coldloop.registers.plant import StationMode
-from rig.figures.plot import COLOURS, INK, LONGEST_TAU_U_S, STYLE, draw_tau_u, legend_above, limit
+from rig.figures.plot import (
+    COLOURS,
+    DASHES,
+    INK,
+    LONGEST_TAU_U_S,
+    STYLE,
+    draw_tau_u,
+    label_marks,
+    limit,
+)
 from rig.studies.intervals import Interval
 from rig.studies.request import Outcome
 from rig.studies.study import StudyResult
 
+COLUMN_IN: Final = 88 / 25.4
+"""Width of a column of a journal, for figures without panels side by side."""
+PAGE_IN: Final = 180 / 25.4
+JOURNAL: Final = STYLE | {"font.size": 8, "axes.titlesize": 8, "legend.fontsize": 7}
+
 
 @contextmanager
-def panels(
-    rows: int, columns: int, size: tuple[float, float], *, sharex: bool = False
-) -> Iterator[tuple[Figure, list[Axes]]]:
+def panels(rows: int, columns: int, height_in: float, *, sharex: bool = False) -> Iterator[tuple[Figure, list[Axes]]]:
     """Give a figure with its panels, row by row; those of a column share their x where asked to."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=size, layout="constrained")
+    with mpl.rc_context(JOURNAL):
+        figure = Figure(figsize=(COLUMN_IN if columns == 1 else PAGE_IN, height_in), layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, sharex="col" if sharex else False)
         yield figure, list(np.ravel(axes))
+        label_marks(figure)
 
 
 def legend_outside(figure: Figure, axes: Axes, columns: int = 4) -> None:
     """Put the legend of one panel above all panels, where it covers no curve."""
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=min(columns, len(labels)))
+    most = columns if figure.get_figwidth() > COLUMN_IN else 2
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(most, len(labels)))
 
 
 def spans_decade(values: ArrayLike) -> bool:
@@ -47,7 +63,8 @@ def spans_decade(values: ArrayLike) -> bool:
 def spread(axes: Axes, x: ArrayLike, values: ArrayLike, colour: str, label: str) -> None:
     """Draw the mean over the draws (first axis of `values`), and the range of them behind it."""
     values = np.asarray(values, dtype=float)
-    axes.plot(x, values.mean(axis=0), color=colour, marker=".", markersize=4, linewidth=1.2, label=label)
+    dashes = DASHES.get(colour, "-")
+    axes.plot(x, values.mean(axis=0), color=colour, linestyle=dashes, marker=".", markersize=4, label=label)
     if len(values) > 1:
         axes.fill_between(np.asarray(x), values.min(axis=0), values.max(axis=0), color=colour, alpha=0.18, linewidth=0)
 
@@ -75,7 +92,7 @@ def time_panels(outcomes: Sequence[tuple[str, Outcome]], bands: Sequence[tuple[f
     """
     periods = {period for _, outcome in outcomes for period in outcome.updates["tau_u"]}
     shown = PANELS if len(periods) > 1 else PANELS[:-1]
-    with panels(len(shown), 1, (9.0, 1.65 * len(shown)), sharex=True) as (figure, axes):
+    with panels(len(shown), 1, 1.0 * len(shown) + 0.6, sharex=True) as (figure, axes):
         place = dict(zip((name for name, _ in shown), axes, strict=True))
         for (label, outcome), colour in zip(outcomes, COLOURS, strict=False):
             hours = outcome.series("time_s") / 3600
@@ -88,13 +105,13 @@ def time_panels(outcomes: Sequence[tuple[str, Outcome]], bands: Sequence[tuple[f
         edges = [*bands, *zip(limits.low, limits.high, strict=True)]
         for name, edge, what in zip(LIMITED, edges, ("band", "band", "bounds", "bounds", "bounds"), strict=True):
             together = np.concatenate([outcome.series(name) for _, outcome in outcomes])
-            limit(place[name], together, edge, f"{what} {edge[0]:g} to {edge[1]:g}")
+            limit(place[name], together, edge, f"{what} {ends_text(*edge)}")
         place["cost"].set_yscale("log")
         place["cost"].set_ylim(bottom=1e-4)
         for (name, label), letter in zip(shown, "abcdefghi", strict=False):
             place[name].set_ylabel(label)
-            place[name].set_title(f"({letter})", loc="left", fontsize=8, pad=3)
-            legend_above(place[name])
+            place[name].set_title(f"({letter})", loc="left", pad=3)
+        legend_outside(figure, place["cost"])
         axes[-1].set_xlabel("plant time (h)")
         axes[-1].set_xlim(0, float(first.series("time_s")[-1]) / 3600)
         figure.align_ylabels(axes)
@@ -102,30 +119,34 @@ def time_panels(outcomes: Sequence[tuple[str, Outcome]], bands: Sequence[tuple[f
 
 
 def _updates(place: Mapping[str, Axes], label: str, outcome: Outcome, colour: str) -> None:
-    """Draw what changes at updating instants."""
-    start_s = outcome.column("tick") * TICK_S
-    place["iterations"].step(
-        start_s / 3600, outcome.column("iterations"), where="post", color=colour, linewidth=0.7, label=label
-    )
-    if "tau_u" in place and len(start_s) > 1:
-        time_s = np.arange(start_s[0], start_s[-1], TICK_S)
-        held = outcome.column("tau_u")[np.searchsorted(start_s, time_s, side="right") - 1]
-        draw_tau_u(place["tau_u"], time_s / 3600, held * TICK_S, time_s, colour, label)
+    """Draw what changes at updating instants, as long as it was in force: for an updating period at most."""
+    start = outcome.column("tick").astype(int)
+    if not len(start):
+        return
+    ticks = np.arange(start[0], start[-1] + 1)
+    update = np.searchsorted(start, ticks, side="right") - 1
+    in_force = ticks < start[update] + outcome.column("tau_u")[update]
+    tau_u, iterations = (np.where(in_force, outcome.column(name)[update], np.nan) for name in ("tau_u", "iterations"))
+    hours = ticks * TICK_S / 3600
+    place["iterations"].step(hours, iterations, where="post", color=colour, linewidth=0.7, label=label)
+    if "tau_u" in place:
+        draw_tau_u(place["tau_u"], hours, tau_u * TICK_S, ticks * TICK_S, colour, label)
         place["tau_u"].set_ylim(0, LONGEST_TAU_U_S + 0.3)
 
 
 def over_time(title: str, runs: Sequence[tuple[str, Outcome]], shown: Mapping[str, str], height: float) -> Figure:
     """Draw series of a refrigerator's runs, `shown` with their labels, over each other; a cold box has not all."""
-    with panels(len(shown), 1, (9.0, height), sharex=True) as (figure, axes):
+    with panels(len(shown), 1, height, sharex=True) as (figure, axes):
         for (label, run), colour in zip(runs, COLOURS, strict=False):
             for name, place in zip(shown, axes, strict=True):
                 if name in run.trace:
-                    place.plot(run.series("time_s") / 60, run.series(name), color=colour, linewidth=0.9, label=label)
+                    place.plot(run.series("time_s") / 60, run.series(name), color=colour, linestyle=DASHES[colour],
+                               linewidth=0.9, label=label)  # fmt: skip
         for (name, label), place in zip(shown.items(), axes, strict=True):
             place.set_ylabel(label)
             if name == "mode":
                 place.set_yticks(list(StationMode), [mode.name.lower().replace("_", " ") for mode in StationMode])
-        axes[0].set_title(title, loc="left", fontsize=8)
+        axes[0].set_title(title, loc="left")
         axes[-1].set_xlabel("plant time (min)")
         legend_outside(figure, axes[0])
         figure.align_ylabels(axes)
@@ -136,7 +157,7 @@ def cost_bars(result: StudyResult, cases: Iterable[str], width: float, *, logari
     """Draw J_BF of rows (load, case, J_BF, ...): a bar for each case, side by side for each load."""
     names = list(dict.fromkeys(str(row[0]) for row in result.rows))
     cases = list(cases)
-    with panels(1, 1, (9.0, 3.6)) as (figure, (place,)):
+    with panels(1, 1, 2.6) as (figure, (place,)):
         for number, (case, colour) in enumerate(zip(cases, COLOURS, strict=False)):
             heights = [float(row[2]) for row in result.rows if row[1] == case]
             offset = (width + 0.02) * (number - 0.5 * (len(cases) - 1))
@@ -151,11 +172,11 @@ def cost_bars(result: StudyResult, cases: Iterable[str], width: float, *, logari
 
 
 def ratio_rows(
-    ratios: Mapping[str, Mapping[str, Interval]], label: str, size: tuple[float, float], gap: float, columns: int
+    ratios: Mapping[str, Mapping[str, Interval]], label: str, height_in: float, gap: float, columns: int
 ) -> Figure:
     """Draw ratios with their intervals: a row for each name, in it a point for each series (the outer keys)."""
     names = list(next(iter(ratios.values())))
-    with panels(1, 1, size) as (figure, (place,)):
+    with panels(1, 1, height_in) as (figure, (place,)):
         for number, ((series, by_name), colour) in enumerate(zip(ratios.items(), COLOURS, strict=False)):
             rows = np.arange(len(names)) + gap * (number - 0.5 * (len(ratios) - 1))
             found = [by_name[name] for name in names]
@@ -165,7 +186,7 @@ def ratio_rows(
         place.set_yticks(range(len(names)), names)
         place.invert_yaxis()
         place.set_xscale("log")
-        place.set_xlabel(label)
+        place.set_xlabel(textwrap.fill(label, 44))
         legend_outside(figure, place, columns)
     return figure
 
@@ -177,29 +198,33 @@ LEAST_DRAWN: Final = 1e-5
 def above_lowest(axes: Axes, powers: ArrayLike, totals: Sequence[Interval], colour: str, label: str) -> None:
     """Draw by which share total costs over the lowest, with intervals, are above it, against power."""
     value, low, high = np.maximum(np.transpose(totals) - 1.0, LEAST_DRAWN)
-    axes.plot(powers, value, color=colour, marker=".", label=label)
+    axes.plot(powers, value, color=colour, linestyle=DASHES.get(colour, "-"), marker=".", label=label)
     axes.fill_between(np.asarray(powers), low, high, color=colour, alpha=0.18, linewidth=0)
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlabel("normalised power $P$ (1)")
-    axes.set_ylabel("total cost above the lowest, share of it (1)")
+    axes.set_ylabel("total cost over the lowest, less 1 (1)")
 
 
 def hour_panels(
     names: Sequence[str], draw: Callable[[str, Axes], None], label: str, ticks: Sequence[int], columns: int = 4
 ) -> Figure:
     """Return a panel for each hour, drawn by `draw`: something against the updating period, with these ticks."""
-    rows = -(-len(names) // 2)
-    with panels(rows, 2, (9.5, 3.1 * rows)) as (figure, axes):
+    beside = min(2, len(names))
+    rows = -(-len(names) // beside)
+    with panels(rows, beside, 2.2 * rows + 0.5) as (figure, axes):
         for name, place in zip(names, axes, strict=False):
             draw(name, place)
             place.set_title(f"({Path(name).name})", loc="left")
             place.set_ylabel(label)
-            place.set_yscale("log")
-            place.set_yticks(ticks, map(str, ticks))
-            place.minorticks_off()
+            low, high = place.get_ylim()
+            if sum(low <= mark <= high for mark in ticks) > 1:  # else costs that are nearly the same: a linear axis
+                place.set_yscale("log")
+                place.set_yticks(ticks, map(str, ticks))
+                place.minorticks_off()
+                place.set_ylim(max(low, 0.8 * ticks[0]), high)
         legend_outside(figure, axes[0], columns)
-        for place in axes[-2:]:
+        for place in axes[-beside:]:
             place.set_xlabel("updating period (s)")
         for place in axes[len(names) :]:
             place.set_visible(False)

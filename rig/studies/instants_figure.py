@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from matplotlib.figure import Figure
 
 from coldloop.process.signals import SAMPLING_PERIOD_S
-from rig.figures.plot import COLOURS, INK, legend_above
-from rig.studies.drawing import panels
+from rig.figures.plot import COLOURS, DASHES, INK
+from rig.studies.drawing import legend_outside, panels
 from rig.studies.instants import ENOUGH, Judged, losses, proposed
 
 
@@ -19,11 +19,18 @@ def drawn(found: Sequence[Judged], names: Sequence[str]) -> Figure:
     """
     sets = sorted(found[1:], key=lambda one: one.variables)
     sizes = [one.variables for one in sets]
-    with panels(2, 1, (7.0, 6.0), sharex=True) as (figure, (loss, iterations)):
+    with panels(2, 1, 4.6, sharex=True) as (figure, (loss, iterations)):
         for name, colour, cost, fullest in zip(
             names, COLOURS, zip(*(one.costs for one in sets), strict=True), found[-1].costs, strict=False
         ):
-            loss.plot(sizes, [each / fullest for each in cost], color=colour, marker=".", label=f"load {name}")
+            loss.plot(
+                sizes,
+                [each / fullest for each in cost],
+                color=colour,
+                linestyle=DASHES[colour],
+                marker=".",
+                label=f"load {name}",
+            )
         loss.axhline(ENOUGH, color=INK, linewidth=0.8, linestyle=":", label=f"small enough, {ENOUGH:g}")
         iterations.plot(sizes, [one.iterations for one in sets], color=COLOURS[0], marker=".")
         lost = dict(zip([one.label for one in found], losses(found), strict=True))
@@ -31,8 +38,12 @@ def drawn(found: Sequence[Judged], names: Sequence[str]) -> Figure:
             for axes, value in ((loss, lost[one.label]), (iterations, one.iterations)):
                 axes.plot(one.variables, value, color=INK, marker=marker, markerfacecolor="none", markersize=9,
                           linestyle="", label=label)  # fmt: skip
-        loss.set_ylabel("loss: J_BF over that of the fullest set (1)")
-        iterations.set_ylabel(f"iterations of the PLC in {SAMPLING_PERIOD_S:g} s (1)")
+        loss.set_ylabel("loss: J_BF over the fullest (1)")
+        iterations.set_ylabel(f"iterations in {SAMPLING_PERIOD_S:g} s (1)")
         iterations.set_xlabel("variables (1)")
-        legend_above(loss)
+        iterations.set_xscale("log")  # the fullest set has several times the variables of the others
+        marks = [mark for mark in (10, 20, 50, 100, 200, 500) if sizes[0] <= mark <= sizes[-1]]
+        iterations.set_xticks(marks, map(str, marks))
+        iterations.minorticks_off()
+        legend_outside(figure, loss)
     return figure

@@ -1,19 +1,24 @@
 """The last thing between any decision and the actuators: bounds and rates."""
 
 from collections.abc import Sequence
+from typing import Final
 
 from coldloop.kernels.single_precision import neighbour, single
 from coldloop.process.limits import InputLimits
+from coldloop.process.signals import TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import Verdict
 from coldloop.safety.sequence import Inputs
 from control_plc.output_limits import admit, beginning, in_range, judge, plain, resume
+
+SET_BACK_TICKS: Final = TICKS_PER_SAMPLE
+"""Time set back by more than this will come again: what was for it is dropped."""
 
 
 class OutputGuard:
     """Keeps every output inside its bounds, its rate window and the slew limit, whatever is requested.
 
-    Its time is that of the ticks, but never faster than the time that has really passed: it does not go back, and a
-    leap of the tick ends no window.
+    Its time is that of the ticks, but never faster than the time that has really passed, and it does not go back: a
+    leap of the tick ends no window, and ticks that come again after a leap of `SET_BACK_TICKS` back do not count.
     """
 
     def __init__(self, limits: InputLimits, applied: Inputs) -> None:
@@ -21,24 +26,26 @@ class OutputGuard:
         self.state = beginning(self.limits, list(map(_inside, applied, limits.low, limits.high)))
         self._twin = beginning(self.limits, applied)
         self.applied = tuple(self.state.applied)
-        self._tick = self._lag = 0
-        """The last tick, and by how much our time is behind it."""
+        self._newest = self._lag = 0
+        """The latest tick, and by how much our time is behind it."""
 
     def begin_at(self, tick: int, applied: Inputs, passed: int | None = None) -> None:
         """Restart at `tick` from the outputs applied there (`output_limits.resume`).
 
         `passed`: ticks since the last scan by another clock, None without one.
         """
-        leap = tick - self._tick
+        leap = tick - self._newest
+        if -SET_BACK_TICKS <= leap < 0:
+            leap = 0
         self._lag += leap - max(0, leap if passed is None else min(leap, passed))
-        self._tick, tick = tick, tick - self._lag
-        resume(self.state, self.limits, tick, applied)
+        self._newest += leap
+        resume(self.state, self.limits, self._newest - self._lag, applied)
         self.applied = tuple(self.state.applied)
 
     def admit(self, tick: int, wanted: Inputs, *, update: bool) -> Inputs:
         """Return what may be applied at `tick`, and remember it as applied."""
-        self._tick = tick
-        admit(self.state, self.limits, tick - self._lag, wanted, update)
+        self._newest = max(self._newest, tick)
+        admit(self.state, self.limits, self._newest - self._lag, wanted, update)
         self.applied = tuple(self.state.applied)
         return self.applied
 

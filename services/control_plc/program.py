@@ -21,6 +21,7 @@ from coldloop.registers.control_plc import (
     Cause,
     CoolDownStep,
     Heartbeat,
+    LinkCause,
     Mode,
     Operator,
     OperatorMode,
@@ -37,7 +38,7 @@ from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
 from control_plc.classical import ClassicalLoops
 from control_plc.cool_down import CoolDown
-from control_plc.guard import OutputGuard
+from control_plc.guard import SET_BACK_TICKS, OutputGuard
 from control_plc.ladder import Ladder, LadderInputs
 from control_plc.player import SequencePlayer
 from control_plc.process_alarms import OPTIMIZER_DRIVES, ProcessAlarms
@@ -50,8 +51,6 @@ HANDSHAKE_TICKS = TICKS_PER_SAMPLE
 """Longest time that the classical loops wait for an announced sequence."""
 HANDSHAKE_PAUSE_S = 30.0 * STRETCH
 """After a handshake that came to nothing the classical loops are not held again for so long."""
-SET_BACK_TICKS = TICKS_PER_SAMPLE
-"""Time set back by more than this drops all sequences: they were for a time that will come again."""
 LOST_TICKS = 4
 """A rack that has been out of step for longer takes no new sequences: they would be played late."""
 
@@ -382,6 +381,7 @@ class ControlProgram:
     def _set_back(self, tick: int) -> None:
         if self.tick - tick > SET_BACK_TICKS:
             self.player.set_back(tick)
+            self.alarms.pulse(AlarmKind.CLOCK_SKEW, LinkCause.TIME_JUMP)
         self.sensors.set_back(tick)
         self.ladder.set_back(tick)
         self.watchdog.set_back(tick)

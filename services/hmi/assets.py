@@ -83,10 +83,10 @@ def _compressed(body: bytes) -> bytes:
 
 
 class StreamCompression:
-    """Compresses messages one by one with what was sent before, 64 kB for each stream."""
+    """Compresses messages one by one with what was sent before, the last message at least: 160 kB for each stream."""
 
     def __init__(self) -> None:
-        self._stream = zlib.compressobj(wbits=16 + 13, memLevel=6)
+        self._stream = zlib.compressobj(wbits=16 + 15, memLevel=6)
 
     def message(self, message: bytes) -> bytes:
         """Return a message as it is sent: complete, so that it waits for no later one."""

@@ -220,19 +220,22 @@ def prediction_document(prediction: Prediction) -> Document:
     }
 
 
-def trend_document(model: Model, names: Sequence[str], start: int, end: int, points: int) -> Document:
-    """Return everything that is drawn between two ticks."""
+def trend_document(
+    model: Model, names: Sequence[str], start: int, end: int, points: int, *, is_brief: bool = False
+) -> Document:
+    """Return everything that is drawn between two ticks; in brief without predictions, and of updates tau_u only."""
     times, series = model.trends.thinned(names, start, end, points)
     gaps = model.trends.gaps(start, end)
     modes = model.trends.modes(start, end)
     in_force = model.trends.modes(start - BEFORE_TICKS, end)  # with the update that the window begins with
-    shown = [one for one in model.predictions if one.tick >= start]
+    shown = [one for one in model.predictions if one.tick >= start and not is_brief]
+    quantities = ("tau_u",) if is_brief else tuple(QUANTITIES)
     limits = model.limits
     return {
         "now_s": model.tick * TICK_S,
         "time": times,
         "series": series,
-        "updates": updates_document(model.updates, in_force, gaps, points),
+        "updates": updates_document(model.updates, in_force, gaps, points, quantities),
         "modes": [{"from": one.start, "to": one.end, "mode": mode_name(one.mode)} for one in modes],
         "doubtful": {name: found for name, found in model.trends.doubtful(start, end).items() if name in names},
         **_marks(model, start, end),
@@ -245,14 +248,15 @@ def trend_document(model: Model, names: Sequence[str], start: int, end: int, poi
 
 
 def updates_document(
-    updates: Sequence[Optimization], modes: Sequence[ModeInterval], gaps: Sequence[Gap], points: int
-) -> Document:
+    updates: Sequence[Optimization], modes: Sequence[ModeInterval], gaps: Sequence[Gap], points: int,
+    quantities: Sequence[str],
+) -> Document:  # fmt: skip
     """Return times, updating periods and costs of updates as far as they were in force: while MPC was active.
 
     A period lasts until the next one, or until its stretch ends. A cost is of an instant. Elsewhere there is None, also
     between updates of which some are missing because nothing could be read.
     """
-    found: Document = {name: [] for name in ("time", *QUANTITIES)}
+    found: Document = {name: [] for name in ("time", *quantities)}
     for stretch in modes:
         if stretch.mode != Mode.MPC:
             continue
@@ -261,7 +265,7 @@ def updates_document(
         inside = [*islice(updates, start, bisect_right(updates, last, key=lambda one: one.tick))]
         if not inside:
             continue
-        columns = {name: [quantity(one) for one in inside] for name, quantity in QUANTITIES.items()}
+        columns = {name: [QUANTITIES[name](one) for one in inside] for name in quantities}
         times, thinned = thin([one.tick * TICK_S for one in inside], columns, points, _lost_updates(inside, gaps))
         found["time"] += [*times, last * TICK_S, (last + 1) * TICK_S]
         for name, values in thinned.items():

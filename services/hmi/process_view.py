@@ -32,7 +32,7 @@ def process_document() -> dict[str, Any]:
         "controlled": [_output(one) for one in PROCESS.banded],
         "measured": [_output(one) for one in PROCESS.outputs if one.band is None and one.range[0] < one.range[1]],
         "load": load if PROCESS.has_load else None,
-        "disturbances": [_output(one) for one in PROCESS.disturbances],
+        "disturbances": [_output(one) for one in PROCESS.measured_disturbances],
     }  # fmt: skip
 
 

@@ -37,7 +37,7 @@ from hmi.trends import NAMES, STATION_NAMES
 BANDED: Final = tuple(one.name for one in PROCESS.banded)
 POINTS: Final = 800
 MOST_POINTS: Final = 4000
-MOST_NAMES: Final = 8 + 1 + len(PROCESS.disturbances) + len(INPUT_NAMES) + len(PROCESS.banded) + len(STATION_NAMES)
+MOST_NAMES: Final = 9 + sum(map(len, (PROCESS.disturbances, INPUT_NAMES, PROCESS.banded, STATION_NAMES)))
 """Signals of one trend: what the page draws without being asked, and eight pens."""
 ROWS_AT_ONCE: Final = 500
 """Rows of a table that are made and sent at a time."""
@@ -147,10 +147,20 @@ class Reading:
     async def trend(self, request: web.Request) -> web.Response:
         """Answer with what is drawn in a window; browsers that ask for the same share one answer."""
         names, start, end, points = self._window(request.query)
-        key = (*names, start, end, points, len(self._model.updates), self._model.events_told, self._model.is_planned)
+        is_brief = request.query.get("brief") == "1"
+        key = (
+            *names,
+            start,
+            end,
+            points,
+            is_brief,
+            len(self._model.updates),
+            self._model.events_told,
+            self._model.is_planned,
+        )
         if key not in self._trends:
             async with self._turn(request):
-                document = encoded(trend_document(self._model, names, start, end, points))
+                document = encoded(trend_document(self._model, names, start, end, points, is_brief=is_brief))
                 answer = compressed_answer(request, document)  # takes time, too
             while len(self._trends) >= CACHED:
                 self._trends.pop(next(iter(self._trends)))

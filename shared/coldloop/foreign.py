@@ -2,8 +2,12 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Final
 
-from coldloop.errors import ColdloopError, ModelFileError
+from coldloop.errors import ColdloopError, ModelFileError, RunInterruptedError
+
+MOST_SAID: Final = 2000
+"""Characters of what that code says in a message."""
 
 
 @contextmanager
@@ -17,8 +21,15 @@ def foreign(
     """
     try:
         yield
-    except kind:
+    except (kind, KeyboardInterrupt, RunInterruptedError):  # the last two are signals
         raise
-    except (Exception, SystemExit) as error:
-        reason = " ".join(said) or f"{type(error).__name__}: {error}".removesuffix(": ")
-        raise kind(f"{what}: {' '.join(reason.split())}" + (f"; {instead}" if instead else "")) from error
+    except BaseException as error:
+        reason = " ".join(said) or f"{type(error).__name__}: {_text(error)}".removesuffix(": ")
+        raise kind(f"{what}: {' '.join(reason.split())[:MOST_SAID]}" + (f"; {instead}" if instead else "")) from error
+
+
+def _text(error: BaseException) -> str:
+    try:
+        return str(error)
+    except Exception:  # noqa: BLE001 of others, too
+        return ""

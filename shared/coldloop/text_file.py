@@ -1,6 +1,8 @@
 """Text files of users: UTF-8, with a byte order mark or without, or UTF-16 with one; files in folders of others."""
 
 import codecs
+import errno
+import os
 import stat
 from pathlib import Path
 from typing import Final
@@ -13,13 +15,17 @@ MARKS: Final = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", cod
 """Byte order marks, and the encodings that they begin."""
 
 
+HANDED_OVER: Final = ("/dev/stdin", "/dev/fd/", "/proc/self/fd/", os.devnull)
+"""Beginnings of the names of what is read though it may be no regular file: a shell's pipes, and nothing."""
+
+
 def read_text(
     path: Path, remedy: str, error: type[ColdloopError] = UsageError, most: int = MOST_BYTES
 ) -> str:  # fmt: skip
     """Return the text of a file.
 
     Args:
-        path: The file, or a pipe.
+        path: A regular file, or what a shell hands over (`/dev/stdin`, `<(...)`).
         remedy: Ends the message where the file cannot be read.
         error: What is raised.
         most: Size of the file in bytes.
@@ -39,13 +45,25 @@ def read_bytes(
 ) -> bytes:  # fmt: skip
     """Return the content of a file, as `read_text` does."""
     try:
-        with path.open("rb") as file:  # a pipe will do, a device without an end will not
-            data = file.read(most + 1)
+        with open(path, "rb", opener=_opened) as file:
+            fits = os.fstat(file.fileno()).st_size <= most
+            data = file.read(most + 1) if fits else b""
     except (OSError, ValueError) as failure:
         raise error(f"{path}: {getattr(failure, 'strerror', failure)}; {remedy}") from None
-    if len(data) > most:
+    if not fits or len(data) > most:  # one that grows
         raise error(f"{path}: more than {most} bytes; {remedy}")
     return data
+
+
+def _opened(path: str, flags: int) -> int:
+    """Open a regular file, without waiting for the other end of a pipe."""
+    if path.startswith(HANDED_OVER):
+        return os.open(path, flags)
+    descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))  # not on Windows
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):
+        return descriptor
+    os.close(descriptor)
+    raise OSError(errno.EINVAL, "not a regular file")
 
 
 def held_file(folder: Path, name: str, remedy: str, error: type[ColdloopError] = UsageError) -> Path:

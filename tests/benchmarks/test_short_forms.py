@@ -27,6 +27,7 @@ SHORT_FORMS = {
     "lanes": ("--ticks 50 --look-ups 1000 --repeat 1", r"(?s)8 plants: .*independent: ratio [0-9.]+"),
     "long_run_memory": ("--hours 1 --out {folder}/runs", r"^14400 ticks, "),
     "page_crowd": ("--seconds 15 --browsers 2", r"the page and 2 browsers: .* deadline misses\. \S"),
+    "page_truth": ("--only single --short", r"single: \d+ compared .*, 0 wrong"),
     "peers": ("--help", r"an interpreter that has Coldloop"),
     "realtime": ("--case 20 20s", r"in 80 scans"),
     "study_workers": ("--duration 20s", r"two workers \d+ s, ratio [0-9.]+"),
@@ -70,7 +71,8 @@ def test_every_benchmark_is_run_by_a_test() -> None:
         *(one.partition(".")[0] for one in TIMED),
         *re.findall(r'printed_by\("(\w+)\.py"', Path(__file__).read_text(encoding="utf-8")),
     }
-    assert named | {"qp_peers"} == {file.stem for file in FOLDER.glob("*.py")}, "qp_solvers runs qp_peers"
+    parts = {"qp_peers", "page_rig"}  # of qp_solvers and page_truth
+    assert named | parts == {file.stem for file in FOLDER.glob("*.py")}
 
 
 @pytest.mark.night

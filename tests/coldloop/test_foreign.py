@@ -1,10 +1,11 @@
 """The guard of calls into code that is not ours."""
 
+import asyncio
 import sys
 
 import pytest
 
-from coldloop.errors import ColdloopError, ConfigurationError, ModelFileError
+from coldloop.errors import ColdloopError, ConfigurationError, ModelFileError, RunInterruptedError
 from coldloop.foreign import foreign
 
 
@@ -25,6 +26,35 @@ def test_it_does_not_end_the_process_but_an_interruption_does() -> None:
         sys.exit(0)
     with pytest.raises(KeyboardInterrupt), foreign("rule"):
         raise KeyboardInterrupt
+
+
+class SpeechlessError(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("no words")
+
+
+@pytest.mark.parametrize(
+    ("raised", "line"),
+    [
+        (SpeechlessError(), "rule: SpeechlessError"),
+        (asyncio.CancelledError(), "rule: CancelledError"),
+        (GeneratorExit(), "rule: GeneratorExit"),
+        (BaseExceptionGroup("both", [SystemExit(1)]), r"rule: BaseExceptionGroup: both \(1 sub-exception\)"),
+        (ValueError("x" * 10_000_000), "rule: ValueError: x{1988}"),
+        (ValueError("\x1b[2J\r"), r"rule: ValueError: \\x1b\[2J"),
+        (MemoryError(), "rule: MemoryError"),
+        (StopIteration(3), "rule: StopIteration: 3"),
+    ],
+    ids=lambda one: type(one).__name__ if isinstance(one, BaseException) else "",
+)
+def test_whatever_it_raises_is_a_short_line(raised: BaseException, line: str) -> None:
+    with pytest.raises(ConfigurationError, match=f"^{line}$"), foreign("rule", kind=ConfigurationError):
+        raise raised
+
+
+def test_a_signal_is_not_what_it_raises() -> None:
+    with pytest.raises(RunInterruptedError), foreign("rule", kind=ConfigurationError):
+        raise RunInterruptedError("SIGTERM", 15)
 
 
 def test_an_error_of_the_kind_passes_and_another_one_is_named() -> None:

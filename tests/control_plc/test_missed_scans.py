@@ -9,7 +9,8 @@ import pytest
 
 from coldloop.process.cold_box import L1, T5
 from coldloop.process.limits import InputLimits
-from coldloop.registers.control_plc import Mode, Operator, OperatorMode, Verdict
+from coldloop.registers.control_plc import LinkCause, Mode, Operator, OperatorMode, Verdict
+from coldloop.registers.safety import AlarmKind
 from coldloop.session.time_base import TimeBase
 from control_plc.guard import OutputGuard
 from control_plc.retained_state import ControlStateStore, RetainedControlState
@@ -109,6 +110,8 @@ def test_time_that_goes_back_begins_anew(bench: "Bench", at: "At") -> None:
     bench.play([at(0.3)] * 240, ticks=10)
     bench.scan()
     bench.program.rejoin(0, U0)
+    told = bench.program.alarms.rows[AlarmKind.CLOCK_SKEW]
+    assert (told.times, told.cause) == (1, LinkCause.TIME_JUMP)
     assert bench.program.remaining == 0
     assert bench.program.player.playing == 0
     applied, update = bench.scan()

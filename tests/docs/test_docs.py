@@ -12,11 +12,13 @@ from pydantic import BaseModel
 from coldloop.registers.maps import MAPS
 from rig.cli import make_parser
 from rig.cli.command_listing import command_listing
+from rig.cli.commands.docs import anchor, headings
 from rig.cli.key_listing import key_listing
 from rig.cli.register_listing import FORMATS
 from rig.plc_sizing.profile import PlcProfile
 from rig.process_file.declaration import ProcessFile
 from rig.settings import Settings
+from tests.harness.path_options import path_table
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -40,6 +42,10 @@ def test_the_page_of_commands_is_what_the_parsers_say() -> None:
     assert (ROOT / "docs" / "commands.md").read_text(encoding="utf-8").endswith(command_listing())
 
 
+def test_the_table_of_paths_is_what_the_parsers_say() -> None:
+    assert path_table() in (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
+
+
 def test_the_map_from_the_paper_to_the_code_names_what_is_there() -> None:
     rows = re.findall(r"^\| I{1,3}.*|^\| [IV]+-.*", (ROOT / "docs" / "science.md").read_text("utf-8"), re.MULTILINE)
     named = [path for row in rows for path in re.findall(r"`((?:services|shared|rig|tests)/[^`]+)`", row)]
@@ -49,13 +55,24 @@ def test_the_map_from_the_paper_to_the_code_names_what_is_there() -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_between_pages_lead_somewhere(page: Path) -> None:
-    for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text(encoding="utf-8")):
-        assert (page.parent / target).exists(), f"{page.name} links to {target}"
+    for target, section in re.findall(r"\]\((?!https?:)([^)#]*)#?([^)]*)\)", page.read_text(encoding="utf-8")):
+        file = page.parent / target if target else page
+        assert file.exists(), f"{page.name} links to {target}"
+        if section:
+            known = {anchor(words) for *_, words in headings(file.read_text(encoding="utf-8"))}
+            assert section in known, f"{page.name} links to {target}#{section}"
+
+
+def test_each_page_is_listed_by_its_purpose_once() -> None:
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    listed = [name for name in re.findall(r"\]\(([\w-]+\.md)\)", index) if not name.startswith("for-")]
+    doors = set(re.findall(r"\]\((for-[\w-]+\.md)\)", index))
+    assert sorted([*listed, *doors, "index.md"]) == sorted(page.name for page in PAGES[1:])
 
 
 def test_every_coldloop_command_of_the_pages_is_understood() -> None:
     blocks = [block for page in PAGES for block in re.findall(r"```sh\n(.*?)```", page.read_text("utf-8"), re.DOTALL)]
-    lines = [line.removeprefix(".venv/bin/") for block in blocks for line in block.splitlines()]
+    lines = [line.partition(" > ")[0].removeprefix(".venv/bin/") for block in blocks for line in block.splitlines()]
     commands = [shlex.split(line, comments=True)[1:] for line in lines if line.startswith("coldloop ")]
     assert len(commands) > 30
     for line in commands:

@@ -30,8 +30,8 @@ BLOCK = re.compile(
     r"(?:\n\n```text\n(?P<printed>.*?)^```)?",
     re.MULTILINE | re.DOTALL,
 )
-PATIENCE_S = 300.0
-"""The first run on a machine compiles the kernels."""
+PATIENCE_S = 900.0
+"""The first run on a machine compiles the kernels, and others may keep it busy."""
 NOT_EXECUTED = "not executed: "
 TEST_SUITE = "executed: as a test suite"
 
@@ -40,7 +40,7 @@ SHORTENED = {
     r"^(coldloop run(?!.*--attach|.*my_load).*)--duration \S+": r"\1--duration 10s",
     r"^coldloop chaos (kill|freeze)": r"coldloop chaos short_plan.toml",
     r"^(coldloop chaos .*)--duration \S+": r"\1--duration 20s",
-    r"^(coldloop --process .* run)": r"\1 --duration 10s",
+    r"^(coldloop --process \S+ run)": r"\1 --duration 10s",
     r"^scripts/run": r"scripts/run --duration 10s",
     r"^scripts/test\b": r"scripts/test --help",
 }
@@ -51,10 +51,10 @@ IN_ONE_PROCESS = {r"^coldloop run(?!.*--(in-process|attach|mode|config))": "cold
 AT_NIGHT = r"^coldloop (export plc|budget --plc|run --mode realtime)"
 """What takes long is left to the night; tests/plc_export, tests/rig/test_plc_profile.py and test_real_time.py do it."""
 
-IN_ORDER = {"README.md", "commands.md", "tutorial.md"}
+IN_ORDER = {"README.md", "commands.md", "tutorial.md", "tutorial-plc.md", "tutorial-rule.md"}
 """Pages whose blocks need what the blocks before them have left, and nothing else but the files of a reader."""
 
-NEEDS_A_RIG = re.compile(r"127\.0\.0\.1:502|coldloop (status|set|events|fault|record)|mbpoll")
+NEEDS_A_RIG = re.compile(r"127\.0\.0\.1:502|port=502|coldloop (status|set|events|fault|record)|mbpoll")
 STARTS_A_RIG = re.compile(r"^(coldloop |scripts/)up\b", re.MULTILINE)
 READ_FIRST = {"README.md", "tutorial.md"}
 BY_THE_CLOCK = re.compile(r"realtime|(coldloop |scripts/)up\b")
@@ -105,9 +105,7 @@ class Lesson(NamedTuple):
     def needs_a_rig(self) -> bool:
         """Whether a rig is to be up that the blocks do not start."""
         first = self.blocks[0]
-        return (
-            first.language != "python" and bool(NEEDS_A_RIG.search(first.text)) and not STARTS_A_RIG.search(first.text)
-        )
+        return bool(NEEDS_A_RIG.search(first.text)) and not STARTS_A_RIG.search(first.text)
 
     def leaves(self) -> set[str]:
         """Return the names of the runs that the blocks make themselves."""
@@ -177,7 +175,8 @@ class Reader:
                 self._test_suite(each)
             elif each.language == "python":
                 with redirect_stdout(io.StringIO()) as printed:
-                    exec(compile("\n" * each.line + each.text, str(lesson.page), "exec"), names)  # noqa: S102 our own page
+                    text = each.text if base is None else re.sub(r"port=502(\d)", f"port={base}+\\1", each.text)
+                    exec(compile("\n" * each.line + text, str(lesson.page), "exec"), names)  # noqa: S102 our own page
                 assert each.printed in {None, printed.getvalue()}
             else:
                 printed = self._execute(each.commands, base)
@@ -197,7 +196,9 @@ class Reader:
 
     def _run(self, command: str) -> str:
         words = shlex.split(command)
-        if FOLLOWS in words:
+        if ">" in words:
+            (self._folder / words[-1]).write_text(self._run(shlex.join(words[:-2])), encoding="utf-8")
+        elif FOLLOWS in words:
             self._read_first_line(words)
         elif not self._whole and re.search(AT_NIGHT, command):
             return ""
@@ -211,6 +212,7 @@ class Reader:
         elif words[0].startswith("scripts/") or OWN_INTERPRETER in words:
             ended = self._started(words).ended(PATIENCE_S)
             assert ended.code == 0, (command, ended)
+            return str(ended.out)
         else:
             if words[0] == "mbpoll":
                 words[1:1] = ["-o", "10"]  # s; a busy machine may need more than its usual one
@@ -218,6 +220,7 @@ class Reader:
             assert done.returncode == 0, (command, done.stdout[-2000:], done.stderr[-2000:])
             if words[0] == "mbpoll":
                 assert re.search(r"\[\d+\]: \t[\d.]+|Written 1 references", done.stdout), done.stdout
+            return done.stdout
         return ""
 
     def _started(self, words: list[str]) -> Process:

@@ -32,7 +32,7 @@ async def test_what_a_browser_has_is_not_sent_again() -> None:
     async with served() as client:
         async with client.get("/", headers=PLAIN) as answer:
             addresses = re.findall(r'"(static/[^"]+)"', await answer.text())
-        assert len(addresses) == 4
+        assert len(addresses) == 5
         for address in addresses:
             async with client.get(f"/{address}") as answer:
                 assert (answer.status, answer.headers["Cache-Control"]) == (200, "max-age=31536000, immutable")

@@ -254,6 +254,8 @@ def test_doubtful_values_are_listed_by_stretch_with_the_worst_quality(model: Mod
         model.faulty_sensors = faulty
         model.put("control_plc", process(tick))
     document = json.loads(encoded(trend_document(model, ["L1", "T5", "load"], 0, 10, 100)))
+    brief = trend_document(model, ["L1", "T5", "load"], 0, 10, 100, is_brief=True)
+    assert (brief["predictions"], set(brief["updates"])) == ([], {"time", "tau_u"})
     assert document["doubtful"] == {
         "T5": [[0.75, 1.25, "held"], [1.5, 1.75, "held"]],
         "L1": [[1.0, 1.25, "suspect"], [1.25, 1.5, "simulated"], [1.5, 1.75, "held"]],

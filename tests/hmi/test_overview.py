@@ -150,7 +150,8 @@ def test_a_register_of_every_block_is_in_the_detail_view(page: "Page") -> None:
 
 DASH = "\N{EN DASH}"
 NOT_FINITE = """async () => {
-  const { state, take } = await import(document.querySelector("script[src]").src.replace("page.js", "store.js"));
+  const page = document.querySelector("script[type=module]").src;
+  const { state, take } = await import(page.replace("page.js", "store.js"));
   const update = { ...state.update.update, j_effective: null, j_delivered: null, load_mismatch: null, gamma: null };
   take({ ...state, values: {}, whole: false, update: { ...state.update, update } });
   return new Promise((shown) => requestAnimationFrame(() => shown(

@@ -9,7 +9,7 @@ import pytest
 from hmi.trends import NAMES
 from tests.harness.processes import Processes
 from tests.harness.waiting import eventually
-from tests.hmi.conftest import RECORDED_S, Served, Site, opened
+from tests.hmi.conftest import RECORDED_S, Served, Site, log_in_by_clicks, opened
 from tests.hmi.test_operating import MANUAL, MPC, confirm, mode, view
 from tests.hmi.test_sceptical_operator import operated, outcome
 
@@ -147,6 +147,11 @@ def test_a_small_screen_shows_the_whole_drawing(browser: "Browser", site: Site) 
         lines = page.locator("#alarm-line").bounding_box()
         assert lines is not None
         assert box["y"] + box["height"] <= lines["y"]
+        log_in_by_clicks(page)
+        page.evaluate("document.querySelector('#drive-chip .value').textContent = 'REST OF A SEQUENCE'")
+        assert page.evaluate(
+            "(({ scrollWidth, clientWidth }) => scrollWidth <= clientWidth)(document.querySelector('.status'))"
+        )
 
 
 def test_a_replay_begins_at_its_beginning_and_knows_since_when_and_which_alarms(

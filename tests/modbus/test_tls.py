@@ -212,7 +212,7 @@ def bad_files(pki: "Pki", case: str) -> TlsSettings:
     ("case", "message"),
     [
         ("missing", r"certificate .*none.crt: No such file or directory; name a readable file, or make some"),
-        ("a folder", r"key .*: Is a directory; name a readable file"),
+        ("a folder", r"key .*: not a regular file; name a readable file"),
         ("passphrase", r"key .*: has a passphrase; name a key without one"),
         ("junk certificate", r"certificate .*: no PEM certificate in it; name a file that has one"),
         ("junk key", r"key .*: no PEM key in it; name a file that has one"),

@@ -1,12 +1,14 @@
 """Somebody else's solver, rule and estimator: a package with entry points, installed and run as its author would."""
 
 import json
+import math
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import pytest
@@ -210,6 +212,60 @@ def test_what_is_no_number_of_a_period_leaves_q_as_it_is_and_is_the_longest_at_a
         OutsideRule("Quick", BUDGET)
 
 
+NUMBERS: Final = {
+    "nan": math.nan, "infinite": math.inf, "none": 0, "negative": -(10**30), "large": 10**30, "part": 2.5,
+    "beyond a float": 10**400, "text": "five", "several": [3, 4], "complex": 3j, "nothing": None,
+}  # fmt: skip
+KEPT: Final = ("nan", "infinite", "none", "negative", "large", "part")
+
+
+@pytest.mark.usefixtures("named")
+@pytest.mark.parametrize("what", NUMBERS)
+@pytest.mark.parametrize("asked", ["first", "decide", "after_interruption"])
+def test_a_rule_that_answers_anything_leaves_q_or_is_refused(
+    asked: str, what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Shorter, asked, lambda *_: NUMBERS[what], raising=False)
+
+    def q() -> int:
+        rule = OutsideRule("Shorter", BUDGET)
+        if asked == "first":
+            return rule.first
+        return rule.after_interruption() if asked == "after_interruption" else rule.decide(SURPRISED, assess(SURPRISED))
+
+    if what in KEPT:
+        assert q() == (SURPRISED.q if asked == "decide" else len(BUDGET.ladder))
+    else:
+        with pytest.raises(ConfigurationError, match=r"^rule Shorter: \w+Error: [^\n]*; the optimiser ends here"):
+            q()
+
+
+@pytest.mark.usefixtures("named")
+@pytest.mark.parametrize(("name", "method"), [
+    ("Shorter", "first"), ("Shorter", "decide"), ("Shorter", "after_interruption"),
+    ("Halving", "alpha"), ("Halving", "reset"), ("Halving", "solve"),
+])  # fmt: skip
+def test_what_raises_where_it_is_looked_up_is_refused_too(
+    name: str, method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing(_: object) -> None:
+        raise RuntimeError("not today")
+
+    def use() -> None:
+        if name == "Shorter":
+            rule = OutsideRule(name, BUDGET)
+            rule.after_interruption()
+            rule.decide(SURPRISED, assess(SURPRISED))
+        else:
+            solver, qp = OutsideSolver(OutsideSettings(solver=name)), problem()
+            solver.reset()
+            solver.solve(qp, qp.low, (1,))
+
+    monkeypatch.setattr(globals()[name], method, property(missing), raising=False)
+    with pytest.raises(ConfigurationError, match=rf"{name}: RuntimeError: not today; the optimiser ends here"):
+        use()
+
+
 def test_the_conformance_suite_finds_what_a_rule_does_not_keep() -> None:
     assert not any(one.failures for one in rule_requirements(Shorter))
     assert all(one.failures == 3 for one in rule_requirements(Wild))
@@ -244,6 +300,40 @@ def test_an_estimate_that_is_none_leaves_the_prediction_and_what_raises_is_said_
         assert (set(x), mismatch, w) == ({3.0}, 0.0, 4.0)
     with pytest.raises(ConfigurationError, match=r"^estimator Failing: LinAlgError: Singular matrix; "):
         corrected("Failing", 60.0)
+
+
+ESTIMATES: Final = {
+    "one number": 3.0, "nothing": None, "three": (1.0, 2.0, 3.0), "text": ("x", 0.0), "short": ([1.0], 0.0),
+    "no number": ([math.nan] * 28, 0.0), "infinite": ([1.0] * 28, math.inf), "complex": ([1j] * 28, 0.0),
+    "table": (np.ones((28, 28)), 0.0),
+    "objects": ([object()] * 28, 0.0), "beyond a float": ([10**400] * 28, 0.0), "no mismatch": ([1.0] * 28, None),
+}  # fmt: skip
+
+
+@pytest.mark.usefixtures("named")
+@pytest.mark.parametrize("what", ESTIMATES)
+def test_an_estimator_that_answers_anything_leaves_the_prediction_or_is_refused(
+    what: str, model: LtiModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prediction, settings = PredictionModel(model), ProgramSettings()
+    constants: Estimator = OptimizerProgram(model, settings, InputLimits()).constants.estimator
+    inputs, outputs, belief = model.u0.copy(), model.y0.copy(), no_belief(prediction.n_states)
+    belief.predicted[:] = 3.0
+
+    def correct(_: object, predicted: Array, __: float, measured: Measured) -> object:
+        for given in (predicted, measured.u, measured.y):
+            given[:] = math.nan
+        return ESTIMATES[what]
+
+    monkeypatch.setattr(Believing, "correct", correct)
+    estimator = OutsideEstimator("Believing", prediction, settings.estimator)
+    refused = what not in ("no number", "infinite", "short", "table")
+    with pytest.raises(ConfigurationError, match=r"^estimator Believing: ") if refused else nullcontext():
+        estimator.correct(constants, belief, inputs, model.w0, outputs)
+    assert set(belief.predicted) == {3.0}
+    assert float(belief.numbers[0]["mismatch"]) == 0.0
+    assert np.array_equal(inputs, model.u0)
+    assert np.array_equal(outputs, model.y0)
 
 
 @pytest.mark.usefixtures("compiles")

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +13,7 @@ import pandas as pd
 import pytest
 
 from coldloop.errors import ColdloopError
+from coldloop.process.loaded import process_of
 from plant.own.disturbances import Disturbances
 from rig.process_file.judgement import described
 from rig.process_file.making import Made, made_from
@@ -127,6 +129,19 @@ def test_disturbances_are_states_that_hold_and_outputs_where_they_are_measured(t
     assert "after 300 s of +1 l/s rain: lower 1 cm  upper 1 cm" in text
     assert "modes      -0.1  -0.1 /s" in text
     assert "warning" not in text
+
+
+def test_only_disturbances_are_drawn_as_such_and_old_model_files_tell_which(tmp_path: Path) -> None:
+    """Of two measured states one has the name of its output: it is no disturbance, and no state of version 0.3 was."""
+    (tmp_path / "new").mkdir()
+    text = FILE.replace('name = "upper"', 'name = "upper_level"')
+    found = made(tmp_path / "new", text)
+    model, process = found.model, found.process
+    assert {"upper_level", "rain", "ambient"} < {one.name for one in process.outputs}
+    assert [one.name for one in process.measured_disturbances] == ["rain", "ambient"]
+    model.save(tmp_path / "new.json")
+    replace(model, process={k: v for k, v in model.process.items() if k != "disturbances"}).save(tmp_path / "old.json")
+    assert process_of(tmp_path / "new.json") == process_of(tmp_path / "old.json") == process
 
 
 IN_M3: Final = POND.replace("= w\n", "= w[0], 1e3 * w[1], 1e3 * w[2], w[3]\n")

@@ -41,6 +41,10 @@ def test_a_section_ends_where_the_next_one_begins(coldloop: "Coldloop") -> None:
     assert len(re.findall(r"^#", section, re.MULTILINE)) == 1
 
 
+def test_a_section_that_has_moved_to_the_evidence_of_its_page_is_found(coldloop: "Coldloop") -> None:
+    assert coldloop("docs", "plc-export#memory-and-time").out.startswith("## Memory and time")
+
+
 @pytest.mark.parametrize(("place", "part"), [("fail-save", "fail-safe"), ("fail-safe#no", "no-answer")])
 def test_what_is_not_there_is_one_line_that_lists_what_is(place: str, part: str, coldloop: "Coldloop") -> None:
     code, _, complaints = coldloop("docs", place)

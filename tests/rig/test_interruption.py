@@ -19,7 +19,7 @@ from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
 from rig.cosim.one_process import OneProcessRig
 from rig.results.recording import BLOCK_TICKS, KEPT_TICKS, Recorder, SampleBlock, Sink
-from tests.harness.processes import Processes
+from tests.harness.processes import Process, Processes
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
@@ -100,6 +100,46 @@ def test_ctrl_c_before_there_is_anything_to_record_leaves_nothing(
         assert "Traceback" not in ended.err
     else:  # the interpreter itself was not up yet: what it says then is its own
         assert ended.code == -signal.SIGINT or "KeyboardInterrupt" in ended.err, ended
+
+
+def in_one_process(done: str, out: Path, processes: Processes) -> Process:
+    """Start a run whose rig does something else that never returns, and says so in a line before."""
+    program = f"""
+import sys
+from coldloop.foreign import foreign
+from coldloop.registers.plant import PlantSample
+from rig.cosim.one_process import OneProcessRig
+
+def stuck(self, scenario, recorder):
+    {done}
+
+OneProcessRig.run = stuck
+from rig.__main__ import main
+sys.exit(main())
+"""
+    words = ("run", "--in-process", "--load", "6h", "--out", str(out))
+    run = processes.python("-c", program, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert run.popen.stdout is not None
+    assert run.popen.stdout.readline() == "stuck\n"
+    return run
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_run_that_compiles(number: signal.Signals, tmp_path: Path, processes: Processes) -> None:
+    """As a compiler does, a sum of the interpreter calls no handler until it is done."""
+    run = in_one_process("print('stuck', flush=True); sum(range(10**15))", tmp_path / "run", processes)
+    run.popen.send_signal(number)
+    assert run.ended().code == -number
+
+
+def test_a_signal_ends_a_run_in_code_of_others_that_does_not_return(tmp_path: Path, processes: Processes) -> None:
+    tick = "recorder.sample(PlantSample(0, 385.0, (43.0, 75.0, 36.0), (1.0,) * 22, (1.0,) * 28))"
+    solver = "with foreign('solver'):\n        print('stuck', flush=True)\n        while True: pass"
+    run = in_one_process(f"{tick}\n    {solver}", tmp_path / "run", processes)
+    run.popen.send_signal(signal.SIGTERM)
+    ended = run.ended()
+    assert (ended.code, "interrupted by SIGTERM; 1 of " in ended.err) == (143, True), ended
+    assert read(tmp_path / "run" / "manifest.json")["recorded_ticks"] == 1
 
 
 def test_a_command_ends_though_nobody_can_be_told(processes: Processes) -> None:

@@ -21,6 +21,7 @@ from scipy.io import loadmat
 
 from coldloop.errors import UsageError
 from coldloop.process.cold_box import COLD_BOX
+from coldloop.process.load_profile import read_load_file
 from coldloop.process.model_file import digest_of
 from rig import cli
 from rig.results.folders import claim_folder
@@ -319,6 +320,51 @@ def test_a_manifest_names_files_of_its_folder_alone(place: str, coldloop: "Coldl
     outcome = coldloop("rerun", mpc)
     assert outcome.code == 2
     assert "outside the folder that names it" in outcome.complaints[-1]
+
+
+def test_no_file_that_a_configuration_names_is_opened_outside_the_folder(coldloop: "Coldloop", mpc: Path) -> None:
+    manifest = json.loads((mpc / "manifest.json").read_text())
+    manifest["configuration"] |= {"plant.kind": "refrigerator", "plant.refrigerator.file": "/dev/zero"}
+    manifest["hashes"]["configuration_sha256"] = configuration_digest(manifest["configuration"])
+    (mpc / "manifest.json").write_text(json.dumps(manifest))
+    complaint = f"coldloop: {mpc / 'manifest.json'}: plant.refrigerator.file: the folder has no copy of it"
+    assert coldloop("rerun", mpc).complaints == [complaint]
+
+
+ENTRIES: Final[dict[str, Any]] = {
+    "a list": [], "no name": {"source": "x"}, "a number": {"source": "x", "file": 3}, "outside": "/dev/zero",
+    "above": "../mpc/inputs/model.json", "a folder": "inputs", "another one": "inputs/model.json",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", ENTRIES)
+def test_a_file_of_the_refrigerator_is_one_of_the_folder(what: str, coldloop: "Coldloop", mpc: Path) -> None:
+    entry = ENTRIES[what]
+    manifest = json.loads((mpc / "manifest.json").read_text())
+    manifest["inputs"]["refrigerator"] = {"source": "x", "file": entry} if isinstance(entry, str) else entry
+    (mpc / "manifest.json").write_text(json.dumps(manifest))
+    outcome = coldloop("rerun", mpc)
+    assert (outcome.code, len(outcome.complaints)) == (2, 1), outcome
+
+
+WRITTEN: Final = {
+    "semicolons, commas in numbers": "time_s;load_w\n0;385,5\n10;445,25\n",
+    "UTF-16": LOAD,
+    "a byte order mark": "\ufeff" + LOAD,
+    "a unit below, empty rows": "time_s,load_w\ns,W\n\n0,385\n\n10,445\n",
+    "many digits": "time_s,load_w\n0,385.123456789012345\n1e1,4.45e2\n",
+}
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("what", WRITTEN)
+def test_the_copy_of_a_load_is_what_was_read(what: str, coldloop: "Coldloop", tmp_path: Path) -> None:
+    (tmp_path / "load.csv").write_text(WRITTEN[what], encoding="utf-16" if what == "UTF-16" else "utf-8")
+    words = ("run", "--in-process", "--load", tmp_path / "load.csv", "--duration", "15s", "--out", tmp_path / "run")
+    assert coldloop(*words).code == 0
+    assert read_load_file(tmp_path / "run" / "inputs" / "load.csv") == read_load_file(tmp_path / "load.csv")
+    (tmp_path / "load.csv").unlink()
+    assert coldloop("rerun", tmp_path / "run").code == 0
 
 
 def test_what_a_manifest_says_is_printed_as_printable(coldloop: "Coldloop", runs: Path, mpc: Path) -> None:

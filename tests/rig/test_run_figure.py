@@ -5,12 +5,16 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
 from coldloop.process.cold_box import INPUT_NAMES
 from rig.figures.plot import DRAWN, Bounds, RunCurves, draw_run, label_marks
 from rig.figures.run_plot import curves_of
 from rig.results.run_folder import RunFolder, _in_force
+from rig.studies.drawing import _updates
+from rig.studies.request import Outcome
 from tests.conftest import Coldloop
 
 TICKS = 4000
@@ -74,11 +78,30 @@ def test_the_updating_period_is_drawn_only_while_it_was_in_force() -> None:
     assert "mode" not in drawn
 
 
-def test_marks_of_a_figure_in_pascal_are_not_alike() -> None:
-    axes = Figure().subplots()
-    axes.plot([0, 1], [150_000.0, 150_008.0])
-    label_marks(axes)
-    axes.figure.canvas.draw()
-    labels = [label.get_text() for label in axes.get_yticklabels()]
-    assert len(set(labels)) == len(labels) > 2
-    assert [float(label) for label in labels] == pytest.approx(list(axes.get_yticks()))
+def test_studies_draw_periods_and_iterations_while_they_were_in_force() -> None:
+    """From tick 6 on another mode drove, until the update at tick 9."""
+    updates = {"tick": [0.0, 4.0, 9.0], "tau_u": [4.0, 2.0, 4.0], "iterations": [3.0, 1.0, 3.0]}
+    run = Outcome("", None, "", 0, updates, {})  # type: ignore[arg-type]
+    place = dict(zip(("iterations", "tau_u"), Figure().subplots(2), strict=True))
+    _updates(place, "run", run, "black")
+    for name, scale in (("iterations", 1.0), ("tau_u", 0.25)):
+        drawn = np.asarray(place[name].lines[0].get_ydata()) / scale
+        expected = [updates[name][0]] * 4 + [updates[name][1]] * 2 + [np.nan] * 3 + [updates[name][2]]
+        assert drawn == pytest.approx(expected, nan_ok=True)
+
+
+@given(low=st.floats(-1e9, 1e9), mantissa=st.floats(1, 10), power=st.integers(-2, 9))
+@example(low=150_000.0, mantissa=8.0, power=0)
+def test_marks_of_any_linear_axis_differ_and_parse_back(low: float, mantissa: float, power: int) -> None:
+    span = mantissa * 10.0**power
+    figure = Figure()
+    axes = figure.subplots()
+    axes.plot([low, low + span], [low + span, low])
+    label_marks(figure)
+    figure.canvas.draw()
+    for axis in (axes.xaxis, axes.yaxis):
+        marks, labels = axis.get_majorticklocs(), [label.get_text() for label in axis.get_ticklabels()]
+        assert len(set(labels)) == len(labels) > 2
+        step = float(np.diff(marks).min())
+        assert [float(label) for label in labels] == pytest.approx(list(marks), abs=0.01 * step, rel=0)
+        assert not axis.get_offset_text().get_text()

@@ -3,12 +3,12 @@
 import argparse
 import math
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import UsageError
 from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.options import check_load, configuration, fixed_updating_period, positive_count
+from rig.terminal import fitted, width
 
 if TYPE_CHECKING:
     from optimizer_plc.qp.problem import PredictiveProblem
@@ -25,10 +25,10 @@ def declare(parser: argparse.ArgumentParser) -> None:
     speed.add_argument(
         "--power", type=_power, metavar="P", help="one power relative to the paper's PLC (default: as configured)"
     )
-    speed.add_argument("--plc", metavar="PLC",
+    speed.add_argument("--plc", type="name", metavar="PLC",
                        help="a PLC instead: a profile (TOML) or one that is shipped, and a sentence that says whether "
                        "the controller runs there; --list names them")  # fmt: skip
-    parser.add_argument("--export", type=Path, metavar="FOLDER",
+    parser.add_argument("--export", type="folder", metavar="FOLDER",
                         help="what an export for a PLC costs: operations of its calls and bytes; with --plc also times"
                         " there, and what does not fit")  # fmt: skip
     parser.add_argument("--took", type=_power, metavar="US",
@@ -36,7 +36,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
                         " self-test; prints its profile")  # fmt: skip
     parser.add_argument("--list", action="store_true", help="list the shipped PLCs")
     parser.add_argument("--keys", action="store_true", help="list the keys of a PLC's profile, as Markdown")
-    parser.add_argument("--load", dest="loads", nargs="+", metavar="LOAD", default=[],
+    parser.add_argument("--load", type="name", dest="loads", nargs="+", metavar="LOAD", default=[],
                         help="with --plc: whether an adaptive updating period pays there under these loads, against "
                         "--updating-period or the best fixed one")  # fmt: skip
     parser.add_argument("--updating-period", dest="period", type=fixed_updating_period, metavar="SECONDS",
@@ -77,7 +77,7 @@ def execute(options: argparse.Namespace) -> int:
         raise UsageError("--load: says whether an adaptive period pays on a PLC; name one with --plc")
     if options.took and not options.export:
         raise UsageError("--took: is of an export's self-test; name its folder with --export")
-    sys.stdout.write(_shown(options))
+    sys.stdout.write(fitted(_shown(options), width()))
     return 0
 
 

@@ -6,14 +6,13 @@ It also revokes certificates that it has made, by the list of revocations that t
 import argparse
 import re
 import sys
-from pathlib import Path
 
 from coldloop.errors import UsageError
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
+    parser.add_argument("--out", type="into", required=True, metavar="DIR", help="folder for the files")
     parser.add_argument("--host", dest="hosts", action="append", default=[], type=_host, metavar="NAME",
                         help="another name or address of the servers, besides localhost; may be repeated")  # fmt: skip
     parser.add_argument("--days", type=_days, default=365, help="days until they expire (default: 365)")

@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
-    plan = parser.add_argument("plan", nargs="?", metavar="PLAN", help="a shipped plan (see --list) or a TOML file")
+    plan = parser.add_argument("plan", type="name", nargs="?", metavar="PLAN", help="a shipped plan, or a TOML file")
     plan.completer = lambda **_: plans()  # type: ignore[attr-defined]  # argcomplete looks for it
     parser.add_argument("--list", action="store_true", help="list the shipped plans")
-    parser.add_argument("--out", type=Path, help="folder for the results (default: chaos/<plan>-<time>)")
+    parser.add_argument("--out", type="into", help="folder for the results (default: chaos/<plan>-<time>)")
     parser.add_argument("--force", action="store_true", help="write into a folder that is not empty")
     parser.add_argument("--seed", type=_seed, dest="plan_seed", help="instead of the plan's")
     parser.add_argument("--duration", type=duration, help="plant time, such as 2h or 90s, instead of the plan's")
-    parser.add_argument("--load", dest="plan_load",
+    parser.add_argument("--load", type="name", dest="plan_load",
                         help="a named load or a CSV file, instead of the plan's")  # fmt: skip
     parser.add_argument("--mode", choices=MODES, dest="plan_mode",
                         help="instead of the plan's")  # fmt: skip

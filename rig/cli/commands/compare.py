@@ -7,8 +7,8 @@ from pathlib import Path
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of runs, two or more")
-    parser.add_argument("--out", type=Path, default=Path("compare.png"), metavar="FILE",
+    parser.add_argument("runs", nargs="+", type="folder", metavar="RUN", help="folders of runs, two or more")
+    parser.add_argument("--out", type="write", default=Path("compare.png"), metavar="FILE",
                         help="figure: .png, .pdf or .svg (default: compare.png)")  # fmt: skip
     parser.add_argument("--force", action="store_true", help="replace a figure that exists")
 

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
-    parser.add_argument("--load", dest="loads", nargs="+", metavar="LOAD", default=["a"],
+    parser.add_argument("--load", type="name", dest="loads", nargs="+", metavar="LOAD", default=["a"],
                         help="loads to compare them under: names or CSV files (default: a)")  # fmt: skip
-    parser.add_argument("--figure", type=Path, metavar="FILE",
+    parser.add_argument("--figure", type="write", metavar="FILE",
                         help="draw loss and iterations over the number of variables: .png, .pdf or .svg")  # fmt: skip
-    parser.add_argument("--out", type=Path, metavar="FILE", help="write the proposed set as a configuration (TOML)")
+    parser.add_argument("--out", type="write", metavar="FILE", help="write the proposed set as a configuration (TOML)")
 
 
 def execute(options: argparse.Namespace) -> int:

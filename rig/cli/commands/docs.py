@@ -24,7 +24,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """List the pages, or print what is asked for: as Markdown, laid out where it goes to a terminal."""
-    pages = {path.stem: path for path in sorted((INSTALLED if INSTALLED.is_dir() else CHECKOUT).glob("*.md"))}
+    found = (INSTALLED if INSTALLED.is_dir() else CHECKOUT).glob("*.md")
+    pages = {path.stem: path for path in sorted(found, key=lambda path: path.stem)}
     if options.page is None:
         width = max(map(len, pages), default=0)
         titles = {name: _title(path.read_text(encoding="utf-8")) for name, path in pages.items()}
@@ -47,10 +48,18 @@ def _asked(asked: str, pages: Mapping[str, Path]) -> str:
     if name not in pages:
         raise UsageError(f"docs: no page '{name}'; there are {', '.join(pages)}")
     text = pages[name].read_text(encoding="utf-8")
-    return _section(text, section, name) if section else text
+    if not section:
+        return text
+    texts = (
+        (text, pages[evidence].read_text(encoding="utf-8")) if (evidence := f"evidence-{name}") in pages else (text,)
+    )
+    if part := next(filter(None, (_section(each, section) for each in texts)), None):
+        return part
+    known = ", ".join(anchor(words) for *_, words in headings(text))
+    raise UsageError(f"docs: {name} has no section '{section}'; it has {known}")
 
 
-def _headings(text: str) -> Iterator[tuple[int, int, str]]:
+def headings(text: str) -> Iterator[tuple[int, int, str]]:
     """Yield line, level and words of each heading."""
     in_code = False
     for number, line in enumerate(text.splitlines()):
@@ -60,7 +69,7 @@ def _headings(text: str) -> Iterator[tuple[int, int, str]]:
 
 
 def _title(text: str) -> str:
-    return next((words for *_, words in _headings(text)), "")
+    return next((words for *_, words in headings(text)), "")
 
 
 def anchor(words: str) -> str:
@@ -68,11 +77,10 @@ def anchor(words: str) -> str:
     return re.sub(r"[^\w\- ]", "", words.lower()).replace(" ", "-")
 
 
-def _section(text: str, section: str, page: str) -> str:
-    headings = list(_headings(text))
-    for place, (first, level, words) in enumerate(headings):
+def _section(text: str, section: str) -> str | None:
+    parts = list(headings(text))
+    for place, (first, level, words) in enumerate(parts):
         if anchor(words) == section:
-            last = next((line for line, other, _ in headings[place + 1 :] if other <= level), None)
+            last = next((line for line, other, _ in parts[place + 1 :] if other <= level), None)
             return "\n".join(text.splitlines()[first:last]) + "\n"
-    known = ", ".join(anchor(words) for *_, words in headings)
-    raise UsageError(f"docs: {page} has no section '{section}'; it has {known}")
+    return None

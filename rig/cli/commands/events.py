@@ -38,7 +38,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--since", type=_since, default=Since(1, 0.0), metavar="NUMBER|TIME",
                         help="from this event on, or from this time (UTC, such as 2026-11-22T01:30)")  # fmt: skip
     parser.add_argument("--follow", action="store_true", help="print new events until interrupted")
-    parser.add_argument("--csv", type=Path, metavar="FILE", help="write a CSV file instead of lines")
+    parser.add_argument("--csv", type="write", metavar="FILE", help="write a CSV file instead of lines")
     parser.add_argument("--force", action="store_true", help="overwrite that file")
 
 

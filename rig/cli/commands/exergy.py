@@ -2,7 +2,6 @@
 
 import argparse
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coldloop.service.command_line import add_configuration_options
@@ -17,7 +16,7 @@ NAME_WIDTH = 26
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
-    parser.add_argument("--plant", type=Path, metavar="FILE", help="plant file (TOML) of another refrigerator")
+    parser.add_argument("--plant", type="read", metavar="FILE", help="plant file (TOML) of another refrigerator")
 
 
 def execute(options: argparse.Namespace) -> int:

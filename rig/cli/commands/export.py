@@ -17,7 +17,7 @@ PLC: Final = Path("plc")
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run; or plc, with --target: the optimiser")
+    parser.add_argument("run", type="folder", metavar="RUN", help="folder of a run; plc, with --target: the optimiser")
     kinds = parser.add_mutually_exclusive_group(required=True)
     for kind, text in (
         ("csv", "a CSV file for each of trace, updates, events"),
@@ -28,10 +28,10 @@ def declare(parser: argparse.ArgumentParser) -> None:
     kinds.add_argument("--target", choices=("c", "st", "plcopen"), help="with plc: as C99 the whole optimiser in single"
                        " precision and its ODE-based solver, as Structured Text (IEC 61131-3), or as PLCopen XML of"
                        " that; with golden vectors and self-tests")  # fmt: skip
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="where to (default: the folder of the run)")
+    parser.add_argument("--out", type="into", metavar="FOLDER", help="where to (default: the folder of the run)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
-    parser.add_argument("--plc", metavar="PLC", help="with plc: a profile, as of coldloop budget: the READMEs say what"
-                        " takes how long there, and what does not fit")  # fmt: skip
+    parser.add_argument("--plc", type="name", metavar="PLC", help="with plc: a profile, as of coldloop budget: the"
+                        " READMEs say what takes how long there, and what does not fit")  # fmt: skip
     parser.add_argument("--ticks", type=positive_count, metavar="N", help="with plc: length of the run whose problems"
                         " are the golden vectors (default: 1440, six minutes)")  # fmt: skip
     parser.add_argument("--score", action="store_true", help="with plc --target c: compile it (gcc), change single bits"

@@ -10,9 +10,9 @@ from pathlib import Path
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run, of half an hour or more")
-    parser.add_argument("--model", type=Path, metavar="FILE", help="model file (default: that of the run)")
-    parser.add_argument("--out", type=Path, metavar="FILE",
+    parser.add_argument("run", type="folder", metavar="RUN", help="folder of a run, of half an hour or more")
+    parser.add_argument("--model", type="read", metavar="FILE", help="model file (default: that of the run)")
+    parser.add_argument("--out", type="write", metavar="FILE",
                         help="write the model with these factors, to be looked at, if it predicts better")  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("export", type=Path, metavar="RECORD", help="text file of a historian or a spreadsheet")
+    add("export", type="read", metavar="RECORD", help="text file of a historian or a spreadsheet")
     add("--inputs", nargs="+", required=True, metavar="NAME",
         help="inputs, load, other disturbances, which hold between readings; others are outputs")  # fmt: skip
     add("--map", action="append", default=[], metavar="TAG=NAME",
@@ -22,7 +22,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
         help="what a quality says of good readings, beside good, ok and such words, and 192 to 255")  # fmt: skip
     add("--every", type=float, metavar="SECONDS", help="between rows (default: as usual between an output's readings)")
     add("--gap", type=float, metavar="SECONDS", help="without a reading that cuts the record (default: 5 rows)")
-    add("--out", type=Path, required=True, metavar="FILE", help="the record to write")
+    add("--out", type="write", required=True, metavar="FILE", help="the record to write")
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -2,7 +2,6 @@
 
 import argparse
 import sys
-from pathlib import Path
 
 from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.options import configuration
@@ -11,8 +10,8 @@ from rig.cli.commands.options import configuration
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
-    parser.add_argument("--plant", type=Path, metavar="FILE", help="plant file (TOML): parameters of another plant")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="write the model file, for model.file")
+    parser.add_argument("--plant", type="read", metavar="FILE", help="plant file (TOML): parameters of another plant")
+    parser.add_argument("--out", type="write", metavar="FILE", help="write the model file, for model.file")
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -11,7 +11,7 @@ FILES: Final = ("process.toml", "my_plant.py")
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="a new folder, or one without such files")
+    parser.add_argument("folder", type="into", metavar="FOLDER", help="a new folder, or one without such files")
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -113,7 +113,7 @@ def add_rig_options(parser: argparse.ArgumentParser, *, again: bool = False) -> 
                         help="plant, control PLC, optimiser PLC (default: the one rig that is up here)")  # fmt: skip
     parser.add_argument("--port-base", type=port_base, default=default, metavar="PORT",
                         help="first of its three ports in a row here, where several rigs are up")  # fmt: skip
-    parser.add_argument("--tls", type=Path, default=default, metavar="FOLDER",
+    parser.add_argument("--tls", type="folder", default=default, metavar="FOLDER",
                         help="folder with the operator's certificate; known for a rig started here")  # fmt: skip
 
 
@@ -125,7 +125,7 @@ def add_to_subcommands(what: "argparse._SubParsersAction[argparse.ArgumentParser
 
 def add_loop_options(parser: argparse.ArgumentParser, loads: str) -> None:
     """Declare what the loop does; `loads` says which loads there are besides those with a name."""
-    load = parser.add_argument("--load", help=f"{', '.join(LOADS)}, {loads} (default: 2h)")
+    load = parser.add_argument("--load", type="name", help=f"{', '.join(LOADS)}, {loads} (default: 2h)")
     load.completer = lambda **_: LOADS  # type: ignore[attr-defined]  # argcomplete looks for it
     parser.add_argument("--solver", choices=SOLVERS, help="default: ode")
     parser.add_argument("--outside-solver", metavar="NAME",
@@ -142,7 +142,7 @@ def add_loop_options(parser: argparse.ArgumentParser, loads: str) -> None:
 
 def add_result_options(parser: argparse.ArgumentParser, folder: str) -> None:
     """Declare where results go, by default into `folder`."""
-    parser.add_argument("--out", type=Path, help=f"folder for the results (default: runs/{folder}-<time>)")
+    parser.add_argument("--out", type="into", help=f"folder for the results (default: runs/{folder}-<time>)")
     parser.add_argument("--force", action="store_true", help="replace the run in a folder that is not empty")
     parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png"], metavar="FORMAT",
                         help="png, pdf, svg (default: png)")  # fmt: skip

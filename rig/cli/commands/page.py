@@ -17,7 +17,7 @@ MOST_RUNS = 2
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_rig_options(parser)
-    parser.add_argument("runs", nargs="*", type=Path, metavar="RUN",
+    parser.add_argument("runs", nargs="*", type="folder", metavar="RUN",
                         help="folder of a recorded run; two: side by side; none: a rig that is up")  # fmt: skip
     parser.add_argument("--page-port", type=int, metavar="PORT", help="port of the page (default: 8020)")
 

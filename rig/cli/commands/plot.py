@@ -2,14 +2,13 @@
 
 import argparse
 import sys
-from pathlib import Path
 
 from rig.cli.commands.choices import FIGURE_FORMATS
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
+    parser.add_argument("run", type="folder", metavar="RUN", help="folder of a run")
     parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png", "pdf", "svg"],
                         metavar="FORMAT", help="png, pdf, svg (default: all)")  # fmt: skip
 

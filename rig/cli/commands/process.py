@@ -5,14 +5,15 @@ import sys
 from pathlib import Path
 
 from rig.cli.commands.options import positive_count
+from rig.terminal import fitted, width
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("file", type=Path, nargs="?", metavar="FILE", help="process file (TOML)")
+    what.add_argument("file", type="read", nargs="?", metavar="FILE", help="process file (TOML)")
     what.add_argument("--keys", action="store_true", help="list the keys of process files, as Markdown")
-    parser.add_argument("--out", type=Path, metavar="MODEL",
+    parser.add_argument("--out", type="write", metavar="MODEL",
                         help="write the model file; then --process MODEL, or COLDLOOP_PROCESS=MODEL")  # fmt: skip
     parser.add_argument("--limit", type=positive_count, default=300, metavar="SECONDS",
                         help="how long its plant may take, in a process of its own (default: 300)")  # fmt: skip
@@ -49,5 +50,5 @@ def execute(options: argparse.Namespace) -> int:
             raise UsageError(f"{out}: {error.strerror}; name a file that can be written with --out") from None
         return f"{described(made)}written to {out}\n"
 
-    sys.stdout.write(text_of_child(options.file, work, options.limit))
+    sys.stdout.write(fitted(text_of_child(options.file, work, options.limit), width()))
     return 0

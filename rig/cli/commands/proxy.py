@@ -11,7 +11,7 @@ LOCAL = "127.0.0.1"
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("plan", metavar="PLAN", help="TOML file with the faults (`coldloop docs chaos`)")
+    parser.add_argument("plan", type="read", metavar="PLAN", help="TOML file with the faults (`coldloop docs chaos`)")
     parser.add_argument("--listen", type=_listener, required=True, metavar="[HOST:]PORT",
                         help="where clients connect; at 127.0.0.1 unless an address is named")  # fmt: skip
     parser.add_argument("--to", type=endpoint, required=True, metavar="HOST:PORT", help="the server behind it")

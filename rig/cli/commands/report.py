@@ -7,8 +7,8 @@ from pathlib import Path
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="page (default: report.html in the folder of the run)")
+    parser.add_argument("run", type="folder", metavar="RUN", help="folder of a run")
+    parser.add_argument("--out", type="write", metavar="FILE", help="page (default: report.html in the run's folder)")
     parser.add_argument("--force", action="store_true", help="replace a page that exists")
 
 

@@ -13,10 +13,10 @@ MANIFEST: Final = "manifest.json"
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("manifest", type=Path, metavar="MANIFEST", help="manifest.json of a run, or its folder")
+    parser.add_argument("manifest", type="folder", metavar="MANIFEST", help="manifest.json of a run, or its folder")
     parser.add_argument(TRUST, action="store_true", help="execute the plant of another process that the folder"
                         " holds; else --process names a file that gives the same model")  # fmt: skip
-    parser.add_argument("--out", type=Path, help="folder for the results of the repetition (default: none are kept)")
+    parser.add_argument("--out", type="into", help="folder for the results of the repetition (default: none are kept)")
     parser.add_argument("--force", action="store_true", help="replace the run in a folder that is not empty")
 
 

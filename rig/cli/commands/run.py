@@ -33,7 +33,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     way.add_argument("--in-process", action="store_true", help="one process and direct calls instead of Modbus/TCP")
     way.add_argument("--attach", nargs=3, type=endpoint, metavar="HOST:PORT",
                      help="use a rig that is up: plant, control PLC, optimiser PLC")  # fmt: skip
-    way.add_argument("--optimizer", metavar="export:FOLDER",
+    way.add_argument("--optimizer", type="export", metavar="export:FOLDER",
                      help="the exported optimiser in the place of ours (`coldloop docs plc-export`)")  # fmt: skip
     parser.add_argument("--duration", type=duration, help="plant time, such as 2h or 90s (default: that of the load)")
     add_loop_options(parser, f"another draw such as a@2, or a CSV file time_s,{LOAD_COLUMN}")

@@ -38,7 +38,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     what = parser.add_subparsers(title="what", metavar="WHAT", required=True)
     load = what.add_parser("load", help=f"{UNIT}, or a CSV file time_s,{LOAD_COLUMN}")
     load.add_argument(
-        "new_load", metavar="LOAD|FILE", help=f"{UNIT}, or a CSV file time_s,{LOAD_COLUMN} that begins now"
+        "new_load", type="name", metavar="LOAD|FILE", help=f"{UNIT}, or a CSV file time_s,{LOAD_COLUMN} that begins now"
     )
     load.add_argument("--at", type=_seconds, metavar="SECONDS", help="plant time at which it begins (default: now)")
     load.set_defaults(document=_load)

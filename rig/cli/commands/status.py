@@ -6,6 +6,7 @@ import sys
 from typing import Final
 
 from rig.cli.commands.options import add_rig_options, operator_settings, rig_endpoints, rig_services
+from rig.terminal import coloured, cut, fitted, width
 
 LOOK_S: Final = 1.0
 
@@ -26,17 +27,19 @@ def execute(options: argparse.Namespace) -> int:
 
 async def _show(options: argparse.Namespace) -> None:
     from coldloop.operating.execution import clients_of
-    from rig.live.status import line, page, read_status
+    from rig.live.status import colour, line, page, read_status
 
     endpoints = rig_endpoints(options, operator_settings(options))
     clients = clients_of({service: getattr(endpoints, service) for service in rig_services(options)})
     try:
         status = await read_status(clients)
-        sys.stdout.write(f"{line(status)}\n" if options.follow else page(status))
+        if not options.follow:
+            sys.stdout.write(fitted(page(status), width()))
         while options.follow:
+            sys.stdout.write(f"{coloured(cut(line(status), width()), colour(status))}\n")
             sys.stdout.flush()
             await asyncio.sleep(LOOK_S)
-            sys.stdout.write(f"{line(await read_status(clients))}\n")
+            status = await read_status(clients)
     finally:
         for client in clients.values():
             client.close()

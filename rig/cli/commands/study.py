@@ -26,14 +26,14 @@ def declare(parser: argparse.ArgumentParser) -> None:
     name.completer = lambda **_: STUDIES  # type: ignore[attr-defined]  # argcomplete looks for it
     parser.add_argument("--list", action="store_true", help="list the studies")
     parser.add_argument("--duration", type=duration, help="plant time of each run (default: that of its load)")
-    parser.add_argument("--load", nargs="+", metavar="LOAD", default=[],
+    parser.add_argument("--load", type="name", nargs="+", metavar="LOAD", default=[],
                         help="named loads or CSV files time_s,load_w")  # fmt: skip
-    parser.add_argument("--variants", type=Path, metavar="FILE",
+    parser.add_argument("--variants", type="read", metavar="FILE",
                         help="of `compare`: TOML, a table of settings for each variant, the reference first"
                         " (`coldloop docs compare`)")  # fmt: skip
     parts = parser.add_mutually_exclusive_group()
     parts.add_argument("--shard", metavar="I/N", help="do every N-th run only, from the I-th on, without evaluation")
-    parts.add_argument("--merge", type=Path, nargs="+", metavar="FOLDER",
+    parts.add_argument("--merge", type="folder", nargs="+", metavar="FOLDER",
                        help="collect the runs of all shards from their --out folders, and evaluate"
                        )  # fmt: skip
     add_scale_options(parser)
@@ -48,7 +48,7 @@ def add_scale_options(parser: argparse.ArgumentParser) -> None:
     scale.add_argument("--quick", action="store_true", help="one seed, ten minutes, fewer points")
     parser.add_argument("--workers", type=positive_count, metavar="N", help="processes to use (default: one a core)")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="a running Dask scheduler, such as tcp://host:8786")
-    parser.add_argument("--out", type=Path, default=Path("studies"), help="folder for all results (default: studies)")
+    parser.add_argument("--out", type="into", default=Path("studies"), help="folder for all results (default: studies)")
 
 
 def workers(options: argparse.Namespace) -> "Workers":

@@ -1,7 +1,6 @@
 """`coldloop up`: the rig on fixed ports, in real time, until Ctrl-C."""
 
 import argparse
-from pathlib import Path
 
 from coldloop.process.load_profile import LOAD_COLUMN
 from coldloop.service.command_line import add_configuration_options
@@ -14,7 +13,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     add_configuration_options(parser)
     parser.add_argument("--factor", type=float, help="seconds of plant time per second (default: 1)")
     add_loop_options(parser, f"or a CSV file time_s,{LOAD_COLUMN}; its end is held")
-    parser.add_argument("--tls", type=Path, metavar="FOLDER",
+    parser.add_argument("--tls", type="folder", metavar="FOLDER",
                         help="Modbus/TCP Security with what `coldloop certificates --out FOLDER` made")  # fmt: skip
     parser.add_argument("--port-base", type=port_base, metavar="PORT",
                         help="first of three consecutive ports (default: 5020)")  # fmt: skip
@@ -23,7 +22,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     other = parser.add_mutually_exclusive_group()
     other.add_argument("--without", choices=WITHOUT, metavar="|".join(WITHOUT),
                        help="leave its place to a client of your own (`coldloop docs your-optimiser`)")  # fmt: skip
-    other.add_argument("--optimizer", metavar="export:FOLDER",
+    other.add_argument("--optimizer", type="export", metavar="export:FOLDER",
                        help="the exported optimiser in the place of ours (`coldloop docs plc-export`)")  # fmt: skip
     parser.add_argument("--cuttable", action="store_true",
                         help="put a proxy into each link, for `coldloop fault cut`")  # fmt: skip

@@ -97,8 +97,10 @@ def _figure(variants: tuple[Variant, ...], ratios: list[Interval], by_draw: Arra
     """Draw a row for each variant: its mean with the interval, and each draw."""
     label = "geometric mean, 95 % interval"
     rows = {variant.name: ratio for variant, ratio in zip(variants[1:], ratios[1:], strict=True)}
-    size = (7.0, 1.6 + 0.4 * len(rows))
-    figure = ratio_rows({label: rows}, f"J_BF over that of {variants[0].name} (1); a mark for each draw", size, 0.25, 1)
+    height_in = 1.2 + 0.35 * len(rows)
+    figure = ratio_rows(
+        {label: rows}, f"J_BF over that of {variants[0].name} (1); a mark for each draw", height_in, 0.25, 1
+    )
     place = figure.axes[0]
     if not spans_decade(by_draw):
         place.set_xscale("linear")

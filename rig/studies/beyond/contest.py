@@ -99,4 +99,4 @@ def _table(title: str, ratios: Mapping[tuple[str, str], Ratio], hours: int) -> s
 
 def _figure(ratios: Mapping[tuple[str, str], Ratio], cost: str) -> Figure:
     means = {solver: {way.label: ratios[solver, way.label][0] for way in WAYS} for solver in SOLVERS}
-    return ratio_rows(means, f"{cost} over that of {' under '.join(REFERENCE)} (1)", (8.0, 4.0), 0.16, len(SOLVERS))
+    return ratio_rows(means, f"{cost} over that of {' under '.join(REFERENCE)} (1)", 4.0, 0.16, len(SOLVERS))

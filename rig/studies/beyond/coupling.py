@@ -48,7 +48,7 @@ class CouplingStudy:
                 result.note(f"J_BF on the {label}, over the cold box alone", ratio)
             if "pressures" not in result.figures:
                 labelled = list(zip(CASES, runs, strict=True))
-                result.figures["pressures"] = over_time(f"hour {Path(load.name).name}", labelled, SHOWN, 8.0)
+                result.figures["pressures"] = over_time(f"hour {Path(load.name).name}", labelled, SHOWN, 6.0)
         result.figures["closed-loop cost"] = cost_bars(result, CASES, 0.19)
         return result
 

@@ -82,7 +82,7 @@ class DisturbancesStudy:
                     result.rows.append((f"{name} ({load.name})", driver, station, *_measures(run)))
                 if load.draw == 1:
                     labelled = list(zip(map(", ".join, _pairs()), runs, strict=True))
-                    result.figures[name] = over_time("", labelled, SHOWN, 11.0)
+                    result.figures[name] = over_time("", labelled, SHOWN, 8.0)
         return result
 
 

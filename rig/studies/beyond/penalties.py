@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
+from rig.figures.plot import ACCENT, INK
 from rig.studies import published
 from rig.studies.beyond.penalty_variants import (
     AS_PRINTED,
@@ -34,7 +35,7 @@ from rig.studies.request import RunRequest, Series
 from rig.studies.study import Outcomes, StudyOptions, StudyResult
 from rig.text_tables import Cell, markdown_table
 
-COLOURS: Final = {QPOASES: "#888888", TUNED: "#1f5fa8", AS_PRINTED: "#b3261e"}
+COLOURS: Final = {QPOASES: "#000000", TUNED: INK, AS_PRINTED: ACCENT}
 NOMINAL: Final = 1.0
 COLUMNS: Final = (
     "part", "load", "preset", "change", "power or period", "J_dev", "J_cst", "c1", "c2", "lowest", "J per time", "J_BF",
@@ -221,7 +222,7 @@ def _figure(found: Paired) -> Figure:
     """Draw by which share total costs are above the lowest, against power, and the paper's above its converged one."""
     points = published.solver_comparison()
     converged = points["qpoases"]["J_total"][-1]
-    with panels(1, 1, (8.0, 4.4)) as (figure, (place,)):
+    with panels(1, 1, 3.2) as (figure, (place,)):
         for variant in (None, *PRESETS.values()):
             label = variant.label if variant else QPOASES
             powers = found.powers[variant]

@@ -126,7 +126,7 @@ def _text(cell: str | float) -> str:
 
 def _figure(costs: dict[str, Array], means: dict[str, float]) -> Figure:
     """Draw, for each regime, each fixed period's cost over that of the adaptive one, and their geometric mean."""
-    with panels(1, len(costs), (2.2 + 2.4 * len(costs), 3.4)) as (figure, places):
+    with panels(1, len(costs), 2.6) as (figure, places):
         for place, (regime, by_period) in zip(places, costs.items(), strict=True):
             over = by_period[1:] / by_period[0]
             place.plot(FIXED_S, over, "-", color=COLOURS[0], alpha=0.25, linewidth=0.8)

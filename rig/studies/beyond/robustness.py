@@ -110,4 +110,4 @@ def _table(ratios: Ratios, cost: str, costs: dict[tuple[str, str], Series]) -> s
 
 def _figure(ratios: Ratios, cost: str) -> Figure:
     by_policy = {policy: {condition: row[policy] for condition, row in ratios.items()} for policy in POLICIES}
-    return ratio_rows(by_policy, f"{cost} over that of {REFERENCE} (1)", (9.0, 6.5), 0.13, 3)
+    return ratio_rows(by_policy, f"{cost} over that of {REFERENCE} (1)", 6.5, 0.13, 3)

@@ -62,10 +62,10 @@ def _difference(one: Outcome, other: Outcome, name: str) -> Series:
 
 def _figure(double: Outcome, single: Outcome) -> Figure:
     hours = double.series("time_s") / 3600
-    with panels(3, 1, (9.0, 5.5), sharex=True) as (figure, axes):
+    with panels(3, 1, 4.0, sharex=True) as (figure, axes):
         for place, (name, unit), colour in zip(axes, INPUTS.items(), COLOURS, strict=False):
             place.plot(hours, _difference(double, single, name), color=colour, linewidth=0.7, label=name)
-            place.set_ylabel(f"single - double ({unit})", fontsize=8)
+            place.set_ylabel(f"single - double ({unit})")
             legend_above(place)
         axes[-1].set_xlabel("plant time (h)")
     return figure

@@ -36,7 +36,7 @@ from rig.plc_sizing.reference_plc import (
     slow_down,
 )
 from rig.plc_sizing.sizes import dense_sizes
-from rig.studies.drawing import legend_outside, panels, paper
+from rig.studies.drawing import panels, paper
 from rig.studies.request import RunRequest, Series
 from rig.studies.study import Outcomes, StudyOptions, StudyResult
 from rig.text_tables import Cell, markdown_table
@@ -154,13 +154,14 @@ def _iterations(curve: SpeedCurve) -> str:
 
 def _figure(rows: list[tuple[Cell, ...]]) -> Figure:
     table: Series = np.array(rows, dtype=float)
-    with panels(1, 1, (8.0, 4.2)) as (figure, (place,)):
-        paper(place, table[:, 0], table[:, 1], COLOURS[0], "PLC (ms), paper")
-        place.plot(table[:, 0], table[:, 2], color=COLOURS[0], label="PLC (ms), fitted")
-        paper(place, table[:, 0], table[:, 3], COLOURS[1], "laptop (us), paper")
-        place.plot(table[:, 0], table[:, 4], color=COLOURS[2], label="this machine (us)")
-        place.set_yscale("log")
-        place.set_xlabel("size of the matrix (1)")
-        place.set_ylabel("time of a Cholesky factorisation (ms or us)")
-        legend_outside(figure, place)
+    with panels(2, 1, 4.2, sharex=True) as (figure, (plc, computers)):
+        paper(plc, table[:, 0], table[:, 1], COLOURS[0], "PLC, paper")
+        plc.plot(table[:, 0], table[:, 2], color=COLOURS[0], label="PLC, fitted")
+        paper(computers, table[:, 0], table[:, 3], COLOURS[1], "laptop, paper")
+        computers.plot(table[:, 0], table[:, 4], "--", color=COLOURS[2], label="this machine")
+        for place, unit in ((plc, "ms"), (computers, "us")):
+            place.set_yscale("log")
+            place.set_ylabel(f"factorisation ({unit})")
+            place.legend(loc="lower right")
+        computers.set_xlabel("size of the matrix (1)")
     return figure

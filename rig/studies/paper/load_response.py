@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from coldloop.process.signals import TICK_S
 from optimizer_plc.budget import MAX_PERIOD_TICKS
-from rig.figures.plot import COLOURS
+from rig.figures.plot import COLOURS, DASHES
 from rig.studies.drawing import legend_outside, panels
 from rig.studies.paper.trajectories import load_steps, seconds_since_step
 from rig.studies.request import Outcome, Series
@@ -109,11 +109,11 @@ def response_table(runs_of: Mapping[str, Sequence[Run]]) -> str:
 def response_figure(runs_of: Mapping[str, Sequence[Run]]) -> Figure:
     """Draw the mean period of each policy in each window."""
     edges = np.where(np.isfinite(EDGES_S), EDGES_S, DRAWN_TO_S)
-    with panels(1, 1, (8.0, 3.6)) as (figure, (place,)):
+    with panels(1, 1, 2.8) as (figure, (place,)):
         for (policy, runs), colour in zip(runs_of.items(), COLOURS, strict=False):
             means = [held_periods(runs).mean(span) for span in pairwise(EDGES_S.tolist())]
-            place.stairs(means, edges, color=colour, baseline=None, linewidth=1.4, label=policy)
-        place.set_xlabel(f"time since the load step (s); the last window, from {EDGES_S[-2]:g} s on, has no end")
+            place.stairs(means, edges, color=colour, linestyle=DASHES[colour], baseline=None, label=policy)
+        place.set_xlabel(f"time since the load step (s); the last is from {EDGES_S[-2]:g} s on")
         place.set_ylabel("mean updating period (s), by time")
         place.set_ylim(bottom=0)
         legend_outside(figure, place)

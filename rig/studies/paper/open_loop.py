@@ -96,7 +96,7 @@ def _crossing_text(power: Interval, other: str) -> str:
 
 def open_loop_figure(found: OpenLoop) -> Figure:
     """Draw by which share the total cost is above the lowest, against power, with intervals."""
-    with panels(1, 1, (8.0, 4.2)) as (figure, (place,)):
+    with panels(1, 1, 3.0) as (figure, (place,)):
         for (solver, powers), colour in zip(found.powers.items(), COLOURS, strict=False):
             intervals = [found.interval(solver, power) for power in powers]
             above_lowest(place, powers, intervals, colour, LABELS[solver])

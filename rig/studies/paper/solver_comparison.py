@@ -165,7 +165,7 @@ def _figure(powers: Series, paired: Sequence[Table], closed: Sequence[Table]) ->
         "c1": "(d) $c_1$ (%, K)", "c2": "(e) $c_2$ (%, K)", "J_BF": "(f) $J^{BF}$, relative (1)",
     }  # fmt: skip
     theirs = published.solver_comparison()
-    with panels(3, 2, (9.5, 10.0), sharex=True) as (figure, axes):
+    with panels(3, 2, 7.5, sharex=True) as (figure, axes):
         for place, name in zip(axes, INDICATORS, strict=True):
             relative, tables = name.startswith("J"), closed if name == "J_BF" else paired
             for solver, colour in zip(SOLVERS, COLOURS, strict=False):

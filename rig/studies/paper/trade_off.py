@@ -103,13 +103,14 @@ def _discriminating(load: Load, periods: tuple[float, ...], outcomes: Outcomes) 
 
 
 def _figure(periods: tuple[float, ...], curves: dict[str, list[list[tuple[float, float]]]]) -> Figure:
-    with panels(2, 2, (9.0, 6.5), sharex=True) as (figure, axes):
+    with panels(2, 2, 5.0, sharex=True) as (figure, axes):
         for place, (solver, draws), colour in zip(axes, curves.items(), COLOURS, strict=False):
             values = np.array(draws)
             spread(place, periods, values[:, :, 0], colour, "$E$: won by the solver")
             spread(place, periods, values[:, :, 1], "#888888", "$D$: lost by shift and mismatch")
             place.set_title(SOLVERS[solver], loc="left", pad=18)
             place.set_ylabel("cost a period (1)")
+            place.yaxis.set_major_formatter(lambda value, _: f"{value:g}")  # the power of ten at each mark
             legend_above(place)
         for place in axes[-2:]:
             place.set_xlabel("updating period (s)")

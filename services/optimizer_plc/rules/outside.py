@@ -1,6 +1,6 @@
 """Somebody else's rule of the updating period, by an entry point of the group `coldloop.rules`."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -37,7 +37,7 @@ class OutsideRule:
     def __init__(self, name: str, budget: PlcBudget) -> None:
         self.name, self._most = name, len(budget.ladder)
         self._rule: OutsideDecision = made(Part.RULE, name, budget.ladder)
-        self.first = self._asked(self._rule.first, otherwise=self._most)
+        self.first = self._asked("first", otherwise=self._most)
 
     @property
     def status(self) -> UpdatingRuleStatus:
@@ -46,7 +46,7 @@ class OutsideRule:
 
     def after_interruption(self) -> int:
         """Return the q of the period that begins with a load step."""
-        return self._asked(getattr(self._rule, "after_interruption", self._rule.first), otherwise=self._most)
+        return self._asked("after_interruption", "first", otherwise=self._most)
 
     def decide(self, o: Observation, a: Assessment) -> int:
         """Return q(t_{k+1}).
@@ -54,11 +54,13 @@ class OutsideRule:
         Raises:
             ConfigurationError: The rule raises, or returns no number.
         """
-        return self._asked(self._rule.decide, o, a, otherwise=o.q)
+        return self._asked("decide", given=(o, a), otherwise=o.q)
 
-    def _asked(self, function: Callable[..., float], *given: object, otherwise: int) -> int:
+    def _asked(self, *names: str, given: Sequence[object] = (), otherwise: int) -> int:
+        """Return what the first method says that there is; to look for it runs code of others, too."""
         with in_its_name(Part.RULE, self.name):
-            q = float(function(*given))
+            name = next((each for each in names if hasattr(self._rule, each)), names[-1])
+            q = float(getattr(self._rule, name)(*given))
         return int(q) if q.is_integer() and 1 <= q <= self._most else otherwise
 
 

@@ -37,14 +37,14 @@ class OutsideSolver:
         self.tau_1_s = settings.tau_1_s
         self.name = settings.solver
         self._method: OutsideMethod = made(Part.SOLVER, settings.solver)
-        if hasattr(self._method, "alpha"):
-            self._method.alpha = settings.alpha
+        with in_its_name(Part.SOLVER, self.name):
+            if hasattr(self._method, "alpha"):
+                self._method.alpha = settings.alpha
 
     def reset(self) -> None:
         """Forget earlier problems, where the method has something to forget."""
-        reset = getattr(self._method, "reset", None)
-        if reset is not None:
-            reset()
+        with in_its_name(Part.SOLVER, self.name):
+            getattr(self._method, "reset", dict)()
 
     def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
         """Return the answer after each count; a point that is no profile, or not finite, is as good as the guess.

@@ -12,8 +12,9 @@ from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric.types import PublicKeyTypes
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
 
-from coldloop.errors import ConfigurationError
+from coldloop.errors import ConfigurationError, UsageError
 from coldloop.modbus.settings import TlsSettings
+from coldloop.text_file import read_bytes
 
 CRL_BEGIN: Final = b"-----BEGIN X509 CRL-----"
 DAY_S: Final = 86400.0
@@ -173,11 +174,9 @@ def _public_key_of(file: Path, what: str) -> PublicKeyTypes:
 
 def _contents(file: Path, what: str) -> bytes:
     try:
-        return file.read_bytes()
-    except OSError as error:
-        raise ConfigurationError(
-            f"{what} {file}: {error.strerror}; name a readable file, or make some with `coldloop certificates`"
-        ) from None
+        return read_bytes(file, "name a readable file, or make some with `coldloop certificates`", most=2**24)
+    except UsageError as error:
+        raise ConfigurationError(f"{what} {error}") from None
 
 
 def _comparable(key: PublicKeyTypes) -> bytes:

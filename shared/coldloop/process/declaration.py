@@ -251,6 +251,8 @@ class Process:
     """Outputs whose constant error is told from states, load and the other constants: estimated by default."""
     iterations: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     """See `share`; what is not named is 1."""
+    disturbances: tuple[str, ...] = ()
+    """Outputs that measure a disturbance beside the load."""
     forecasts: tuple[Forecast, ...] = ()
     mimic: str = ""
     """Drawing for the operator's page, an SVG text; empty where there is none."""
@@ -404,10 +406,9 @@ class Process:
         return self.load.name != NO_LOAD.name
 
     @property
-    def disturbances(self) -> tuple[Output, ...]:
-        """Outputs of a process file that measure a disturbance beside the load: they have its name, and no band."""
-        states = set() if self.load.has_named_loads else {state.name for state in self.states}
-        return tuple(output for output in self.outputs if output.band is None and output.name in states)
+    def measured_disturbances(self) -> tuple[Output, ...]:
+        """The outputs that are its `disturbances`."""
+        return tuple(output for output in self.outputs if output.name in self.disturbances)
 
     def share(self, of: str) -> float:
         """Return the time of a solver's iteration, or of a preparation, over that with the cold box's problem."""

@@ -6,8 +6,9 @@ it the process is the cold box.
 
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from coldloop.errors import ModelFileError
 from coldloop.process.cold_box import COLD_BOX
@@ -27,9 +28,16 @@ def process_of(path: Path) -> Process:
     if "process" not in document:
         raise ModelFileError(f"{path}: the model file of a cold box, which declares no process; {REMEDY}")
     try:
-        return Process.of(document["process"])
+        return Process.of({"disturbances": _disturbances(document)} | document["process"])
     except (KeyError, TypeError, ValueError) as error:
         raise ModelFileError(f"{path}: process: {error}; {REMEDY}") from error
+
+
+def _disturbances(document: Mapping[str, Any]) -> list[str]:
+    """Return which outputs measure a disturbance by a model file of version 0.3: those of states that nothing moves."""
+    rows = zip(document["state_names"], document["A"], document["B"], document["F"], strict=True)
+    holding = {name for name, A, B, F in rows if not any((*A, *B, F))}
+    return [name for name in document["output_names"] if name in holding]
 
 
 def _loaded() -> Process:

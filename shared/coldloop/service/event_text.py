@@ -163,6 +163,7 @@ _ALARM_CAUSES: Final[Mapping[int, Words]] = {
     AlarmKind.PLANT_OTHER_MASTER: _causes(LinkCause),
     AlarmKind.PLANT_FROZEN: _causes(LinkCause),
     AlarmKind.OUTPUTS_REJECTED: _causes(LinkCause),
+    AlarmKind.CLOCK_SKEW: _causes(LinkCause),
     AlarmKind.CERTIFICATE: _listed(("", "expires soon", "has expired", "unreadable")),
 }
 

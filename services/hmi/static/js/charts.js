@@ -2,8 +2,8 @@
 import { axisLabels, numberText, timeText } from "./numbers.js";
 import { TEXTS } from "./quality.js";
 import { scaleOf } from "./readout.js";
-import uPlot from "../vendor/uPlot.js";
 
+const { uPlot } = window;
 
 export function colour(name) { return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim(); }
 
@@ -40,7 +40,7 @@ export function makeChart(holder, lines, options) {
     }))],
     hooks: {
       drawClear: [(u) => drawGround(u, extra)],
-      draw: [(u) => { drawAhead(u, extra, lines); drawReplaced(u, extra); }],
+      draw: [(u) => { drawAhead(u, extra, lines); drawReplaced(u, extra); nameBand(u, extra); }],
       setCursor: options.onCursor ? [(u) => options.onCursor(u)] : [],
       setSelect: options.onZoom ? [(u) => { if (u.select.width > 4) options.onZoom(u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")); u.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false); }] : [],
     },
@@ -95,8 +95,13 @@ function swatch(line) {
   return made;
 }
 
-// Of a logarithmic axis only the decades are shown.
-const decades = (_u, splits) => splits.map((value) => (value > 0 && Math.abs(Math.log10(value) - Math.round(Math.log10(value))) < 1e-6 ? value : null));
+// Of a logarithmic axis only decades are shown, and of many decades as many as have room.
+function decades(u, splits) {
+  const powers = splits.map((value) => (value > 0 ? Math.log10(value) : NaN));
+  const isDecade = (power) => Math.abs(power - Math.round(power)) < 1e-6;
+  const every = Math.max(1, Math.ceil((14 * devicePixelRatio * powers.filter(isDecade).length) / (u.bbox.height || Infinity)));
+  return splits.map((value, i) => (isDecade(powers[i]) && Math.round(powers[i]) % every === 0 ? value : null));
+}
 
 // What is to be seen in a trend document, and nothing else: modes, gaps, substituted values, predictions, marks.
 const MARKS = { load: "load", alarm: "alarm", operator: "command", fault: "sensor fault" };
@@ -132,12 +137,6 @@ function drawGround(u, extra) {
     ctx.globalAlpha = 1; ctx.strokeStyle = colour("muted"); ctx.setLineDash([6, 4]); ctx.lineWidth = 1;
     for (const y of [top, bottom]) { ctx.beginPath(); ctx.moveTo(bbox.left, y); ctx.lineTo(bbox.left + bbox.width, y); ctx.stroke(); }
     ctx.setLineDash([]);
-    ctx.fillStyle = colour("muted"); ctx.font = `${10 * devicePixelRatio}px system-ui, sans-serif`; ctx.textAlign = "right";
-    const right = bbox.left + bbox.width - 4 * devicePixelRatio, name = extra.bandName || "band";
-    if (extra.bandName && bottom > bbox.top && top >= bbox.top) ctx.fillText(name, right, top + 11 * devicePixelRatio);
-    if (top < bbox.top) ctx.fillText(`▲ ${name} to ${numberText(extra.band[1], 7)}`, right, bbox.top + 11 * devicePixelRatio);
-    if (bottom > bbox.top + bbox.height) ctx.fillText(`▼ ${name} from ${numberText(extra.band[0], 7)}`, right, bbox.top + bbox.height - 4 * devicePixelRatio);
-    ctx.textAlign = "left";
   }
   for (const [from, to] of extra.gaps) drawGap(u, from, to);
   for (const stretch of extra.modes) {
@@ -164,6 +163,24 @@ function drawGround(u, extra) {
     ctx.strokeStyle = colour("ink"); ctx.lineWidth = 1;
     ctx.beginPath(); ctx.moveTo(x, bbox.top); ctx.lineTo(x, bbox.top + bbox.height); ctx.stroke();
   }
+  ctx.restore();
+}
+
+// What the band is called, and which of its edges are outside, over the curves.
+function nameBand(u, { band, bandName }) {
+  if (!known(band) || u.scales.y.min === null) return;
+  const { ctx, bbox } = u, size = devicePixelRatio, name = bandName || "band", bottom = bbox.top + bbox.height;
+  const [low, high] = band.map((edge) => u.valToPos(edge, "y", true));
+  ctx.save();
+  ctx.font = `${10 * size}px system-ui, sans-serif`; ctx.textAlign = "right";
+  const write = (text, y) => {
+    const right = bbox.left + bbox.width - 4 * size, width = ctx.measureText(text).width;
+    ctx.fillStyle = colour("panel"); ctx.fillRect(right - width - 2 * size, y - 9 * size, width + 4 * size, 12 * size);
+    ctx.fillStyle = colour("muted"); ctx.fillText(text, right, y);
+  };
+  if (high < bbox.top) write(`▲ ${name} to ${numberText(band[1], 7)}`, bbox.top + 11 * size);
+  else if (bandName && low > bbox.top) write(name, high + 11 * size);
+  if (low > bottom) write(`▼ ${name} from ${numberText(band[0], 7)}`, bottom - 4 * size);
   ctx.restore();
 }
 

@@ -1,6 +1,6 @@
 // Starts the page: views, theme, links, the state of the stream.
 import { fixedText, numberText } from "./numbers.js";
-import { ask, connect, element, indexed, isStale, onChange, pageIsSilent, signal, state, take, titleOf, valueText } from "./store.js";
+import { ask, connect, drawAll, element, indexed, isStale, onChange, pageIsSilent, signal, state, titleOf, valueText } from "./store.js";
 import { bindAll, bindNames, controlledBar, inputBar, loadBar, measuredBar } from "./values.js";
 import { hideTrends, initTrends, recolourStrips, recolourTrends, refreshStrips, showTrends } from "./trends.js";
 import { initWhy, pick, recolourWhy, showWhy } from "./why.js";
@@ -110,9 +110,7 @@ async function mimic(kind) {
 }
 
 async function start() {
-  [state.catalog, state.me] = await Promise.all([ask("api/catalog"), ask("api/me")]);
-  const first = await ask("api/state").catch(() => null); // not for who has to log in first
-  if (first) state.plant = first.plant;
+  [state.catalog, state.me] = await Promise.all([ask("api/catalog"), ask("api/me"), connect()]);
   await mimic(state.plant.kind);
   theme(localStorage.getItem("theme") || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
   byId("theme").addEventListener("click", () => { const next = document.documentElement.dataset.theme === "dark" ? "light" : "dark"; localStorage.setItem("theme", next); theme(next); });
@@ -121,8 +119,9 @@ async function start() {
   initTrends((time) => { location.hash = "#why"; pick(`?at=${time}`); });
   initPoint(document); initWhy(); initCommands(redrawAlarms); initAlarms(); initReplay();
   showUser();
-  if (first) take(first); else if (!state.me.role) byId("login-open").click();
-  connect(); show();
+  drawAll();
+  if (state.refused && !state.me.role) byId("login-open").click();
+  show();
   addEventListener("hashchange", () => { show(); byId("view").focus({ preventScroll: true }); byId("view").scrollTop = 0; });
 }
 

@@ -9,8 +9,10 @@ const SILENT_MS = 1500, GIVEN_UP_MS = 5000, SEND_MS = 20000;
 export function onChange(listener) { listeners.push(listener); }
 
 // Changes are drawn once a frame: a slow browser takes all that has come and shows the newest, instead of each late.
-let changed = null;
+let changed = null, isBuilt = false;
+export function drawAll() { isBuilt = true; tell({ names: null, alarms: true, update: true }); }
 function tell({ names, alarms, update }) {
+  if (!isBuilt) return;
   if (changed === null) {
     changed = { names: new Set(), alarms: false, update: false };
     if (document.hidden) setTimeout(draw); else requestAnimationFrame(draw);
@@ -33,6 +35,7 @@ export function take(message) {
   if ("alarms" in message) state.alarms = message.alarms;
   if ("update" in message) state.update = message.update;
   if ("replay" in message) state.replay = message.replay;
+  answered();
   tell({ names: reset ? null : new Set(Object.keys(message.values)), alarms: "alarms" in message, update: "update" in message });
 }
 
@@ -53,11 +56,14 @@ export function signal(name) { return state.catalog.signals[name] || null; }
 
 // Why there is no stream: an answer that says so is the server's, such as an expired login.
 async function why() {
-  state.refused = "";
-  try { await ask("api/state"); } catch (error) { if (error.status) state.refused = `The page's own server refuses: ${error.message}`; }
+  state.refused = await ask("api/state").then(() => "", (error) => (error.status ? `The page's own server refuses: ${error.message}` : ""));
+  answered();
 }
+let answered = null;
+const answer = new Promise((resolve) => { answered = resolve; });
 
-// A connection that has gone silent, as after a server's loss of power, reports no error: it is closed.
+// A connection that has gone silent, as after a server's loss of power, reports no error: it is closed. Ends with the
+// first message, or an error.
 export function connect() {
   let source = null, begun = 0;
   const open = () => {
@@ -73,6 +79,7 @@ export function connect() {
     if (source && performance.now() - Math.max(begun, state.heard) > GIVEN_UP_MS) source.giveUp();
     tell({ names: new Set(), alarms: false, update: false });
   }, 250);
+  return answer;
 }
 
 export function valueText(name, as) {

@@ -44,7 +44,7 @@ const names = () => layout().flatMap((one) => one.lines).filter((line) => line.f
 const aboutOf = (name) => ["process.y.", "process.u.", "process."].map((part) => state.catalog.signals[`control_plc.${part}${name}`]).concat(state.catalog.signals[`plant.station.signals.${name}`]).find(Boolean);
 const unitOf = (name) => { const about = aboutOf(name); return about && about.unit ? ` ${about.unit}` : ""; };
 const stationBand = (name) => { const [low, high] = (state.plant.bands || {})[`plant.station.signals.${name}`] || []; return Number.isFinite(low) && Number.isFinite(high) ? [low, high] : null; };
-const REFRESH_MS = 500;
+const REFRESH_MS = 1000;
 
 let seconds = 0, zoom = null, held = false, newest = null, onPick = () => {};
 let charts = null, timer = null;
@@ -95,7 +95,7 @@ async function refresh() {
   if (document.getElementById("trends").hidden) return;
   const end = zoom ? Math.min(zoom[1], state.tick * state.catalog.tick_s) : null;
   const span = zoom ? Math.max(1, end - zoom[0]) : seconds;
-  const query = `names=${names()}&seconds=${span}&points=900`;
+  const query = `names=${names()}&seconds=${span}&points=600`;
   const isHeld = held && newest && !zoom;  // what was asked for last stays, also where it is drawn anew
   if (isHeld && charts) return;
   if (!isHeld) try { newest = await ask(`api/trend?${query}${zoom ? `&end=${end}` : ""}`); } catch { return; }
@@ -164,7 +164,7 @@ export async function refreshStrips() {
   if (document.getElementById("overview").hidden) return;
   const { controlled, disturbances, load, sample_s } = state.catalog.process, length = WINDOWS[0] * sample_s;
   let found;
-  try { found = await ask(`api/trend?names=${[...controlled, ...disturbances].map((one) => one.name).concat(load ? "load" : [])}&seconds=${length}&points=400`); } catch { return; }
+  try { found = await ask(`api/trend?names=${[...controlled, ...disturbances].map((one) => one.name).concat(load ? "load" : [])}&seconds=${length}&points=400&brief=1`); } catch { return; }
   const holder = document.getElementById("strip-charts");
   stripsNow = found.now_s;
   if (!strips) {

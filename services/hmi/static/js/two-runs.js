@@ -1,4 +1,5 @@
 // Two replays side by side: one bar for both.
+document.documentElement.dataset.theme = localStorage.getItem("theme") || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
 const byId = (id) => document.getElementById(id);
 const send = (run, wish) => fetch(`run/${run}/api/replay`, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(wish) });
 const both = (wish) => Promise.all([send(1, wish), send(2, wish)]);
