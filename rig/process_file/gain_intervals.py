@@ -14,8 +14,8 @@ Array = NDArray[np.float64]
 LEVEL: Final = 0.99
 """Probability with which all gains are in their intervals."""
 DRAWS: Final = 30
-WIDER: Final = 1.35
-"""Factor for slow noise, which a fitted model follows and its draws lack: found over 200 records of a known plant."""
+WIDER: Final = 1.5
+"""Factor for slow noise, which a fitted model follows and its draws lack: found over records of a known plant."""
 
 
 def gains_after(found: Identified, horizon_s: float) -> Array:
