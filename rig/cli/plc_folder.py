@@ -13,12 +13,14 @@ import numpy as np
 from coldloop import __version__
 from coldloop.config import selected
 from coldloop.errors import UsageError
+from coldloop.parsing import parsed_json
 from coldloop.process.limits import RateReference
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.settings import SHOWN
+from rig.plc_export.c.bit_flips import require_compiler, scored
 from rig.plc_export.c.bus_registers import bus_files
 from rig.plc_export.c.exported_optimizer import FOLDER as OPTIMIZER
 from rig.plc_export.c.exported_optimizer import MANIFEST, manifest_of
@@ -72,7 +74,8 @@ COUNTED: Final = 80
 
 
 def export_plc(
-    target: str, ticks: int | None, folder: Path, settings: Settings, profile: PlcProfile | None = None
+    target: str, ticks: int | None, folder: Path, settings: Settings, profile: PlcProfile | None = None, *,
+    score: bool = False,
 ) -> list[Path]:  # fmt: skip
     """Record problems and write the sources for a target; return the paths.
 
@@ -82,11 +85,14 @@ def export_plc(
         folder: Where they are written to.
         settings: Of the optimiser.
         profile: The PLC that memory and times are compared with, if any.
+        score: Whether the manifest says which changes of one bit the self-tests in C miss.
 
     Raises:
         UsageError: The folder is not empty or cannot be written to, or no input moves in so many ticks.
     """
     refuse_taken(folder)
+    if score:
+        require_compiler()
     if not PROCESS.forecasts:
         refuse(settings.optimizer_plc.program)
     recorded = record(ticks or TICKS)
@@ -96,6 +102,8 @@ def export_plc(
         written = whole_optimizer(target, settings, ticks, profile)
         texts |= {f"{OPTIMIZER}/{name}": text for name, text in written.items()}
     texts |= {f"{GUARD}/{name}": text for name, text in output_guard(target, settings).items()}
+    if score:
+        texts[MANIFEST] = json.dumps({**parsed_json(texts[MANIFEST]), "bit_flips": scored(texts)}, indent=1)
     write_whole(folder, texts)
     return [folder / name for name in texts]
 

@@ -335,6 +335,11 @@ class ProcessFile(_Section):
     """SVG file with a drawing for the operator's page, beside the process file."""
 
     @property
+    def horizon_s(self) -> float:
+        """Of the prediction, in seconds."""
+        return self.prediction.decision_instants[-1] * self.tick_s * self.ticks_per_sample
+
+    @property
     def outside(self) -> tuple[LoadSection | DisturbanceSection, ...]:
         """The load, if there is one, and the other disturbances."""
         return (*((self.load,) if self.load else ()), *self.disturbances)

@@ -157,9 +157,8 @@ def _at_rest(file: ProcessFile, fmu: Fmu, wiring: Wiring) -> tuple[FmuSimulation
     u, w = operating_point(file)
     simulation = FmuSimulation(fmu, wiring, file.tick_s)
     simulation.put(u, w)
-    horizon_s = _horizon(file) * file.ticks_per_sample * file.tick_s
     spans = np.array([one.range[1] - one.range[0] for one in file.outputs])
-    windows = max(1, round(file.plant.rest_s / horizon_s)) if file.plant.rest_s else HORIZONS_TO_REST
+    windows = max(1, round(file.plant.rest_s / file.horizon_s)) if file.plant.rest_s else HORIZONS_TO_REST
     moved = spans
     for k in range(1, windows + 1):
         y = np.array([_sample(file, simulation) for _ in range(_horizon(file))])
@@ -171,9 +170,9 @@ def _at_rest(file: ProcessFile, fmu: Fmu, wiring: Wiring) -> tuple[FmuSimulation
             return simulation, replace(wiring, rest_ticks=k * _horizon(file) * file.ticks_per_sample)
     worst = int(np.argmax(moved / spans))
     raise UsageError(
-        f"{fmu.path}: does not come to rest with the inputs at their operating point: {file.outputs[worst].name} still "
-        f"moves by {moved[worst]:.3g} in {horizon_s:g} s after {windows * horizon_s:g} s; give other values of at, "
-        "plant.start nearer to rest, or a longer plant.rest_s"
+        f"{fmu.path}: does not come to rest with the inputs at their operating point: {file.outputs[worst].name} still"
+        f" moves by {moved[worst]:.3g} in {file.horizon_s:g} s after {windows * file.horizon_s:g} s; give other values"
+        " of at, plant.start nearer to rest, or a longer plant.rest_s"
     )
 
 

@@ -209,7 +209,10 @@ def _seconds(stamps: Frame, lines: Frame, table: Table, request: Request, said: 
     else:
         clear = texts.str.replace(r"(:\d\d),(?=\d)", r"\1.", regex=True)
         zoned = clear.str.contains(WITH_ZONE)
-        ways = [pd.to_datetime(clear, format="mixed", dayfirst=way, utc=True, errors="coerce") for way in (False, True)]
+        day = bool(clear.str.match(r"\d\d?\.\d").any())  # of 31.12.2026 it comes first, of others it may
+        ways = [
+            pd.to_datetime(clear, format="mixed", dayfirst=way, utc=True, errors="coerce") for way in (day, not day)
+        ]
         dates = min(ways, key=lambda way: (way.isna().sum(), np.ptp(way.dropna().astype("int64"))))
         if not zoned.any() and request.zone is not None:
             dates = dates.dt.tz_localize(None).dt.tz_localize(request.zone, ambiguous="NaT", nonexistent="NaT")

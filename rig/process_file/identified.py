@@ -81,8 +81,8 @@ class _Fit(NamedTuple):
     """Rms error of each output on the data held back, over its deviation there."""
 
 
-def identified(record: Record) -> Identified:
-    """Return the model that predicts a record best.
+def identified(record: Record, order: int = 0) -> Identified:
+    """Return the model that predicts a record best, or that of an order.
 
     Raises:
         UsageError: It is too short, or its inputs do not move enough, or together.
@@ -95,23 +95,34 @@ def identified(record: Record) -> Identified:
     pieces = [np.arange(len(u))[piece] for piece in record.pieces]
     used = [piece[: len(piece) - round(len(piece) * HELD_BACK)] for piece in pieces]
     past = _past(record, sum(map(len, used)))
-    seen = _states(u, y, used, past)
-    candidates = [_fitted(seen, u, y, pieces, used, order) for order in range(1, seen.rows.shape[1] + 1)]
-    errors = [float(np.sqrt((each.error**2).mean())) for each in candidates]
-    order = next(k for k, error in enumerate(errors, 1) if error <= max(WORTH * min(errors), EXACT))
-    whole = _fitted(_states(u, y, pieces, past), u, y, pieces, pieces, order)
+    error = np.zeros(len(y_scale))
+    if not order:
+        seen = _states(u, y, used, past)
+        candidates = [_fitted(seen, u, y, pieces, used, order) for order in range(1, seen.rows.shape[1] + 1)]
+        errors = [float(np.sqrt((each.error**2).mean())) for each in candidates]
+        order = next(k for k, error in enumerate(errors, 1) if error <= max(WORTH * min(errors), EXACT))
+        error = candidates[order - 1].error
+    states = _states(u, y, pieces, past)
+    whole = _fitted(states, u, y, pieces, pieces, min(order, states.rows.shape[1]))
     A, B = _continuous(whole.A, whole.B, record.period_s)
     rests = bool(np.linalg.eigvals(A).real.max() * record.period_s * len(u) < -1.0)
     return Identified(
         A, B / u_scale, whole.C * y_scale[:, np.newaxis], whole.constant * y_scale + y_mean, rests,
-        1.0 - candidates[order - 1].error,
+        1.0 - error,
     )  # fmt: skip
 
 
 def unexplained(A: Array, B: Array, C: Array, D: Array, record: Record) -> Array:
-    """Return what a model in continuous time leaves of a record: rms error of each output over its deviation.
+    """Return what a model in continuous time leaves of a record: rms error of each output over its deviation."""
+    left = record.outputs - simulated(A, B, C, D, record)
+    error: Array = np.sqrt((left**2).mean(axis=0)) / np.maximum(record.outputs.std(axis=0), 1e-12)
+    return error
 
-    Initial state and constants are those that leave least.
+
+def simulated(A: Array, B: Array, C: Array, D: Array, record: Record) -> Array:
+    """Return what a model in continuous time makes of the inputs of a record, shape (N, p).
+
+    Initial states and constants are those that leave least of the outputs.
     """
     n, m = B.shape
     u, scale = record.inputs - record.operating, np.maximum(record.outputs.std(axis=0), 1e-12)
@@ -120,8 +131,8 @@ def unexplained(A: Array, B: Array, C: Array, D: Array, record: Record) -> Array
     left = record.outputs - responses[:, :, q : q + n * m] @ at.B.ravel() - u @ D.T
     free = np.delete(responses, np.s_[q : q + n * m], axis=2) / scale[:, np.newaxis]
     unknowns = np.linalg.lstsq(free.reshape(-1, free.shape[2]), (left / scale).ravel())[0]
-    error: Array = np.sqrt(((left / scale - free @ unknowns) ** 2).mean(axis=0))
-    return error
+    made: Array = record.outputs - left + scale * (free @ unknowns)
+    return made
 
 
 def _check_moves(record: Record, deviations: Array) -> None:

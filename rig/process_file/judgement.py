@@ -11,6 +11,7 @@ from coldloop.number_text import ends_text, number_text
 from coldloop.process.declaration import Input, Output, Process
 from rig.plc_sizing.holding import NOTHING, digits_last_s, leaves_its_band, shortest_period_s, waiting
 from rig.process_file.bath import exchanged
+from rig.process_file.gain_intervals import LEVEL, half_widths
 from rig.process_file.making import Made
 
 Array = NDArray[np.float64]
@@ -38,10 +39,13 @@ def described(made: Made) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _values(names: tuple[str, ...], values: Array, units: tuple[str, ...]) -> str:
-    triples = zip(names, values, units, strict=True)
-    shown = (f"{n} {number_text(value if abs(value) > NOTHING else 0.0, 5)} {unit}" for n, value, unit in triples)
-    return "  ".join(map(str.rstrip, shown))
+def _values(names: tuple[str, ...], values: Array, units: tuple[str, ...], reach: Array | None = None) -> str:
+    """Return values with their units, and half their intervals where these are known."""
+    found = []
+    for k, (name, value, unit) in enumerate(zip(names, values, units, strict=True)):
+        within = f" +- {number_text(reach[k], 2)}" if reach is not None and k < len(reach) else ""
+        found.append(f"{name} {number_text(value if abs(value) > NOTHING else 0.0, 5)}{within} {unit}".rstrip())
+    return "  ".join(found)
 
 
 def _rest(made: Made) -> list[str]:
@@ -55,7 +59,7 @@ def _rest(made: Made) -> list[str]:
     sizes = (
         f"{process.name}: {counted}; "
         f"tick {process.tick_s:g} s, sampling period {process.tick_s * process.ticks_per_sample:g} s, horizon "
-        f"{process.decision_instants[-1] * process.tick_s * process.ticks_per_sample:g} s, {problem} variables"
+        f"{process.horizon_s:g} s, {problem} variables"
     )
     return [
         sizes,
@@ -79,18 +83,34 @@ def _modes(made: Made) -> list[str]:
 
 def _gains(made: Made) -> list[str]:
     m = made.model
-    horizon_s = made.process.decision_instants[-1] * made.process.tick_s * made.process.ticks_per_sample
+    horizon_s = made.process.horizon_s
     held = m.discretised(horizon_s)
     n = len(made.own_A)
     effects = np.column_stack([m.C @ held.B + m.D, m.C @ held.F + m.G, (m.C @ held.A)[:, n:]])
     names = (*m.input_names, m.load_name, *m.state_names[n:])
     units = (*m.input_units, m.load_unit, *m.state_units[n:])
+    reach = _reaches(made, horizon_s)
     return [
-        f"after {horizon_s:g} s of +1 {unit} {name}: ".replace("  ", " ")
-        + _values(m.output_names, column, m.output_units)
-        for name, unit, column in zip(names, units, effects.T, strict=True)
-        if column.any()
+        *(
+            [f"gains      all within +- with a probability of {100 * LEVEL:g} %, by the noise of the record"]
+            if reach
+            else []
+        ),
+        *(
+            f"after {horizon_s:g} s of +1 {unit} {name}: ".replace("  ", " ")
+            + _values(m.output_names, column, m.output_units, reach.get(name))
+            for name, unit, column in zip(names, units, effects.T, strict=True)
+            if column.any()
+        ),
     ]
+
+
+def _reaches(made: Made, horizon_s: float) -> dict[str, Array]:
+    """Return half the intervals of what each input of a record does to the outputs, by its name."""
+    if made.linear.record is None:
+        return {}
+    record, found = made.linear.record
+    return dict(zip(record.input_names, half_widths(record, found, horizon_s).T, strict=True))
 
 
 def _rank_deficit(matrix: Array) -> int:
@@ -159,7 +179,11 @@ def _inverse_responses(made: Made) -> list[str]:
     if (poles.real < -NOTHING).all():
         ends = m.D - m.C[:, :n] @ np.linalg.solve(made.own_A, m.B[:n])
     found = []
-    for i, j in ((m.output_names.index(one.name), j) for one in process.banded for j in range(len(m.input_names))):
+    seen = np.abs(moves).max(axis=0) * [one.high - one.low for one in process.inputs]
+    for one, j in ((one, j) for one in process.banded for j in range(len(m.input_names))):
+        i = m.output_names.index(one.name)
+        if seen[i, j] < one.noise:
+            continue
         share = moves[:, i, j] / (ends[i, j] or np.inf)
         far = np.flatnonzero(np.abs(share) > INVERSE)
         if far.size and share[far[0]] < 0.0:
@@ -173,17 +197,16 @@ def _inverse_responses(made: Made) -> list[str]:
 def _unstable(made: Made, growth: float) -> list[str]:
     """Return how long a plant with a mode that grows can wait for an update, and what its horizon may be."""
     process, limits = made.process, np.array([[one.low, one.high, one.rate] for one in made.process.inputs]).T
-    horizon_s = process.decision_instants[-1] * process.tick_s * process.ticks_per_sample
     single, double = (digits_last_s(growth, real) for real in (np.float32, np.float64))
     period_s = shortest_period_s(0.25 * (process.share("preparation") + process.share("ode")), process.tick_s)
     needs = waiting(made.model, process, limits)
     held = needs and needs.text(period_s, "the shortest one of the reference PLC")
     found = [f"unstable: a mode grows with {growth:.3g} /s and doubles in {log(2.0) / growth:.3g} s; {held}"]
     found += [f"fail-safe: {text}" for text in (unheld(process.banded, made.own_A),) if text]
-    if horizon_s > single:
+    if process.horizon_s > single:
         found.append(
             f"horizon: beyond {single:.3g} s the mode leaves the problem no digits in single precision, beyond "
-            f"{double:.3g} s none in double; it is {horizon_s:g} s: shorten prediction.decision_instants"
+            f"{double:.3g} s none in double; it is {process.horizon_s:g} s: shorten prediction.decision_instants"
         )
     return found
 
@@ -196,7 +219,7 @@ def _warnings(made: Made) -> list[str]:
     fastest, slowest = -poles.real.min(), -poles.real.max()
     if poles.real.max() > NOTHING:
         found += _unstable(made, float(poles.real.max()))
-    elif slowest > NOTHING and process.decision_instants[-1] * sample_s * slowest < 1.0:
+    elif slowest > NOTHING and process.horizon_s * slowest < 1.0:
         found.append(f"horizon: it ends before the slowest mode, {1 / slowest:.3g} s, has moved much")
     fast = poles[(poles.imag * sample_s > np.pi) & (-poles.real * sample_s < 3.0)].imag  # 5 % of them are left
     found += [f"sampling: the oscillation of {2 * np.pi / w:.3g} s is faster than two sampling periods" for w in fast]
@@ -209,14 +232,14 @@ def _warnings(made: Made) -> list[str]:
                 f"band: {output.name} rests at {number_text(value, 5)}, its band is {ends_text(band.low, band.high)}"
             )
     rows = [m.output_names.index(output.name) for output in process.banded]
-    reach = m.discretised(process.decision_instants[-1] * sample_s).B * [one.scale for one in process.inputs]
+    reach = m.discretised(process.horizon_s).B * [one.scale for one in process.inputs]
     effect = (m.C[rows] @ reach) / [[band.high - band.low] for band in process.bands]
     if _rank_deficit(effect):
         found.append("controllability: the inputs do not move the outputs with a band independently within the horizon")
     if made.linear.error > ROUGH:
         found.append(f"kink: derivatives differ by {made.linear.error:.1e} with the step; the model holds for one side")
     if process.bath is not None:
-        found += exchanged(m, process.bath, process.decision_instants[-1] * sample_s)
+        found += exchanged(m, process.bath, process.horizon_s)
     found += [f"loop: {text}" for text in _loops(made, effect)]
     found += _inverse_responses(made)
     found += [f"dead time: {text}" for text in _dead_times(made)]

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
 from rig.process_file.declaration import ProcessFile
+from rig.process_file.identified import Identified, Record
 
 Array = NDArray[np.float64]
 
@@ -43,6 +44,8 @@ class Linearised(NamedTuple):
     """Of the derivatives: largest difference from those with steps twice as wide, over the largest of each column."""
     notes: tuple[str, ...] = ()
     """What there is to say of how it was found, a line each."""
+    record: tuple[Record, Identified] | None = None
+    """What it was identified from, if it was, and what was found there."""
 
 
 def operating_point(file: ProcessFile) -> tuple[Array, Array]:

@@ -78,8 +78,7 @@ def _by_record(file: ProcessFile, plant: Linearised, path: Path) -> Linearised:
 
 def _gains_compared(file: ProcessFile, plant: Linearised, model: Linearised) -> list[str]:
     """Return which gains of a record's model, after the horizon, are far from those of the plant that it is for."""
-    horizon_s = file.prediction.decision_instants[-1] * file.tick_s * file.ticks_per_sample
-    true, found = (one.C @ discretise(one.A, one.B, one.F[:, 0], horizon_s).B + one.D for one in (plant, model))
+    true, found = (one.C @ discretise(one.A, one.B, one.F[:, 0], file.horizon_s).B + one.D for one in (plant, model))
     seen = np.abs(true) > SEEN * np.abs(true).max(axis=1, keepdims=True)
     return [
         f"warning    gain: of {file.outputs[i].name} by {file.inputs[j].name} {found[i, j]:.3g}, of the plant itself "

@@ -44,7 +44,7 @@ def from_step_test(file: ProcessFile, path: Path) -> Linearised:
         if one not in moved
     ]
     model = model_identified(file, found, _outputs(file, found), moved)
-    return model._replace(notes=(*model.notes, *notes))
+    return model._replace(notes=(*model.notes, *notes), record=(record, found))
 
 
 def record_compared(file: ProcessFile, path: Path, plant: Linearised, model: Linearised) -> list[str]:

@@ -110,8 +110,8 @@ class Machine:
         if written is None:
             return {"REAL": np.float32(0), "LREAL": np.float64(0), "DINT": 0, "BOOL": False}[kind]
         match kind, written:
-            case ("REAL", ("real", str(text))) | ("LREAL", ("lreal", str(text))):
-                return REALS[text]
+            case ("REAL", ("real" | "untyped", str(text))) | ("LREAL", ("lreal" | "untyped", str(text))):
+                return REALS[f"{kind}#{text.rpartition('#')[2]}"]
             case "DINT", ("int", str(text)):
                 return int(text)
             case "DINT", ("operation", "-", ("int", str(text))):
@@ -138,7 +138,7 @@ class Translation:
             if variable.section == "VAR_EXTERNAL":
                 there = library.globals.get(variable.name)
                 assert there, variable.name
-                assert (there.type, there.constant) == (variable.type, variable.constant), variable.name
+                assert there.type == variable.type, variable.name
 
     def text(self) -> str:
         """Return the Python function."""
@@ -198,6 +198,8 @@ class Translation:
         if variable:
             assert not variable.constant, f"{name} is constant"
             assert variable.section != "VAR_INPUT", f"{name} is an input"
+            held = self.library.globals.get(name) if variable.section == "VAR_EXTERNAL" else None
+            assert held is None or held.value is None, f"{name} has an initial value: nothing writes to it"
         return self.typed(("variable", name))[0]
 
     def assignment(self, target: object, value: tuple[str, str]) -> str:

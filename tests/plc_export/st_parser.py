@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 TOKEN: Final = re.compile(r"""
-    (?P<space>\s+|\(\*.*?\*\)) | (?P<lreal>LREAL\#[+-]?\d+\.\d+(?:E[+-]?\d+)?)
-    | (?P<real>REAL\#[+-]?\d+\.\d+(?:E[+-]?\d+)?) | (?P<time>T\#\d+ms)
+    (?P<space>\s+|\(\*.*?\*\)) | (?P<lreal>LREAL\#\d+\.\d+(?:E[+-]?\d+)?)
+    | (?P<real>REAL\#\d+\.\d+(?:E[+-]?\d+)?) | (?P<untyped>\d+\.\d+E[+-]\d+) | (?P<time>T\#\d+ms)
     | (?P<int>\d+(?!\d|\.\d)) | (?P<name>[A-Za-z][A-Za-z0-9_]*) | (?P<sign>:=|<>|<=|>=|\.\.|[-+*/=<>()\[\],;:.])
 """, re.VERBOSE | re.DOTALL)  # fmt: skip
 SECTIONS: Final = ("VAR_INPUT", "VAR_IN_OUT", "VAR_OUTPUT", "VAR_EXTERNAL", "VAR_GLOBAL", "VAR")
@@ -154,7 +154,7 @@ class Parser:
 
     def _section(self) -> Iterator[Variable]:
         section = self.take(*SECTIONS)
-        constant = self.skip("CONSTANT")
+        constant = section == "VAR" and self.skip("CONSTANT")
         while not self.skip("END_VAR"):
             name = self.name()
             self.take(":")
@@ -165,12 +165,20 @@ class Parser:
 
     def _initial(self) -> object:
         if not self.skip("["):
-            return self._unary()
-        values = [self._unary()]
+            return self._value()
+        values = [self._value()]
         while self.skip(","):
-            values.append(self._unary())
+            values.append(self._value())
         self.take("]")
         return values
+
+    def _value(self) -> Tree:
+        """Return an initial value: a typed literal, or a negative one without type."""
+        kind, text = self.tokens[self.at + 1]
+        if kind != "untyped":
+            return self._unary()
+        self.take("-")
+        return "untyped", f"-{self.take(text)}"
 
     # -- statements ----------------------------------------------------------------------------------------------------
 

@@ -116,7 +116,7 @@ class Exported:
             values["cl_weights"] = f"cl_reals_{N} := [{listed}]"
         globals_ = "".join(f"{name} : {value};" for name, value in values.items())
         functions = files("rig.plc_export").joinpath("structured_text/functions.st").read_text(encoding="ascii")
-        configuration = f"CONFIGURATION c VAR_GLOBAL CONSTANT {globals_} END_VAR END_CONFIGURATION"
+        configuration = f"CONFIGURATION c VAR_GLOBAL {globals_} END_VAR END_CONFIGURATION"
         self.machine = Machine(printer.types(), functions, blocks, configuration)
         self.instance = self.machine.instance(block_name(self.block))
 

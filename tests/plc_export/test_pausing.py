@@ -41,7 +41,7 @@ class Paused:
         printer.literal(0.0)
         blocks = "\n".join(map(printer.block, map(made.block, lowering.blocks)))
         literals = f"cl_literals : cl_literals_table := [{', '.join(printer.literals)}]"
-        configuration = f"CONFIGURATION c VAR_GLOBAL CONSTANT {literals}; END_VAR END_CONFIGURATION"
+        configuration = f"CONFIGURATION c VAR_GLOBAL {literals}; END_VAR END_CONFIGURATION"
         self.machine = Machine(printer.types(), template("structured_text/functions.st"), blocks, configuration)
         self.instance = self.machine.instance(block_name(block))
         names = interface_names(made.block(block), printer.type)

@@ -177,7 +177,7 @@ class InText:
         state = dict(state_types(("m", "state"), type_of(empty())))
         lowering = Lowering({*values, *split, *state}, split)
         lowering.block(found, {"c": Record(("c",)), "m": Record(("m", "state"))})
-        printer = StructuredTextPrinter(types_in(values), state)
+        printer = StructuredTextPrinter({**types_in(values), **state})
         blocks = "\n".join(map(printer.block, lowering.blocks))
         globals_ = section("VAR_GLOBAL", {global_name(path): printer.type(kind) for path, kind in state.items()})
         lists = configuration(iter([*Constants(values, printer).lists(), globals_]))

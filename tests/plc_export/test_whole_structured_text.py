@@ -7,13 +7,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from coldloop.process.limits import InputLimits
 from optimizer_plc.program import OptimizerProgram
+from rig.plc_export.kernels.golden_calls import golden_calls
+from rig.plc_export.kernels.guard_program import GuardKernels
 from rig.plc_export.kernels.recorded_updates import integers_of
 from rig.plc_export.structured_text.constants import LARGEST_LIST
+from rig.plc_export.structured_text.guard_files import GuardText
 from rig.plc_export.structured_text.optimizer_files import OptimizerText
 from rig.plc_export.structured_text.plcopen import plcopen_xml
+from rig.plc_export.structured_text.printer import StructuredTextPrinter
 from rig.plc_export.structured_text.register_table import register_table
-from tests.plc_export.matiec import NEEDS_MATIEC, self_test
+from tests.plc_export.matiec import NEEDS_MATIEC, joined, self_test
 from tests.plc_export.recorded_optimizers import OPTIMISERS, disturbed_updates, recorded_updates, recorder
 from tests.plc_export.st_interpreter import Machine
 from tests.plc_export.st_parser import parsed
@@ -21,7 +26,7 @@ from tests.plc_export.test_plcopen import ET, SCHEMA, text_of
 
 FEW = 100
 """Ticks: the interpreter takes a second for an update or two."""
-NUMBER = re.compile(r"REAL#-?\d\.\d{9}E[+-]\d\d")
+NUMBER = re.compile(r"(REAL#|-)\d\.\d{9}E[+-]\d\d")
 
 pytestmark = [
     pytest.mark.usefixtures("compiles"),
@@ -63,7 +68,8 @@ def test_a_changed_bit_is_found_wherever_it_is(texts: dict[str, str]) -> None:
     for name, what in (("configuration.st", 4), ("golden.st", 5)):
         number = list(NUMBER.finditer(texts[name]))[-7]
         after = np.nextafter(np.float32(number[0].removeprefix("REAL#")), np.float32(np.inf))
-        changed = f"{texts[name][: number.start()]}REAL#{after:.9E}{texts[name][number.end() :]}"
+        written, text = StructuredTextPrinter({}).number(after), texts[name]
+        changed = f"{text[: number.start()]}{written}{text[number.end() :]}"
         test = run(Machine(*{**texts, name: changed}.values()).instance("cl_self_test"))
         assert (test.what, test.passed) == (what, False)
 
@@ -171,7 +177,14 @@ def test_a_restart_ends_what_is_under_way(machine: Machine) -> None:
 @pytest.mark.parametrize("assignments", OPTIMISERS.values(), ids=OPTIMISERS)
 @pytest.mark.parametrize("level", ["-O0", "-O2"])
 def test_the_self_test_passes_in_native_code(tmp_path: Path, assignments: tuple[str, ...], level: str) -> None:
-    assert self_test(tmp_path, export(1200, *assignments).files(), level) == "1 1 0"
+    assert self_test(tmp_path, export(1200, *assignments).files().values(), level) == "1 1 0"
+
+
+@NEEDS_MATIEC
+@pytest.mark.night
+def test_optimiser_and_output_guard_are_one_project_in_native_code(tmp_path: Path, texts: dict[str, str]) -> None:
+    guard = GuardText(GuardKernels(InputLimits()), golden_calls(InputLimits())).files()
+    assert self_test(tmp_path, joined(texts, guard), "-O2") == "1 1 0\n1 1 0"
 
 
 @NEEDS_MATIEC
@@ -179,7 +192,8 @@ def test_the_self_test_passes_in_native_code(tmp_path: Path, assignments: tuple[
 @pytest.mark.parametrize("assignments", OPTIMISERS.values(), ids=OPTIMISERS)
 def test_half_an_hour_of_updates_has_the_same_bits_in_native_code(tmp_path: Path, assignments: tuple[str, ...]) -> None:
     golden = recorded_updates(7200, "e", *assignments)
-    assert self_test(tmp_path, OptimizerText(recorder(*assignments).optimizer, golden).files(), "-O2") == "1 1 0"
+    texts = OptimizerText(recorder(*assignments).optimizer, golden).files()
+    assert self_test(tmp_path, texts.values(), "-O2") == "1 1 0"
 
 
 @NEEDS_MATIEC
@@ -189,13 +203,14 @@ def test_whatever_arrives_is_answered_as_in_python_in_native_code(tmp_path: Path
     golden = [update for seed in range(4) for fixed_ticks in (0, 10)
               for update in disturbed_updates(source, seed, fixed_ticks, *assignments)]  # fmt: skip
     assert any(np.isnan(each.update.y).any() for each in golden)
-    assert self_test(tmp_path, OptimizerText(recorder(*assignments).optimizer, golden).files(), "-O2") == "1 1 0"
+    texts = OptimizerText(recorder(*assignments).optimizer, golden).files()
+    assert self_test(tmp_path, texts.values(), "-O2") == "1 1 0"
 
 
 @pytest.mark.parametrize("assignments", OPTIMISERS.values(), ids=OPTIMISERS)
 def test_no_list_of_constants_is_larger_than_tools_take(assignments: tuple[str, ...]) -> None:
     made = export(FEW, *assignments)
-    lists = made.files()["configuration.st"].split("VAR_GLOBAL CONSTANT")[1:]
+    lists = made.files()["configuration.st"].split("VAR_GLOBAL\n")[1:]
     assert len(lists) > 4
     assert all(4 * len(NUMBER.findall(each)) <= LARGEST_LIST for each in lists)
     assert made.sizes().constants > 4 * LARGEST_LIST

@@ -144,6 +144,9 @@ SHAPES: Final[dict[str, tuple[str | bytes, dict[str, Any]]]] = {
     "zone by option, spring": (text(stamped(NO_ZONE)), CALL),
     "no zone at all": (text(stamped(strftime("%Y-%m-%d %H:%M:%S"))), {}),
     "fractions of a second": (text(stamped(lambda date: (date + timedelta(milliseconds=250)).isoformat(" "))), {}),
+    "day before month": (
+        text(stamped(strftime("%d.%m.%Y %H:%M:%S"), datetime(2026, 3, 2, 0, 50, tzinfo=UTC))), {"zone": "UTC"},
+    ),
     "German dates": (text(map(commas, stamped(strftime("%d.%m.%Y %H:%M:%S"))), separator=";"), {}),  # type: ignore[arg-type]
     "American dates": (text(stamped(strftime("%m/%d/%Y %I:%M:%S %p"))), {}),
     "names of months": (text(stamped(strftime("%d-%b-%y %H:%M:%S"))), {}),
@@ -195,6 +198,7 @@ SHAPES: Final[dict[str, tuple[str | bytes, dict[str, Any]]]] = {
 TOLD: Final = {
     "semicolons, decimal commas": "semicolons between columns, decimal commas",
     "Latin-1": "read as Latin-1",
+    "day before month": "times      2026-03-02 00:50:00+00:00 to 2026-03-02",
     "no zone at all": "of an unknown zone",
     "double lines": "92 readings at the time of a later one",
     "gaps": "pieces without gaps: 0 to 250 s, 350 to 600 s, 660 to 995 s",

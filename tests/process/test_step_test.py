@@ -1,5 +1,6 @@
 """A step test as the source of a plant: what is found in a record, against the system that made it."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ColdloopError
 from coldloop.process.lti_model import discretise
+from rig.process_file.gain_intervals import gains_after, half_widths
 from rig.process_file.identified import Record, identified
 from rig.process_file.judgement import described
 from rig.process_file.making import Made, made_from
@@ -116,7 +118,24 @@ def test_noise_leaves_gains_within_some_percent_and_the_slow_poles_near(tmp_path
     text = described(found)
     assert "of the last third, held back, it explains  y 9" in text
     assert "modes " in text
-    assert "+1  a: y " in text.replace("+1 a", "+1  a")
+    assert "gains      all within +- with a probability of 99 %" in text
+    (widths,) = re.findall(r"after 300 s of \+1 a: y \S+ \+- (\S+)  z \S+ \+- (\S+)\n", text)
+    assert [float(each) for each in widths] == pytest.approx([0.02, 0.015], rel=0.6)
+
+
+@pytest.mark.night
+@pytest.mark.parametrize(("noise", "memory", "samples"), [(0.05, 0.0, 600), (0.1, 0.8, 400), (0.5, 0.0, 400)])
+def test_joint_intervals_of_gains_cover_them(noise: float, memory: float, samples: int) -> None:
+    """Noise is white, or follows itself with a factor from sample to sample."""
+    true, inside, draws = C @ discretise(A, B, np.zeros(3), 300.0).B, 0, 200
+    for seed in range(draws):
+        u, errors = steps(samples, seed=1000 + seed), np.random.default_rng(seed).standard_normal((samples, 2))
+        for k in range(1, len(errors)):
+            errors[k] = memory * errors[k - 1] + np.sqrt(1.0 - memory**2) * errors[k]
+        record = Record(PERIOD_S, u, answered(u) + noise * errors, np.zeros(2), ("a", "b"), "here")
+        found = identified(record)
+        inside += bool((np.abs(gains_after(found, 300.0) - true) <= half_widths(record, found, 300.0)).all())
+    assert inside >= 0.98 * draws
 
 
 def test_a_record_in_which_inputs_step_once_each_is_enough() -> None:

@@ -34,6 +34,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
                         " READMEs say what takes how long there, and what does not fit")  # fmt: skip
     parser.add_argument("--ticks", type=positive_count, metavar="N", help="with plc: length of the run whose problems"
                         " are the golden vectors (default: 1440, six minutes)")  # fmt: skip
+    parser.add_argument("--score", action="store_true", help="with plc --target c: compile it (gcc), change single bits"
+                        " of its tables in the linked programs, and put into the manifest which the self-tests miss;"
+                        " takes minutes")  # fmt: skip
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -49,8 +52,8 @@ def _recorded_run(options: argparse.Namespace) -> list[Path]:
 
     if options.ticks is not None:
         raise UsageError("--ticks: is for coldloop export plc --target")
-    if options.config or options.assignments or options.plc:
-        raise UsageError("--config, --set and --plc: are for coldloop export plc --target")
+    if options.config or options.assignments or options.plc or options.score:
+        raise UsageError("--config, --set, --plc and --score: are for coldloop export plc --target")
     return export(options.run, options.kind, options.out or options.run, force=options.force)
 
 
@@ -63,8 +66,10 @@ def _solver(options: argparse.Namespace) -> list[Path]:
         raise UsageError(f"{options.run}: has no target; coldloop export plc --target {options.target} --out FOLDER")
     if options.out is None or options.force:
         raise UsageError("export plc: name a new folder with --out; --force does not replace one")
+    if options.score and options.target != "c":
+        raise UsageError(f"--score: is for --target c; no linker makes a program of {options.target} here")
     profile = find_profile(options.plc) if options.plc else None
-    return export_plc(options.target, options.ticks, options.out, _settings(options), profile)
+    return export_plc(options.target, options.ticks, options.out, _settings(options), profile, score=options.score)
 
 
 def _settings(options: argparse.Namespace) -> "Settings":

@@ -35,6 +35,7 @@ class ConstantRecords:
                      for name, part in zip(value._fields, value, strict=True))  # fmt: skip
             return f"{{{', '.join(parts)}}}"
         array = np.asarray(value)
+        array = array if array.size else np.zeros(1, array.dtype)  # C has no array without elements
         real = array.dtype.kind == "f"
         self._sum = crc(array.astype(self.real if real else np.int32), self._sum)
         function, kind = ("sum_of_reals", self.type) if real else ("sum_of_integers", "int32_t")

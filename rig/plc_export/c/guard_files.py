@@ -10,7 +10,7 @@ from coldloop.registers.control_plc import SEQUENCE_ROWS
 from rig.plc_export.c.constants import ConstantRecords
 from rig.plc_export.c.optimizer_files import size_of
 from rig.plc_export.c.printer import Printer
-from rig.plc_export.c.text import GENERATED, KernelFiles
+from rig.plc_export.c.text import GENERATED, KernelFiles, golden_files
 from rig.plc_export.kernels.golden_calls import GoldenCall, tables_of
 from rig.plc_export.kernels.guard_program import GuardKernels
 from rig.plc_export.kernels.ode_program import crc
@@ -62,16 +62,11 @@ class GuardExport:
         return {"limits.h": header, "limits.c": source}
 
     def _golden_files(self) -> dict[str, str]:
-        single = Printer(np.float32)
         sum_ = 0
         for values in self._tables.values():
             sum_ = crc(values.view(np.int32), sum_)
         declared = {f"golden_{name}[{len(values)}][{values.shape[1]}]": values
                     for name, values in self._tables.items()}  # fmt: skip
-        externs = "".join(f"extern const {single.scalar(values)} {name};\n" for name, values in declared.items())
         integers, _, rows = self._tables.values()
-        header = (f"{GENERATED}#include <stdint.h>\n\n#define N_GOLDEN {len(integers)}\n"
-                  f"#define N_GOLDEN_ROWS {len(rows)}\n#define GOLDEN_INTEGERS {integers.shape[1]}\n"
-                  f"#define SUM_OF_GOLDEN UINT32_C({sum_})\n{externs}")  # fmt: skip
-        arrays = "\n".join(single.tabulated(name, values) for name, values in declared.items())
-        return {"golden.h": header, "golden.c": f'{GENERATED}#include <math.h>\n\n#include "golden.h"\n\n{arrays}'}
+        return golden_files(Printer(np.float32), sum_, declared, N_GOLDEN=len(integers), N_GOLDEN_ROWS=len(rows),
+                            GOLDEN_INTEGERS=integers.shape[1])  # fmt: skip

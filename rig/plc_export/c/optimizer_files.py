@@ -13,7 +13,7 @@ from optimizer_plc.program import OptimizerProgram
 from rig.plc_export.c.constants import ConstantRecords
 from rig.plc_export.c.printer import Printer
 from rig.plc_export.c.solver_files import stack
-from rig.plc_export.c.text import GENERATED, KernelFiles
+from rig.plc_export.c.text import GENERATED, KernelFiles, golden_files
 from rig.plc_export.kernels.ode_program import crc
 from rig.plc_export.kernels.optimizer_program import OptimizerKernels
 from rig.plc_export.kernels.recorded_updates import GoldenUpdate, integers_of, reals_of
@@ -137,13 +137,8 @@ const {begin} starts[{len(self.kernels.rules)}] = {{
             f"golden_reals[{len(reals)}][GOLDEN_REALS]": reals,
             f"golden_rows[{len(rows)}][{rows.shape[1]}]": rows,
         }
-        externs = "".join(f"extern const {self.printer.scalar(each)} {name};\n" for name, each in declared.items())
-        header = (f"{GENERATED}#include <stdint.h>\n\n#define N_GOLDEN {len(integers)}\n"
-                  f"#define N_GOLDEN_ROWS {len(rows)}\n"
-                  f"#define GOLDEN_INTEGERS {integers.shape[1]}\n#define GOLDEN_REALS {reals.shape[1]}\n"
-                  f"#define SUM_OF_GOLDEN UINT32_C({sum_})\n{externs}")  # fmt: skip
-        arrays = "\n".join(self.printer.tabulated(name, values) for name, values in declared.items())
-        return {"golden.h": header, "golden.c": f'{GENERATED}#include <math.h>\n\n#include "golden.h"\n\n{arrays}'}
+        return golden_files(self.printer, sum_, declared, N_GOLDEN=len(integers), N_GOLDEN_ROWS=len(rows),
+                            GOLDEN_INTEGERS=integers.shape[1], GOLDEN_REALS=reals.shape[1])  # fmt: skip
 
 
 def size_of(record: RecordType | StructType, real: int = 4) -> int:

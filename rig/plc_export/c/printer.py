@@ -131,8 +131,9 @@ class Printer(TreePrinter):
         return f"{storage}const {self.scalar(values)} {name}[{listed.size}] = {{\n{rows}}};\n"
 
     def tabulated(self, name: str, values: Array) -> str:
-        """Return the definition of a constant array of rows; its name has the lengths."""
-        rows = "".join(f"    {{{', '.join(self._rows(row, 6))}}},\n" for row in values)
+        """Return the definition of a constant array, of numbers or of rows; its name has the lengths."""
+        lines = (f"{{{', '.join(self._rows(row, 6))}}}" for row in values) if values.ndim > 1 else self._rows(values, 6)
+        rows = "".join(f"    {line},\n" for line in lines)
         return f"const {self.scalar(values)} {name} = {{\n{rows}}};\n"
 
     def _rows(self, values: Array, width: int) -> Iterator[str]:

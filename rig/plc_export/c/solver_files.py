@@ -11,7 +11,7 @@ from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.interface import Costs
 from optimizer_plc.solvers.ode import OdeMethod
 from rig.plc_export.c.printer import Printer, identifier
-from rig.plc_export.c.text import GENERATED, KernelFiles
+from rig.plc_export.c.text import GENERATED, KernelFiles, golden_files
 from rig.plc_export.kernels.ode_program import PER_PROBLEM, OdeProgram, crc, leaves
 from rig.plc_export.kernels.recorded_problems import GoldenVector, arrays_in
 from rig.plc_export.templates import template
@@ -147,16 +147,9 @@ uint32_t sum_of_integers(uint32_t sum, const volatile int32_t *values, int32_t c
         )
         none = "\n".join(f"    before.{name} = INFINITY;" for name in Costs._fields)
         vectors = "\n".join(f"    qp.{identifier(name)} = {identifier(name)};" for name in PER_PROBLEM)
-        head = template("c/problem.c")
-        bytes_ = template("c/sums.c")
-        body = {
-            "SUMS_OF_BYTES": bytes_,
-            "SUMS": sums,
-            "METHOD": f"{matrices}\n{settings}",
-            "BEFORE": none,
-            "VECTORS": vectors,
-        }
-        return self._filled(head, body)
+        body = {"SUMS_OF_BYTES": template("c/sums.c"), "SUMS": sums, "METHOD": f"{matrices}\n{settings}",
+                "BEFORE": none, "VECTORS": vectors}  # fmt: skip
+        return self._filled(template("c/problem.c"), body)
 
     def _tables(self) -> str:
         arrays = "\n".join(self.printer.array(name, values, "") for name, values in self._constants().items())
@@ -172,17 +165,11 @@ uint32_t sum_of_integers(uint32_t sum, const volatile int32_t *values, int32_t c
             "costs": np.array([each.answer.costs for each in vectors]),
             "iterations": np.array([each.answer.iterations for each in vectors]),
         }  # fmt: skip
-        declared = "".join(
-            f"extern const {self.printer.scalar(values)} golden_{name}[{values.size}];\n"
-            for name, values in stacked.items()
-        )
         sum_ = 0
         for values in stacked.values():
             sum_ = crc(values, sum_)
-        header = (f"{GENERATED}#include <stdint.h>\n\n#define N_GOLDEN {len(vectors)}\n"
-                  f"#define SUM_OF_GOLDEN UINT32_C({sum_})\n{declared}")  # fmt: skip
-        arrays = "\n".join(self.printer.array(f"golden_{name}", values, "") for name, values in stacked.items())
-        return {"golden.h": header, "golden.c": f'{GENERATED}#include <math.h>\n\n#include "golden.h"\n\n{arrays}'}
+        declared = {f"golden_{name}[{values.size}]": values.ravel() for name, values in stacked.items()}
+        return golden_files(self.printer, sum_, declared, N_GOLDEN=len(vectors))
 
     def _self_test(self) -> str:
         return self._filled(template("c/self_test.c"), {})

@@ -1,9 +1,9 @@
 """What a C source has besides its kernels: helpers, and the types of records."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
-from rig.plc_export.c.printer import Printer, identifier
+from rig.plc_export.c.printer import Array, Printer, identifier
 from rig.plc_export.tree.nodes import Function, Kind, RecordType, RowsType, StructType, Type
 
 GENERATED: Final = "/* Written by Coldloop from the kernels of its optimiser; changes belong there. */\n"
@@ -71,6 +71,15 @@ extern const {self._real} literals[N_LITERALS];
         """Return the definition of the table of literals, for a file without kernels."""
         listed = "".join(f"    {each},\n" for each in self._printer.literals)
         return f"const {self._real} literals[N_LITERALS] = {{\n{listed}}};\n"
+
+
+def golden_files(printer: Printer, sum_: int, tables: Mapping[str, Array], **sizes: int) -> dict[str, str]:
+    """Return the files of golden vectors: tables by name with lengths, the sum over them, and sizes by name."""
+    defined = "".join(f"#define {name} {size}\n" for name, size in sizes.items())
+    externs = "".join(f"extern const {printer.scalar(values)} {name};\n" for name, values in tables.items())
+    arrays = "\n".join(printer.tabulated(name, values) for name, values in tables.items())
+    return {"golden.h": f"{GENERATED}#include <stdint.h>\n\n{defined}#define SUM_OF_GOLDEN UINT32_C({sum_})\n{externs}",
+            "golden.c": f'{GENERATED}#include <math.h>\n\n#include "golden.h"\n\n{arrays}'}  # fmt: skip
 
 
 def helpers(real: str, kernels: str) -> str:

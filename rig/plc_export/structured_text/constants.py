@@ -23,7 +23,9 @@ LEAST_EXPONENT: Final = -1100
 
 
 class Constants:
-    """What is written as `VAR_GLOBAL CONSTANT`: the literals of a printer, and these.
+    """What nothing writes to, as `VAR_GLOBAL`: the literals of a printer, and these.
+
+    Not every tool takes `VAR_EXTERNAL CONSTANT`, which would have to go with `VAR_GLOBAL CONSTANT`.
 
     Args:
         values: By the fields that lead to them.
@@ -75,11 +77,11 @@ class Constants:
             if size > LARGEST_LIST:
                 raise UnfitKernelError(f"{name}: {size} bytes, and a list of constants has at most {LARGEST_LIST}")
             if size > room:
-                yield section("VAR_GLOBAL CONSTANT", listed)
+                yield section("VAR_GLOBAL", listed)
                 listed, room = {}, LARGEST_LIST
             listed[name] = f"{kind} := {value}"
             room -= size
-        yield section("VAR_GLOBAL CONSTANT", listed)
+        yield section("VAR_GLOBAL", listed)
 
     def configuration(self, *more: str) -> str:
         """Return the configuration with these lists, more of them, and room for the verdict of the self-test."""
@@ -89,7 +91,7 @@ class Constants:
     def sum(self) -> int:
         """Return the sum over all of them that the self-test computes."""
         double = not self.printer.single
-        sum_ = sum_of(np.array([float(each.partition("#")[2]) for each in self.printer.literals]), double=double)
+        sum_ = sum_of(np.array([float(each.rpartition("#")[2]) for each in self.printer.literals]), double=double)
         for values in self.values.values():
             sum_ = sum_of(values if values.size else np.zeros(1), sum_, double=double)
         return sum_

@@ -67,7 +67,7 @@ class GuardText:
         constants |= {("c", f"golden_{name}"): values for name, values in self._tables.items()}
         state = type_of(beginning(kernels.limits, kernels.limits.low))
         self.state = {**dict(state_types(STATE, state)), **dict(state_types(TWIN, state)), BEGUN: Kind.BOOL}
-        self.printer = StructuredTextPrinter(types_in(constants), self.state, np.float64)
+        self.printer = StructuredTextPrinter({**types_in(constants), **self.state}, np.float64)
         lowering = Lowering({*constants, *self.state})
         self.entries = [
             lowering.block(each, {one.name: PLACES[one.name] for one in each.parameters if one.name in PLACES})

@@ -86,7 +86,7 @@ class OptimizerText:
         constants, split = in_pieces(constants_of(kernels))
         self.state = {**dict(state_types(STATE, type_of(optimizer.state))), FIXED_TICKS: Kind.INT, BEGUN: Kind.BOOL,
                       JOBS: Kind.INT, JOB: Kind.INT}  # fmt: skip
-        self.printer = StructuredTextPrinter(types_in(constants), self.state)
+        self.printer = StructuredTextPrinter({**types_in(constants), **self.state})
         lowering = Lowering({*constants, *split, *self.state}, split)
         of_session, periods = Name(Kind.INT, dotted(FIXED_TICKS)), len(kernels.rules)
         places: dict[str, Place] = {

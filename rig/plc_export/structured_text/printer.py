@@ -47,7 +47,6 @@ FUNCTIONS: Final = {
     "//": f"{PREFIX}floor_div",
 }
 NO_NOTES: Final[Mapping[str, str]] = {}
-NO_STATE: Final[Mapping[Path, Type]] = {}
 TABLE: Final = f"{PREFIX}literals"
 LARGEST: Final = np.finfo(np.float32).max
 """In the place of what is infinite or no number, for which there is no literal."""
@@ -57,20 +56,16 @@ class StructuredTextPrinter(TreePrinter):
     """Prints blocks; keeps the types of arrays that they use.
 
     Args:
-        constants: Types of the fields of records that are global constants.
-        state: And of those that are global variables.
+        variables: Types of the fields of records that are global: constants and state.
         real: Single or double precision.
     """
 
     table = TABLE
 
-    def __init__(
-        self, constants: Mapping[Path, Type], state: Mapping[Path, Type] = NO_STATE,
-        real: type[np.floating] = np.float32,
-    ) -> None:  # fmt: skip
+    def __init__(self, variables: Mapping[Path, Type], real: type[np.floating] = np.float32) -> None:
         super().__init__(real)
         self.scalars = SCALARS if self.single else DOUBLE
-        self.globals, self.state = {**constants, **state}, state
+        self.globals = variables
         self.arrays: dict[str, str] = {}
         """Definition of each type of arrays, by its name."""
         self._names, self._notes, self._uses_literals = Names(), NO_NOTES, False
@@ -78,9 +73,13 @@ class StructuredTextPrinter(TreePrinter):
     # -- numbers and types ---------------------------------------------------------------------------------------------
 
     def number(self, value: float) -> str:
-        """Return a typed literal with digits enough for its bits; the largest one for what is not finite."""
+        """Return an initial value with digits enough for its bits; the largest one for what is not finite.
+
+        A type is named where there is no sign, as not every tool takes one behind `REAL#`.
+        """
         finite = value if np.isfinite(value) else LARGEST * (-1 if value < 0 else 1)
-        return f"REAL#{np.float32(finite):.9E}" if self.single else f"LREAL#{float(finite):.16E}"
+        text = f"{np.float32(finite):.9E}" if self.single else f"{float(finite):.16E}"
+        return text if text.startswith("-") else f"{self.scalars[Kind.REAL]}#{text}"
 
     def literal(self, value: float) -> str:
         """Return the element of the table that has this value."""
@@ -114,19 +113,17 @@ class StructuredTextPrinter(TreePrinter):
         self._notes = notes
         inputs, shared = self._declared(block.inputs), self._declared(block.shared)
         outputs = self._declared([*block.outputs, *(each for each in block.variables if each.name in notes)])
-        constants, state = ({global_name(path): self.type(self.globals[path]) for path in block.constants
-                             if (path in self.state) is variable} for variable in (False, True))  # fmt: skip
+        outside = {global_name(path): self.type(self.globals[path]) for path in block.constants}
         variables = self._declared([each for each in block.variables if each.name not in notes])
         body = [*self._body(block.body, 1)]
         variables |= {self._instance(each): block_name(each) for each in block.called}
         if self._uses_literals:
-            constants[TABLE] = f"{TABLE}_table"
+            outside[TABLE] = f"{TABLE}_table"
         where = "/".join(block.source.split("/")[-3:])
         return "".join([
             comment(f"{where}: {block.summary}"), f"FUNCTION_BLOCK {block_name(block)}\n", section("VAR_INPUT", inputs),
-            section("VAR_IN_OUT", shared), section("VAR_OUTPUT", outputs), section("VAR_EXTERNAL CONSTANT", constants),
-            section("VAR_EXTERNAL", state), section("VAR", variables), *(f"{line}\n" for line in body),
-            "END_FUNCTION_BLOCK\n",
+            section("VAR_IN_OUT", shared), section("VAR_OUTPUT", outputs), section("VAR_EXTERNAL", outside),
+            section("VAR", variables), *(f"{line}\n" for line in body), "END_FUNCTION_BLOCK\n",
         ])  # fmt: skip
 
     def _declared(self, names: Iterable[Name]) -> dict[str, str]:

@@ -115,12 +115,12 @@ class StructuredTextExport:
         }
         copies = "".join(f"    FOR i := 0 TO {values.size - 1} DO\n        {name}[i] := the_{name}[i];\n    END_FOR;\n"
                          for name, values in arrays.items())  # fmt: skip
-        guessed = self.printer.number(vector.answer.guessed)
+        constants["the_guessed"] = f"REAL := {self.printer.number(vector.answer.guessed)}"
         return "".join([
             f"FUNCTION_BLOCK cl_golden_{number}\n", section("VAR_IN_OUT", kinds),
             section("VAR_OUTPUT", {"guessed": "REAL", "golden_sum": "DINT"}), section("VAR", {"i": "DINT"}),
             section("VAR CONSTANT", constants), copies,
-            f"    guessed := {guessed};\n    golden_sum := {sum_of_vector(vector)};\nEND_FUNCTION_BLOCK\n",
+            f"    guessed := the_guessed;\n    golden_sum := {sum_of_vector(vector)};\nEND_FUNCTION_BLOCK\n",
         ])  # fmt: skip
 
     def _self_test(self) -> str:

@@ -396,6 +396,11 @@ class Process:
         return "refrigerator" in self.plants
 
     @property
+    def horizon_s(self) -> float:
+        """Of the prediction, in seconds."""
+        return self.decision_instants[-1] * self.tick_s * self.ticks_per_sample
+
+    @property
     def has_load(self) -> bool:
         """Whether there is a disturbance."""
         return self.load.name != NO_LOAD.name
