@@ -63,17 +63,20 @@ class RunFiles:
         self._discard()
         self._reserve = DiskReserve(folder)
         self._realtime = scenario.realtime
-        self._manifest = first_manifest(
-            effective, scenario, copy_inputs(settings, scenario.load, folder), way, arguments
-        )
-        write_json(folder / "manifest.json", self._manifest)
-        write_json(folder / "schema.json", schema_document(station=settings.plant.kind is PlantKind.REFRIGERATOR))
-        files = (
-            TraceSink(folder, self._reserve, StageCost(model, design)),
-            UpdatesSink(folder, self._reserve),
-            EventsSink(folder, self._reserve),
-            StationSink(folder, self._reserve),
-        )
+        with contextlib.ExitStack() as failed:
+            failed.callback(self._reserve.close)
+            self._manifest = first_manifest(
+                effective, scenario, copy_inputs(settings, scenario.load, folder), way, arguments
+            )
+            write_json(folder / "manifest.json", self._manifest)
+            write_json(folder / "schema.json", schema_document(station=settings.plant.kind is PlantKind.REFRIGERATOR))
+            files = (
+                TraceSink(folder, self._reserve, StageCost(model, design)),
+                UpdatesSink(folder, self._reserve),
+                EventsSink(folder, self._reserve),
+                StationSink(folder, self._reserve),
+            )
+            failed.pop_all()
         self.recorder = Recorder(scenario.ticks, [self._evaluation, *files, *sinks])
 
     def finish(self, error: BaseException | None, figure: FigureProcess) -> dict[str, Any]:

@@ -120,7 +120,7 @@ def test_whether_an_adaptive_period_pays_is_the_ratio_of_the_runs(coldloop: "Col
         ("times.csv", "size,plc_ms\n5,1\n10,3\n", "2 sizes; the curve needs 3 or more"),
         ("times.csv", "size,plc_ms\n5,1\n10,3\n10,4\n", "line 4: the size 10 is there twice"),
         ("times.csv", "size,plc_ms\n5,1\n10,3\n20,2\n", "times have to rise"),
-        ("/dev/zero", "", "more than 268435456 bytes"),
+        ("/dev/zero", "", "not a regular file"),
         (WHOLE.replace("400", "1e-300"), "", "operation_ns"),
     ],
 )
