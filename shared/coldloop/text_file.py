@@ -60,11 +60,10 @@ def _opened(path: str, flags: int) -> int:
     if path.startswith(HANDED_OVER):
         return os.open(path, flags)
     descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))  # not on Windows
-    mode = os.fstat(descriptor).st_mode
-    if stat.S_ISREG(mode):
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):
         return descriptor
     os.close(descriptor)
-    raise OSError(errno.EINVAL, "a directory" if stat.S_ISDIR(mode) else "not a regular file")
+    raise OSError(errno.EINVAL, "not a regular file")
 
 
 def held_file(folder: Path, name: str, remedy: str, error: type[ColdloopError] = UsageError) -> Path:

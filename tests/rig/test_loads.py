@@ -142,7 +142,7 @@ def test_a_load_that_the_plant_cannot_hold_is_told_when_it_is_read(content: str,
 
 
 def test_a_folder_is_not_a_load(tmp_path: Path) -> None:
-    assert_told(tmp_path, str(tmp_path), "directory", "name a readable CSV file")
+    assert_told(tmp_path, str(tmp_path), "not a regular file", "name a readable CSV file")
 
 
 def test_a_load_that_is_neither_a_name_nor_a_file_is_told_with_the_names(tmp_path: Path) -> None:

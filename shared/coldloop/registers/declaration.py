@@ -252,17 +252,19 @@ class Block:
     process: Process = COLD_BOX
     """By which sizes, names, units and ranges are."""
 
-    @property
+    @cached_property
     def fields(self) -> Mapping[str, Field]:
         """The declared fields of its record."""
         return fields_of(self.record, self.process)
 
-    @property
-    def elements(self) -> Iterator[tuple[str, Field]]:
+    @cached_property
+    def elements(self) -> tuple[tuple[str, Field], ...]:
         """Name and declaration of each register of a row."""
-        for name, declared in self.fields.items():
-            for element, field in declared.registers:
-                yield element if declared.each else f"{name}.{element}" if element else name, field
+        return tuple(
+            (element if declared.each else f"{name}.{element}" if element else name, field)
+            for name, declared in self.fields.items()
+            for element, field in declared.registers
+        )
 
     @cached_property
     def row_words(self) -> int:
