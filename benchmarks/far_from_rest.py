@@ -94,7 +94,7 @@ def write(folder: Path, names: list[str]) -> None:
 def draw(figure_file: Path, folders: list[Path]) -> None:
     """Draw a column for each case that the last folder has."""
     names = [name for name in CASES if (folders[-1] / f"{name}.csv").exists()]
-    with panels(len(LABELS), len(names), (13.0, 10.0), sharex=True) as (figure, axes):
+    with panels(len(LABELS), len(names), 10.0, sharex=True) as (figure, axes):
         for i, name in enumerate(names):
             column = axes[i :: len(names)]
             column[0].set_title(name)

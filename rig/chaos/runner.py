@@ -14,9 +14,9 @@ from rig.chaos.plan import ChaosPlan
 from rig.chaos.proxied_services import ProxiedServices
 from rig.chaos.sequencer import FaultSequencer, Progress
 from rig.chaos.trace import ChaosTrace
-from rig.cosim.scenario import Scenario
+from rig.cosim.scenario import Scenario, with_copied_load
 from rig.cosim.session_client import SessionClient
-from rig.cosim.wiring import START_PATIENCE_S, with_copied_load
+from rig.cosim.wiring import START_PATIENCE_S
 from rig.results.recording import Recorder
 from rig.settings import Settings
 

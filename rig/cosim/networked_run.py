@@ -14,10 +14,9 @@ from rig.cosim.job import Job, StopRequest
 from rig.cosim.local_services import run_on_localhost
 from rig.cosim.rig_configuration import attached, running_configuration
 from rig.cosim.saved_session import restore_session, save_session
-from rig.cosim.scenario import Scenario
+from rig.cosim.scenario import Scenario, with_copied_load
 from rig.cosim.session_client import SessionClient
 from rig.cosim.session_recording import SessionUnderWay, find_session, record_session
-from rig.cosim.wiring import with_copied_load
 from rig.results.recording import Recorder
 from rig.results.way import Way
 from rig.settings import Settings

@@ -1,10 +1,18 @@
 """What a run is to do, whichever way it is run."""
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
 
-from coldloop.process.load_profile import LoadProfile
+from coldloop.process.load_profile import LOAD_COLUMN, LoadProfile
+from coldloop.process.signals import TICK_S
+from coldloop.table import TIME
+from coldloop.whole_file import whole_text
 from plant.load import HOUR_TICKS, named_families
+from rig.settings import Settings
 
+INPUTS: Final = "inputs"
+LOAD_COPY: Final = f"{INPUTS}/load.csv"
 BEHIND_LAST_STEP = 1200
 """Default time that a run continues after the last step of a load file."""
 
@@ -26,3 +34,18 @@ def natural_ticks(name: str, load: LoadProfile) -> int:
     """Return the default duration of a run under the load of this name or file."""
     families = named_families(name)
     return len(families) * HOUR_TICKS if families else load.times[-1] + BEHIND_LAST_STEP
+
+
+def with_copied_load(settings: Settings, profile: LoadProfile, folder: Path) -> Settings:
+    """Return settings that name a copy of the load in the folder of a run; those of a named load as they are.
+
+    The copy is written from what was read: a pipe is read once, and a file may change meanwhile.
+    """
+    if named_families(settings.plant.load) is not None:
+        return settings
+    (folder / INPUTS).mkdir(exist_ok=True)
+    steps = zip(profile.times, profile.watts, strict=True)
+    rows = "".join(f"{tick * TICK_S!r},{watts!r}\n" for tick, watts in steps)
+    whole_text(folder / LOAD_COPY, f"{TIME},{LOAD_COLUMN}\n{rows}")
+    plant = settings.plant.model_copy(update={"load": str(folder / LOAD_COPY)})
+    return settings.model_copy(update={"plant": plant})

@@ -5,12 +5,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from coldloop.modbus.endpoints import PLANT_PORT, Endpoint
-from coldloop.process.load_profile import LOAD_COLUMN, LoadProfile
-from coldloop.process.signals import TICK_S
 from coldloop.safety.retained import RetainSettings
-from coldloop.table import TIME
-from coldloop.whole_file import whole_text
-from plant.load import named_families
 from rig.cosim.answer_time import QUIET_S
 from rig.cosim.endpoints import RigEndpoints
 from rig.settings import Settings
@@ -18,8 +13,6 @@ from rig.settings import Settings
 SERVICES: Final = ("plant", "control_plc", "optimizer_plc")
 RETAINING: Final = ("plant", "control_plc")
 """Services that resume after a restart, from a state file."""
-INPUTS: Final = "inputs"
-LOAD_COPY: Final = f"{INPUTS}/load.csv"
 START_PATIENCE_S: Final = 600.0
 """Services that need other kernels than before compile them first, on a slow machine for minutes."""
 
@@ -61,21 +54,6 @@ def retaining(settings: Settings, folder: Path, *, always: bool) -> Settings:
             file.unlink(missing_ok=True)
             sections[service] = section.model_copy(update={"retain": RetainSettings(file=file)})
     return settings.model_copy(update=sections)
-
-
-def with_copied_load(settings: Settings, profile: LoadProfile, folder: Path) -> Settings:
-    """Return settings that name a copy of the load in the folder of a run; those of a named load as they are.
-
-    The copy is written from what was read: a pipe is read once, and a file may change meanwhile.
-    """
-    if named_families(settings.plant.load) is not None:
-        return settings
-    (folder / INPUTS).mkdir(exist_ok=True)
-    steps = zip(profile.times, profile.watts, strict=True)
-    rows = "".join(f"{tick * TICK_S!r},{watts!r}\n" for tick, watts in steps)
-    whole_text(folder / LOAD_COPY, f"{TIME},{LOAD_COLUMN}\n{rows}")
-    plant = settings.plant.model_copy(update={"load": str(folder / LOAD_COPY)})
-    return settings.model_copy(update={"plant": plant})
 
 
 def wired(settings: Settings, endpoints: RigEndpoints, detours: Detours | None = None) -> Settings:

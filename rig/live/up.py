@@ -16,8 +16,9 @@ from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Measurement
 from rig.cosim.kept_up import keep_up, say
 from rig.cosim.local_services import KeptService, LocalServices
+from rig.cosim.scenario import with_copied_load
 from rig.cosim.session_client import SessionClient
-from rig.cosim.wiring import RETAINING, SERVICES, START_PATIENCE_S, retaining, with_copied_load
+from rig.cosim.wiring import RETAINING, SERVICES, START_PATIENCE_S, retaining
 from rig.live.link_cuts import CuttableLinks
 from rig.live.page_process import PageProcess
 from rig.live.private_folder import make_own_folder, make_private

@@ -8,7 +8,7 @@ from typing import Any, Final
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.text_file import held_file, read_bytes
-from rig.cosim.wiring import INPUTS, LOAD_COPY, with_copied_load
+from rig.cosim.scenario import INPUTS, LOAD_COPY, with_copied_load
 from rig.settings import Settings
 
 MODEL_COPY: Final = f"{INPUTS}/model.json"

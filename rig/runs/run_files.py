@@ -12,8 +12,7 @@ from coldloop.errors import ColdloopError, ResultsError, UsageError
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.signals import TICK_S
 from plant.settings import PlantKind
-from rig.cosim.scenario import Scenario
-from rig.cosim.wiring import INPUTS
+from rig.cosim.scenario import INPUTS, Scenario
 from rig.figures.worker import FigureProcess
 from rig.results.columns import ALL_FILES, schema_document
 from rig.results.disk_reserve import DiskReserve

@@ -8,7 +8,9 @@ from pydantic import ValidationError
 
 from coldloop.config import explained
 from coldloop.errors import ModelFileError
+from coldloop.process.cold_box import COLD_BOX as THE_COLD_BOX
 from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.model_file import COLD_BOX, ModelHeader, read_header
 from plant.cold_box.model import parameters_digest
@@ -29,7 +31,7 @@ def own_header(file: Path) -> ModelHeader:
         ModelFileError: The file cannot be read, its parameters cannot be used, or the model was made from others.
     """
     header = read_header(file)
-    if header.process:
+    if header.process or PROCESS != THE_COLD_BOX:
         from plant.own.maker import check_signals  # noqa: PLC0415 a cold box starts without it
 
         check_signals(header)

@@ -134,7 +134,7 @@ def test_it_is_the_solver_of_the_process_that_is_named(processes: Processes, tmp
         (("runs", "--target", "c", "--out", "new"), "runs: has no target"),
         (("runs", "--csv", "--ticks", "40"), "--ticks: is for coldloop export plc"),
         (("plc", "--target", "st", "--out", "new", "--plc", "none"), "--plc none: neither a file nor one of"),
-        (("runs", "--csv", "--set", "plant.seed=2"), "--config, --set and --plc: are for coldloop export plc"),
+        (("runs", "--csv", "--set", "plant.seed=2"), "--config, --set, --plc and --score: are for coldloop export plc"),
         (
             ("plc", "--target", "c", "--out", "new", "--set", "optimizer_plc.program.arithmetic=float64"),
             "in single precision alone",

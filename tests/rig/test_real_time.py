@@ -101,7 +101,7 @@ async def start_real_time(bus: "Bus", factor: float, *, session: int = 1, optimi
 async def test_a_killed_optimiser_leaves_the_plant_held_and_a_new_one_takes_over_again(
     on_the_bus: "OnTheBus", processes: harness.Processes
 ) -> None:
-    def start_optimiser() -> harness.ProcessNow:
+    def start_optimiser() -> harness.Process:
         return processes.service("optimizer_plc", port=bus.endpoints.optimizer_plc.port, settings=bus.settings)
 
     async with on_the_bus(ENDLESS_HOLD, services=("plant", "control_plc")) as bus:
