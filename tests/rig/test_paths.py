@@ -29,9 +29,12 @@ LINES: Final = {
         "proxy PLAN --listen 1 --to 127.0.0.1:502", "certificates --out OUT", "new OUT",
         f"process {EXAMPLES}/quadruple_tank.toml --out OUT", "budget --plc siemens-s7-1511-1-pn", "model", "design",
         f"import {EXAMPLES}/quadruple_tank_record.csv --inputs v1 v2 --out OUT", "identify RUN", "exergy",
-        "study compare --load a --out OUT", "reproduce --quick", "config",
+        "study periods --load a --out OUT", "reproduce --quick", "config",
     )
-} | {"export --plc": "export plc --target c --ticks 200 --out OUT"}  # fmt: skip
+} | {
+    "export --plc": "export plc --target c --ticks 200 --out OUT",
+    "study --variants": "study compare --load a --out OUT",
+}  # fmt: skip
 """Of each command a line with what it needs besides the option; a positional argument is its second word."""
 OPTIONS: Final = [each for each in path_options() if each.name not in ("--config", "--tls") or each.command == ("run",)]
 
