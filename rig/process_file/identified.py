@@ -6,6 +6,7 @@ future are the states. Transition and output matrices follow by least squares fr
 constants and input matrix by those of the simulated outputs, so that gains are those of the record as a whole.
 """
 
+import warnings
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -242,5 +243,7 @@ def _continuous(A: Array, B: Array, period_s: float) -> tuple[Array, Array]:
 
     n, m = B.shape
     whole = np.block([[A, B], [np.zeros((m, n)), np.eye(m)]])
-    rates = np.real(logm(whole)) / period_s
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of errors of 1e-13: a record is not known as well as that
+        rates = np.real(logm(whole)) / period_s
     return rates[:n, :n], rates[:n, n:]
