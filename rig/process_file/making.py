@@ -57,7 +57,8 @@ def made_from(path: Path) -> Made:
     Raises:
         ColdloopError: One line that names file, key and remedy.
     """
-    file = with_units(read_process_file(path), path.parent)
+    said = read_process_file(path)
+    file = with_units(said, path.parent)
     linear = linearised(file, path.parent)
     file = _with_sensors(file)
     try:
@@ -80,7 +81,7 @@ def made_from(path: Path) -> Made:
         output_units=tuple(one.unit for one in process.outputs),
         load_name=process.load.name, load_unit=process.load.unit, parameters_digest=linear.digest, plant=linear.kind,
         note=f"made from {path.name}", plant_parameters=linear.parameters | played, process=process.document(),
-        declaration_digest=declaration_digest(read_process_file(path), path.parent),
+        declaration_digest=declaration_digest(said, path.parent),
     )  # fmt: skip
     if process.bath is not None:
         check_bath(file, model, process.bath)

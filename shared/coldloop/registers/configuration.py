@@ -10,8 +10,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Final, NamedTuple
 
 from coldloop.parsing import parsed_json
+from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.declaration import Block, text, u16
+from coldloop.registers.declaration import Block, Role, text, u16
 from coldloop.registers.text import from_words, to_words
 
 LINE_WORDS: Final = 16
@@ -34,10 +35,15 @@ class ConfigurationLine(NamedTuple):
     text: Annotated[tuple[int, ...], text("Part of a JSON object: values by dotted key", LINE_WORDS)]
 
 
-CONFIGURATION_BLOCK: Final = Block("configuration", 55000, ConfigurationDigest, "Digest of the running configuration")
-CONFIGURATION_LINES_BLOCK: Final = Block(
-    "configuration text", 55040, ConfigurationLine, "The running configuration", rows=LINES
+LAST_BLOCKS: Final = (
+    Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
+    Block("journal page", 45010, JournalPage, "State of the journal"),
+    Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
+    Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
+    Block("configuration", 55000, ConfigurationDigest, "Digest of the running configuration"),
+    Block("configuration text", 55040, ConfigurationLine, "The running configuration", rows=LINES),
 )
+"""The end of every map: the service's journal and its configuration."""
 
 
 def publish_configuration(bank: RegisterBank, values: Mapping[str, Any]) -> None:

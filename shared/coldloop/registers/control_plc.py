@@ -5,9 +5,8 @@ from functools import cache
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.process.declaration import LAST_NUMBER, LAST_TICK, Process
-from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
-from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
+from coldloop.registers.configuration import LAST_BLOCKS
 from coldloop.registers.declaration import (
     Block,
     RegisterMap,
@@ -387,11 +386,6 @@ def control_map(process: Process) -> RegisterMap:
         Block("sequence", 500, SequenceRow, "Spare buffer for a sequence", Role.OPTIMIZER, SEQUENCE_ROWS),
         Block("pace", 1950, SessionPace, "Time base of the present session", Role.OPERATOR),
         Block("alarms", 2000, Alarm, "One row for each alarm", rows=len(AlarmKind)),
-        Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
-        Block("journal page", 45010, JournalPage, "State of the journal"),
-        Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
-        Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
-        CONFIGURATION_BLOCK,
-        CONFIGURATION_LINES_BLOCK,
+        *LAST_BLOCKS,
     )
     return RegisterMap(service="control_plc", version=4, blocks=placed(process, blocks))

@@ -239,7 +239,7 @@ class Register(NamedTuple):
 
 @dataclass(frozen=True)
 class Block:
-    """A record's place in a map: `rows` copies of it, or one for each output, one after the other from `address` on."""
+    """A record's place in a map: `rows` copies of it one after the other from `address` on."""
 
     name: str
     address: int
@@ -251,6 +251,9 @@ class Block:
     """Each row ends with the CRC-32 of the words before it (`coldloop.registers.seal`)."""
     process: Process = COLD_BOX
     """By which sizes, names, units and ranges are."""
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.address, self.record))  # codecs are found by it in each tick
 
     @cached_property
     def fields(self) -> Mapping[str, Field]:

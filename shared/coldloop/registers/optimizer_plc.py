@@ -5,9 +5,8 @@ from functools import cache
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.process.declaration import Process
-from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
-from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
+from coldloop.registers.configuration import LAST_BLOCKS
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.declaration import (
     Block,
@@ -217,11 +216,6 @@ def optimizer_map(process: Process) -> RegisterMap:
         Block("prediction", 200, Prediction, "Predicted result of the last sequence", sealed=True),
         Block("model deviation", 320, ModelDeviation, "How the plant differs from the prediction model"),
         Block("history", 16384, Optimization, "The last updates", rows=HISTORY_ROWS),
-        Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
-        Block("journal page", 45010, JournalPage, "State of the journal"),
-        Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
-        Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
-        CONFIGURATION_BLOCK,
-        CONFIGURATION_LINES_BLOCK,
+        *LAST_BLOCKS,
     )
     return RegisterMap(service="optimizer_plc", version=4, blocks=placed(process, blocks))

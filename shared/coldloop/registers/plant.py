@@ -8,9 +8,8 @@ from typing import Annotated, Final, NamedTuple
 
 from coldloop.process.declaration import LAST_TICK, Process
 from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, STATION_VALVE_NAMES
-from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
-from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
+from coldloop.registers.configuration import LAST_BLOCKS
 from coldloop.registers.declaration import (
     Block,
     Field,
@@ -381,12 +380,7 @@ def plant_map(process: Process) -> RegisterMap:
         Block("load table", 1000, LoadStep, f"{noun} over the session", Role.OPERATOR, LOAD_ROWS),
         Block("station history", 9200, StationSample, "The last ticks of the warm part", rows=STATION_ROWS),
         Block("history", 16384, PlantSample, "The last ticks", rows=HISTORY_ROWS),
-        Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
-        Block("journal page", 45010, JournalPage, "State of the journal"),
-        Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
-        Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
-        CONFIGURATION_BLOCK,
-        CONFIGURATION_LINES_BLOCK,
+        *LAST_BLOCKS,
     )
     unused = () if process.has_station else OF_A_REFRIGERATOR
     return RegisterMap(service="plant", version=4, blocks=placed(process, blocks), unused=unused)
