@@ -2,10 +2,10 @@
 
 from typing import Self
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import Field
 
 from coldloop.process.limits import InputLimits
-from coldloop.process.model_settings import ModelSettings
+from coldloop.process.settings import RootSettings
 from coldloop.service.telemetry_settings import TelemetrySettings
 from coldloop.session.settings import SessionSettings
 from control_plc.settings import ControlSection
@@ -15,17 +15,14 @@ from plant.settings import PlantSection
 from rig.operator_settings import RigSection
 
 
-class Settings(BaseModel):
+class Settings(RootSettings):
     """All sections of a configuration file."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    limits: InputLimits = InputLimits()
-    model: ModelSettings = ModelSettings()
+    limits: InputLimits = Field(default_factory=InputLimits)
     session: SessionSettings = SessionSettings()
-    plant: PlantSection = PlantSection()
-    control_plc: ControlSection = ControlSection()
-    optimizer_plc: OptimizerSection = OptimizerSection()
+    plant: PlantSection = Field(default_factory=PlantSection)
+    control_plc: ControlSection = Field(default_factory=ControlSection)
+    optimizer_plc: OptimizerSection = Field(default_factory=OptimizerSection)
     telemetry: TelemetrySettings = TelemetrySettings()
     rig: RigSection = RigSection()
     hmi: HmiSection = HmiSection()

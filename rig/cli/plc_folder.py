@@ -17,7 +17,7 @@ from coldloop.parsing import parsed_json
 from coldloop.process.limits import RateReference
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
-from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS
+from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.settings import SHOWN
 from rig.plc_export.c.bit_flips import require_compiler, scored
@@ -64,7 +64,7 @@ REFERENCES: Final = {
     RateReference.PER_UPDATE: "Each update may use this rate, however soon it follows the one before.",
     RateReference.ELAPSED: "An update may use the share of this rate for which the outputs have stood still before it.",
 }
-FIXED_TICKS: Final = max(SHORTEST_TICKS, LONGEST_TICKS // 2)
+FIXED_TICKS: Final = max(SHORTEST_TICKS, TICKS_PER_SAMPLE // 2)
 """Updating period of the second half of the golden updates; that of the first is adaptive."""
 CUT: Final = Cut(WORK, PIECE)
 """How calls are cut in Structured Text; in C each does all of an iteration."""

@@ -56,7 +56,7 @@ def run_ideal_loop(
     prediction = prediction_of(model, program.estimator.disturbed, program.design)
     problem = PredictiveProblem(prediction, program.design, settings.limits)
     kalman = program.estimator.model_copy(update={"kind": EstimatorKind.KALMAN})
-    estimator, belief = estimator_of(prediction, kalman), no_belief(prediction.n_states)
+    estimator, belief = estimator_of(prediction, kalman), no_belief(prediction.n_states, len(prediction.y0))
     solver = DaqpSolver(program.daqp)
     plant = plant_maker(header, settings.plant)(scenario.load, scenario.seed)
     applied = as_transmitted(SequenceRow(tuple(model.u0.tolist())), CONTROL_MAP).u

@@ -72,7 +72,9 @@ async def restore_session(rig: SessionClient, saved: SavedSession | None, sessio
         tick = (await rig.plant.read(Identity)).tick
         await rig.plant.write(sealed(LiveLoad(0, saved.load.watts[0]), PLANT_MAP))
         coming = LoadProfile(saved.load.times, saved.load.watts)
-        await LoadStream(rig.plant, session, coming, begin=tick + lead_ticks(saved.pace)).feed(tick)
+        await LoadStream(
+            rig.plant, session, coming, begin=tick + lead_ticks(saved.pace, rig.plant.process.tick_s)
+        ).feed(tick)
     except LinkError as error:
         log.warning("the rig was not restored: %s", error)
     else:

@@ -7,9 +7,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from coldloop.errors import UsageError
 from coldloop.parsing import parsed_json
-from coldloop.process.signals import TICK_S
+from coldloop.process.signals import SAMPLING_PERIOD_S
 from coldloop.text_file import held_file, read_bytes
-from optimizer_plc.budget import MAX_PERIOD_TICKS
 from rig.plc_sizing.profile import PlcProfile
 from rig.text_tables import markdown_table
 
@@ -137,7 +136,7 @@ def misfits(cost: ExportCost, profile: PlcProfile) -> list[str]:
 
 
 def _longest_s() -> float:
-    return MAX_PERIOD_TICKS * TICK_S
+    return SAMPLING_PERIOD_S
 
 
 def profile_of(cost: ExportCost, total_us: float) -> str:

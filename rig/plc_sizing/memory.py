@@ -8,7 +8,6 @@ from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.computing_settings import Arithmetic, EstimatorSettings
 from optimizer_plc.estimator import stationary_gains
 from optimizer_plc.qp.arithmetic import real_of
-from optimizer_plc.qp.design import N_INPUTS
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem
 from optimizer_plc.settings import SolverName
@@ -94,5 +93,5 @@ def footprint(problem: PredictiveProblem, estimator: int, solver: SolverName) ->
         shift=problem.Phi.nbytes,
         solver=workspaces(problem.size, len(problem.Gamma))[solver],
         estimator=estimator,
-        sequence=2 * SEQUENCE_ROWS * N_INPUTS * WORD,
+        sequence=2 * SEQUENCE_ROWS * problem.design.n_inputs * WORD,
     )

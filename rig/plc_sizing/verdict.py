@@ -3,8 +3,7 @@
 from math import floor
 from typing import NamedTuple
 
-from coldloop.process.signals import TICK_S
-from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
+from optimizer_plc.budget import PlcBudget
 from optimizer_plc.qp.problem import PredictiveProblem
 from optimizer_plc.settings import ProgramSettings
 from rig.plc_sizing.memory import Footprint
@@ -42,7 +41,10 @@ def capacity(size: int, needed: Footprint, memory_bytes: int, budget: PlcBudget)
         budget: Of the PLC and the solver.
     """
     fixed = needed.estimator + needed.sequence
-    room, time_s = max(memory_bytes - fixed, 0), max(MAX_PERIOD_TICKS * TICK_S - budget.times.slots, 0.0)
+    room, time_s = (
+        max(memory_bytes - fixed, 0),
+        max(budget.longest_ticks * budget.times.tick_s - budget.times.slots, 0.0),
+    )
     return Capacity(
         size * (room / (needed.total - fixed)) ** (1 / 2), size * (time_s / budget.times.iteration) ** (1 / 3)
     )
@@ -77,8 +79,8 @@ def verdict(profile: PlcProfile, program: ProgramSettings, problem: PredictivePr
     longest, shortest = budget.ladder[-1], budget.ladder[0]
     first, then = sorted((("memory", limits.by_memory), ("time", limits.by_time)), key=lambda one: one[1])
     return (
-        f"{profile.name}: {problem_text} fits, in {memory}; it updates every {shortest * TICK_S:g} s at the "
-        f"soonest ({_iterations(budget, shortest)}), {_iterations(budget, longest)} in {longest * TICK_S:g} s; "
+        f"{profile.name}: {problem_text} fits, in {memory}; it updates every {shortest * budget.times.tick_s:g} s at the "
+        f"soonest ({_iterations(budget, shortest)}), {_iterations(budget, longest)} in {longest * budget.times.tick_s:g} s; "
         f"{first[0]} gives way first, with more than {_variables(first[1])} variables ({then[0]} with "
         f"more than {_variables(then[1])}){_calls(profile, budget)}."
     )

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from coldloop.errors import StudyError
 from optimizer_plc.qp.costs import indicators
-from optimizer_plc.qp.design import N_INPUTS, N_SLACKS
 from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 
 Array = NDArray[np.float64]
@@ -47,7 +46,7 @@ class PlayedProfiles:
         n = self._n = problem.n_inputs
         self._problem = problem
         self._hessian = 2.0 * problem.Phi[:n, :n]
-        self._rates = np.ascontiguousarray(problem.Gamma[N_SLACKS * len(design.constraint_instants) :, :n])
+        self._rates = np.ascontiguousarray(problem.Gamma[design.n_slacks * len(design.constraint_instants) :, :n])
         self._outputs = np.ascontiguousarray(problem.stacked_outputs_z[:n].T)
         self._low, self._high, self._weights = (np.tile(row, design.horizon) for row in problem.bands)
         rate = np.asarray(problem.limits.rate) / np.asarray(design.input_scale)
@@ -55,8 +54,8 @@ class PlayedProfiles:
 
     def played(self, qp: QuadraticProblem, z: Array) -> Array:
         """Return a profile z (n,) within the rates, without slacks."""
-        knots = z[: self._n].reshape(-1, N_INPUTS).copy()
-        knots[0] = np.clip(knots[0], qp.low[:N_INPUTS], qp.high[:N_INPUTS])
+        knots = z[: self._n].reshape(-1, self._problem.design.n_inputs).copy()
+        knots[0] = np.clip(knots[0], qp.low[: knots.shape[1]], qp.high[: knots.shape[1]])
         for knot, reach in enumerate(self._reach, start=1):
             knots[knot] = np.clip(knots[knot], knots[knot - 1] - reach, knots[knot - 1] + reach)
         return self._with_slacks(knots.ravel())

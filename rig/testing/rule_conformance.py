@@ -5,8 +5,8 @@ from typing import Final
 
 import numpy as np
 
-from coldloop.process.signals import TICK_S
-from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS
+from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.updating_periods import SHORTEST_TICKS
 from optimizer_plc.rules import Observation, assess
 from optimizer_plc.rules.outside import OutsideDecision
 from rig.testing.requirement import Requirement
@@ -14,7 +14,7 @@ from rig.testing.requirement import Requirement
 DECISIONS: Final = 200
 """In each session."""
 LADDERS: Final = (
-    tuple(range(SHORTEST_TICKS, LONGEST_TICKS + 1)), (SHORTEST_TICKS, LONGEST_TICKS), (LONGEST_TICKS,),
+    tuple(range(SHORTEST_TICKS, TICKS_PER_SAMPLE + 1)), (SHORTEST_TICKS, TICKS_PER_SAMPLE), (TICKS_PER_SAMPLE,),
 )  # fmt: skip
 """Every period, two, and a single one: on a slow PLC there is no other."""
 Made = Callable[[Sequence[int]], OutsideDecision]

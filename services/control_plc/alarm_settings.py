@@ -7,8 +7,8 @@ from typing import Annotated, Final, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import STRETCH, TICK_S
+from coldloop.process.declaration import Process, Range
+from coldloop.process.settings import ProcessSettings, declared, stretched, within
 from coldloop.registers.safety import AlarmKind, AlarmPriority
 
 PASSING: Final = (AlarmKind.SCAN_OVERRUN, AlarmKind.ACCESS_REFUSED, AlarmKind.SECOND_WRITER)
@@ -29,16 +29,6 @@ class AlarmRule(NamedTuple):
     off_delay_s: float = 0.0
     """How long the condition must have ended before the alarm returns."""
 
-    @property
-    def on_ticks(self) -> int:
-        """The on-delay, in ticks."""
-        return _ticks(self.on_delay_s)
-
-    @property
-    def off_ticks(self) -> int:
-        """The off-delay, in ticks."""
-        return _ticks(self.off_delay_s)
-
 
 DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
     # The process is uncontrolled, or under another master: act at once.
@@ -50,7 +40,7 @@ DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
     AlarmKind.LEVEL_BAND: AlarmRule(HIGH),  # the bath may run dry or flood; on-delay: `band_delay_s`
     AlarmKind.T5_BAND: AlarmRule(HIGH),  # the turbines leave their range; on-delay: `band_delay_s`
     AlarmKind.PLANT_FROZEN: AlarmRule(HIGH),  # measurements are old
-    AlarmKind.CAPACITY: AlarmRule(HIGH, 20.0 * STRETCH, 30.0 * STRETCH),  # no control holds this load
+    AlarmKind.CAPACITY: AlarmRule(HIGH, 20.0, 30.0),  # no control holds this load
     # Control is degraded, or a protection is lost: act within the shift.
     AlarmKind.MODE: AlarmRule(MEDIUM),  # the ladder has left MPC
     AlarmKind.SEQUENCE_EXHAUSTED: AlarmRule(MEDIUM),  # outputs are held, then the classical loops control
@@ -79,9 +69,7 @@ def _known_name(name: str) -> str:
     return name.lower()
 
 
-DECLARED_BANDS: Final = tuple(band.alarm or (band.low, band.high) for band in PROCESS.bands)
-
-Delay = Annotated[FiniteFloat, Field(ge=0, le=345_600 * TICK_S)]
+Delay = Annotated[FiniteFloat, within(lambda process: (0, 345_600 * process.tick_s))]
 
 
 class RuleSettings(BaseModel):
@@ -104,16 +92,14 @@ class RuleSettings(BaseModel):
         )
 
 
-class AlarmSettings(BaseModel):
+class AlarmSettings(ProcessSettings):
     """When the alarms are raised, how urgent they are, and how long they may be shelved."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    level_band: tuple[FiniteFloat, FiniteFloat] = DECLARED_BANDS[0]
+    level_band: tuple[FiniteFloat, FiniteFloat] = declared(lambda process: _bands_of(process)[0])
     """Of the first output that has a band: of the cold box L1, %."""
-    t5_band: tuple[FiniteFloat, FiniteFloat] = DECLARED_BANDS[min(1, len(DECLARED_BANDS) - 1)]
+    t5_band: tuple[FiniteFloat, FiniteFloat] = declared(lambda process: _bands_of(process)[:2][-1])
     """Of the second one: of the cold box T5, K. Further ones are as the process declares them."""
-    band_delay_s: Delay = 5.0 * STRETCH
+    band_delay_s: Delay = stretched(5.0)
     """On-delay of the two band alarms: how long an output must be outside, plant time."""
     rules: dict[Annotated[str, AfterValidator(_known_name)], RuleSettings] = {}
     """By name of the alarm, such as `sensor_bad`."""
@@ -134,20 +120,27 @@ class AlarmSettings(BaseModel):
     @property
     def bands(self) -> tuple[tuple[float, float], ...]:
         """What each output with a band is to be within."""
-        return (self.level_band, self.t5_band, *DECLARED_BANDS[2:])[: len(DECLARED_BANDS)]
+        found = _bands_of(self.process)
+        return (self.level_band, self.t5_band, *found[2:])[: len(found)]
 
     def rule(self, kind: AlarmKind) -> AlarmRule:
         """Return how an alarm is treated."""
         default = DEFAULT_RULES[kind]
+        if kind is AlarmKind.CAPACITY:
+            stretch = self.process.stretch
+            default = AlarmRule(default.priority, default.on_delay_s * stretch, default.off_delay_s * stretch)
         if kind in BANDS:
             default = default._replace(on_delay_s=self.band_delay_s)
         return self.rules.get(kind.name.lower(), RuleSettings()).changed(default)
 
     def shelving_ticks(self, asked_s: int) -> int:
         """Return how long an alarm is shelved when so many seconds are asked for; 0 asks for the default."""
-        return _ticks(min(asked_s or self.shelving_s, self.longest_shelving_s))
+        return self.ticks(min(asked_s or self.shelving_s, self.longest_shelving_s))
+
+    def ticks(self, seconds: float) -> int:
+        """Return a time in ticks, not shorter than it; what is smaller than the error of a float does not count."""
+        return math.ceil(seconds / self.process.tick_s - 1e-9)
 
 
-def _ticks(seconds: float) -> int:
-    """Return a time in ticks, not shorter than it; what is smaller than the error of a float does not count."""
-    return math.ceil(seconds / TICK_S - 1e-9)
+def _bands_of(process: Process) -> tuple[Range, ...]:
+    return tuple(band.alarm or (band.low, band.high) for band in process.bands)

@@ -13,7 +13,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
-from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.service.journal import Journal
@@ -181,7 +180,7 @@ class AlarmPanel:
     def delay(self, kind: AlarmKind) -> int:
         """Return the delay (ticks) after which an alarm follows its condition."""
         rule = self._rules[kind]
-        return rule.off_ticks if self.rows[kind].active else rule.on_ticks
+        return self._settings.ticks(rule.off_delay_s if self.rows[kind].active else rule.on_delay_s)
 
     def raised(self, kind: AlarmKind, cause: int = 0) -> None:
         """Report that the condition of an alarm holds, and its cause."""
@@ -246,7 +245,9 @@ class AlarmPanel:
         ticks = self._settings.shelving_ticks(asked_s)
         until = min(self.now + ticks, 0xFFFFFFFF)
         if until != self.rows[kind].shelved_until:
-            self._step(kind, EventKind.ALARM_SHELVED, who=who, value=ticks * TICK_S, shelved_until=until)
+            self._step(
+                kind, EventKind.ALARM_SHELVED, who=who, value=ticks * self._settings.process.tick_s, shelved_until=until
+            )
 
     def restore(self, rows: Sequence[Alarm]) -> None:
         """Take the alarms of before a restart; priorities are those of the configuration."""

@@ -10,14 +10,12 @@ import math
 from collections.abc import Collection, Sequence
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
+from pydantic import BaseModel, ConfigDict, FiniteFloat, PositiveFloat, model_validator
 
 from coldloop.process.cold_box import LEVEL_LOOP, T5_LOOP
 from coldloop.process.declaration import Loop
 from coldloop.process.limits import InputLimits
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S
-from coldloop.process.whole_ticks import whole_ticks
+from coldloop.process.settings import ProcessSettings, declared, whole_ticks, within
 from coldloop.safety.sequence import Inputs
 
 
@@ -52,14 +50,14 @@ class LevelLoop(PiSettings):
     integral_time_s: PositiveFloat = LEVEL_LOOP.integral_time_s
 
 
-class ClassicalSettings(BaseModel):
+class ClassicalSettings(ProcessSettings):
     """The tuning of loops by the quantity of their output, as the cold box declares it; of others it is declared."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     temperature: TemperatureLoop = TemperatureLoop()
     level: LevelLoop = LevelLoop()
-    period_s: Annotated[float, Field(ge=TICK_S, le=SAMPLING_PERIOD_S)] = SAMPLING_PERIOD_S
+    period_s: Annotated[float, within(lambda process: (process.tick_s, process.sampling_period_s))] = declared(
+        lambda process: process.sampling_period_s
+    )
     """How often the loops are executed: a whole number of ticks, and no longer than the window of the rate limits."""
 
     @property
@@ -67,19 +65,19 @@ class ClassicalSettings(BaseModel):
         """Output, input and tuning of each loop."""
         return tuple(
             (output.name, loop.input, getattr(self, output.quantity) if output.quantity else _declared(loop))
-            for output in PROCESS.banded
+            for output in self.process.banded
             if output.band is not None and (loop := output.band.loop) is not None
         )
 
     @property
     def period_ticks(self) -> int:
         """The period, in ticks."""
-        return round(self.period_s / TICK_S)
+        return round(self.period_s / self.process.tick_s)
 
     @model_validator(mode="after")
     def _whole_ticks(self) -> Self:
-        if whole_ticks(self.period_s) is None:
-            raise ValueError(f"period_s must be a multiple of the tick, {TICK_S} s")
+        if whole_ticks(self.period_s, self.process.tick_s) is None:
+            raise ValueError(f"period_s must be a multiple of the tick, {self.process.tick_s} s")
         return self
 
 
@@ -149,6 +147,8 @@ class ClassicalLoops:
     """
 
     def __init__(self, settings: ClassicalSettings, limits: InputLimits, operating_outputs: Sequence[float]) -> None:
+        process = settings.process
+
         def loop(tuning: PiSettings, output: int, actuator: int) -> PiController:
             return PiController(
                 tuning,
@@ -156,13 +156,15 @@ class ClassicalLoops:
                 period_s=settings.period_s,
                 low=limits.low[actuator],
                 high=limits.high[actuator],
-                reach=limits.rate[actuator] * settings.period_s / SAMPLING_PERIOD_S,
+                reach=limits.rate[actuator] * settings.period_s / process.sampling_period_s,
             )
 
-        self._period = settings.period_ticks
+        self._period, self._tick_s = settings.period_ticks, process.tick_s
         self._seen: int | None = None
         self._executed: int | None = None
-        places = ((OUTPUT_NAMES.index(y), INPUT_NAMES.index(u), tuning) for y, u, tuning in settings.pairs)
+        places = (
+            (process.output_names.index(y), process.input_names.index(u), tuning) for y, u, tuning in settings.pairs
+        )
         self._loops = [(output, actuator, loop(tuning, output, actuator)) for output, actuator, tuning in places]
 
     def restart(self) -> None:
@@ -182,7 +184,9 @@ class ClassicalLoops:
         """
         if not self._is_due(tick):
             return applied
-        elapsed_s = None if self._executed is None else min(tick - self._executed, LONGEST_GAP * self._period) * TICK_S
+        elapsed_s = (
+            None if self._executed is None else min(tick - self._executed, LONGEST_GAP * self._period) * self._tick_s
+        )
         self._executed = tick
         inputs = list(applied)
         for output, actuator, loop in self._loops:

@@ -5,7 +5,6 @@ from collections.abc import Awaitable
 from typing import Final
 
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import INPUT_NAMES, TICK_S
 from coldloop.registers.audit import EventKind, JournalQuery
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
 from coldloop.registers.common import SessionPace, pace_subject
@@ -90,7 +89,7 @@ class Clients:
         pace, watchdog = self._sessions.pace, self._program.watchdog
         if not watchdog.time:
             return UNWATCHED_S
-        return watchdog.time * TICK_S / (pace.factor if pace.realtime else 1.0)
+        return watchdog.time * self._limits.process.tick_s / (pace.factor if pace.realtime else 1.0)
 
     def _judge_optimizer(self, record: tuple[object, ...], _row: int, caller: Caller) -> None:
         try:
@@ -102,7 +101,8 @@ class Clients:
             raise IllegalValueError("a plan needs a CRC: it decides when inputs change")
 
     def _judge_operator(self, record: Operator, _row: int, _caller: Caller) -> None:
-        for name, value, low, high in zip(INPUT_NAMES, record.u, self._limits.low, self._limits.high, strict=True):
+        names = self._limits.process.input_names
+        for name, value, low, high in zip(names, record.u, self._limits.low, self._limits.high, strict=True):
             if not low <= value <= high:
                 raise IllegalValueError(f"setpoint of {name} = {value:g} is outside {low:g}..{high:g}")
 

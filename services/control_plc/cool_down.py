@@ -11,22 +11,13 @@ Pure: measured outputs in, wanted inputs out. How far the turbine may open is it
 """
 
 from collections.abc import Collection, Sequence
-from typing import Annotated, Final
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from coldloop.process.limits import InputLimits
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import BATH, CONTROLLED, INPUT_NAMES, OUTPUT_NAMES, TICK_S
 from coldloop.registers.control_plc import CoolDownStep
 from coldloop.safety.sequence import Inputs
-
-LEVEL, TEMPERATURE, TURBINE_OUTLET = (
-    map(OUTPUT_NAMES.index, (BATH.level, BATH.temperature, BATH.turbine_outlet)) if BATH else (0, 0, 0)
-)
-BANDS: Final = dict(zip(CONTROLLED, PROCESS.bands, strict=True))
-"""By output."""
-FEED, HEATER, TURBINE_VALVE = map(INPUT_NAMES.index, BATH.inputs) if BATH else (0, 0, 0)
 
 
 class CoolDownSettings(BaseModel):
@@ -64,7 +55,13 @@ class CoolDown:
     ) -> None:
         self._settings, self._limits = settings, limits
         self._inputs, self._outputs = inputs, outputs
-        self._has_begun = BATH is None or step is not CoolDownStep.FINISHED
+        process = limits.process
+        self._process, self._bands = process, dict(zip(process.controlled, process.bands, strict=True))
+        if process.bath is not None:
+            named = (process.bath.level, process.bath.temperature, process.bath.turbine_outlet)
+            self._level, self._temperature, self._turbine_outlet = map(process.output_names.index, named)
+            self._feed, self._heater, self._turbine_valve = map(process.input_names.index, process.bath.inputs)
+        self._has_begun = process.bath is None or step is not CoolDownStep.FINISHED
         self._settled_since: int | None = None
         self.step = step
 
@@ -78,9 +75,9 @@ class CoolDown:
         """Outputs whose loops are open."""
         match self.step:
             case CoolDownStep.TURBINE:
-                return LEVEL, TURBINE_OUTLET
+                return self._level, self._turbine_outlet
             case CoolDownStep.BATH | CoolDownStep.FILLING:
-                return (LEVEL,)
+                return (self._level,)
             case _:
                 return ()
 
@@ -90,7 +87,7 @@ class CoolDown:
         if not self.is_active:
             return ()
         filling = self.step in (CoolDownStep.FILLING, CoolDownStep.SETTLING)
-        return [output for output in range(len(OUTPUT_NAMES)) if not (filling and output in CONTROLLED)]
+        return [output for output in range(len(self._process.outputs)) if not (filling and output in self._bands)]
 
     def observe(self, tick: int, y: Sequence[float]) -> bool:
         """Take the outputs measured at `tick`; return whether the step has changed."""
@@ -100,34 +97,35 @@ class CoolDown:
 
     def _next(self, tick: int, y: Sequence[float]) -> CoolDownStep:
         if not self._has_begun:
-            warm = y[TEMPERATURE] > self._settings.warm_k and y[LEVEL] < self._settings.liquid_pct
+            warm = y[self._temperature] > self._settings.warm_k and y[self._level] < self._settings.liquid_pct
             return CoolDownStep.TURBINE if warm else CoolDownStep.FINISHED
         match self.step:
-            case CoolDownStep.TURBINE if y[TURBINE_OUTLET] <= self._outputs[TURBINE_OUTLET]:
+            case CoolDownStep.TURBINE if y[self._turbine_outlet] <= self._outputs[self._turbine_outlet]:
                 return CoolDownStep.BATH
-            case CoolDownStep.BATH if y[LEVEL] >= self._settings.liquid_pct:
+            case CoolDownStep.BATH if y[self._level] >= self._settings.liquid_pct:
                 return CoolDownStep.FILLING
-            case CoolDownStep.FILLING if y[LEVEL] >= BANDS[LEVEL].low:
+            case CoolDownStep.FILLING if y[self._level] >= self._bands[self._level].low:
                 return CoolDownStep.SETTLING
             case CoolDownStep.SETTLING if self._has_settled(tick, y):
                 return CoolDownStep.FINISHED
         return self.step
 
     def _has_settled(self, tick: int, y: Sequence[float]) -> bool:
-        inside = all(BANDS[output].low <= y[output] <= BANDS[output].high for output in (LEVEL, TURBINE_OUTLET))
+        bands = ((output, self._bands[output]) for output in (self._level, self._turbine_outlet))
+        inside = all(band.low <= y[output] <= band.high for output, band in bands)
         if not inside or self._settled_since is None or tick < self._settled_since:
             self._settled_since = tick if inside else None
-        return inside and (tick - (self._settled_since or 0)) * TICK_S >= self._settings.settled_s
+        return inside and (tick - (self._settled_since or 0)) * self._process.tick_s >= self._settings.settled_s
 
     def wanted(self, by_loops: Inputs) -> Inputs:
         """Return the wanted inputs, where the closed loops want `by_loops`; the output guard moves towards them."""
         row = list(by_loops)
         if self.step in (CoolDownStep.TURBINE, CoolDownStep.BATH):
-            row[FEED] = self._limits.high[FEED]
+            row[self._feed] = self._limits.high[self._feed]
         else:
-            row[FEED] = self._inputs[FEED]
-        if LEVEL in self.open_loops:
-            row[HEATER] = self._limits.low[HEATER]
-        if TURBINE_OUTLET in self.open_loops:
-            row[TURBINE_VALVE] = self._inputs[TURBINE_VALVE]
+            row[self._feed] = self._inputs[self._feed]
+        if self._level in self.open_loops:
+            row[self._heater] = self._limits.low[self._heater]
+        if self._turbine_outlet in self.open_loops:
+            row[self._turbine_valve] = self._inputs[self._turbine_valve]
         return tuple(row)

@@ -1,24 +1,19 @@
 """The last thing between any decision and the actuators: bounds and rates."""
 
 from collections.abc import Sequence
-from typing import Final
 
 from coldloop.kernels.single_precision import neighbour, single
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import Verdict
 from coldloop.safety.sequence import Inputs
 from control_plc.output_limits import admit, beginning, in_range, judge, plain, resume
-
-SET_BACK_TICKS: Final = TICKS_PER_SAMPLE
-"""Time set back by more than this will come again: what was for it is dropped."""
 
 
 class OutputGuard:
     """Keeps every output inside its bounds, its rate window and the slew limit, whatever is requested.
 
     Its time is that of the ticks, but never faster than the time that has really passed, and it does not go back: a
-    leap of the tick ends no window, and ticks that come again after a leap of `SET_BACK_TICKS` back do not count.
+    leap of the tick ends no window, and ticks that come again after a leap of a sampling period back do not count.
     """
 
     def __init__(self, limits: InputLimits, applied: Inputs) -> None:
@@ -35,7 +30,7 @@ class OutputGuard:
         `passed`: ticks since the last scan by another clock, None without one.
         """
         leap = tick - self._newest
-        if -SET_BACK_TICKS <= leap < 0:
+        if -self.limits.ticks_per_sample <= leap < 0:
             leap = 0
         self._lag += leap - max(0, leap if passed is None else min(leap, passed))
         self._newest += leap

@@ -11,10 +11,8 @@ from typing import Final, NamedTuple
 
 from coldloop.kernels.single_precision import neighbour, single
 from coldloop.process.limits import InputLimits, RateReference
-from coldloop.process.signals import INPUT_NAMES, TICKS_PER_SAMPLE
 from control_plc.numbers import Numbers, Rows
 
-N_INPUTS: Final = len(INPUT_NAMES)
 TOLERANCE: Final = 1e-5
 """Share of an input's range by which a sequence may miss a limit: single precision cannot tell it apart. The guard
 itself allows nothing."""
@@ -38,6 +36,8 @@ class Limits(NamedTuple):
     """By which a sequence may miss a bound or a rate."""
     slew_ticks: int
     """Within fewer ticks than this an output moves by at most its rate."""
+    ticks_per_sample: int
+    """Ticks of a sampling period."""
     elapsed: bool
     """The rate of an update is scaled by the time since the outputs last moved."""
 
@@ -46,7 +46,9 @@ def plain(limits: InputLimits) -> Limits:
     """Return limits as plain numbers."""
     slack = tuple(TOLERANCE * (high - low) for low, high in zip(limits.low, limits.high, strict=True))
     elapsed = limits.rate_reference is RateReference.ELAPSED
-    return Limits(limits.low, limits.high, limits.rate, slack, limits.slew_ticks, elapsed)
+    return Limits(
+        limits.low, limits.high, limits.rate, slack, limits.slew_ticks, limits.process.ticks_per_sample, elapsed
+    )
 
 
 @dataclass(slots=True)
@@ -67,11 +69,11 @@ class GuardState:
     """Tick of each of the last changes, in turn, shape (slew_ticks,)."""
     before: MutableSequence[MutableSequence[float]]
     """Outputs applied before each of them, shape (slew_ticks, inputs)."""
+    moved: int
+    """Tick of the last change."""
     start: int = 0
     share: float = 1.0
     """Depends on how long before the window the outputs last moved."""
-    moved: int = -TICKS_PER_SAMPLE
-    """Tick of the last change."""
     oldest: int = 0
     """Place of the oldest of the last changes, which the next one takes."""
     out_of_bounds: bool = False
@@ -81,20 +83,22 @@ class GuardState:
 def beginning(limits: Limits, applied: Numbers) -> GuardState:
     """Return the state after `applied` has been constant for ever."""
     rows: list[MutableSequence[float]] = [list(applied) for _ in range(limits.slew_ticks)]
-    state = GuardState(list(applied), list(applied), list(applied), [NEVER for _ in rows], rows)
+    state = GuardState(
+        list(applied), list(applied), list(applied), [NEVER for _ in rows], rows, -limits.ticks_per_sample
+    )
     begin(state, limits, applied)
     return state
 
 
 def begin(state: GuardState, limits: Limits, applied: Numbers) -> None:
     """Make the state that after `applied` (inputs,) has been constant for ever."""
-    for i in range(N_INPUTS):
+    for i in range(len(limits.low)):
         state.applied[i] = state.anchor[i] = applied[i]
     for slot in range(limits.slew_ticks):
         state.moves[slot] = NEVER
-        for i in range(N_INPUTS):
+        for i in range(len(limits.low)):
             state.before[slot][i] = applied[i]
-    state.start, state.share, state.moved, state.oldest = 0, 1.0, -TICKS_PER_SAMPLE, 0
+    state.start, state.share, state.moved, state.oldest = 0, 1.0, -limits.ticks_per_sample, 0
     state.out_of_bounds = not in_range(limits, applied)
 
 
@@ -104,15 +108,17 @@ def resume(state: GuardState, limits: Limits, tick: int, applied: Numbers) -> No
     An open window stays open: consecutive breaks would otherwise give a full rate each. A value that is not finite is
     ignored: the last one stays.
     """
-    for i in range(N_INPUTS):
+    for i in range(len(limits.low)):
         state.coming[i] = applied[i] if math.isfinite(applied[i]) else state.applied[i]
-    is_open = 0 <= tick - state.start < TICKS_PER_SAMPLE and are_near(limits, state.anchor, state.coming, state.share)
+    is_open = 0 <= tick - state.start < limits.ticks_per_sample and are_near(
+        limits, state.anchor, state.coming, state.share
+    )
     for slot in range(limits.slew_ticks):
         if are_near(limits, state.before[slot], state.coming, 1.0):
             state.moves[slot] = min(state.moves[slot], tick)
         else:  # what is further away limits nothing any more
             state.moves[slot] = NEVER
-    for i in range(N_INPUTS):
+    for i in range(len(limits.low)):
         state.applied[i] = state.coming[i]
         if not is_open:
             state.anchor[i] = state.coming[i]
@@ -124,11 +130,11 @@ def resume(state: GuardState, limits: Limits, tick: int, applied: Numbers) -> No
 
 def copy_state(source: GuardState, target: GuardState, limits: Limits) -> None:
     """Make `target` the same as `source`."""
-    for i in range(N_INPUTS):
+    for i in range(len(limits.low)):
         target.applied[i], target.anchor[i] = source.applied[i], source.anchor[i]
     for slot in range(limits.slew_ticks):
         target.moves[slot] = source.moves[slot]
-        for i in range(N_INPUTS):
+        for i in range(len(limits.low)):
             target.before[slot][i] = source.before[slot][i]
     target.start, target.share = source.start, source.share
     target.moved, target.oldest, target.out_of_bounds = source.moved, source.oldest, source.out_of_bounds
@@ -136,16 +142,16 @@ def copy_state(source: GuardState, target: GuardState, limits: Limits) -> None:
 
 def rate_share(limits: Limits, elapsed_ticks: int) -> float:
     """Return the share of the rate that an update may use so many ticks after the one before."""
-    return min(1.0, elapsed_ticks / TICKS_PER_SAMPLE) if limits.elapsed else 1.0
+    return min(1.0, elapsed_ticks / limits.ticks_per_sample) if limits.elapsed else 1.0
 
 
 def admit(state: GuardState, limits: Limits, tick: int, wanted: Numbers, update: bool) -> None:  # noqa: FBT001 compiled
     """Apply `wanted` (inputs,) at `tick` as far as the limits allow; `update`: a sequence begins there."""
     applied = state.applied
-    if update or tick - state.start >= TICKS_PER_SAMPLE:
+    if update or tick - state.start >= limits.ticks_per_sample:
         state.share = rate_share(limits, tick - state.moved)
         state.start = tick
-        for i in range(N_INPUTS):
+        for i in range(len(limits.low)):
             state.anchor[i] = applied[i]
     if same(wanted, applied) and not state.out_of_bounds:  # it was admitted before, and a new window begins with it
         return
@@ -157,22 +163,22 @@ def admit(state: GuardState, limits: Limits, tick: int, wanted: Numbers, update:
 def change(state: GuardState, limits: Limits, tick: int, wanted: Numbers) -> None:
     """Apply what is nearest to `wanted`, and remember what was applied before if that is another."""
     applied, slot = state.applied, state.oldest
-    for i in range(N_INPUTS):  # of this slot too each is still limited by what it held
+    for i in range(len(limits.low)):  # of this slot too each is still limited by what it held
         state.coming[i] = nearest(state, limits, tick, wanted[i], i)
     if same(state.coming, applied):
         return
     state.moves[slot] = state.moved = tick
-    for i in range(N_INPUTS):
+    for i in range(len(limits.low)):
         state.before[slot][i] = applied[i]
     state.oldest = slot + 1 if slot + 1 < limits.slew_ticks else 0
-    for i in range(N_INPUTS):
+    for i in range(len(limits.low)):
         applied[i] = state.coming[i]
 
 
 def same(one: Numbers, other: Numbers) -> bool:
     """Return whether two rows of outputs are the same."""
     found = True
-    for i in range(N_INPUTS):
+    for i in range(len(one)):
         found = found and one[i] == other[i]
     return found
 
@@ -215,7 +221,7 @@ def is_reached(state: GuardState, limits: Limits, tick: int, value: float, i: in
 def are_near(limits: Limits, one: Numbers, other: Numbers, share: float) -> bool:
     """Return whether two rows of outputs are apart by at most a share of the rates."""
     near = True
-    for i in range(N_INPUTS):
+    for i in range(len(limits.low)):
         near = near and abs(other[i] - one[i]) <= limits.rate[i] * share
     return near
 
@@ -223,7 +229,7 @@ def are_near(limits: Limits, one: Numbers, other: Numbers, share: float) -> bool
 def in_range(limits: Limits, row: Numbers) -> bool:
     """Return whether the outputs are finite and inside the bounds, but for the slack."""
     inside = True
-    for i in range(N_INPUTS):
+    for i in range(len(limits.low)):
         inside = inside and limits.low[i] - limits.slack[i] <= row[i] <= limits.high[i] + limits.slack[i]
     return inside
 
@@ -250,7 +256,7 @@ def admits(state: GuardState, limits: Limits, first_tick: int, rows: Rows, lengt
     """Return whether a sequence of `length` rows, one per tick, would be applied unchanged; `state` advances."""
     for k in range(length):
         admit(state, limits, first_tick + k, rows[k], k == 0)
-        for i in range(N_INPUTS):
+        for i in range(len(limits.low)):
             if abs(state.applied[i] - rows[k][i]) > limits.slack[i]:
                 return False
     return True

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from enum import IntEnum
 
 from coldloop.process.declaration import LAST_NUMBER
-from coldloop.process.signals import TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Acknowledgement, Plan, Update, Verdict
 from coldloop.safety.sequence import Inputs, InputSequence, checksum
 from control_plc.guard import OutputGuard
@@ -132,7 +131,9 @@ class SequencePlayer:
         """Begin an update; return it with its number."""
         self.update = update._replace(update=self._updates, playing=self.playing)
         self._updates = self._updates + 1 if self._updates < LAST_NUMBER else 0  # as at the start of a session
-        self.next_update_tick = update.tick + TICKS_PER_SAMPLE  # until the optimiser has planned another
+        self.next_update_tick = (
+            update.tick + self._guard.limits.ticks_per_sample
+        )  # until the optimiser has planned another
         self.phase = UpdatePhase.LATCHED
         return self.update
 

@@ -4,13 +4,11 @@ from collections.abc import Collection, Sequence
 from typing import Final
 
 from coldloop.process.declaration import Range
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import CONTROLLED
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.safety import AlarmKind, CapacityCause
 from coldloop.service.journal import Journal
-from control_plc.alarm_settings import BANDS
+from control_plc.alarm_settings import BANDS, AlarmSettings
 from control_plc.alarms import AlarmPanel
 from control_plc.ladder import Ladder
 
@@ -20,16 +18,14 @@ OPTIMIZER_DRIVES: Final = (Mode.MPC, Mode.REST)
 """Modes in which the optimiser's sequences are played."""
 
 
-DEAD_BANDS: Final = PROCESS.dead_bands
-
-
-def present_limits(bands: Sequence[Range], panel: AlarmPanel) -> list[Range]:
+def present_limits(settings: AlarmSettings, panel: AlarmPanel) -> list[Range]:
     """Return the limits of each output with a band: its band while its alarm is raised, wider by the dead band else."""
+    bands, dead_bands = settings.bands, settings.process.dead_bands
     level, further = (panel.rows[kind] for kind in BANDS)
     raised = [level.active, *(further.active and further.cause == place for place in range(len(bands) - 1))]
     return [
         (low, high) if is_raised else (low - dead_band, high + dead_band)
-        for (low, high), dead_band, is_raised in zip(bands, DEAD_BANDS, raised, strict=True)
+        for (low, high), dead_band, is_raised in zip(bands, dead_bands, raised, strict=True)
     ]
 
 
@@ -39,13 +35,14 @@ class ProcessAlarms:
     Args:
         panel: Whose alarms they are.
         journal: Where sensors that became bad or good are noted.
-        bands: Of the outputs that have one: L1 and T5 of the cold box.
+        settings: With the bands.
     """
 
-    def __init__(self, panel: AlarmPanel, journal: Journal, bands: Sequence[tuple[float, float]]) -> None:
+    def __init__(self, panel: AlarmPanel, journal: Journal, settings: AlarmSettings) -> None:
         self._panel = panel
         self._journal = journal
-        self._bands = bands
+        self._settings = settings
+        self._controlled = settings.process.controlled
         self._raised: tuple[int, int, int] | None = None
         self._limits: list[Range] = []
         self._before: dict[AlarmKind, frozenset[int]] = dict.fromkeys(SENSORS, frozenset())
@@ -81,8 +78,8 @@ class ProcessAlarms:
         first, others = (self._panel.rows[kind] for kind in BANDS)
         raised = first.active, others.active, others.cause
         if raised != self._raised:
-            self._raised, self._limits = raised, present_limits(self._bands, self._panel)
-        limits = zip(CONTROLLED, self._limits, strict=True)
+            self._raised, self._limits = raised, present_limits(self._settings, self._panel)
+        limits = zip(self._controlled, self._limits, strict=True)
         outside = [not (cooling or low <= y[output] <= high) for output, (low, high) in limits]
         report(AlarmKind.LEVEL_BAND, condition=outside[0])
         further = [place for place, is_outside in enumerate(outside[1:]) if is_outside]

@@ -12,9 +12,7 @@ from dataclasses import dataclass
 
 from coldloop.errors import ConfigurationError
 from coldloop.process.limits import InputLimits
-from coldloop.process.load_profile import LOAD_SPAN
 from coldloop.process.model_file import ModelHeader
-from coldloop.process.signals import STRETCH, TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import (
     Acknowledgement,
@@ -38,7 +36,7 @@ from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
 from control_plc.classical import ClassicalLoops
 from control_plc.cool_down import CoolDown
-from control_plc.guard import SET_BACK_TICKS, OutputGuard
+from control_plc.guard import OutputGuard
 from control_plc.ladder import Ladder, LadderInputs
 from control_plc.player import SequencePlayer
 from control_plc.process_alarms import OPTIMIZER_DRIVES, ProcessAlarms
@@ -47,9 +45,7 @@ from control_plc.settings import ControlSection, ControlStrategy
 
 SEEN = 0.1
 """Share of its rate by which an input must have moved for the process to show it."""
-HANDSHAKE_TICKS = TICKS_PER_SAMPLE
-"""Longest time that the classical loops wait for an announced sequence."""
-HANDSHAKE_PAUSE_S = 30.0 * STRETCH
+HANDSHAKE_PAUSE_TICKS = 120
 """After a handshake that came to nothing the classical loops are not held again for so long."""
 LOST_TICKS = 4
 """A rack that has been out of step for longer takes no new sequences: they would be played late."""
@@ -184,7 +180,7 @@ class ControlProgram:
         self._in_scan = False
         self.watchdog.set(self.watchdog.time, tick)
         self._loops.restart()
-        self._process_alarms = ProcessAlarms(self.alarms, self.journal, self.alarm_settings.bands)
+        self._process_alarms = ProcessAlarms(self.alarms, self.journal, self.alarm_settings)
         self.alarms.begin_at(tick)
 
     # -- what others see -----------------------------------------------------------------------------------------------
@@ -299,11 +295,15 @@ class ControlProgram:
         """Return whether the loops are at rest, so that the first sequence begins at inputs the optimiser knows.
 
         A handshake fails when its update is abandoned, its sequence refused or missing, and in any case after
-        `HANDSHAKE_TICKS`. The next begins with an update, not amid one: the loops may have moved the inputs since.
+        a sampling period. The next begins with an update, not amid one: the loops may have moved the inputs since.
         """
         player, held_from = self.player, self._held_from
         if held_from is not None:
-            over = player.given_up or player.broken_promise or not 0 <= tick - held_from < HANDSHAKE_TICKS
+            over = (
+                player.given_up
+                or player.broken_promise
+                or not 0 <= tick - held_from < self._limits.process.ticks_per_sample
+            )
             if over:
                 self._failed_handshake, self._held_from = tick, None
                 self._answer_failed = self._answer_failed or self._held_for_answer
@@ -320,7 +320,7 @@ class ControlProgram:
 
     def _rested_by(self, tick: int) -> bool:
         """Return whether the loops have worked for long enough since a handshake failed."""
-        return tick - self._failed_handshake > HANDSHAKE_PAUSE_S / TICK_S
+        return tick - self._failed_handshake > HANDSHAKE_PAUSE_TICKS
 
     def end_scan(self, measurement: Measurement) -> Update | None:
         """Take the measurement of this tick; return the update if it was latched here."""
@@ -330,7 +330,8 @@ class ControlProgram:
         if self.cool_down.observe(self.tick, y):
             self.journal.note(self.tick, EventKind.COOL_DOWN, self.cool_down.step)
         self.process = ProcessNow(self.tick, measurement.load, applied, y)
-        self._unknown = not (LOAD_SPAN[0] <= measurement.load <= LOAD_SPAN[1] and _are_states(measurement.x))
+        least, largest = self._limits.process.load.stored_span
+        self._unknown = not (least <= measurement.load <= largest and _are_states(measurement.x))
         self._let_play(usable=self._usable)
         latched = None
         if self.player.latches(self.tick, measurement.load):
@@ -365,7 +366,7 @@ class ControlProgram:
         """Continue at another tick: the rack was away, or time has jumped.
 
         Forward, all timers count the time that has passed. Back by a little, they begin at the present tick at the
-        latest; back by more than `SET_BACK_TICKS`, sequences are dropped too, and the optimiser is invited again.
+        latest; back by more than a sampling period, sequences are dropped too, and the optimiser is invited again.
 
         Args:
             tick: Tick of the next scan.
@@ -379,7 +380,7 @@ class ControlProgram:
         self.guard.begin_at(self.tick, tuple(applied), passed)
 
     def _set_back(self, tick: int) -> None:
-        if self.tick - tick > SET_BACK_TICKS:
+        if self.tick - tick > self._limits.process.ticks_per_sample:
             self.player.set_back(tick)
             self.alarms.pulse(AlarmKind.CLOCK_SKEW, LinkCause.TIME_JUMP)
         self.sensors.set_back(tick)

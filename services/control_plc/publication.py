@@ -4,11 +4,9 @@ import logging
 import math
 from collections.abc import Callable, Mapping
 
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.control_plc import LadderStatus, PlantLinkStatus, ProcessNow, Status
-from coldloop.registers.maps import CONTROL_MAP
 from coldloop.registers.safety import AlarmKind, AlarmState
 from coldloop.safety.writer_lease import WriterLease
 from coldloop.service.event_text import alarm_word, log_event
@@ -67,8 +65,8 @@ class ControlPublication:
         program = self._program
         self._bank.put(
             Identity(
-                map_digest=CONTROL_MAP.digest,
-                map_version=CONTROL_MAP.version,
+                map_digest=self._bank.map.digest,
+                map_version=self._bank.map.version,
                 state=ServiceState.RUNNING if self._sessions.running else ServiceState.READY,
                 model_digest=self._model_digest,
                 session=program.session,
@@ -107,7 +105,7 @@ class ControlPublication:
         program = self._program
         events = self.journal.show()
         for event in events:
-            log_event(log, event)
+            log_event(log, event, self._bank.map.process)
         if events:
             self._keep()
         if program.alarms.changes != self._told_alarms:
@@ -150,7 +148,7 @@ class ControlPublication:
         """Return what telemetry publishes."""
         status, process = self._bank.get(Status), self._bank.get(ProcessNow)
         alarms = {
-            alarm_word(kind).replace(" ", "_"): AlarmState(alarm.state).name.lower()
+            alarm_word(kind, self._bank.map.process).replace(" ", "_"): AlarmState(alarm.state).name.lower()
             for kind, alarm in zip(AlarmKind, self._program.alarms.rows, strict=True)
             if alarm.state != AlarmState.NORMAL
         }
@@ -162,6 +160,6 @@ class ControlPublication:
             "cause": self._program.ladder.cause.name.lower(),
             "alarms": alarms,
             "load_w": process.load,
-            "inputs": dict(zip(INPUT_NAMES, process.u, strict=True)),
-            "outputs": dict(zip(OUTPUT_NAMES, process.y, strict=True)),
+            "inputs": dict(zip(self._bank.map.process.input_names, process.u, strict=True)),
+            "outputs": dict(zip(self._bank.map.process.output_names, process.y, strict=True)),
         }

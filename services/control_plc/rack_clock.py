@@ -8,8 +8,6 @@ and a half. Each measurement has the rack's tick and age, and corrects the sched
 import math
 from typing import Final, NamedTuple
 
-from coldloop.process.signals import TICK_S
-
 PHASE: Final = 0.5
 """Scans are half-way between two ticks of the rack: where neither side's jitter can confuse two ticks."""
 GAIN: Final = 0.1
@@ -81,14 +79,16 @@ class RackClock:
     Args:
         factor: Seconds of plant time in a second of real time, nominally.
         now: The present time, s: tick 0 is due then, until the rack is heard of.
+        tick_s: Length of a tick, s of plant time.
     """
 
-    def __init__(self, factor: float, now: float) -> None:
+    def __init__(self, factor: float, now: float, tick_s: float) -> None:
+        self._plant_tick_s = tick_s
         self.begin(factor, now)
 
     def begin(self, factor: float, now: float) -> None:
         """Reset with another factor: nothing is known of the rack."""
-        self.tick_s = TICK_S / factor
+        self.tick_s = self._plant_tick_s / factor
         self.offset = 0.0
         """Last phase error, in ticks: positive when the rack is ahead of our schedule."""
         self._rate = 0.0

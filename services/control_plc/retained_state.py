@@ -8,14 +8,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
-from coldloop.process.declaration import LAST_NUMBER, LAST_TICK
-from coldloop.process.signals import INPUT_NAMES
+from coldloop.process.declaration import LAST_NUMBER, LAST_TICK, Process
+from coldloop.process.settings import ProcessSettings, settings_of, settings_process
 from coldloop.registers.codec import check_record
 from coldloop.registers.common import SessionPace
-from coldloop.registers.control_plc import SEQUENCE_ROWS, CoolDownStep, Operator, SequenceHeader
-from coldloop.registers.maps import CONTROL_MAP
+from coldloop.registers.control_plc import SEQUENCE_ROWS, CoolDownStep, Operator, SequenceHeader, control_map
 from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.safety.retained import RetainedFile, RetainedStateError
 from coldloop.safety.retained_writer import RetainedStateWriter
@@ -27,17 +26,24 @@ log = logging.getLogger("coldloop.control_plc")
 
 OWNER: Final = "control_plc/6"
 """Who retained states belong to, and the version of what they hold."""
-ROW: Final = struct.Struct(f">{len(INPUT_NAMES)}f")
 OF_THE_SESSION: Final = ("session", "tick", "pace", "updates", "playing", "cool_down")
 """What is retained of a session."""
 
 Count = Annotated[int, Field(ge=0, lt=2**32)]
 
 
-class RetainedControlState(BaseModel):
-    """The session, how far it has got, what is being played, what operators have said, the alarms, and who we are."""
+def _row(process: Process) -> struct.Struct:
+    return struct.Struct(f">{len(process.inputs)}f")
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+
+def _not_longer(text: str) -> str:
+    if len(text) > 2 * SEQUENCE_ROWS * _row(settings_process()).size:
+        raise ValueError("a sequence longer than the longest")
+    return text
+
+
+class RetainedControlState(ProcessSettings):
+    """The session, how far it has got, what is being played, what operators have said, the alarms, and who we are."""
 
     boot: Annotated[int, Field(ge=1, lt=2**16)]
     """Number of the start that wrote it."""
@@ -50,7 +56,7 @@ class RetainedControlState(BaseModel):
     pace: TimeBase
     updates: Annotated[int, Field(ge=0, le=LAST_NUMBER)]
     """Number of the next update."""
-    playing: tuple[SequenceHeader, Annotated[str, Field(max_length=2 * SEQUENCE_ROWS * ROW.size)]] | None
+    playing: tuple[SequenceHeader, Annotated[str, AfterValidator(_not_longer)]] | None
     """Header and rows (base64 of single precision, high byte first) of the sequence being played."""
     cool_down: CoolDownStep
     operator: Operator
@@ -60,21 +66,23 @@ class RetainedControlState(BaseModel):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
+        registers = control_map(self.process)
         for record in (SessionPace.shown(self.session, self.pace), self.operator, *self.alarms):
-            check_record(record, CONTROL_MAP)
+            check_record(record, registers)
         if self.playing is not None:
-            check_record(self.playing[0], CONTROL_MAP)
+            check_record(self.playing[0], registers)
         return self
 
     @classmethod
-    def parsed(cls, content: Mapping[str, object]) -> Self:
-        """Return the state that a file holds.
+    def parsed(cls, content: Mapping[str, object], process: Process) -> Self:
+        """Return the state of a control PLC of this process that a file holds.
 
         Raises:
             RetainedStateError: It holds something else.
         """
         try:
-            return cls.model_validate(content)
+            with settings_of(process):
+                return cls.model_validate(content)
         except ValidationError as error:
             raise RetainedStateError(f"the retained state is not used: {error.errors()[0]['msg']}") from None
 
@@ -85,7 +93,7 @@ class RetainedControlState(BaseModel):
             return None
         header, text = self.playing
         try:
-            rows = list(ROW.iter_unpack(base64.b64decode(text)))
+            rows = list(_row(self.process).iter_unpack(base64.b64decode(text)))
         except (ValueError, struct.error):
             return None
         return InputSequence(header, rows) if checksum(header, rows) == header.crc else None
@@ -97,7 +105,8 @@ class ControlStateStore:
     Writing is done by a thread: a scan never waits for a disk.
     """
 
-    def __init__(self, file: Path | None, model_digest: int) -> None:
+    def __init__(self, file: Path | None, model_digest: int, process: Process) -> None:
+        self._process, self._row = process, _row(process)
         self._file = RetainedFile(file, OWNER, model_digest) if file else None
         self._writer = RetainedStateWriter(self._file) if self._file else None
         self._packed: tuple[InputSequence, tuple[SequenceHeader, str]] | None = None
@@ -112,7 +121,7 @@ class ControlStateStore:
             return None
         try:
             content = self._file.load()
-            state = None if content is None else RetainedControlState.parsed(content)
+            state = None if content is None else RetainedControlState.parsed(content, self._process)
         except RetainedStateError as error:
             self.refused = True
             log.warning("retained state refused", extra={"reason": str(error), "file": self._file.set_aside()})
@@ -149,7 +158,7 @@ class ControlStateStore:
         if sequence is None:
             return None
         if self._packed is None or self._packed[0] is not sequence:
-            rows = b"".join(ROW.pack(*row) for row in sequence.rows)
+            rows = b"".join(self._row.pack(*row) for row in sequence.rows)
             self._packed = sequence, (sequence.header, base64.b64encode(rows).decode())
         return self._packed[1]
 

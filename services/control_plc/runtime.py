@@ -19,13 +19,12 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.process.declaration import LAST_TICK
 from coldloop.process.model_file import read_header
-from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import SessionPace
 from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.control_plc import ControlSession
-from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
+from coldloop.registers.maps import maps_of
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import AlarmKind, WatchdogTime
 from coldloop.service.logs import dropped
@@ -48,7 +47,6 @@ from control_plc.settings import SHOWN, ControlSettings
 
 log = logging.getLogger("coldloop.control_plc")
 
-TICKS_PER_SECOND: Final = max(1, round(1 / TICK_S))
 ANSWER_TICKS: Final = 8
 """In real time a later answer is stale: the rack is read again."""
 SHORTEST_PATIENCE_S: Final = 0.1
@@ -69,9 +67,10 @@ class ControlPlc:
 
     def __init__(self, settings: ControlSettings) -> None:
         header = read_header(settings.model.file)
+        process, maps = settings.process, maps_of(settings.process)
         section = settings.control_plc
         self._settings = settings
-        self._store = ControlStateStore(section.retain.file, header.short_digest)
+        self._store = ControlStateStore(section.retain.file, header.short_digest, process)
         recalled = self._store.recall()
         self._program = program = make_program(header, section, settings.limits)
         program.journal.continue_from(self._store.boot, recalled.events if recalled else 0)
@@ -80,12 +79,12 @@ class ControlPlc:
         self.sessions = Sessions(program, settings.session, recalled)
         self._link = PlantLink(program.alarms, program.journal, self._store.holder)
         self._cycle = ScanCycle(program, self._link, self._adopt)
-        self._plant = RegisterClient.at(PLANT_MAP, section.plant)
-        self._clock = RackClock(self.sessions.pace.factor, time.monotonic())
+        self._plant = RegisterClient.at(maps.plant, section.plant)
+        self._clock = RackClock(self.sessions.pace.factor, time.monotonic(), process.tick_s)
         if self.sessions.kept is not None:
             self._clock.synchronise(self.sessions.kept.tick + PHASE, time.monotonic())
         self._finder = RackFinder(self._plant, self._link, self._cycle, self._clock, power_up_s=section.power_up_s)
-        self.bank = RegisterBank(CONTROL_MAP, section.word_order)
+        self.bank = RegisterBank(maps.control_plc, section.word_order)
         publish_configuration(self.bank, selected(settings, SHOWN))
         self.publication = ControlPublication(
             program, self.sessions, self._link, self.bank, header.short_digest, self._keep
@@ -94,6 +93,7 @@ class ControlPlc:
         certificates = [tls for tls in (section.server.tls, section.plant.tls) if tls is not None]
         self.certificates = CertificateWatch(certificates, program, self.publication.safety)
         self._watch = ScanWatch()
+        self._ticks_per_second = max(1, round(1 / process.tick_s))
         self._lost_lines = 0
         self._awaiting_since: float | None = None
         self._repaced = -REPACED_S
@@ -253,7 +253,7 @@ class ControlPlc:
     def _after_scan(self, *, latched: bool) -> None:
         """Publish what has changed, and save the retained state."""
         program, publication = self._program, self.publication
-        on_the_second = program.tick % TICKS_PER_SECOND == 0
+        on_the_second = program.tick % self._ticks_per_second == 0
         if program.track():
             self.bank.put(program.operator)
         if on_the_second:

@@ -6,39 +6,36 @@ a plant that rests is known by its inputs, which rest too. A turbine without a p
 """
 
 from collections.abc import Collection, MutableSequence, Sequence
-from typing import Annotated, Self
+from typing import Annotated, NamedTuple, Self
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import Field, FiniteFloat, model_validator
 
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import BATH, CONTROLLED, OUTPUT_NAMES, STRETCH, TICK_S
+from coldloop.process.declaration import Process
+from coldloop.process.settings import ProcessSettings, declared, stretched, within
 from control_plc.numbers import Numbers
 
 Range = tuple[FiniteFloat, FiniteFloat]
-QUANTITIES = [output.quantity for output in PROCESS.outputs]
-FIRST_OF_KIND, P1 = (QUANTITIES.index(kind) if kind in QUANTITIES else 0 for kind in ("temperature", "pressure"))
-"""First of the pressures, which are the last outputs; the temperatures are before them. Other outputs have one kind."""
-_TURBINE = (BATH.turbine_speed, *BATH.turbine_pressures) if BATH and BATH.turbine_speed else ()
-TURBINE_SPEED, BEFORE, BEHIND = map(OUTPUT_NAMES.index, _TURBINE) if _TURBINE else (-1, 0, 0)
 STANDSTILL_RATIO = 1.1
 """Of the pressures before and behind the turbine's nozzle, below which it may stand; it is some ten in operation."""
-FEW = int(P1 == 0)
-"""1: most of the others are counted without the output itself, which matters where there are few."""
-MOVES_AS_ONE = PROCESS.moves_as_one
 MOVES = 240
 """Ticks in which an output that is not controlled must have moved before it can be frozen."""
-IS_CONTROLLED = [output in CONTROLLED for output in range(len(OUTPUT_NAMES))]
-FIRST_RESTS = [0 if controlled else -MOVES for controlled in IS_CONTROLLED]
 UNKNOWN, NOT_MOVED = -2, -1
 """In the place of the tick since which the inputs have moved."""
 RECOVERY_TICKS = 8
 """A sensor is good again when its measurements have been good for so long."""
 
 
-class SensorCheckSettings(BaseModel):
-    """Ranges of sensors, and how long a bad one is bridged."""
+class Kinds(NamedTuple):
+    """Where outputs of a kind begin: other outputs are one kind, and both are 0."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    temperatures: int
+    """The first temperature; they end where the pressures begin."""
+    pressures: int
+    """The first pressure; they are the last outputs."""
+
+
+class SensorCheckSettings(ProcessSettings):
+    """Ranges of sensors, and how long a bad one is bridged."""
 
     level: Range = (-5.0, 105.0)
     """%."""
@@ -48,25 +45,29 @@ class SensorCheckSettings(BaseModel):
     """K."""
     pressure: Range = (-1.0, 100.0)
     """bar."""
-    frozen_s: Annotated[float, Field(gt=0)] = 20.0 * STRETCH
+    frozen_s: Annotated[float, Field(gt=0)] = stretched(20.0)
     """A controlled output that does not change for so long, while others move, is frozen."""
-    resting_s: Annotated[float, Field(gt=0)] = 60.0 * STRETCH
+    resting_s: Annotated[float, Field(gt=0)] = stretched(60.0)
     """Another one, that has moved for a minute before, is if it rests for so long and for twice as long as ever before:
     what is constant in a plant with exact sensors is not taken for frozen."""
     may_rest: bool = True
     """While its inputs do not move a plant may stand still bit for bit, as a simulated one with exact sensors does.
     False for sensors that are always noisy: an image unchanged for `frozen_s` is then stale in any case."""
-    bridged_s: Annotated[float, Field(ge=0)] = 10.0 * STRETCH
+    bridged_s: Annotated[float, Field(ge=0)] = stretched(10.0)
     """How long the classical loops work with the last good value of a controlled output; then that loop is left."""
-    estimated_s: Annotated[float, Field(ge=0)] = 1800.0 * STRETCH
+    estimated_s: Annotated[float, Field(ge=0)] = stretched(1800.0)
     """How long MPC works without one, by its estimate from the others."""
-    estimated_most: Annotated[int, Field(ge=0, le=len(OUTPUT_NAMES))] = min(5, len(OUTPUT_NAMES))
+    estimated_most: Annotated[int, within(lambda process: (0, len(process.outputs)))] = declared(
+        lambda process: min(5, len(process.outputs))
+    )
     """Bad sensors at most for that; with more, MPC is left after `bridged_s`, too."""
 
     @property
     def ranges(self) -> tuple[Range, ...]:
         """Range of each output."""
-        return tuple(getattr(self, output.quantity) if output.quantity else output.range for output in PROCESS.outputs)
+        return tuple(
+            getattr(self, output.quantity) if output.quantity else output.range for output in self.process.outputs
+        )
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -91,19 +92,22 @@ def count_unchanged(
     elapsed: int,
     least: Numbers,
     controlled: Numbers,
+    kinds: Kinds,
 ) -> None:
     """Count for how many ticks each output is unchanged while most of the others moved.
 
     For those that are not controlled these are most temperatures and most pressures: exact sensors of one kind rest
     with the plant while noisy ones of the other kind do not.
 
-    `before` (22) becomes `y`, the measurements `elapsed` ticks later. `rests` (22), first `FIRST_RESTS`, are the
+    `before` (outputs,) becomes `y`, the measurements `elapsed` ticks later. `rests` (outputs,) are the
     longest such times of those that are not controlled, without the times for which they were frozen; below 0: the
     moves that are missing until they count. `least` is as `SensorMonitor` has it; `controlled` says which are.
     """
-    most = 2 * moved(before, y, 0, len(y)) > len(y) - FEW
-    temperatures, pressures = moved(before, y, FIRST_OF_KIND, P1), moved(before, y, P1, len(y))
-    most_of_each = (P1 == 0 or 2 * temperatures > P1 - FIRST_OF_KIND) and 2 * pressures > len(y) - P1 - FEW
+    first, end = kinds.temperatures, kinds.pressures
+    few = int(end == 0)  # most of the others are counted without the output itself, which matters where there are few
+    most = 2 * moved(before, y, 0, len(y)) > len(y) - few
+    temperatures, pressures = moved(before, y, first, end), moved(before, y, end, len(y))
+    most_of_each = (end == 0 or 2 * temperatures > end - first) and 2 * pressures > len(y) - end - few
     for output in range(len(y)):
         if y[output] == before[output]:
             unchanged[output] += elapsed * (most if controlled[output] else most_of_each)
@@ -119,11 +123,6 @@ def count_unchanged(
 def is_frozen(unchanged: float, rest: float, least: float) -> bool:
     """Return whether an output is unchanged for at least so many ticks, and for twice its longest rest."""
     return rest >= 0 and unchanged >= least and unchanged >= 2 * rest
-
-
-def may_stand(output: int, y: Sequence[float]) -> bool:
-    """Return whether an output is the speed of a turbine that stands, for all that the pressures say."""
-    return output == TURBINE_SPEED and y[output] == 0.0 and y[BEFORE] < STANDSTILL_RATIO * y[BEHIND]
 
 
 def moved(before: Numbers, y: Numbers, first: int, end: int) -> int:
@@ -201,6 +200,20 @@ class ImageWatch:
         return self.count if self.has_moved else 0
 
 
+def _kinds(process: Process) -> Kinds:
+    quantities = [output.quantity for output in process.outputs]
+    return Kinds(*(quantities.index(kind) if kind in quantities else 0 for kind in ("temperature", "pressure")))
+
+
+def _turbine(process: Process) -> tuple[int, int, int] | None:
+    """Return the outputs that are the turbine's speed, and the pressures before and behind it; None without one."""
+    bath = process.bath
+    if bath is None or not bath.turbine_speed:
+        return None
+    speed, before, behind = map(process.output_names.index, (bath.turbine_speed, *bath.turbine_pressures))
+    return speed, before, behind
+
+
 class SensorMonitor:
     """Looks at every measurement. All its times are plant time: scans can be missed.
 
@@ -213,23 +226,27 @@ class SensorMonitor:
     """
 
     def __init__(self, settings: SensorCheckSettings, initial: Sequence[float], moves: Sequence[float] = ()) -> None:
+        process = settings.process
         self.low, self.high = zip(*settings.ranges, strict=True)
-        self.frozen_ticks = round(settings.frozen_s / TICK_S)
-        resting_ticks = round(settings.resting_s / TICK_S)
-        self.least = [self.frozen_ticks if output in CONTROLLED else resting_ticks for output in range(len(initial))]
+        self.frozen_ticks = round(settings.frozen_s / process.tick_s)
+        self._controlled = process.controlled
+        self.is_controlled = [output in process.controlled for output in range(len(initial))]
+        self.kinds, self._turbine = _kinds(process), _turbine(process)
+        resting_ticks = round(settings.resting_s / process.tick_s)
+        self.least = [self.frozen_ticks if controlled else resting_ticks for controlled in self.is_controlled]
         """Ticks for which each output is at least unchanged before it is frozen."""
-        self._bridged_ticks = round(settings.bridged_s / TICK_S)
-        self._estimated_ticks = round(settings.estimated_s / TICK_S)
+        self._bridged_ticks = round(settings.bridged_s / process.tick_s)
+        self._estimated_ticks = round(settings.estimated_s / process.tick_s)
         self._estimated_most = settings.estimated_most
         self._good = list(initial)
         self.before = list(initial)
         self._tick: int | None = None
         self._now = 0
         self.unchanged = [0] * len(initial)
-        self.rests = FIRST_RESTS.copy()
+        self.rests = [0 if controlled else -MOVES for controlled in self.is_controlled]
         self.moves = moves
         self.may_rest = settings.may_rest
-        self.each_may_rest = settings.may_rest and not MOVES_AS_ONE
+        self.each_may_rest = settings.may_rest and not process.moves_as_one
         self.inputs = [[0.0] * len(moves) for _ in initial]
         """Inputs when each output moved last, ..."""
         self.inputs_moved = [UNKNOWN] * len(initial)
@@ -257,11 +274,11 @@ class SensorMonitor:
             standing: Outputs that may be constant while others move.
         """
         elapsed = 1 if self._tick is None else max(0, tick - self._tick)
-        count_unchanged(self.unchanged, self.rests, self.before, y, elapsed, self.least, IS_CONTROLLED)
+        count_unchanged(self.unchanged, self.rests, self.before, y, elapsed, self.least, self.is_controlled, self.kinds)
         self._tick = self._now = tick
         history = zip(self.unchanged, self.rests, self.least, strict=True)
         frozen: Collection[int] = [output for output, each in enumerate(history) if is_frozen(*each)]
-        frozen = [output for output in frozen if output not in standing and not may_stand(output, y)]
+        frozen = [output for output in frozen if output not in standing and not self._may_stand(output, y)]
         if self.each_may_rest:
             note_moves(self.unchanged, self.inputs, self.inputs_moved, inputs, self.moves, tick)
             frozen = [output for output in frozen if is_to_move(self.inputs_moved[output], tick, self.least[output])]
@@ -275,6 +292,13 @@ class SensorMonitor:
             if output not in self.bad:
                 self._good[output] = value
         return tuple(self._good)
+
+    def _may_stand(self, output: int, y: Sequence[float]) -> bool:
+        """Return whether an output is the speed of a turbine that stands, for all that the pressures say."""
+        if self._turbine is None or output != self._turbine[0] or y[output] != 0.0:
+            return False
+        _, before, behind = self._turbine
+        return y[before] < STANDSTILL_RATIO * y[behind]
 
     def set_back(self, tick: int) -> None:
         """Set the time back to `tick`: conditions that hold now begin there."""
@@ -293,7 +317,7 @@ class SensorMonitor:
                 del self.bad[output], self._recovering[output]
 
     def seen(self, tick: int, y: Sequence[float], *others: Sequence[float]) -> None:
-        """Note that all outputs y (22) have been good up to `tick`, and what was measured there."""
+        """Note that all outputs y (outputs,) have been good up to `tick`, and what was measured there."""
         self._tick = self._now = tick
         self.image.last = (y, *others)
         self._good[:] = self.before[:] = y
@@ -309,7 +333,9 @@ class SensorMonitor:
         return self._bad_for(self._bridged_ticks if len(self.bad) > self._estimated_most else self._estimated_ticks)
 
     def _bad_for(self, ticks: int) -> list[int]:
-        return [output for output in CONTROLLED if output in self.bad and self._now - self.bad[output] + 1 > ticks]
+        return [
+            output for output in self._controlled if output in self.bad and self._now - self.bad[output] + 1 > ticks
+        ]
 
     @property
     def mask(self) -> int:

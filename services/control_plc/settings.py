@@ -4,13 +4,12 @@ import math
 from enum import StrEnum
 from typing import Annotated, Final
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from coldloop.modbus.endpoints import CONTROL_PORT, PLANT_PORT, Endpoint
 from coldloop.modbus.settings import ServerSettings
 from coldloop.process.limits import InputLimits
-from coldloop.process.model_settings import ModelSettings
-from coldloop.process.signals import SAMPLING_PERIOD_S, STRETCH, TICK_S
+from coldloop.process.settings import ProcessSettings, RootSettings, declared, stretched, within
 from coldloop.registers.codec import WordOrder
 from coldloop.safety.retained import RetainSettings
 from coldloop.service.metrics_settings import MetricsSettings
@@ -51,15 +50,13 @@ class ControlStrategy(StrEnum):
     """The classical loops; no update is latched, and the optimiser idles."""
 
 
-class LadderSettings(BaseModel):
+class LadderSettings(ProcessSettings):
     """How long each rung of the fail-safe ladder bears."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    hold_s: Annotated[float, Field(ge=0)] = 30.0 * STRETCH
+    hold_s: Annotated[float, Field(ge=0)] = stretched(30.0)
     """How long the last value holds before the classical loops take over."""
-    optimizer_timeout_s: Annotated[float, Field(ge=0, le=64_000 * TICK_S)] = max(
-        15.0 * max(STRETCH, 1.0), 3 * SAMPLING_PERIOD_S
+    optimizer_timeout_s: Annotated[float, within(lambda process: (0, 64_000 * process.tick_s))] = declared(
+        lambda process: max(15.0 * max(process.stretch, 1.0), 3 * process.sampling_period_s)
     )
     """An optimiser that gives no sign of life for so long is lost; 0 is never. Plant time, longer than any tau_u."""
     optimizer_patience_s: Annotated[float, Field(gt=0)] = 5.0
@@ -68,18 +65,16 @@ class LadderSettings(BaseModel):
     @property
     def hold_ticks(self) -> int:
         """The hold, in ticks."""
-        return round(self.hold_s / TICK_S)
+        return round(self.hold_s / self.process.tick_s)
 
     @property
     def optimizer_ticks(self) -> int:
         """The time-out, in ticks."""
-        return math.ceil(self.optimizer_timeout_s / TICK_S)
+        return math.ceil(self.optimizer_timeout_s / self.process.tick_s)
 
 
-class ControlSection(BaseModel):
+class ControlSection(ProcessSettings):
     """Section `control_plc` of the configuration."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     server: ControlServer = ControlServer()
     word_order: WordOrder = WordOrder.HIGH_FIRST
@@ -92,22 +87,19 @@ class ControlSection(BaseModel):
     skew_alarm_ppm: Annotated[float, Field(gt=0)] = 500.0
     """How much the rack's clock and ours may differ in real time before the alarm is raised."""
     driver: ControlStrategy = ControlStrategy.MPC
-    classical: ClassicalSettings = ClassicalSettings()
+    classical: ClassicalSettings = Field(default_factory=ClassicalSettings)
     cool_down: CoolDownSettings = CoolDownSettings()
     """Of a cold box that is warm at the beginning."""
-    ladder: LadderSettings = LadderSettings()
-    sensors: SensorCheckSettings = SensorCheckSettings()
-    alarms: AlarmSettings = AlarmSettings()
+    ladder: LadderSettings = Field(default_factory=LadderSettings)
+    sensors: SensorCheckSettings = Field(default_factory=SensorCheckSettings)
+    alarms: AlarmSettings = Field(default_factory=AlarmSettings)
     retain: RetainSettings = RetainSettings()
 
 
-class ControlSettings(BaseModel):
+class ControlSettings(RootSettings):
     """What the control PLC reads of a configuration."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    limits: InputLimits = InputLimits()
-    model: ModelSettings = ModelSettings()
+    limits: InputLimits = Field(default_factory=InputLimits)
     session: SessionSettings = SessionSettings()
-    control_plc: ControlSection = ControlSection()
+    control_plc: ControlSection = Field(default_factory=ControlSection)
     telemetry: TelemetrySettings = TelemetrySettings()

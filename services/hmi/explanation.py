@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-from coldloop.process.signals import TICK_S
+from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
 from coldloop.process.updating_periods import ComputingTimes
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization, UpdatingRuleKind, UpdatingRuleStatus
@@ -131,7 +131,7 @@ def explain(
     if before is not None and before.update + 1 != update.update:
         before = None
     branch = _branch(update, before, rule)
-    times = ComputingTimes(rule.slots, rule.preparation, rule.iteration)
+    times = ComputingTimes(rule.slots, rule.preparation, rule.iteration, TICK_S, TICKS_PER_SAMPLE)
     n_before = times.iterations(times.period(before.q)) if before is not None else 0
     increments = increments_of(update, n_before) if branch in DECIDED and before is not None else None
     needed = update.tau_u if branch is Branch.FIXED else times.period(update.q)

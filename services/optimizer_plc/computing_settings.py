@@ -2,27 +2,31 @@
 
 from collections.abc import Sequence
 from enum import StrEnum
-from typing import Annotated, Final, Self
+from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, field_validator, model_validator
 
-from coldloop.process.loaded import PROCESS
-from coldloop.process.per_signal import PositivePerInput
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STRETCH
+from coldloop.process.declaration import Process
+from coldloop.process.settings import PositivePerInput, ProcessSettings, declared, settings_process, stretched, within
 
 PENALTY_WEIGHT = 3000.0
 """alpha that all solvers are judged by with the default weights. In a program's settings it follows from `penalties`
 and `design.violation_weight` wherever it is not set."""
 
 
-SIGNALS: Final = (*OUTPUT_NAMES, *INPUT_NAMES)
-GROUPS: Final = {
-    "outputs": PROCESS.constants,
-    "inputs": tuple(one.name for one in PROCESS.inputs if one.has_constant),
-}
-"""What `estimator.disturbances` calls all outputs, or inputs, that may have one. Of the cold box no sensor tells
-a constant error of L1 from liquid helium, nor one of the heater from the load.
-"""
+def signals_of(process: Process) -> tuple[str, ...]:
+    """Return what may have a constant error, in the order of their states: outputs, then inputs."""
+    return (*process.output_names, *process.input_names)
+
+
+def groups_of(process: Process) -> dict[str, tuple[str, ...]]:
+    """Return what `estimator.disturbances` calls all outputs, or inputs, that may have a constant error.
+
+    Of the cold box no sensor tells a constant error of L1 from liquid helium, nor one of the heater from the load.
+    """
+    return {
+        "outputs": process.constants, "inputs": tuple(one.name for one in process.inputs if one.has_constant)
+    }  # fmt: skip
 
 
 class Arithmetic(StrEnum):
@@ -46,15 +50,13 @@ class NoiseReference(StrEnum):
     TIME = "time"
 
 
-class EstimatorSettings(BaseModel):
+class EstimatorSettings(ProcessSettings):
     """Settings of the estimator; standard deviations are per square root of a sampling period of 5 s."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: EstimatorKind = EstimatorKind.KALMAN
     load_known: bool = True
     """Whether the heat load is measured; where it is not, all of it is load mismatch, and no period is interrupted."""
-    load_walk_w: PositiveFloat = PROCESS.load.walk
+    load_walk_w: PositiveFloat = declared(lambda process: process.load.walk)
     """Random walk of the load mismatch, W; for a load that is not measured, of the size of its steps."""
     pressure_noise_pa: PositiveFloat = 50.0
     """Process noise of states in Pa."""
@@ -80,11 +82,11 @@ class EstimatorSettings(BaseModel):
     """Of one measurement, whatever the updating period; or of a mean over a sampling period, so that measurements which
     follow each other sooner count for less: a model error is then not taken for more load the shorter the period is."""
     disturbances: tuple[str, ...] = ()
-    """Signals, by name or group (`GROUPS`), with an unknown constant that is estimated, so that there is no offset on a
+    """Signals, by name or group (`outputs`, `inputs`), with an unknown constant that is estimated, so that there is no offset on a
     plant that is not the model. That of an output is added to its reading, that of an input acts like more of it."""
     disturbance_walk: PositiveFloat = 3.0
     """Random walk of an output's constant over its sensor's standard deviation."""
-    input_walk: PositivePerInput = tuple(one.walk for one in PROCESS.inputs)
+    input_walk: PositivePerInput = declared(lambda process: tuple(one.walk for one in process.inputs))
     """Random walk of an input's constant, in its unit."""
     longest_riccati: Annotated[int, Field(ge=1)] = 2000
     """Longest run of the Riccati recursion for a stationary gain, in periods."""
@@ -97,20 +99,21 @@ class EstimatorSettings(BaseModel):
     @field_validator("disturbances")
     @classmethod
     def _known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        found = _members(names)
-        if any(name not in SIGNALS for name in found) or len(set(found)) < len(found):
-            raise ValueError(f"disturbances are a list, each once, of {', '.join((*GROUPS, *SIGNALS))}")
+        process = settings_process()
+        found, signals = _members(names, process), signals_of(process)
+        if any(name not in signals for name in found) or len(set(found)) < len(found):
+            raise ValueError(f"disturbances are a list, each once, of {', '.join((*groups_of(process), *signals))}")
         return names
 
     @property
     def sensors(self) -> tuple[float, ...]:
         """Standard deviation of each output's sensor, in its unit."""
-        return _by_quantity(self, "sensor", [output.noise for output in PROCESS.outputs])
+        return _by_quantity(self, "sensor", [output.noise for output in self.process.outputs])
 
     @property
     def disturbed(self) -> tuple[int, ...]:
-        """Which of `SIGNALS` have a disturbance, rising."""
-        return tuple(sorted(map(SIGNALS.index, _members(self.disturbances))))
+        """Which of the outputs, and then inputs, have a disturbance, rising."""
+        return tuple(sorted(map(signals_of(self.process).index, _members(self.disturbances, self.process))))
 
     @model_validator(mode="after")
     def _what_is_estimated(self) -> Self:
@@ -121,10 +124,8 @@ class EstimatorSettings(BaseModel):
         return self
 
 
-class PlausibilitySettings(BaseModel):
+class PlausibilitySettings(ProcessSettings):
     """When the Kalman filter does without a reading, because prediction and other readings contradict it."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     sigmas: Annotated[float, Field(ge=0)] = 0.0
     """Largest residual over its standard deviation; 0: any is plausible. With 6 a good sensor is suspected by noise
@@ -138,13 +139,15 @@ class PlausibilitySettings(BaseModel):
     """The same of a temperature, K."""
     pressure_allowance: Annotated[float, Field(ge=0)] = 0.01
     """The same of a pressure, bar."""
-    settled_s: Annotated[float, Field(ge=0)] = 60.0 * STRETCH
+    settled_s: Annotated[float, Field(ge=0)] = stretched(60.0)
     """A reading is judged when it has been used for so long: until then the filter learns how the plant differs."""
-    agreeing_s: Annotated[float, Field(ge=0)] = 60.0 * STRETCH
+    agreeing_s: Annotated[float, Field(ge=0)] = stretched(60.0)
     """A suspect that agrees with the others for so long is taken back."""
-    longest_s: Annotated[float, Field(ge=0)] = 1800.0 * STRETCH
+    longest_s: Annotated[float, Field(ge=0)] = stretched(1800.0)
     """It is taken back after so long in any case: what the others say of it is then no better."""
-    most: Annotated[int, Field(ge=0, le=len(OUTPUT_NAMES) - 1)] = min(2, len(OUTPUT_NAMES) - 1)
+    most: Annotated[int, within(lambda process: (0, len(process.outputs) - 1))] = declared(
+        lambda process: min(2, len(process.outputs) - 1)
+    )
     """Readings that may be suspected at once; when more contradict the prediction it is the plant: the four gauges of
     the supply see a compressor trip."""
     model_sigmas: Annotated[float, Field(gt=0)] = 4.0
@@ -152,7 +155,7 @@ class PlausibilitySettings(BaseModel):
     minute (and but for its allowance). While it does not, no other reading is suspected, and suspects are taken back:
     what contradicts them is wrong itself. L1, which has no constant error, is taken back where two or more say so."""
 
-    spike_s: Annotated[float, Field(ge=0)] = 7.5 * STRETCH
+    spike_s: Annotated[float, Field(ge=0)] = stretched(7.5)
     """A reading that contradicts the others is left out at once, and a suspect when it has done so for longer than
     this, less a tenth of the time in which it did not."""
     level_span: tuple[float, float] = (5.0, 95.0)
@@ -172,30 +175,31 @@ class PlausibilitySettings(BaseModel):
     @property
     def spans(self) -> tuple[tuple[float, float], ...]:
         """Within which predictions each output is judged."""
-        return tuple(self.level_span if output.quantity == "level" else (-1e30, 1e30) for output in PROCESS.outputs)
+        return tuple(
+            self.level_span if output.quantity == "level" else (-1e30, 1e30) for output in self.process.outputs
+        )
 
     @property
     def allowances(self) -> tuple[float, ...]:
         """Of each output."""
-        return _by_quantity(self, "allowance", [output.allowance for output in PROCESS.outputs])
+        return _by_quantity(self, "allowance", [output.allowance for output in self.process.outputs])
 
 
-def _by_quantity(settings: BaseModel, what: str, declared: Sequence[float]) -> tuple[float, ...]:
-    """Return what a section sets for the quantity of each output; what is `declared` where it has none."""
+def _by_quantity(settings: ProcessSettings, what: str, numbers: Sequence[float]) -> tuple[float, ...]:
+    """Return what a section sets for the quantity of each output; of `numbers` where it has none."""
     return tuple(
         getattr(settings, f"{output.quantity}_{what}") if output.quantity else value
-        for output, value in zip(PROCESS.outputs, declared, strict=True)
+        for output, value in zip(settings.process.outputs, numbers, strict=True)
     )
 
 
-def _members(names: tuple[str, ...]) -> list[str]:
-    return [member for name in names for member in GROUPS.get(name, (name,))]
+def _members(names: tuple[str, ...], process: Process) -> list[str]:
+    groups = groups_of(process)
+    return [member for name in names for member in groups.get(name, (name,))]
 
 
-class OdeSettings(BaseModel):
+class OdeSettings(ProcessSettings):
     """Settings of the ODE-based solver."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     alpha: PositiveFloat = PENALTY_WEIGHT
     """Penalty weight."""
@@ -213,26 +217,22 @@ class OdeSettings(BaseModel):
     hold_at_bounds: bool = True
     """Whether variables pressed against a bound are held during a step, instead of being projected after it only. Not
     in the paper."""
-    tau_1_s: PositiveFloat = 0.25 * PROCESS.share("ode")
+    tau_1_s: PositiveFloat = declared(lambda process: 0.25 * process.share("ode"))
     """Time of an iteration at P = 1, s (paper, section IV-D)."""
 
 
-class QpoasesSettings(BaseModel):
+class QpoasesSettings(ProcessSettings):
     """Settings of throttled qpOASES."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     alpha: PositiveFloat = PENALTY_WEIGHT
     """Weight that its answers are judged with; qpOASES itself knows no penalty."""
-    tau_1_s: PositiveFloat = 0.475 * PROCESS.share("qpoases")
+    tau_1_s: PositiveFloat = declared(lambda process: 0.475 * process.share("qpoases"))
     """120 us a recalculation, slowed down by 4000 (paper, section VI), are 0.48 s; with a slot of 0.25 s for the
     preparation the paper's 10 iterations in 5 s at P = 1 need this."""
 
 
-class OsqpSettings(BaseModel):
+class OsqpSettings(ProcessSettings):
     """Settings of OSQP."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     alpha: PositiveFloat = PENALTY_WEIGHT
     """Weight that its answers are judged with; not OSQP's relaxation."""
@@ -240,33 +240,29 @@ class OsqpSettings(BaseModel):
     """Step size of the multipliers: with less, truncated answers are worse, with more, convergence is slower."""
     relaxation: Annotated[float, Field(ge=0.1, lt=2.0)] = 1.6
     """What OSQP calls alpha; it moves an iterate by this share."""
-    tau_1_s: PositiveFloat = 0.05 * PROCESS.share("osqp")
+    tau_1_s: PositiveFloat = declared(lambda process: 0.05 * process.share("osqp"))
     """25,763 operations, dense, at 0.529 Mflop/s (`docs/budget.md`)."""
 
 
-class FastGradientSettings(BaseModel):
+class FastGradientSettings(ProcessSettings):
     """Settings of the fast gradient method."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     alpha: PositiveFloat = PENALTY_WEIGHT
     """Weight of broken rows (paper, equation of the penalised cost)."""
     adaptive_restart: bool = True
     """Whether the momentum is dropped when it points uphill."""
-    tau_1_s: PositiveFloat = 0.03 * PROCESS.share("fast-gradient")
+    tau_1_s: PositiveFloat = declared(lambda process: 0.03 * process.share("fast-gradient"))
     """14,811 operations, dense, at 0.529 Mflop/s are 0.028 s (`docs/budget.md`)."""
 
 
-class DaqpSettings(BaseModel):
+class DaqpSettings(ProcessSettings):
     """Settings of DAQP."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     alpha: PositiveFloat = PENALTY_WEIGHT
     """Weight that its answers are judged with; DAQP itself knows no penalty."""
     primal_tolerance: PositiveFloat = 1e-9
     """Violation of a row up to which it counts as kept."""
-    tau_1_s: PositiveFloat = 4.75 * PROCESS.share("daqp")
+    tau_1_s: PositiveFloat = declared(lambda process: 4.75 * process.share("daqp"))
     """One solve in an updating period of 5 s at P = 1: an oracle's time, not a measured one."""
 
 
@@ -292,10 +288,8 @@ class OutsideSettings(BaseModel):
         return tuple(filter(None, (self.solver, self.rule, self.estimator)))
 
 
-class InteriorPointSettings(BaseModel):
+class InteriorPointSettings(ProcessSettings):
     """Settings of the interior-point method."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     alpha: PositiveFloat = PENALTY_WEIGHT
     """Weight of broken rows, as that of the ODE-based solver."""
@@ -306,7 +300,7 @@ class InteriorPointSettings(BaseModel):
     """It is never less than this."""
     margin: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.1
     """Share of the box's width by which the guess is at least moved away from its bounds."""
-    tau_1_s: PositiveFloat = 0.17 * PROCESS.share("interior-point")
+    tau_1_s: PositiveFloat = declared(lambda process: 0.17 * process.share("interior-point"))
     """From an upper bound of our code's 78,769 operations, 0.149 s at 0.529 Mflop/s (`docs/budget.md`)."""
 
 

@@ -19,7 +19,7 @@ from coldloop.registers.control_plc import (
     Update,
     Verdict,
 )
-from coldloop.registers.maps import CONTROL_MAP
+from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.optimizer_plc import ControlLinkState
 from coldloop.safety.sequence import InputSequence
 from coldloop.session.time_base import TimeBase
@@ -32,10 +32,6 @@ ATTEMPTS: Final = 3
 ILLEGAL_VALUE: Final = 3
 DAMAGED_THERE: Final = (Verdict.BAD_CRC, Verdict.WRONG_LENGTH)
 """Verdicts on a sequence that is not as it was sent; its number may not be either."""
-ROWS_WITH_HEADER: Final = (
-    MAX_READ_WRITE_WORDS - CONTROL_MAP.block_of(SequenceHeader).row_words
-) // CONTROL_MAP.block_of(SequenceRow).row_words
-"""Rows that fit into one request with the header that commits them: 18 of three inputs."""
 LONGEST_WAIT_S: Final = 1.0
 """The control PLC answers a request that waits for an update after this real time at the latest."""
 
@@ -47,6 +43,7 @@ class ControlClient:
     holds the lease.
 
     Args:
+        register_map: Of the control PLC, for the process.
         endpoint: Where it is.
         link: Counts damaged answers, and of the steps of an introduction.
         model_digest: Of our model.
@@ -56,12 +53,18 @@ class ControlClient:
         ConfigurationError: The files for TLS cannot be used.
     """
 
-    def __init__(self, endpoint: Endpoint, link: ControlLink, model_digest: int, model_name: str) -> None:
+    def __init__(
+        self, register_map: RegisterMap, endpoint: Endpoint, link: ControlLink, model_digest: int, model_name: str
+    ) -> None:
+        self._map = register_map
+        header, row = (register_map.block_of(record).row_words for record in (SequenceHeader, SequenceRow))
+        self._rows_with_header = (MAX_READ_WRITE_WORDS - header) // row
+        """Rows that fit into one request with the header that commits them: 18 of three inputs."""
         self._endpoint = endpoint
         self._link = link
         self._model_digest = model_digest
         self._model_name = model_name
-        self._client = RegisterClient.at(CONTROL_MAP, endpoint)
+        self._client = RegisterClient.at(self._map, endpoint)
         self._beats = 0
 
     def close(self) -> None:
@@ -76,7 +79,7 @@ class ControlClient:
         """
         if self._endpoint.tls is not None:
             self._client.close()
-            self._client = RegisterClient.at(CONTROL_MAP, self._endpoint)
+            self._client = RegisterClient.at(self._map, self._endpoint)
 
     # -- who is there --------------------------------------------------------------------------------------------------
 
@@ -164,9 +167,9 @@ class ControlClient:
 
     async def _commit(self, sequence: InputSequence) -> Acknowledgement:
         header, rows = sequence.header, list(map(SequenceRow, sequence.rows))
-        await self._client.write_rows(rows[ROWS_WITH_HEADER:], start=ROWS_WITH_HEADER)
+        await self._client.write_rows(rows[self._rows_with_header :], start=self._rows_with_header)
         try:
-            return await self._client.exchange(header, Acknowledgement, rows=rows[:ROWS_WITH_HEADER])
+            return await self._client.exchange(header, Acknowledgement, rows=rows[: self._rows_with_header])
         except DamagedAnswerError:  # the sequence has been judged, and may have been accepted
             self._link.damaged()
             return await self._again(lambda: self._client.read(Acknowledgement))

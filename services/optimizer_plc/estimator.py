@@ -7,14 +7,12 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.compiled import kept, kernel
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import OUTPUT_NAMES, STATE_NAMES, TICK_S
 from optimizer_plc.computing_settings import (
-    SIGNALS,
     EstimatorKind,
     EstimatorSettings,
     NoiseReference,
     PlausibilitySettings,
+    signals_of,
 )
 from optimizer_plc.open_loop import NONE, Apart, none_apart, predict_apart, watch
 from optimizer_plc.plausibility import (
@@ -106,7 +104,8 @@ def estimator_of(
     """
     kalman = settings.kind is EstimatorKind.KALMAN
     check_detectability(prediction)
-    if not kalman and prediction.n_states > len(STATE_NAMES):
+    process = prediction.process
+    if not kalman and prediction.n_states > len(process.states):
         raise ConfigurationError(
             "optimizer_plc.program.estimator.kind=state-feedback: the model has more states than the plant reports; "
             "use kalman"
@@ -115,19 +114,19 @@ def estimator_of(
     stationary = stationary_gains(prediction, settings) if kalman else StationaryGains(*np.zeros((2, 1, 1, 1)))
     return Estimator(
         Transition(*map(np.array, zip(*(step.transposed() for step in m.transitions.values()), strict=True))),
-        m.outputs.transposed(), np.array(m.x0), np.array(m.u0), np.array(m.y0), m.w0, real(TICK_S), kalman,
+        m.outputs.transposed(), np.array(m.x0), np.array(m.u0), np.array(m.y0), m.w0, real(process.tick_s), kalman,
         settings.load_known,
         StationaryGains(*(array.astype(real, copy=False) for array in stationary)),
-        plausibility_of(plausibility, prediction, settings.sensors, len(prediction.transitions) * TICK_S, real),
+        plausibility_of(plausibility, prediction, settings.sensors, len(prediction.transitions) * process.tick_s, real),
     )  # fmt: skip
 
 
-def no_belief(n_states: int, real: Real = DOUBLE) -> Belief:
+def no_belief(n_states: int, n_outputs: int, real: Real = DOUBLE) -> Belief:
     """Return the belief of an estimator that begins at the operating point."""
     numbers = np.zeros(1, [("w", real), ("mismatch", real), ("since", "i8")])
     belief = Belief(
-        numbers, np.zeros(n_states, real), np.zeros(n_states, real), np.zeros(len(OUTPUT_NAMES), real),
-        new_readings(real), none_apart(n_states, real),
+        numbers, np.zeros(n_states, real), np.zeros(n_states, real), np.zeros(n_outputs, real),
+        new_readings(n_outputs, real), none_apart(n_states, real),
     )  # fmt: skip
     forget(belief)
     return belief
@@ -245,14 +244,14 @@ def check_detectability(prediction: PredictionModel) -> None:
     modes = np.vstack([
         np.hstack([step.A[:n, :n] - np.eye(n), step.F[:n]]), np.hstack([prediction.C[:, :n], prediction.G])
     ])  # fmt: skip
-    if not PROCESS.has_load:
+    if not prediction.process.has_load:
         modes = modes[:, :n]
     modes /= np.maximum(np.linalg.norm(modes, axis=0), UNDETECTABLE)
     _, sizes, directions = np.linalg.svd(modes)
     if sizes[-1] > UNDETECTABLE:
         return
     shares = np.abs(directions[-1][n - len(prediction.disturbances) : n])
-    worst = SIGNALS[prediction.disturbances[int(np.argmax(shares))]]
+    worst = signals_of(prediction.process)[prediction.disturbances[int(np.argmax(shares))]]
     raise ConfigurationError(
         f"optimizer_plc.program.estimator.disturbances: no sensor tells a constant error of {worst} from the plant's"
         " state, the load and the other errors: leave it out"
@@ -265,7 +264,7 @@ def state_walks(prediction: PredictionModel, settings: EstimatorSettings) -> lis
         "Pa": settings.pressure_noise_pa, "m3": settings.volume_noise_m3, "K": settings.temperature_noise_k,
         "kg": settings.mass_noise_kg, "kg/s": settings.flow_noise_kg_s, "bar s": settings.integral_noise_bar_s,
     }  # fmt: skip
-    units, states = prediction.model.state_units, PROCESS.states
+    units, states = prediction.model.state_units, prediction.process.states
     declared = [state.walk for state in states] + [None] * (len(units) - len(states))
     return [by_unit[unit] if walk is None else walk for walk, unit in zip(declared, units, strict=True)]
 
@@ -288,7 +287,19 @@ def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -
     steps = {ticks: (step.A[:nx, :nx], step.F[:nx, 0]) for ticks, step in prediction.transitions.items()}
     of_time = settings.noise_reference is NoiseReference.TIME
     drift, sensors = walks_of(prediction, settings), np.array(settings.sensors)
-    found = kept("kalman", gains_after, steps, C, drift, sensors, of_time, settings.longest_riccati)
+    process = prediction.process
+    found = kept(
+        "kalman",
+        gains_after,
+        steps,
+        C,
+        drift,
+        sensors,
+        of_time,
+        settings.longest_riccati,
+        process.tick_s,
+        process.sampling_period_s,
+    )
     gains, inverses = np.split(found, [nx + 1], axis=2)
     gains = np.insert(gains, [nx] * len(prediction.ahead), 0.0, axis=2)
     return StationaryGains(np.ascontiguousarray(gains), np.ascontiguousarray(inverses))

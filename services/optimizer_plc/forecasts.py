@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.declaration import Forecast
-from coldloop.process.signals import TICKS_PER_SAMPLE
+from coldloop.process.declaration import Process
 
 Array = NDArray[np.float64]
 
@@ -15,14 +14,14 @@ class Forecasts:
     """Forecasts over plant time. Only their changes count: how large a disturbance is now is measured or estimated.
 
     Args:
-        forecasts: Of the process.
+        process: With its forecasts.
         ends: Last samples of the parts of the horizon, rising.
     """
 
-    def __init__(self, forecasts: Sequence[Forecast], ends: Sequence[int]) -> None:
-        self._edges = TICKS_PER_SAMPLE * np.array([0, *ends])
+    def __init__(self, process: Process, ends: Sequence[int]) -> None:
+        self._edges = process.ticks_per_sample * np.array([0, *ends])
         self._courses = []
-        for one in forecasts:
+        for one in process.forecasts:
             ticks, values = np.array(one.ticks, dtype=np.float64), np.array(one.values)
             until = np.concatenate([[0.0], np.cumsum(np.diff(ticks) * values[:-1])])
             self._courses.append((ticks, values, until))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import BATH, INPUT_NAMES, OUTPUT_NAMES
+from coldloop.process.declaration import Process
 from optimizer_plc.qp.arithmetic import Real
 
 Array = NDArray[np.float64]
@@ -44,19 +44,20 @@ class TurbineWatch(NamedTuple):
     """Of the valve in the mask of suspects: it follows those of the outputs."""
 
 
-def turbine_watch(y0: Array, real: Real) -> TurbineWatch:
-    """Return how the turbine of the process is watched, by its outputs (22,) at the operating point."""
-    if BATH is None or not BATH.turbine_speed or len(OUTPUT_NAMES) + len(INPUT_NAMES) > MOST_BITS:
+def turbine_watch(process: Process, y0: Array, real: Real) -> TurbineWatch:
+    """Return how the turbine of the process is watched, by its outputs (n_y,) at the operating point."""
+    bath, outputs = process.bath, process.output_names
+    if bath is None or not bath.turbine_speed or len(outputs) + len(process.inputs) > MOST_BITS:
         return TurbineWatch(-1, 0, 0, 0, real(-math.inf), real(STANDSTILL_RATIO), 0)
-    valve, speed = INPUT_NAMES.index(BATH.turbine_valve), OUTPUT_NAMES.index(BATH.turbine_speed)
-    before, behind = map(OUTPUT_NAMES.index, BATH.turbine_pressures)
-    bit = 1 << (len(OUTPUT_NAMES) + valve)
+    valve, speed = process.input_names.index(bath.turbine_valve), outputs.index(bath.turbine_speed)
+    before, behind = map(outputs.index, bath.turbine_pressures)
+    bit = 1 << (len(outputs) + valve)
     return TurbineWatch(valve, speed, before, behind, real(SLOW * y0[speed]), real(STANDSTILL_RATIO), bit)
 
 
 @kernel
 def stands(c: TurbineWatch, y: Array) -> bool:
-    """Return whether outputs (22,) say that the turbine stands; a reading that is no number says nothing."""
+    """Return whether outputs (n_y,) say that the turbine stands; a reading that is no number says nothing."""
     slow: bool = y[c.speed] < c.slow and y[c.before] < c.ratio * y[c.behind]
     return slow
 

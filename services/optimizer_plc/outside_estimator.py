@@ -9,7 +9,6 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.signals import SAMPLING_PERIOD_S, TICK_S
 from optimizer_plc.computing_settings import EstimatorSettings
 from optimizer_plc.entry_points import Part, in_its_name, made
 from optimizer_plc.estimator import Belief, Estimator, walks_of
@@ -95,8 +94,8 @@ class OutsideEstimator:
 
 def plant_model(prediction: PredictionModel, settings: EstimatorSettings) -> PlantModel:
     """Return what an outside estimator is given of the model: copies, which it may change."""
-    n, step = prediction.n_estimated, prediction.transitions[1]
+    n, step, process = prediction.n_estimated, prediction.transitions[1], prediction.process
     A, B, F = step.A[:n, :n].copy(), step.B[:n].copy(), step.F[:n].copy()
     C, D, G = prediction.C[:, :n].copy(), prediction.D.copy(), prediction.G.copy()
-    walks = walks_of(prediction, settings) * math.sqrt(TICK_S / SAMPLING_PERIOD_S)
-    return PlantModel(A, B, F, C, D, G, TICK_S, len(prediction.disturbances), np.array(settings.sensors), walks)
+    walks = walks_of(prediction, settings) * math.sqrt(process.tick_s / process.sampling_period_s)
+    return PlantModel(A, B, F, C, D, G, process.tick_s, len(prediction.disturbances), np.array(settings.sensors), walks)

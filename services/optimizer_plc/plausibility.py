@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import CONTROLLED, OUTPUT_NAMES
 from optimizer_plc.computing_settings import PlausibilitySettings
 from optimizer_plc.qp.arithmetic import Real
 from optimizer_plc.qp.linear_algebra import cholesky, cholesky_solve
@@ -50,7 +49,7 @@ class Plausibility(NamedTuple):
     sigmas: float
     """Largest residual over its standard deviation; 0: any is plausible."""
     allowance: Array
-    """What a plant that is not its model adds to a residual, shape (22,)."""
+    """What a plant that is not its model adds to a residual, shape (n_y,)."""
     in_all: float
     """Largest quadratic form of the innovations that the outputs which are left may have."""
     longest_period_s: float
@@ -62,14 +61,14 @@ class Plausibility(NamedTuple):
     model_sigmas: float
     """Largest residual over its standard deviation, root mean square, while the model holds."""
     constants: NDArray[np.int64]
-    """State that is the constant error of each output; below 0: it has none. Shape (22,)."""
+    """State that is the constant error of each output; below 0: it has none. Shape (n_y,)."""
     spike_s: float
     forgetting: float
     low: Array
-    """Outputs whose prediction is outside of these are not judged, shape (22,)."""
+    """Outputs whose prediction is outside of these are not judged, shape (n_y,)."""
     high: Array
     noise: Array
-    """Standard deviation of each sensor, shape (22,)."""
+    """Standard deviation of each sensor, shape (n_y,)."""
     watched: int
     """Output that is judged by predictions without it, or -1."""
     origin: float
@@ -86,7 +85,7 @@ def plausibility_of(
     real: Real,
 ) -> Plausibility:  # fmt: skip
     """Return what is plausible with a model, sensors and inverse covariances for periods up to the longest."""
-    n_y = len(OUTPUT_NAMES)
+    n_y = len(prediction.y0)
     constants = np.full(n_y, -1)
     disturbances = prediction.disturbances
     for place, signal in enumerate(disturbances, prediction.n_estimated - len(disturbances)):
@@ -108,14 +107,14 @@ def plausibility_of(
 
 def watched_output(settings: PlausibilitySettings, prediction: PredictionModel) -> int:
     """Return the controlled output that has no constant error, where readings are judged; or -1."""
-    without = [output for output in CONTROLLED if output not in prediction.disturbances]
+    without = [output for output in prediction.constrained if output not in prediction.disturbances]
     judged = settings.sigmas and settings.movement_sigmas and not prediction.ahead
     return without[0] if judged and without else -1
 
 
-def new_readings(real: Real) -> Any:  # noqa: ANN401 records
-    """Return the state of all readings at a beginning: used since just now, shape (22,)."""
-    return np.zeros(len(OUTPUT_NAMES), [(name, real if kind == "real" else kind) for name, kind in READING])
+def new_readings(n_outputs: int, real: Real) -> Any:  # noqa: ANN401 records
+    """Return the state of all readings at a beginning: used since just now, shape (n_y,)."""
+    return np.zeros(n_outputs, [(name, real if kind == "real" else kind) for name, kind in READING])
 
 
 @kernel

@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.first_use import kernels_of
 from coldloop.process.limits import InputLimits
-from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import Plan, SequenceHeader, Update, Verdict
 from coldloop.registers.optimizer_plc import (
     INPUT_SAMPLES,
@@ -65,16 +63,16 @@ class OptimizerProgram:
 
     def __init__(self, model: LtiModel, settings: ProgramSettings, limits: InputLimits) -> None:
         with kernels_of(_described(settings), about_s=15):
-            self.settings = settings
+            self.settings, self.process = settings, settings.process
             self.model_digest = model.short_digest
             self._real = real_of(settings.arithmetic)
             self.disturbances = settings.estimator.disturbed
             self._prediction = prediction = prediction_of(model, self.disturbances, settings.design)
-            self._forecasts = Forecasts(PROCESS.forecasts, settings.design.decision_instants)
+            self._forecasts = Forecasts(self.process, settings.design.decision_instants)
             self.problem = PredictiveProblem(prediction, settings.design, limits, self._real, settings.penalties)
             self.solver = make_solver(settings)
             self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
-            self.state = empty_state(prediction.n_states, self.problem.size, self._real)
+            self.state = empty_state(prediction.n_states, len(model.u0), len(model.y0), self.problem.size, self._real)
             estimator = estimator_of(prediction, settings.estimator, self._real, settings.plausibility)
             self._nothing_ahead = np.zeros(0, self._real)
             at_rest = self.problem.at(QpParameters(self.state.belief.x, self._real(0.0), self.state.u))
@@ -110,7 +108,7 @@ class OptimizerProgram:
             updating_period_s: Fixed updating period; 0 is adaptive.
             rule: Decides adaptive periods instead of the rule that the settings name.
         """
-        fixed_ticks = round(updating_period_s / TICK_S)
+        fixed_ticks = round(updating_period_s / self.process.tick_s)
         self.constants = self.constants._replace(fixed_ticks=fixed_ticks)
         self.rule = rule or make_rule(self.settings, self.budget, fixed_ticks, self._real)
         outside = self.settings.outside.estimator
@@ -215,8 +213,8 @@ class OptimizerProgram:
     def _sequence(self) -> InputSequence:
         """Return the last answer as the control PLC takes it."""
         now, sent, rows = self._now, self._sent, self.state.sent.rows
-        length = int(sent["length"])
-        inputs = list(map(tuple, rows[:length:TICKS_PER_SAMPLE].tolist()))
+        length, held = int(sent["length"]), self.process.ticks_per_sample
+        inputs = list(map(tuple, rows[:length:held].tolist()))
         header = SequenceHeader(
             number=int(sent["number"]),
             update=int(now["update"]),
@@ -226,7 +224,7 @@ class OptimizerProgram:
             model_digest=self.model_digest,
             crc=0,
         )
-        return with_checksum(header, [inputs[tick // TICKS_PER_SAMPLE] for tick in range(length)])
+        return with_checksum(header, [inputs[tick // held] for tick in range(length)])
 
     def answered(self, *, late: bool) -> None:
         """Note how an answer came."""
@@ -251,8 +249,8 @@ class OptimizerProgram:
 
     def model_deviation(self) -> ModelDeviation:
         """Return how the plant differs from the model, as the filter has estimated it at the last update."""
-        belief, n_y = self.state.belief, len(OUTPUT_NAMES)
-        constants = np.zeros(n_y + len(INPUT_NAMES))
+        belief, n_y = self.state.belief, len(self.process.outputs)
+        constants = np.zeros(n_y + len(self.process.inputs))
         end = self._prediction.n_estimated
         constants[list(self.disturbances)] = belief.x[end - len(self.disturbances) : end]
         return ModelDeviation(
@@ -268,7 +266,8 @@ class OptimizerProgram:
 
     def rule_status(self) -> UpdatingRuleStatus:
         """Return what decides the updating period in this session."""
-        return self.rule.status._replace(**self.budget.times._asdict())
+        times = self.budget.times
+        return self.rule.status._replace(slots=times.slots, preparation=times.preparation, iteration=times.iteration)
 
     def report(self, verdict: Verdict) -> Optimization:
         """Return what was done with the last update, once the control PLC has answered."""

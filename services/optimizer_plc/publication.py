@@ -3,14 +3,12 @@
 from collections.abc import Mapping
 from typing import Final
 
-from coldloop.process.signals import TICK_S
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.registers.audit import EventKind, JournalQuery
 from coldloop.registers.bank import Caller, IllegalValueError, RegisterBank
 from coldloop.registers.codec import WordOrder, blank
 from coldloop.registers.common import Identity, ServiceState, SessionPace, pace_subject
-from coldloop.registers.declaration import Block
-from coldloop.registers.maps import OPTIMIZER_MAP
+from coldloop.registers.declaration import Block, RegisterMap
 from coldloop.registers.optimizer_plc import (
     HISTORY_ROWS,
     OperatingLimits,
@@ -31,6 +29,7 @@ class OptimizerPublication:
     """Registers and journal of the optimiser PLC.
 
     Args:
+        register_map: Of this service, for the process.
         order: Word order of the registers.
         budget: Decides which updating periods can be asked for in real time.
         limits: Bands, bounds and rates of the problem.
@@ -39,11 +38,12 @@ class OptimizerPublication:
     """
 
     def __init__(
-        self, order: WordOrder, budget: PlcBudget, limits: OperatingLimits, model_digest: int, holder: int
-    ) -> None:
-        self.bank = RegisterBank(OPTIMIZER_MAP, order)
+        self, register_map: RegisterMap, order: WordOrder, budget: PlcBudget, limits: OperatingLimits,
+        model_digest: int, holder: int,
+    ) -> None:  # fmt: skip
+        self.bank = RegisterBank(register_map, order)
         self.bank.put(limits)
-        self.bank.put_sealed(blank(Prediction, OPTIMIZER_MAP))
+        self.bank.put_sealed(blank(Prediction, self.bank.map))
         self.bank.judged_by(self._judge, OptimizerSession)
         self.bank.judged_by(self._judge_pace, SessionPace)
         self.pace = TimeBase(realtime=False, factor=1.0)
@@ -71,7 +71,7 @@ class OptimizerPublication:
             )
         if ticks and asked.realtime and not self._budget.is_enough(ticks):
             raise IllegalValueError(
-                f"session.updating_period = {ticks}: in real time no answer is there within {ticks * TICK_S:g} s, one "
+                f"session.updating_period = {ticks}: in real time no answer is there within {ticks * self._budget.times.tick_s:g} s, one "
                 f"iteration takes {self._budget.answer_after_s(1):g} s with its preparation: give more, or 0 (adaptive)"
             )
 
@@ -113,7 +113,7 @@ class OptimizerPublication:
         self.pace = pace
         self.bank.put(SessionPace.shown(session, pace))
         self.bank.put(rule)
-        self.bank.put_sealed(blank(Prediction, OPTIMIZER_MAP))
+        self.bank.put_sealed(blank(Prediction, self.bank.map))
         self._shown.show()
         self._show_identity(0)
 
@@ -135,8 +135,8 @@ class OptimizerPublication:
     def _show_identity(self, tick: int) -> None:
         self.bank.put(
             Identity(
-                map_digest=OPTIMIZER_MAP.digest,
-                map_version=OPTIMIZER_MAP.version,
+                map_digest=self.bank.map.digest,
+                map_version=self.bank.map.version,
                 state=ServiceState.RUNNING if self._session else ServiceState.READY,
                 model_digest=self._model_digest,
                 session=self._session,

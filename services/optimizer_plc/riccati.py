@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import SAMPLING_PERIOD_S, TICK_S
 from optimizer_plc.qp.linear_algebra import cholesky, cholesky_solve, multiply
 
 Array = NDArray[np.float64]
@@ -31,7 +30,8 @@ ATTEMPTS: Final = 50
 
 
 def gains_after(
-    steps: Mapping[int, tuple[Array, Array]], C: Array, drift: Array, sensors: Array, of_time: bool, periods: int  # noqa: FBT001
+    steps: Mapping[int, tuple[Array, Array]], C: Array, drift: Array, sensors: Array, of_time: bool, periods: int,  # noqa: FBT001
+    tick_s: float, sampling_period_s: float,
 ) -> Array:  # fmt: skip
     """Return the stationary gains, transposed, beside the inverse covariances, shape (steps, n_y, n + 1 + n_y).
 
@@ -44,6 +44,8 @@ def gains_after(
         sensors: Standard deviations of the measurements, shape (n_y,).
         of_time: The latter are those of a mean over a sampling period.
         periods: Steps of the Riccati recursion at most.
+        tick_s: Length of a tick, s.
+        sampling_period_s: That of the model, s.
 
     Raises:
         ConfigurationError: The recursion does not converge.
@@ -52,13 +54,13 @@ def gains_after(
     for ticks, (step, load) in steps.items():
         A = np.eye(n + 1)
         A[:n, :n], A[:n, n] = step, load
-        process = drift**2 * (ticks * TICK_S / SAMPLING_PERIOD_S)
-        measured = sensors**2 * (SAMPLING_PERIOD_S / (ticks * TICK_S) if of_time else 1.0)
+        process = drift**2 * (ticks * tick_s / sampling_period_s)
+        measured = sensors**2 * (sampling_period_s / (ticks * tick_s) if of_time else 1.0)
         gain = _converged(A, C, process, measured, P, periods)
         if gain is None:
             raise ConfigurationError(
                 f"optimizer_plc.program.estimator: no stationary Kalman filter for updating periods of"
-                f" {ticks * TICK_S:g} s, the Riccati recursion does not converge: either no sensor shows a mode that"
+                f" {ticks * tick_s:g} s, the Riccati recursion does not converge: either no sensor shows a mode that"
                 f" does not decay, or noise and walks are too far apart, or longest_riccati = {periods} is too short"
             )
         found.append(np.hstack([gain.T, inverse_covariance(A, C, process, measured, P)]))

@@ -22,9 +22,9 @@ from coldloop.errors import (
 )
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.process.lti_model import load
-from coldloop.process.signals import TICK_S
 from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.control_plc import AwaitUpdate, Update, Verdict
+from coldloop.registers.maps import maps_of
 from coldloop.registers.optimizer_plc import ControlLinkState, ModelDeviation
 from coldloop.safety.sequence import InputSequence
 from coldloop.service.metrics_server import MetricsServer
@@ -39,9 +39,9 @@ from optimizer_plc.settings import SHOWN, OptimizerSettings
 
 log = logging.getLogger("coldloop.optimizer_plc")
 
-LOOK_OUT_S: Final = TICK_S / 8
+LOOK_OUT_TICKS: Final = 1 / 8
 """Plant time between two looks for a load step in real time: the new computation begins so much later."""
-HEARTBEAT_S: Final = 4 * TICK_S
+HEARTBEAT_TICKS: Final = 4
 """Plant time between two heartbeats while an answer is computed."""
 SHORTEST_PAUSE_S: Final = 0.001
 """Real time between two such requests, however high the factor: others want to be served too."""
@@ -79,16 +79,19 @@ class OptimizerPlc:
 
     def __init__(self, settings: OptimizerSettings) -> None:
         section = settings.optimizer_plc
-        self._settings = settings
+        self._settings, self._tick_s = settings, settings.process.tick_s
+        maps = maps_of(settings.process)
         self._program = OptimizerProgram(load(settings.model.file), section.program, settings.limits)
         digest, holder = self._program.model_digest, 1 + secrets.randbelow(0xFFFFFFFF)
         self.publication = OptimizerPublication(
-            section.word_order, self._program.budget, self._program.operating_limits, digest, holder
+            maps.optimizer_plc, section.word_order, self._program.budget, self._program.operating_limits, digest, holder
         )
         self.publication.bank.keep_fresh(ModelDeviation, self._program.model_deviation)
         publish_configuration(self.publication.bank, selected(settings, SHOWN))
         self._link = self.publication.link
-        self._control = ControlClient(section.control_plc, self._link, digest, str(settings.model.file))
+        self._control = ControlClient(
+            maps.control_plc, section.control_plc, self._link, digest, str(settings.model.file)
+        )
         self._configured_pace = TimeBase(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
         self._session = 0
         self._wanted = FRESH_UPDATE
@@ -185,7 +188,7 @@ class OptimizerPlc:
         period_s = self._settings.optimizer_plc.program.updating_period_s
         pace, asked = await self._control.pace(session), self.publication.asked_for(session)
         if asked is not None:
-            period_s = asked.updating_period * TICK_S
+            period_s = asked.updating_period * self._tick_s
         if pace is None:
             pace = TimeBase(bool(asked.realtime), asked.factor) if asked is not None else self._configured_pace
         self._session = session
@@ -241,7 +244,9 @@ class OptimizerPlc:
 
     async def _is_computed(self, answer: _Answer) -> bool:
         """Wait until the PLC would have its answer; return whether no load step or session has cut it off before."""
-        spacing_s = (LOOK_OUT_S if answer.interruptible else HEARTBEAT_S) / self.publication.pace.factor
+        spacing_s = (
+            self._tick_s * (LOOK_OUT_TICKS if answer.interruptible else HEARTBEAT_TICKS) / self.publication.pace.factor
+        )
         look_s = min(max(spacing_s, SHORTEST_PAUSE_S), LONGEST_PAUSE_S)
         while (remaining := answer.ready - time.monotonic()) > 0.0:
             await asyncio.sleep(min(remaining, look_s))

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import BATH, OUTPUT_NAMES
 from coldloop.registers.control_plc import SEQUENCE_ROWS
-from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
+from optimizer_plc.budget import PlcBudget
 from optimizer_plc.estimator import Belief, Estimator, begin_prediction, correct, predict
 from optimizer_plc.idle_input import ROOM, TurbineWatch, idle_valve, stands, turbine_watch
 from optimizer_plc.plausibility import USED, are_finite, suspects_of
@@ -35,10 +34,6 @@ BY_THE_RULE: Final = 0
 """The q that `plan` is given when the rule is to decide it."""
 LARGEST: Final = 1e38
 """What registers carry, in single precision."""
-
-LEVEL, TEMPERATURE, FEED_TEMPERATURE = (
-    map(OUTPUT_NAMES.index, (BATH.level, BATH.temperature, BATH.feed_temperature)) if BATH else (0, 0, 0)
-)
 
 
 class Constants(NamedTuple):
@@ -115,7 +110,11 @@ def constants_of(
     rest: Array,
 ) -> Constants:  # fmt: skip
     """Return the constants of a session with adaptive periods."""
-    real = problem.Phi.dtype.type
+    real, process, every = problem.Phi.dtype.type, settings.process, range(budget.longest_ticks + 1)
+    bath, level, temperature, feed_temperature = process.bath, 0, 0, 0
+    if bath is not None:
+        named = bath.level, bath.temperature, bath.feed_temperature
+        level, temperature, feed_temperature = map(process.output_names.index, named)
     return Constants(
         estimator=estimator, target=target,
         Phi=problem.Phi, Gamma=problem.Gamma, maps=problem.maps, shifts=problem.shifts,
@@ -123,21 +122,21 @@ def constants_of(
         predicted=output_maps(problem),
         weights=problem.knots_to_samples, input_scale=problem.input_scale, rate=problem.rate,
         scaled_rate=problem.scaled_rate,
-        rate_shares=np.array([problem.limits.rate_share(ticks) for ticks in range(MAX_PERIOD_TICKS + 1)], real),
+        rate_shares=np.array([problem.limits.rate_share(ticks) for ticks in every], real),
         n_inputs=problem.n_inputs,
         alpha=real(alpha), floor=real(settings.adaptive.cost_floor),
         least_load=real(settings.holdable_load_w[0] - estimator.w0),
         largest_load=real(settings.holdable_load_w[1] - estimator.w0),
         reserve=real(settings.capacity_reserve_w),
-        least_load_error=real(BATH.least_load_error if BATH else 0.0),
+        least_load_error=real(bath.least_load_error if bath else 0.0),
         approach=real(settings.cold_end.approach_k or np.inf), following_s=real(settings.cold_end.following_s),
-        level=LEVEL, temperature=TEMPERATURE, feed_temperature=FEED_TEMPERATURE,
+        level=level, temperature=temperature, feed_temperature=feed_temperature,
         opening_per_k=real(settings.cold_end.opening_per_k),
         opening_from=real(settings.cold_end.opening_from - estimator.u0[target.feed]),
-        turbine=turbine_watch(estimator.y0, real),
+        turbine=turbine_watch(process, estimator.y0, real),
         load_step=real(settings.interrupting_load_step_w), sequence_ticks=shortest_sequence(settings, budget),
         fixed_ticks=0, most=len(budget.ladder), periods=np.array([0, *budget.ladder]),
-        fitting=np.array([budget.iterations(ticks) for ticks in range(MAX_PERIOD_TICKS + 1)]),
+        fitting=np.array([budget.iterations(ticks) for ticks in every]),
     )  # fmt: skip
 
 
@@ -148,7 +147,7 @@ def shortest_sequence(settings: ProgramSettings, budget: PlcBudget) -> int:
     before they last for that; where a load step may interrupt, in the last tick of a period, for another one after it.
     """
     if settings.interrupting_load_step_w:
-        return min(max(settings.sequence_ticks, 2 * MAX_PERIOD_TICKS - 1), SEQUENCE_ROWS)
+        return min(max(settings.sequence_ticks, 2 * budget.longest_ticks - 1), SEQUENCE_ROWS)
     ladder, adaptive = budget.ladder, settings.adaptive
     leap, most = len(ladder), len(ladder)
     if not settings.outside.rule:

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.estimator import Belief, no_belief
 from optimizer_plc.qp.arithmetic import Real
-from optimizer_plc.qp.design import N_INPUTS
 from optimizer_plc.rules.interface import MEMORY
 
 Array = NDArray[np.float64]
@@ -71,18 +70,18 @@ class OptimizerState(NamedTuple):
     """What the rule of the updating period remembers, shape (1,)."""
 
 
-def empty_state(n_states: int, size: int, real: Real) -> OptimizerState:
-    """Return room for the state, for so many states of the model and variables of the problem."""
+def empty_state(n_states: int, n_inputs: int, n_outputs: int, size: int, real: Real) -> OptimizerState:
+    """Return room for the state, for so many states, inputs and outputs of the model, and variables of the problem."""
 
     def numbers(fields: tuple[tuple[str, str], ...]) -> Any:  # noqa: ANN401 a record
         return np.zeros(1, [(name, real if kind == "real" else kind) for name, kind in fields])
 
     def delivery() -> Delivery:
-        rows = np.zeros((SEQUENCE_ROWS, N_INPUTS), np.float32)
-        x, u, z = (np.zeros(n, real) for n in (n_states, N_INPUTS, size))
+        rows = np.zeros((SEQUENCE_ROWS, n_inputs), np.float32)
+        x, u, z = (np.zeros(n, real) for n in (n_states, n_inputs, size))
         return Delivery(numbers(DELIVERY), x, u, z, rows)
 
     return OptimizerState(
-        numbers(PERIOD), no_belief(n_states, real), delivery(), delivery(), np.zeros(N_INPUTS, real),
-        np.zeros(N_INPUTS, real), np.zeros(MEMORY, real),
+        numbers(PERIOD), no_belief(n_states, n_outputs, real), delivery(), delivery(), np.zeros(n_inputs, real),
+        np.zeros(n_inputs, real), np.zeros(MEMORY, real),
     )  # fmt: skip

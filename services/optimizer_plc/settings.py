@@ -12,17 +12,22 @@ from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, Endpoint
 from coldloop.modbus.settings import ServerSettings
 from coldloop.process.declaration import FURTHEST_WEIGHT
 from coldloop.process.limits import InputLimits
-from coldloop.process.load_profile import LOAD_SPAN
-from coldloop.process.model_settings import ModelSettings
-from coldloop.process.signals import BATH, TICK_S
+from coldloop.process.settings import (
+    TOLERANCE,
+    ProcessSettings,
+    RootSettings,
+    declared,
+    settings_process,
+    whole_ticks,
+    within,
+)
 from coldloop.process.updating_periods import SHORTEST_TICKS
-from coldloop.process.whole_ticks import TOLERANCE, whole_ticks
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop.service.metrics_settings import MetricsSettings
 from coldloop.service.telemetry_settings import TelemetrySettings
 from coldloop.session.settings import SessionSettings
-from optimizer_plc.budget import MAX_PERIOD_TICKS, BudgetSettings
+from optimizer_plc.budget import BudgetSettings
 from optimizer_plc.computing_settings import (
     Arithmetic,
     DaqpSettings,
@@ -39,15 +44,14 @@ from optimizer_plc.computing_settings import (
 )
 from optimizer_plc.qp.design import SCALES, WEIGHTS, ColdEndSettings, ControlDesign
 from optimizer_plc.qp.penalties import (
-    DEFAULT_PENALTIES,
     OF_ALPHA,
     OF_PRESETS,
-    PRESETS,
     UNMEASURED,
     PenaltySettings,
     Preset,
     alpha_of,
     filled,
+    presets_of,
 )
 
 SHOWN: Final = ("limits", "optimizer_plc.program")
@@ -143,45 +147,49 @@ def left_out(key: str, estimator: EstimatorSettings) -> str:
     return ""
 
 
-class ProgramSettings(BaseModel):
+class ProgramSettings(ProcessSettings):
     """What the optimiser's program is to do."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+    model_config = ConfigDict(validate_default=True)
 
     solver: SolverName = SolverName.ODE
     arithmetic: Arithmetic = Arithmetic.FLOAT64
     """Floating-point type of all that is computed on line; the PLC of the paper has float32 only."""
-    updating_period_s: Annotated[float, Field(ge=0, le=MAX_PERIOD_TICKS * TICK_S)] = ADAPTIVE
+    updating_period_s: Annotated[float, within(lambda process: (0, process.sampling_period_s))] = ADAPTIVE
     """Fixed updating period, a multiple of 0.25 s; 0 is adaptive."""
     interrupting_load_step_w: Annotated[float, Field(ge=0)] = 0.0
     """A load step of more than this ends an updating period at once, whatever decides its length; 0 is never."""
-    holdable_load_w: tuple[FiniteFloat, FiniteFloat] = (BATH and BATH.holdable_load) or LOAD_SPAN
+    holdable_load_w: tuple[FiniteFloat, FiniteFloat] = declared(
+        lambda process: (process.bath and process.bath.holdable_load) or process.load.stored_span
+    )
     """Loads that are held at rest within the bands, in the load's unit: of the cold box by runs of its nonlinear
     plant. With a bath, a load outside raises the alarm `capacity`."""
-    capacity_reserve_w: Annotated[float, Field(ge=0)] = BATH.load_reserve if BATH else 0.0
+    capacity_reserve_w: Annotated[float, Field(ge=0)] = declared(
+        lambda process: process.bath.load_reserve if process.bath else 0.0
+    )
     """So does an estimated load this near the largest one that the linear model holds with the feed at its limit."""
     sequence_ticks: Annotated[int, Field(ge=2, le=SEQUENCE_ROWS)] = 18
     """Shortest sequence sent; 18 rows fit into one Modbus request with their header. It is never shorter than two
     updating periods: one to be played, one in case the next sequence is late; nor than the longest time until the next
     sequence of adaptive periods can arrive (`scheme.shortest_sequence`)."""
     adaptive: AdaptiveSettings = AdaptiveSettings()
-    design: ControlDesign = ControlDesign()
-    cold_end: ColdEndSettings = ColdEndSettings()
+    design: ControlDesign = Field(default_factory=ControlDesign)
+    cold_end: ColdEndSettings = Field(default_factory=ColdEndSettings)
     preset: Preset = Preset.TUNED
     """Penalties, start of the ODE-based solver, disturbances, limit of the feed, margin of the bands, limit of
     residuals, if not set."""
-    penalties: PenaltySettings = PenaltySettings()
-    budget: BudgetSettings = BudgetSettings()
-    estimator: EstimatorSettings = EstimatorSettings()
-    plausibility: PlausibilitySettings = PlausibilitySettings()
+    penalties: PenaltySettings = Field(default_factory=PenaltySettings)
+    budget: BudgetSettings = Field(default_factory=BudgetSettings)
+    estimator: EstimatorSettings = Field(default_factory=EstimatorSettings)
+    plausibility: PlausibilitySettings = Field(default_factory=PlausibilitySettings)
     """Of readings; for the Kalman filter."""
-    ode: OdeSettings = OdeSettings()
-    qpoases: QpoasesSettings = QpoasesSettings()
-    osqp: OsqpSettings = OsqpSettings()
-    fast_gradient: FastGradientSettings = FastGradientSettings()
-    interior_point: InteriorPointSettings = InteriorPointSettings()
+    ode: OdeSettings = Field(default_factory=OdeSettings)
+    qpoases: QpoasesSettings = Field(default_factory=QpoasesSettings)
+    osqp: OsqpSettings = Field(default_factory=OsqpSettings)
+    fast_gradient: FastGradientSettings = Field(default_factory=FastGradientSettings)
+    interior_point: InteriorPointSettings = Field(default_factory=InteriorPointSettings)
     hybrid: HybridSettings = HybridSettings()
-    daqp: DaqpSettings = DaqpSettings()
+    daqp: DaqpSettings = Field(default_factory=DaqpSettings)
     outside: OutsideSettings = OutsideSettings()
     """Solver, rule and estimator of somebody else's, used instead of ours."""
 
@@ -191,9 +199,10 @@ class ProgramSettings(BaseModel):
     @field_validator("updating_period_s")
     @classmethod
     def _whole_ticks(cls, value: float) -> float:
-        if whole_ticks(value) is None or 0 < value < SHORTEST_TICKS * TICK_S * (1.0 - TOLERANCE):
-            shortest = f"{SHORTEST_TICKS * TICK_S:g} s"
-            raise ValueError(f"an updating period is a multiple of {TICK_S:g} s from {shortest} on, or 0 for adaptive")
+        tick_s = settings_process().tick_s
+        if whole_ticks(value, tick_s) is None or 0 < value < SHORTEST_TICKS * tick_s * (1.0 - TOLERANCE):
+            shortest = f"{SHORTEST_TICKS * tick_s:g} s"
+            raise ValueError(f"an updating period is a multiple of {tick_s:g} s from {shortest} on, or 0 for adaptive")
         return value
 
     @model_validator(mode="before")
@@ -205,11 +214,12 @@ class ProgramSettings(BaseModel):
             estimator = EstimatorSettings.model_validate(given.get("estimator", {}))
         except (AttributeError, ValueError):
             return given  # which is refused
+        process = settings_process()
         if preset is Preset.TUNED and not estimator.load_known:
-            given = {**given, "estimator": filled(given.get("estimator", {}), UNMEASURED)}
+            given = {**given, "estimator": filled(given.get("estimator", {}), process.tuned.get(UNMEASURED, {}))}
         values = {
             section: {key: value for key, value in keys.items() if not left_out(f"{section}.{key}", estimator)}
-            for section, keys in PRESETS[preset].items()
+            for section, keys in presets_of(process)[preset].items()
         }
         return {**given, **{section: filled(given.get(section, {}), keys) for section, keys in values.items()}}
 
@@ -226,7 +236,7 @@ class ProgramSettings(BaseModel):
         """What the preset has and is not applied, by key relative to this section, with the reason."""
         return {
             f"{section}.{key}": f"preset {self.preset} has {as_toml(value)}, not applied: {reason}"
-            for section, keys in PRESETS[self.preset].items() for key, value in keys.items()
+            for section, keys in presets_of(self.process)[self.preset].items() for key, value in keys.items()
             if (reason := left_out(f"{section}.{key}", self.estimator))
         }  # fmt: skip
 
@@ -241,7 +251,7 @@ class ProgramSettings(BaseModel):
                 if isinstance(number, float) and not (number == 0.0 or 1.0 / LARGEST <= abs(number) <= largest):
                     raise ValueError(f"{key} = {number:g}: give 0 or a size from {1.0 / LARGEST:g} to {LARGEST:g}: "
                                      "single precision holds its square")  # fmt: skip
-        most = FURTHEST_WEIGHT * alpha_of(DEFAULT_PENALTIES, ControlDesign())
+        most = FURTHEST_WEIGHT * alpha_of(PenaltySettings(), ControlDesign())
         for key in ALPHAS:
             alpha = getattr(self, key.partition(".")[0]).alpha
             if alpha > most:
@@ -316,25 +326,20 @@ class ControlEndpoint(Endpoint):
     """TCP port."""
 
 
-class OptimizerSection(BaseModel):
+class OptimizerSection(ProcessSettings):
     """Section `optimizer_plc` of the configuration."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     server: OptimizerServer = OptimizerServer()
     word_order: WordOrder = WordOrder.HIGH_FIRST
     metrics: MetricsSettings = MetricsSettings()
     control_plc: ControlEndpoint = ControlEndpoint()
-    program: ProgramSettings = ProgramSettings()
+    program: ProgramSettings = Field(default_factory=ProgramSettings)
 
 
-class OptimizerSettings(BaseModel):
+class OptimizerSettings(RootSettings):
     """What the optimiser PLC reads of a configuration."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    limits: InputLimits = InputLimits()
-    model: ModelSettings = ModelSettings()
+    limits: InputLimits = Field(default_factory=InputLimits)
     session: SessionSettings = SessionSettings()
-    optimizer_plc: OptimizerSection = OptimizerSection()
+    optimizer_plc: OptimizerSection = Field(default_factory=OptimizerSection)
     telemetry: TelemetrySettings = TelemetrySettings()

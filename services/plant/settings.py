@@ -10,10 +10,15 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 from coldloop.modbus.endpoints import PLANT_PORT
 from coldloop.modbus.settings import ServerSettings
 from coldloop.process.limits import InputLimits
-from coldloop.process.loaded import PROCESS
-from coldloop.process.model_settings import ModelSettings
-from coldloop.process.per_signal import PerInput
-from coldloop.process.signals import STRETCH, TICK_S
+from coldloop.process.settings import (
+    PerInput,
+    ProcessSettings,
+    RootSettings,
+    declared,
+    settings_process,
+    stretched,
+    within,
+)
 from coldloop.registers.codec import WordOrder
 from coldloop.safety.retained import RetainSettings
 from coldloop.service.metrics_settings import MetricsSettings
@@ -61,10 +66,8 @@ class MismatchSettings(BaseModel):
         return (self.heater, self.load, self.level_gauge, self.delay_ticks) != (1.0, 1.0, 1.0, 0)
 
 
-class SensorSettings(BaseModel):
+class SensorSettings(ProcessSettings):
     """Standard deviations of the sensors' noise, and what they show too much; 0 is an exact sensor."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     level: Deviation = 0.0
     """%."""
@@ -88,13 +91,13 @@ class SensorSettings(BaseModel):
         """Standard deviation of each output."""
         return tuple(
             getattr(self, output.quantity) if output.quantity else self.declared * output.noise
-            for output in PROCESS.outputs
+            for output in self.process.outputs
         )
 
     @property
     def biases(self) -> tuple[float, ...]:
         """Bias of each output."""
-        return tuple(getattr(self, f"{output.quantity}_bias", 0.0) for output in PROCESS.outputs)
+        return tuple(getattr(self, f"{output.quantity}_bias", 0.0) for output in self.process.outputs)
 
 
 class SafeAction(StrEnum):
@@ -106,21 +109,19 @@ class SafeAction(StrEnum):
     """It applies `safe_state`."""
 
 
-class WatchdogSettings(BaseModel):
+class WatchdogSettings(ProcessSettings):
     """The rack's watchdog over the control PLC."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    timeout_s: Annotated[float, Field(ge=0, le=64_000 * TICK_S)] = 10.0 * max(STRETCH, 1.0)
+    timeout_s: Annotated[float, within(lambda process: (0, 64_000 * process.tick_s))] = stretched(10.0, least=1.0)
     """Plant time without new outputs after which it expires; 0 is never. In lock-step plant time then stops."""
     action: SafeAction = SafeAction.HOLD
-    safe_state: PerInput = tuple(one.safe for one in PROCESS.inputs)
+    safe_state: PerInput = declared(lambda process: tuple(one.safe for one in process.inputs))
     """Of each input: of the cold box CV155 %, NCR22_A W, CV156 %."""
 
     @field_validator("safe_state")
     @classmethod
     def _within_registers(cls, values: tuple[float, ...]) -> tuple[float, ...]:
-        for one, value in zip(PROCESS.inputs, values, strict=True):
+        for one, value in zip(settings_process().inputs, values, strict=True):
             low, high = one.span
             if not low <= value <= high:
                 raise ValueError(f"{one.name} = {value:g} is outside {low:g} to {high:g} {one.unit}".rstrip())
@@ -129,7 +130,7 @@ class WatchdogSettings(BaseModel):
     @property
     def ticks(self) -> int:
         """The time-out, in ticks."""
-        return math.ceil(self.timeout_s / TICK_S)
+        return math.ceil(self.timeout_s / self.process.tick_s)
 
 
 class PlantServer(ServerSettings):
@@ -174,12 +175,10 @@ class RefrigeratorSettings(BaseModel):
     """What happens, and when: `{at_s = 600, target = "nc1", value = 0}` trips a compressor after ten minutes."""
 
 
-class PlantSection(BaseModel):
+class PlantSection(ProcessSettings):
     """Section `plant` of the configuration."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    kind: PlantKind = PlantKind(PROCESS.plants[0])
+    kind: PlantKind = declared(lambda process: PlantKind(process.plants[0]))
     refrigerator: RefrigeratorSettings = RefrigeratorSettings()
     """Read by the refrigerator only, as is `station`."""
     station: StationSettings = StationSettings()
@@ -192,22 +191,19 @@ class PlantSection(BaseModel):
     """Seed of the sensors' noise."""
     mismatch: MismatchSettings = MismatchSettings()
     """Of a cold box alone."""
-    sensors: SensorSettings = SensorSettings()
+    sensors: SensorSettings = Field(default_factory=SensorSettings)
     clock_error_ppm: Annotated[float, Field(ge=-50_000, le=50_000)] = 0.0
     """How much too fast the rack's clock is in real time, in millionths: for tests of those who follow it."""
-    watchdog: WatchdogSettings = WatchdogSettings()
+    watchdog: WatchdogSettings = Field(default_factory=WatchdogSettings)
     rate_limited: bool = True
     """No output moves by more than `limits.rate` in one tick of the rackfor any writer; the safe state does."""
     retain: RetainSettings = RetainSettings()
 
 
-class PlantSettings(BaseModel):
+class PlantSettings(RootSettings):
     """What the plant service reads of a configuration."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    limits: InputLimits = InputLimits()
-    model: ModelSettings = ModelSettings()
+    limits: InputLimits = Field(default_factory=InputLimits)
     session: SessionSettings = SessionSettings()
-    plant: PlantSection = PlantSection()
+    plant: PlantSection = Field(default_factory=PlantSection)
     telemetry: TelemetrySettings = TelemetrySettings()

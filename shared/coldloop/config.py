@@ -49,12 +49,17 @@ class Configuration(Generic[M]):
     def effective(self) -> list[tuple[str, Any, str]]:
         """Return (dotted key, value, source) of every value."""
         rows = flattened(self.settings.model_dump(mode="json"))
-        usual = flattened(type(self.settings)().model_dump(mode="json"))
+        usual = flattened(self.usual().model_dump(mode="json"))
         notes = self.notes()
         return [
             (key, value, self.sources.get(key) or notes.get(key, DEFAULT if value == usual.get(key) else DERIVED))
             for key, value in rows.items()
         ]
+
+    def usual(self) -> M:
+        """Return the settings without what was set; where there is a model, it is the one that was set."""
+        model: BaseModel | None = getattr(self.settings, "model", None)
+        return type(self.settings).model_validate({"model": model} if model else {})
 
     def notes(self) -> dict[str, str]:
         """Return what sections say (`notes`, by key) of values that nothing has set."""

@@ -218,13 +218,13 @@ class RackLink(RuleBasedStateMachine):
         self.program = make_program(HEADER, SECTION, self.limits)
         self.link = PlantLink(self.program.alarms, self.program.journal, self.holder)
         self.cycle = ScanCycle(self.program, self.link, self.adopt)
-        self.clock = RackClock(1.0, self.fake.now)
+        self.clock = RackClock(1.0, self.fake.now, 0.25)
 
     def adopt(self, reading: Measurement) -> bool:
         if reading.session != self.session:
             return False
         self.accepted = None
-        kept = RetainedControlState.parsed(self.kept) if self.kept and self.kept["session"] == reading.session else None
+        kept = RetainedControlState.parsed(self.kept, COLD_BOX) if self.kept and self.kept["session"] == reading.session else None
         self.program.resume(
             reading.session, reading.tick, reading.u, updates=kept.updates if kept else 0,
             operator=kept.operator if kept else self.program.operator, playing=kept.sequence if kept else None,
@@ -264,7 +264,7 @@ class RackLink(RuleBasedStateMachine):
             self.keep()
 
     def keep(self) -> None:
-        content = ControlStateStore(None, HEADER.short_digest).content(self.program, TimeBase(self.realtime, 1.0))
+        content = ControlStateStore(None, HEADER.short_digest, COLD_BOX).content(self.program, TimeBase(self.realtime, 1.0))
         content["holder"] = self.holder
         self.kept = json.loads(json.dumps(content)) if self.remembers else None
 

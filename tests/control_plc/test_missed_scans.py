@@ -183,8 +183,8 @@ def test_after_a_restart_the_rest_of_what_was_played_is_played_on(bench: "Bench"
 def test_the_time_of_the_watchdog_that_an_operator_set_outlasts_a_restart(bench: "Bench") -> None:
     program = bench.program
     program.watchdog.set(240, program.tick)
-    content = ControlStateStore(None, 0).content(program, TimeBase(realtime=False, factor=1.0))
-    kept = RetainedControlState.parsed(json.loads(json.dumps(content)))
+    content = ControlStateStore(None, 0, COLD_BOX).content(program, TimeBase(realtime=False, factor=1.0))
+    kept = RetainedControlState.parsed(json.loads(json.dumps(content)), COLD_BOX)
     program.watchdog.set(60, program.tick)
     program.recall(kept.operator, kept.alarms, kept.watchdog, kept.tick)
     assert program.watchdog.registers(program.tick).time == 240

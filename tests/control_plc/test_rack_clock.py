@@ -13,7 +13,7 @@ from control_plc.rack_clock import MAX_CORRECTION, PHASE, RackClock
 def follow(ppm: float, factor: float, ticks: int, *, jitter_s: float = 0.0, seed: int = 1) -> tuple[RackClock, float]:
     """Scan for so many ticks beside a rack whose clock is off; return the clock and the last phase errors' largest."""
     rng = random.Random(seed)  # noqa: S311 - noise
-    clock, worst = RackClock(factor, 0.0), 0.0
+    clock, worst = RackClock(factor, 0.0, 0.25), 0.0
     for tick in range(ticks):
         at = clock.due(tick)
         position = PHASE + at / clock.tick_s * (1.0 + ppm * 1e-6)
@@ -38,13 +38,13 @@ def test_the_skew_is_found_within_ten_ppm_in_six_hours_at_factor_50(ppm: float) 
 
 
 def test_nothing_is_claimed_of_the_skew_before_there_are_measurements() -> None:
-    clock = RackClock(1.0, 0.0)
+    clock = RackClock(1.0, 0.0, 0.25)
     assert clock.skew().error_ppm == float("inf")
 
 
 @given(errors=st.lists(st.floats(-1.5, 1.5), min_size=1, max_size=200))
 def test_no_single_measurement_moves_the_schedule_by_more_than_the_bound(errors: list[float]) -> None:
-    clock = RackClock(1.0, 0.0)
+    clock = RackClock(1.0, 0.0, 0.25)
     at = 0.0
     for error in errors:
         at += clock.tick_s
@@ -62,7 +62,7 @@ def test_one_position_that_cannot_be_teaches_nothing_about_the_rate() -> None:
 
 
 def test_after_a_break_the_next_scan_is_the_first_one_that_is_still_due() -> None:
-    clock = RackClock(2.0, 0.0)
+    clock = RackClock(2.0, 0.0, 0.25)
     clock.synchronise(117.2, at=50.0)
     assert clock.due(117) == pytest.approx(50.0 + 0.3 * TICK_S / 2.0)
     assert clock.tick_at(50.0) == 117

@@ -211,9 +211,9 @@ class Link(RuleBasedStateMachine):
     @precondition(lambda self: self.program.tick > 0)
     @rule()
     def the_control_plc_is_killed_and_comes_back(self) -> None:
-        store = ControlStateStore(None, HEADER.short_digest)
+        store = ControlStateStore(None, HEADER.short_digest, COLD_BOX)
         content = store.content(self.program, TimeBase(realtime=False, factor=1.0))
-        kept = RetainedControlState.parsed(json.loads(json.dumps(content)))
+        kept = RetainedControlState.parsed(json.loads(json.dumps(content)), COLD_BOX)
         self.program = self.new_program()
         self.program.alarms.restore(kept.alarms)
         self.program.resume(kept.session, kept.tick, self.trace[-1], updates=kept.updates, operator=kept.operator)

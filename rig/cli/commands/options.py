@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from coldloop.errors import UsageError
 from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import TICK_S
-from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS
+from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.process.whole_ticks import whole_ticks
 from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.choices import FIGURE_FORMATS, LOADS, PRESETS, SOLVERS
@@ -46,7 +46,7 @@ class HostPort(NamedTuple):
 
 
 SHORTEST_S: Final = SHORTEST_TICKS * TICK_S
-LONGEST_S: Final = LONGEST_TICKS * TICK_S
+LONGEST_S: Final = TICKS_PER_SAMPLE * TICK_S
 
 
 def updating_period(text: str) -> float:
@@ -64,7 +64,7 @@ def _period(text: str, what: str) -> float:
         ticks = whole_ticks(float(text))
     except ValueError:
         ticks = None
-    if ticks is None or not SHORTEST_TICKS <= ticks <= LONGEST_TICKS:
+    if ticks is None or not SHORTEST_TICKS <= ticks <= TICKS_PER_SAMPLE:
         raise argparse.ArgumentTypeError(
             f"'{text}' is {what} multiple of {TICK_S:g} s, a tick, from {SHORTEST_S:g} to {LONGEST_S:g} s"
         )

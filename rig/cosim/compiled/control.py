@@ -4,20 +4,19 @@ from typing import Any
 
 import numpy as np
 
-from coldloop.process.signals import CONTROLLED, TICKS_PER_SAMPLE
-from coldloop.registers.control_plc import Mode, OperatorMode, ProcessNow, SequenceHeader, Update
+from coldloop.registers.control_plc import SEQUENCE_ROWS, Mode, OperatorMode, ProcessNow, SequenceHeader, Update
 from coldloop.registers.safety import AlarmKind, CapacityCause
 from coldloop.safety.sequence import InputSequence, with_checksum
 from control_plc.alarm_settings import BANDS
-from control_plc.output_limits import GuardState
+from control_plc.output_limits import GuardState, Limits
 from control_plc.process_alarms import present_limits
 from control_plc.program import ControlProgram
-from rig.cosim.compiled.records import GUARD, NOT, SCAN, Alarms, Array, Trace, empty_rows, record
+from rig.cosim.compiled.records import NOT, Alarms, Array, Trace, guard_type, scan_type
 
 OF_PLANS = (AlarmKind.CAPACITY, AlarmKind.SENSOR_SUSPECT, AlarmKind.INPUT_WITHOUT_EFFECT)
 """Alarms of what plans say."""
-LONGEST_SILENCE = TICKS_PER_SAMPLE + 2
-"""Ticks between two signs of life of an optimiser that answers every update."""
+SILENCE_TICKS = 2
+"""What may be longer than a sampling period between two signs of life of an optimiser that answers every update."""
 
 
 def is_ordinary(program: ControlProgram) -> bool:
@@ -34,7 +33,7 @@ def is_ordinary(program: ControlProgram) -> bool:
         and program.has_noted_suspects
         and due(program) > program.tick
         and not program.watchdog.expired
-        and (not program.watchdog.time or program.watchdog.time > LONGEST_SILENCE)
+        and (not program.watchdog.time or program.watchdog.time > program.guard.limits.ticks_per_sample + SILENCE_TICKS)
     )
 
 
@@ -45,15 +44,21 @@ def due(program: ControlProgram) -> float:
 
 def alarms_of(program: ControlProgram) -> Alarms:
     """Return the band alarms as they are, with their present limits."""
-    low, high = np.array(present_limits(program.alarm_settings.bands, program.alarms), dtype=np.float64).T
+    low, high = np.array(present_limits(program.alarm_settings, program.alarms), dtype=np.float64).T
     rows, delays = (program.alarms.rows[kind] for kind in BANDS), map(program.alarms.delay, BANDS)
     causes = [row.cause if row.active else NOT for row in rows]
-    return Alarms(low.copy(), high.copy(), np.array(CONTROLLED), np.array(causes), np.array(list(delays)))
+    return Alarms(
+        low.copy(),
+        high.copy(),
+        np.array(program.alarm_settings.process.controlled),
+        np.array(causes),
+        np.array(list(delays)),
+    )
 
 
 def scan_record(program: ControlProgram) -> Any:  # noqa: ANN401 a record
     """Return the state of player, sensors, alarms and watchdog, shape (1,)."""
-    scans, player, sensors = record(SCAN), program.player, program.sensors
+    scans, player, sensors = np.zeros(1, scan_type(program.alarm_settings.process)), program.player, program.sensors
     s, update, playing = scans[0], player.update, player.sequence
     if update is None or playing is None:
         raise RuntimeError("an ordinary tick plays a sequence")
@@ -76,9 +81,9 @@ def scan_record(program: ControlProgram) -> Any:  # noqa: ANN401 a record
     return scans
 
 
-def guard_records(state: GuardState) -> Any:  # noqa: ANN401 records
+def guard_records(state: GuardState, limits: Limits) -> Any:  # noqa: ANN401 records
     """Return the state of the output guard, and room for a twin of it, shape (2,)."""
-    guards = np.zeros(2, GUARD)
+    guards = np.zeros(2, guard_type(limits))
     g, slots = guards[0], len(state.moves)
     for name in ("applied", "anchor", "start", "share", "moved", "oldest"):
         g[name] = getattr(state, name)
@@ -137,6 +142,6 @@ def played_sequence(s: Any, update: int, rows: Array, model_digest: int) -> Inpu
 
 def sequence_rows(sequence: InputSequence) -> Array:
     """Return the rows of a sequence, and room for those of the next one, shape (2, 240, inputs)."""
-    rows = empty_rows()
+    rows = np.zeros((2, SEQUENCE_ROWS, len(sequence.rows[0])))
     rows[0, : len(sequence.rows)] = sequence.rows
     return rows

@@ -13,7 +13,7 @@ import rig.cosim.compiled.portable  # noqa: F401 it lets kernels call what is pl
 from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import inlined, kernel
 from coldloop.registers.plant import MAX_STATE
-from control_plc.output_limits import N_INPUTS, admit, copy_state, in_range, judge
+from control_plc.output_limits import admit, copy_state, in_range, judge
 from control_plc.sensors import are_inside, count_unchanged, have_moved, is_frozen, is_to_move, note_moves
 from optimizer_plc import scheme
 from optimizer_plc.scheme import BY_THE_RULE
@@ -119,7 +119,7 @@ def scan(
         for i in range(plant.y.shape[0]):
             plant.y[i] = plant.y[i] + w.biases[i] + w.deviations[i] * plant.noise[row, i]
     y = trace.y[row]
-    count_unchanged(s.unchanged, s.rests, s.seen, y, 1, w.least, w.controlled)
+    count_unchanged(s.unchanged, s.rests, s.seen, y, 1, w.least, w.controlled, w.kinds)
     if w.each_may_rest:
         note_moves(s.unchanged, s.inputs, s.inputs_moved, u, w.moves, tick)
     note_image(w, s, u)
@@ -169,7 +169,7 @@ def run_block(
     w, alarms, o, rows, plant = borrowed(w), borrowed(alarms), borrowed(o), borrowed(rows), borrowed(plant)
     trace, reports = borrowed(trace), borrowed(reports)
     s, guard, twin = scans[0], guards[0], guards[1]
-    u_before, answered = np.empty(N_INPUTS), False
+    u_before, answered = np.empty(guard.applied.shape[0]), False
     outcome = DONE
     while s.tick < until:
         tick, instant = s.tick, s.tick == s.next_update

@@ -9,7 +9,6 @@ from typing import Any, Final, Protocol, TypeVar
 from numba.extending import overload
 
 from coldloop.kernels.implementations import Implementations
-from coldloop.process.loaded import PROCESS
 from plant.program import PlantProgram
 from rig.cosim.compiled.records import Array, PlantState
 
@@ -30,7 +29,7 @@ class CompiledPlant(Protocol):
 
 def compiled_plant(program: PlantProgram) -> CompiledPlant | None:
     """Return a program as the loop takes it; None where its ticks are not compiled."""
-    if PROCESS.has_station:
+    if program.process.has_station:
         from rig.cosim.compiled.cold_box_plants import of_cold_box  # noqa: PLC0415 other processes have no such signals
 
         return of_cold_box(program)

@@ -6,12 +6,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import is_compiled
-from coldloop.process.load_profile import LOAD_SPAN, LoadProfile
-from coldloop.process.loaded import PROCESS
+from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from control_plc.program import ControlProgram
-from control_plc.sensors import IS_CONTROLLED
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.solvers import KernelSolver
 from plant.program import PlantProgram
@@ -54,17 +52,18 @@ class CompiledStretches:
         may_compile: bool,
     ) -> None:
         self._plant, self._compiled, self._control, self._optimizer = plant, compiled, control_plc, optimizer_plc
+        process = control_plc.alarm_settings.process
         self._is_compiled = _is_compiled(optimizer_plc)
         self._may_compile = may_compile
         self._is_there: dict[Callable[..., int], bool] = {}
-        self._trace, self._reports = empty_trace(STATION_COLUMNS if plant.station else 0), empty_reports()
+        self._trace, self._reports = empty_trace(process, STATION_COLUMNS if plant.station else 0), empty_reports()
         self._pause_until = 0
         sensors = control_plc.sensors
         self._world = World(
             compiled.constants, plant.biases, plant.deviations, np.array(load.times), np.array(load.watts),
             control_plc.guard.limits, np.array(sensors.low), np.array(sensors.high), np.array(sensors.least),
-            np.array(IS_CONTROLLED), np.array(sensors.moves), sensors.may_rest, sensors.each_may_rest,
-            sensors.frozen_ticks, *LOAD_SPAN, control_plc.watchdog.time,
+            np.array(sensors.is_controlled), sensors.kinds, np.array(sensors.moves), sensors.may_rest, sensors.each_may_rest,
+            sensors.frozen_ticks, *process.load.stored_span, control_plc.watchdog.time,
             optimizer_plc.settings.interrupting_load_step_w,
         )  # fmt: skip
 
@@ -93,7 +92,7 @@ class CompiledStretches:
         program, sequence = self._control, self._control.player.sequence
         if sequence is None or program.player.next_update_tick - program.tick < SHORTEST:
             return None
-        scans, guards = control.scan_record(program), control.guard_records(program.guard.state)
+        scans, guards = control.scan_record(program), control.guard_records(program.guard.state, program.guard.limits)
         rows, alarms = control.sequence_rows(sequence), control.alarms_of(program)
         if not self._run(loops.play, self._world, alarms, scans, guards, rows[0], plant, self._trace, until):
             return None
@@ -106,7 +105,7 @@ class CompiledStretches:
         program, optimizer_plc, playing = self._control, self._optimizer, self._control.player.sequence
         if playing is None:
             raise RuntimeError("an ordinary update plays a sequence")
-        scans, guards = control.scan_record(program), control.guard_records(program.guard.state)
+        scans, guards = control.scan_record(program), control.guard_records(program.guard.state, program.guard.limits)
         rows = control.sequence_rows(playing)
         o = optimizer_plc
         parts = Optimizer(o.constants, o.method, o.rule, o.state)
@@ -151,7 +150,7 @@ def _is_compiled(program: OptimizerProgram) -> bool:
     """Tell whether the program's updates have a compiled form: solver, rule and estimator of our own, no forecast."""
     if type(program) is not OptimizerProgram:  # who has made another kind of it wants to be asked
         return False
-    return isinstance(program.solver, KernelSolver) and not (program.plans_by_steps or PROCESS.forecasts)
+    return isinstance(program.solver, KernelSolver) and not (program.plans_by_steps or program.process.forecasts)
 
 
 def _is_ordinary(program: OptimizerProgram) -> bool:

@@ -30,7 +30,7 @@ from coldloop.registers.optimizer_plc import (
     UpdatingRuleStatus,
 )
 from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.runtime import HEARTBEAT_S, LOOK_OUT_S
+from optimizer_plc.runtime import HEARTBEAT_TICKS, LOOK_OUT_TICKS
 from rig.plc_export.c.text import GENERATED
 from rig.plc_export.kernels.optimizer_program import OptimizerKernels
 from rig.plc_export.templates import filled, template
@@ -79,7 +79,7 @@ def bus_files(
 def _header(
     optimizer: OptimizerProgram, kernels: OptimizerKernels, order: WordOrder, configuration: Mapping[str, Any]
 ) -> str:  # fmt: skip
-    times = optimizer.budget.times._asdict()
+    times = {name: getattr(optimizer.budget.times, name) for name in ("slots", "preparation", "iteration")}
     statuses = [rule.status._replace(**times) for rule in kernels.rules]
     image = _image(optimizer, statuses[0], order, configuration)
     words = struct.unpack(f">{len(image) // 2}H", image)
@@ -93,7 +93,7 @@ def _header(
         "USUAL_PERIOD": round(optimizer.settings.updating_period_s / TICK_S),
         "OPTIMIZER_LOW_FIRST": str(order is WordOrder.LOW_FIRST).lower(),
         "PREPARATION_S": repr(float(times["preparation"])), "ITERATION_S": repr(float(times["iteration"])),
-        "LOOK_OUT_S": repr(LOOK_OUT_S), "HEARTBEAT_S": repr(HEARTBEAT_S),
+        "LOOK_OUT_S": repr(LOOK_OUT_TICKS * TICK_S), "HEARTBEAT_S": repr(HEARTBEAT_TICKS * TICK_S),
     }  # fmt: skip
     defined = "".join(f"#define {name} {value}\n" for name, value in names.items())
     return f"""{GENERATED}#ifndef REGISTERS_H

@@ -6,8 +6,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICK_S
-from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.program import OptimizerProgram
 from rig.plc_export.c.constants import ConstantRecords
@@ -66,7 +66,7 @@ class OptimizerExport:
     def files(self) -> dict[str, str]:
         """Return the texts of the files by their names."""
         sizes = {"INPUTS": len(INPUT_NAMES), "OUTPUTS": len(OUTPUT_NAMES), "STATES": len(STATE_NAMES),
-                 "ROWS": SEQUENCE_ROWS, "LONGEST": LONGEST_TICKS, "SHORTEST": SHORTEST_TICKS,
+                 "ROWS": SEQUENCE_ROWS, "LONGEST": TICKS_PER_SAMPLE, "SHORTEST": SHORTEST_TICKS,
                  "TICK_S": TICK_S}  # fmt: skip
         parts = {"GENERATED": GENERATED.rstrip(), **{name: str(size) for name, size in sizes.items()}}
         texts = {name: filled(template(f"c/optimizer/{name}"), parts)

@@ -12,7 +12,7 @@ from optimizer_plc.decisions import Latched
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
-from optimizer_plc.session_state import empty_state
+from optimizer_plc.session_state import OptimizerState, empty_state
 from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers.interface import Costs
 from optimizer_plc.solvers.ode import OdeMethod, ode_solver
@@ -112,18 +112,23 @@ def counts_of(found: Sequence[int]) -> CallCounts:
     return CallCounts(min(found), sum(found) / len(found), max(found))
 
 
+def _empty(optimizer: OptimizerProgram) -> OptimizerState:
+    state, process = optimizer.state, optimizer.process
+    return empty_state(len(state.belief.x), len(process.inputs), len(process.outputs), len(state.sent.z), REAL)
+
+
 def counted_updates(optimizer: OptimizerProgram, golden: Iterable[GoldenUpdate]) -> Mapping[str, CallCounts]:
     """Return the operations of the calls that golden updates take beside the iterations: plan, start, finish."""
     kernels = OptimizerKernels(optimizer)
     begin, take, solve, _ = (each.name for each in kernels.entries)
     program = CountedProgram(kernels.functions)
     c, method = kernels.constants["constants"], kernels.constants["method"]
-    state = empty_state(len(optimizer.state.belief.x), len(optimizer.state.sent.z), REAL)
+    state = _empty(optimizer)
     noted = {name: program.noting(name) for name in (take, "pose", "warm_start", "deliver")}
     for each in golden:
         if each.fixed_ticks >= 0:
             c = c._replace(fixed_ticks=each.fixed_ticks)
-            state = empty_state(len(state.belief.x), len(state.sent.z), REAL)
+            state = _empty(optimizer)
             program[begin](c, state)
         program[take](c, kernels.rules[c.fixed_ticks], kernels.starts[c.fixed_ticks], state, latched(each))
         if each.sequence:

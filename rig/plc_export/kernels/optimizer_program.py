@@ -6,8 +6,7 @@ from typing import Any, Final, cast
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
-from coldloop.process.updating_periods import LONGEST_TICKS
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICKS_PER_SAMPLE
 from optimizer_plc import decisions, scheme
 from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.decisions import Latched, Starts
@@ -41,7 +40,7 @@ class OptimizerKernels:
     def __init__(self, optimizer: OptimizerProgram) -> None:
         real = real_of(Arithmetic.FLOAT32)
         self.rules = [make_rule(optimizer.settings, optimizer.budget, ticks, real)
-                      for ticks in range(LONGEST_TICKS + 1)]  # fmt: skip
+                      for ticks in range(TICKS_PER_SAMPLE + 1)]  # fmt: skip
         """The rule for each fixed updating period in ticks; that for 0 adapts it."""
         self.starts = [Starts(rule.first, rule.after_interruption()) for rule in self.rules]
         self.constants: Mapping[str, Any] = {

@@ -10,7 +10,7 @@ import numpy as np
 
 from coldloop.process.load_profile import LOAD_UNIT
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICK_S, TICKS_PER_SAMPLE
-from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS
+from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.program import OptimizerProgram
 from rig.plc_export.kernels.ode_program import Array, leaves
@@ -138,7 +138,7 @@ class OptimizerText:
         begun = ", ".join(f"{name} := {'TRUE' if each == ANEW else name}"
                           for each, name in interface_names(begin, self.printer.type).items())  # fmt: skip
         return filled(template("structured_text/optimizer/optimizer.st"), {
-            **signal_counts(), "LONGEST": str(LONGEST_TICKS), "SHORTEST": str(SHORTEST_TICKS), "LATCHED": passed,
+            **signal_counts(), "LONGEST": str(TICKS_PER_SAMPLE), "SHORTEST": str(SHORTEST_TICKS), "LATCHED": passed,
             "TICK_S": str(TICK_S), "UNIT": LOAD_UNIT, "BEGIN": begun, "PIECE": str(PIECE),
             "LOAD_STEP": interface_names(take, self.printer.type)[take.outputs[0]],
         })  # fmt: skip

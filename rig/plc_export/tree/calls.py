@@ -95,6 +95,8 @@ class CallReader(ExpressionReader):
             return self._invocation(node, kernel)
         if called.value is type and len(node.args) == 1:
             return DType(cast("Kind", self.scalar(node.args[0]).type))
+        if called.value is len and len(node.args) == 1:
+            return self._length(node.args[0])
         if called.value is int and len(node.args) == 1:
             return self._integer(node)
         if hasattr(called.value, "_fields"):
@@ -131,6 +133,12 @@ class CallReader(ExpressionReader):
 
     def _tuple(self, node: ast.Tuple) -> Record:
         return Record("", tuple(("", self.typed(each, self.read(each))) for each in node.elts))
+
+    def _length(self, node: ast.expr) -> Known:
+        array = self.storage(node)
+        if not isinstance(array.type, ArrayType):
+            raise self.source.refusal(node, "only arrays have a length")
+        return Known(array.type.shape[0])
 
     def _integer(self, node: ast.Call) -> Value:
         operand = self.scalar(node.args[0])

@@ -11,8 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from coldloop.process.signals import TICK_S
-from optimizer_plc.budget import MAX_PERIOD_TICKS
+from coldloop.process.signals import SAMPLING_PERIOD_S, TICK_S
 from rig.figures.plot import COLOURS, DASHES
 from rig.studies.drawing import legend_outside, panels
 from rig.studies.paper.trajectories import load_steps, seconds_since_step
@@ -46,7 +45,7 @@ class HeldPeriods(NamedTuple):
     def share_of_longest(self, span: tuple[float, float]) -> float:
         """Return the share of a window's time that has the longest period; NaN if no tick is in it."""
         chosen = self.tau_u_s[(span[0] <= self.since_s) & (self.since_s < span[1])]
-        return float((chosen == MAX_PERIOD_TICKS * TICK_S).mean()) if len(chosen) else np.nan
+        return float((chosen == SAMPLING_PERIOD_S).mean()) if len(chosen) else np.nan
 
 
 def held_periods(runs: Sequence[Run]) -> HeldPeriods:

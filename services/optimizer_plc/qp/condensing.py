@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from optimizer_plc.qp.design import N_INPUTS, N_SLACKS, ControlDesign
+from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.linear_algebra import multiply
 from optimizer_plc.qp.prediction import PredictionModel, state_cost
 
@@ -36,14 +36,14 @@ class Condensed(NamedTuple):
 
 def condense(prediction: PredictionModel, design: ControlDesign, weights: Array) -> Condensed:
     """Return the condensed cost and outputs; `weights` (N, knots) are those of the knots in each sample."""
-    n, nx = (N_INPUTS + N_SLACKS) * weights.shape[1], prediction.n_states
+    n, nx = (design.n_inputs + design.n_slacks) * weights.shape[1], prediction.n_states
     A, B, F = prediction.sample
     to_z = np.zeros((nx, n))
     to_s = np.hstack([np.eye(nx), np.zeros((nx, 1))])
     Q, n_x = np.zeros((nx, nx)), len(prediction.model.x0)  # disturbances weigh nothing
     Q[:n_x, :n_x] = state_cost(prediction.model, design)
     R = np.asarray(design.input_weight)
-    resting = np.hstack([prediction.resting_inputs, np.zeros((N_INPUTS, 1))])
+    resting = np.hstack([prediction.resting_inputs, np.zeros((design.n_inputs, 1))])
     weighted_resting = multiply(transposed(resting), np.diag(R))
     C, D, G = (matrix[list(prediction.constrained)] for matrix in (prediction.C, prediction.D, prediction.G))
     Phi, cross, constant = np.zeros((n, n)), np.zeros((nx + 1, n)), np.zeros((nx + 1, nx + 1))
@@ -72,29 +72,29 @@ def condense(prediction: PredictionModel, design: ControlDesign, weights: Array)
 
 def input_map(of_knots: Array, design: ControlDesign) -> Array:
     """Return the matrix (inputs, n) from z to the input deviation at a sample with these knot weights (knots,)."""
-    u_of_z = np.zeros((N_INPUTS, (N_INPUTS + N_SLACKS) * len(of_knots)))
+    u_of_z = np.zeros((design.n_inputs, (design.n_inputs + design.n_slacks) * len(of_knots)))
     for knot, weight in enumerate(of_knots):
-        for i in range(N_INPUTS):
-            u_of_z[i, N_INPUTS * knot + i] = weight * design.input_scale[i]
+        for i in range(design.n_inputs):
+            u_of_z[i, design.n_inputs * knot + i] = weight * design.input_scale[i]
     return u_of_z
 
 
-def slack_map(of_knots: Array) -> Array:
+def slack_map(of_knots: Array, design: ControlDesign) -> Array:
     """Return the matrix (slacks, n) from z to the slacks at a sample with these knot weights (knots,)."""
-    n_inputs = N_INPUTS * len(of_knots)
-    slack_of_z = np.zeros((N_SLACKS, n_inputs + N_SLACKS * len(of_knots)))
+    n_inputs = design.n_inputs * len(of_knots)
+    slack_of_z = np.zeros((design.n_slacks, n_inputs + design.n_slacks * len(of_knots)))
     for knot, weight in enumerate(of_knots):
-        for i in range(N_SLACKS):
-            slack_of_z[i, n_inputs + N_SLACKS * knot + i] = weight
+        for i in range(design.n_slacks):
+            slack_of_z[i, n_inputs + design.n_slacks * knot + i] = weight
     return slack_of_z
 
 
 def _slack_weights(weights: Array, design: ControlDesign) -> Array:
     rho = np.repeat(design.violation_weight, 2)
-    n = (N_INPUTS + N_SLACKS) * weights.shape[1]
+    n = (design.n_inputs + design.n_slacks) * weights.shape[1]
     total = np.zeros((n, n))
     for of_knots in weights:
-        slack_of_z = slack_map(of_knots)
+        slack_of_z = slack_map(of_knots, design)
         total += multiply(transposed(slack_of_z), rho[:, None] * slack_of_z)
     return total
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from coldloop.process.limits import InputLimits
 from optimizer_plc.qp.condensing import Condensed, slack_map
-from optimizer_plc.qp.design import N_INPUTS, N_SLACKS, ControlDesign
+from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.penalties import PenaltySettings
 
 Array = NDArray[np.float64]
@@ -49,7 +49,7 @@ def output_rows(condensed: Condensed, design: ControlDesign, weights: Array, y0:
     rho = np.array(design.violation_weight)
     rows, states, bounds, gains = [], [], [], []
     for instant in design.constraint_instants:
-        slack_of_z = slack_map(weights[instant - 1])
+        slack_of_z = slack_map(weights[instant - 1], design)
         for output in range(len(rho)):
             y_z, y_s = condensed.outputs_z[instant - 1][output], condensed.outputs_s[instant - 1][output]
             margin = design.band_margin[output]
@@ -71,30 +71,31 @@ def output_rows(condensed: Condensed, design: ControlDesign, weights: Array, y0:
 def rate_rows(design: ControlDesign, limits: InputLimits, penalties: PenaltySettings) -> RateRows:
     """Return the rows of the rates, scaled by what breaking them costs; there may be none."""
     ranges = np.asarray(limits.high) - np.asarray(limits.low)
-    size = (N_INPUTS + N_SLACKS) * len(design.decision_instants)
+    n_inputs = design.n_inputs
+    size = (n_inputs + design.n_slacks) * len(design.decision_instants)
     gains_of_inputs = np.sqrt(penalties.rate_rows) / np.array(design.input_scale)
     rows, bounds, before, first, gained = [], [], [], [], []
     starts = (design.decision_instants[0] - 1, *design.decision_instants[:-1])
     for knot, (start, end) in enumerate(zip(starts, design.decision_instants, strict=True)):
-        for i in range(N_INPUTS):
+        for i in range(n_inputs):
             limit = (end - start) * limits.rate[i]
             if limit >= ranges[i]:
                 continue
             row = np.zeros(size)
-            row[N_INPUTS * knot + i] = design.input_scale[i]
+            row[n_inputs * knot + i] = design.input_scale[i]
             if knot:
-                row[N_INPUTS * (knot - 1) + i] = -design.input_scale[i]
+                row[n_inputs * (knot - 1) + i] = -design.input_scale[i]
             for sign in (1.0, -1.0):
                 rows.append(sign * row)
                 bounds.append(limit)
                 first.append(float(knot == 0))
-                before.append(sign * np.eye(N_INPUTS)[i] * (knot == 0))
+                before.append(sign * np.eye(n_inputs)[i] * (knot == 0))
                 gained.append(gains_of_inputs[i])
     gains = np.array(gained)
     return RateRows(
         Gamma=np.reshape(rows, (-1, size)) * gains[:, None],
         bounds=np.array(bounds) * gains,
         first=np.array(first),
-        before=np.ascontiguousarray((np.reshape(before, (-1, N_INPUTS)) * gains[:, None]).T),
+        before=np.ascontiguousarray((np.reshape(before, (-1, n_inputs)) * gains[:, None]).T),
         gains=gains,
     )

@@ -9,8 +9,6 @@ from typing import Annotated, Final, Self
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
-    ConfigDict,
     Field,
     FiniteFloat,
     PositiveFloat,
@@ -20,13 +18,15 @@ from pydantic import (
 )
 
 from coldloop.process.declaration import FURTHEST_WEIGHT
-from coldloop.process.loaded import PROCESS
-from coldloop.process.per_signal import PerBand, PerInput, PositivePerBand
-from coldloop.process.signals import BATH, STRETCH
-
-N_INPUTS = len(PROCESS.inputs)
-N_SLACKS = 2 * len(PROCESS.bands)
-"""Slack inputs: below and above each band; of the paper L1 low, L1 high, T5 low, T5 high."""
+from coldloop.process.settings import (
+    PerBand,
+    PerInput,
+    PositivePerBand,
+    ProcessSettings,
+    declared,
+    settings_process,
+    stretched,
+)
 
 
 def _rising_instants(instants: tuple[int, ...]) -> tuple[int, ...]:
@@ -62,24 +62,22 @@ def _numbers(value: Numbers) -> tuple[float, ...]:
     return value if isinstance(value, tuple) else (value,)
 
 
-class ControlDesign(BaseModel):
+class ControlDesign(ProcessSettings):
     """The constrained control problem: what has a number for each input or band is in their order in the process."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    decision_instants: Instants = PROCESS.decision_instants
+    decision_instants: Instants = declared(lambda process: process.decision_instants)
     """Sampling periods at which inputs are free; the last one is the horizon."""
-    constraint_instants: Instants = PROCESS.constraint_instants
+    constraint_instants: Instants = declared(lambda process: process.constraint_instants)
     """Sampling periods at which bands count."""
-    output_low: PerBand = tuple(band.low for band in PROCESS.bands)
+    output_low: PerBand = declared(lambda process: tuple(band.low for band in process.bands))
     """Bands: of the cold box those of L1 (%) and T5 (K)."""
-    output_high: PerBand = tuple(band.high for band in PROCESS.bands)
+    output_high: PerBand = declared(lambda process: tuple(band.high for band in process.bands))
     """Upper ends of the bands."""
-    band_margin: PerBand = tuple(band.margin for band in PROCESS.bands)
+    band_margin: PerBand = declared(lambda process: tuple(band.margin for band in process.bands))
     """How far inside the bands the rows of the problem are: soft rows let an output rest beyond them."""
-    input_scale: PerInput = tuple(one.scale for one in PROCESS.inputs)
+    input_scale: PerInput = declared(lambda process: tuple(one.scale for one in process.inputs))
     """Size of each input in the problem."""
-    input_weight: PerInput = tuple(one.weight for one in PROCESS.inputs)
+    input_weight: PerInput = declared(lambda process: tuple(one.weight for one in process.inputs))
     """Diagonal of R, on deviations from the operating point."""
     pressure_scale: PositiveFloat = 2000.0
     """Size of a pressure in the cost, Pa."""
@@ -89,9 +87,19 @@ class ControlDesign(BaseModel):
     """Size of a temperature in the cost, K."""
     state_weight: PositiveFloat = 0.1
     """Weight of the states in the cost."""
-    violation_weight: PositivePerBand = tuple(band.weight for band in PROCESS.bands)
+    violation_weight: PositivePerBand = declared(lambda process: tuple(band.weight for band in process.bands))
     """rho, per sample and square of what a band is missed by: of the cold box per %^2 of L1 and K^2 of T5."""
     target: Target = Target.OPERATING_POINT
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs."""
+        return len(self.input_scale)
+
+    @property
+    def n_slacks(self) -> int:
+        """Number of slack inputs: below and above each band; of the paper L1 low, L1 high, T5 low, T5 high."""
+        return 2 * len(self.output_low)
 
     @property
     def horizon(self) -> int:
@@ -103,7 +111,9 @@ class ControlDesign(BaseModel):
     def _near_the_process(cls, value: Numbers, info: ValidationInfo) -> Numbers:
         name = str(info.field_name)
         furthest = FURTHEST_SCALE if name in SCALES else FURTHEST_WEIGHT
-        for own, given in zip(_numbers(cls.model_fields[name].default), _numbers(value), strict=True):
+        for own, given in zip(
+            _numbers(cls.model_fields[name].get_default(call_default_factory=True)), _numbers(value), strict=True
+        ):
             if not own / furthest <= given <= own * furthest:
                 raise ValueError(f"each must be from {own / furthest:g} to {own * furthest:g}, around {own:g}: "
                                  "beyond that single precision loses the other terms of the cost")  # fmt: skip
@@ -111,7 +121,7 @@ class ControlDesign(BaseModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if self.target is not Target.OPERATING_POINT and BATH is None:
+        if self.target is not Target.OPERATING_POINT and settings_process().bath is None:
             raise ValueError("target: a process without a bath has only operating-point")
         if self.constraint_instants[-1] > self.horizon:
             raise ValueError("constraint_instants end behind the last of decision_instants, which is the horizon")
@@ -125,28 +135,26 @@ class ControlDesign(BaseModel):
         return self
 
 
-class ColdEndSettings(BaseModel):
+class ColdEndSettings(ProcessSettings):
     """How far the feed of a bath may be opened: where helium before it is warmer than the bath, more of it cools less.
 
     The linear model does not know that. Of the cold box it is CV155, and T2 - T1 is measured whatever the valves pass
     and the exchangers transfer.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     approach_k: Annotated[float, Field(ge=0.0)] = 0.0
     """T2 - T1 at which the feed is opened no further; 0 is any. Capacity of the cold box is largest at 0.3 K with CV156
     at 36 %."""
     opening_per_k: PositiveFloat = 70.0
     """How far the feed may be from where it is, in % for each K that T2 - T1 is from it. Less slows load steps."""
-    following_s: PositiveFloat = 60.0 * STRETCH
+    following_s: PositiveFloat = stretched(60.0)
     """Time constant with which the limit follows T2 - T1, as it is estimated: noise of 0.03 K would move it by 2 %."""
     opening_from: FiniteFloat = 50.0
     """Opening, %, that is allowed in any case: should T1 or T2 be wrong."""
 
     @model_validator(mode="after")
     def _of_a_bath(self) -> Self:
-        if self.approach_k and BATH is None:
+        if self.approach_k and settings_process().bath is None:
             raise ValueError("approach_k limits the feed of a bath, and the process has none; leave it out")
         return self
 

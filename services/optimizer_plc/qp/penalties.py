@@ -8,22 +8,21 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated, Any, Final
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
-from coldloop.process.loaded import PROCESS
-from coldloop.process.per_signal import PositivePerInput
-from optimizer_plc.qp.design import N_INPUTS, ControlDesign
+from coldloop.process.cold_box import COLD_BOX
+from coldloop.process.declaration import Process
+from coldloop.process.settings import PositivePerInput, ProcessSettings, declared
+from optimizer_plc.qp.design import ControlDesign
 
 
-class PenaltySettings(BaseModel):
+class PenaltySettings(ProcessSettings):
     """Weights of the penalties, relative to one another and to the cost weights."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     output_rows: Annotated[float, Field(gt=0.0, le=1e6)] = 30.0
     """alpha over rho, the weight of a band violation. A violation v is shared between its slack and its row: the row
     keeps v / (1 + output_rows), and J has output_rows / (1 + output_rows) rho v^2 for it."""
-    rate_rows: PositivePerInput = (16.0,) * N_INPUTS
+    rate_rows: PositivePerInput = declared(lambda process: (16.0,) * len(process.inputs))
     """Weight of the rate rows over alpha, per square of `design.input_scale`. With the squares of `input_scale` the
     rows are in % and W, all with the same alpha, as the paper prints it."""
     box: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
@@ -32,9 +31,6 @@ class PenaltySettings(BaseModel):
     first_knot_in_box: bool = True
     """Whether the first knot keeps the rate from the input before it as a bound of the box, too, and not as a row only.
     Where it does not, its input is moved to within that rate before it is sent."""
-
-
-DEFAULT_PENALTIES: Final = PenaltySettings()
 
 
 def alpha_of(penalties: PenaltySettings, design: ControlDesign) -> float:
@@ -56,27 +52,35 @@ class Preset(StrEnum):
     in their own units, and cost_scale is the one whose costs come down with the iterations as in the paper's figure."""
 
 
-UNMEASURED: Final[Mapping[str, Any]] = PROCESS.tuned.get("unmeasured", {})
-"""What section `estimator` of the preset `tuned` has instead where the load is not measured."""
-PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
-    Preset.TUNED: {name: values for name, values in PROCESS.tuned.items() if name != "unmeasured"}
-    or {"estimator": {"disturbances": ("outputs",)}},
-    Preset.PAPER: {},
-    Preset.AS_PRINTED: {
-        "penalties": {
-            "output_rows": 1.0,
-            "rate_rows": tuple(one.scale**2 for one in PROCESS.inputs),
-            "box": 1.0,
-            "first_knot_in_box": False,
+UNMEASURED: Final = "unmeasured"
+"""What section `estimator` of a process's preset `tuned` has instead where the load is not measured."""
+
+
+def presets_of(process: Process) -> Mapping[Preset, Mapping[str, Mapping[str, Any]]]:
+    """Return the settings of each preset for a process, by section of `optimizer_plc.program`."""
+    return {
+        Preset.TUNED: {name: values for name, values in process.tuned.items() if name != UNMEASURED}
+        or {"estimator": {"disturbances": ("outputs",)}},
+        Preset.PAPER: {},
+        Preset.AS_PRINTED: {
+            "penalties": {
+                "output_rows": 1.0,
+                "rate_rows": tuple(one.scale**2 for one in process.inputs),
+                "box": 1.0,
+                "first_knot_in_box": False,
+            },
+            "ode": {"cost_scale": 1e-8, "look_ahead_rows": False, "hold_at_bounds": False},
         },
-        "ode": {"cost_scale": 1e-8, "look_ahead_rows": False, "hold_at_bounds": False},
-    },
-}
-"""Settings of each preset by section of `optimizer_plc.program`."""
+    }
+
+
 OF_PRESETS: Final = tuple(
-    f"{section}.{key}" for preset in PRESETS.values() for section, values in preset.items() for key in values
+    f"{section}.{key}"
+    for preset in presets_of(COLD_BOX).values()
+    for section, values in preset.items()
+    for key in values
 )
-"""Keys of `optimizer_plc.program` that a preset decides."""
+"""Keys of `optimizer_plc.program` that a preset decides: the cold box's has all."""
 OF_ALPHA: Final = ("penalties.output_rows", "design.violation_weight")
 """Keys that decide alpha: see `alpha_of`."""
 

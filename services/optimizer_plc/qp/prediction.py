@@ -11,9 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import BATH, CONTROLLED, OUTPUT_NAMES, STATE_NAMES, TICKS_PER_SAMPLE
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.linear_algebra import multiply
@@ -62,10 +60,10 @@ class PredictionModel:
     `constrained` are those that have a band.
     """
 
-    constrained = CONTROLLED
-
     def __init__(self, model: LtiModel) -> None:
         self.model = model
+        self.process = model.declared
+        self.constrained = self.process.controlled
         tick = Transition(*(np.array(M, order="C") for M in (model.A_tick, model.B_tick, model.F_tick[:, None])))
         self.C, self.D, self.G = np.array(model.C), np.array(model.D), np.array(model.G[:, None])
         self.x0, self.u0, self.y0 = model.x0, model.u0, model.y0
@@ -78,7 +76,7 @@ class PredictionModel:
         self.resting_inputs = np.zeros((self.D.shape[1], len(self.x0)))
         """Inputs at which the plant rests at the operating point, by the states, shape (3, n)."""
         self.transitions = {1: tick}
-        for ticks in range(2, TICKS_PER_SAMPLE + 1):
+        for ticks in range(2, self.process.ticks_per_sample + 1):
             self.transitions[ticks] = self.transitions[ticks - 1].then(tick)
 
     def rounded(self, real: Real) -> "PredictionModel":
@@ -165,7 +163,7 @@ class PredictionModel:
     @property
     def sample(self) -> Transition:
         """The transition over one sampling period of 5 s."""
-        return self.transitions[TICKS_PER_SAMPLE]
+        return self.transitions[self.process.ticks_per_sample]
 
     @property
     def outputs(self) -> Transition:
@@ -178,14 +176,17 @@ def prediction_of(model: LtiModel, disturbed: Sequence[int], design: ControlDesi
 
     Changes are forecast as means over the time from one decision instant to the next.
     """
-    load, forecasts = PROCESS.load.name, PROCESS.forecasts
-    sources = [-1 if one.name == load else STATE_NAMES.index(one.name) for one in forecasts]
-    return PredictionModel(model).with_disturbances(disturbed).with_forecasts(sources, design.decision_instants)
+    prediction = PredictionModel(model)
+    process = prediction.process
+    sources = [
+        -1 if one.name == process.load.name else process.state_names.index(one.name) for one in process.forecasts
+    ]
+    return prediction.with_disturbances(disturbed).with_forecasts(sources, design.decision_instants)
 
 
 def state_cost(model: LtiModel, design: ControlDesign) -> Array:
     """Return Q, shape (n, n): what the states, and the outputs through them, weigh."""
-    weights = np.array([output.weight for output in PROCESS.outputs])
+    weights = np.array([output.weight for output in model.declared.outputs])
     through_outputs: Array = model.C.T @ (weights[:, None] * model.C)
     return through_outputs + np.diag(state_weights(model, design))
 
@@ -195,16 +196,17 @@ def state_weights(model: LtiModel, design: ControlDesign) -> Array:
 
     Pressure, level and the mean of the temperatures weigh alike; further states and those of other processes nothing.
     """
-    weights = np.zeros(len(model.x0))
-    if BATH is None:
+    weights, process = np.zeros(len(model.x0)), model.declared
+    bath = process.bath
+    if bath is None:
         return weights
-    if BATH.pressure_state:
-        weights[STATE_NAMES.index(BATH.pressure_state)] = design.state_weight / design.pressure_scale**2
-    if BATH.level_state:
-        place = STATE_NAMES.index(BATH.level_state)
-        scale = design.level_scale / model.C[OUTPUT_NAMES.index(BATH.level), place]
+    if bath.pressure_state:
+        weights[process.state_names.index(bath.pressure_state)] = design.state_weight / design.pressure_scale**2
+    if bath.level_state:
+        place = process.state_names.index(bath.level_state)
+        scale = design.level_scale / model.C[process.output_names.index(bath.level), place]
         weights[place] = design.state_weight / scale**2
-    for name in BATH.temperature_states:
-        share = 1.0 / len(BATH.temperature_states)
-        weights[STATE_NAMES.index(name)] = design.state_weight * share / design.temperature_scale**2
+    for name in bath.temperature_states:
+        share = 1.0 / len(bath.temperature_states)
+        weights[process.state_names.index(name)] = design.state_weight * share / design.temperature_scale**2
     return weights

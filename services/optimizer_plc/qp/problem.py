@@ -5,28 +5,29 @@ slacks of the output bands. phi and gamma are affine in the predicted state, the
 before the first knot; Phi and Gamma are constant. There is no factor 1/2 before Phi (`rig/report/slips.md`, 11).
 """
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import TICKS_PER_SAMPLE
+from coldloop.process.settings import settings_of
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.condensing import Condensed, condense, transposed
 from optimizer_plc.qp.constraints import OutputRows, RateRows, output_rows, rate_rows
-from optimizer_plc.qp.design import N_INPUTS, N_SLACKS, ControlDesign, Target
+from optimizer_plc.qp.design import ControlDesign, Target
 from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
 from optimizer_plc.qp.linear_algebra import add_transposed_product
-from optimizer_plc.qp.penalties import DEFAULT_PENALTIES, PenaltySettings
+from optimizer_plc.qp.penalties import PenaltySettings
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.profile import hold, inputs_of, interpolation, shift, shifted
 from optimizer_plc.qp.target import rest_of
 
 Array = NDArray[np.float64]
 
-SHIFTS = TICKS_PER_SAMPLE
-"""Longest shift, in ticks, that is tabulated: that of the longest updating period."""
+
+LONG_AGO: Final = 2**15
+"""Ticks, more than any sampling period has."""
 
 
 class QuadraticProblem(NamedTuple):
@@ -48,7 +49,7 @@ class QpParameters(NamedTuple):
     w: float
     u_before: Array
     """Input applied just before the first knot takes effect."""
-    elapsed_ticks: int = TICKS_PER_SAMPLE
+    elapsed_ticks: int = LONG_AGO
     """Time since the update before; matters when the rate limit follows the elapsed time."""
     target: Array | None = None
     """Scaled inputs, shape (3,), that the cost is about; None is the operating point."""
@@ -69,13 +70,18 @@ class PredictiveProblem:
         design: ControlDesign,
         limits: InputLimits,
         real: Real = DOUBLE,
-        penalties: PenaltySettings = DEFAULT_PENALTIES,
+        penalties: PenaltySettings | None = None,
     ) -> None:
+        if penalties is None:
+            with settings_of(prediction.process):
+                penalties = PenaltySettings()
         self.design = design
+        self.longest_ticks = prediction.process.ticks_per_sample
+        """Longest updating period: shifts are tabulated up to it."""
         self.limits = limits
         self.n_knots = len(design.decision_instants)
-        self.n_inputs = N_INPUTS * self.n_knots
-        self.size = (N_INPUTS + N_SLACKS) * self.n_knots
+        self.n_inputs = design.n_inputs * self.n_knots
+        self.size = (design.n_inputs + design.n_slacks) * self.n_knots
         self._real = real
         self._n_constrained = len(prediction.constrained)
         weights = interpolation(design.decision_instants, np.arange(1.0, design.horizon + 1))
@@ -87,18 +93,19 @@ class PredictiveProblem:
         self.Gamma = self._rounded(np.ascontiguousarray(np.vstack([outputs.Gamma, rates.Gamma])))
         self.row_gains = self._rounded(np.concatenate([outputs.gains, rates.gains]))
         scaled_rate = np.asarray(limits.rate) / np.asarray(design.input_scale)
-        first_rate = scaled_rate if penalties.first_knot_in_box else np.full(N_INPUTS, np.inf)
+        first_rate = scaled_rate if penalties.first_knot_in_box else np.full(design.n_inputs, np.inf)
         u0 = np.array(prediction.model.u0)
         rest = np.zeros((0, n_states + 1))
-        if design.target is not Target.OPERATING_POINT:
-            rest = rest_of(prediction, design).states
+        bath = prediction.process.bath
+        if bath is not None and design.target is not Target.OPERATING_POINT:
+            rest = rest_of(prediction, design, bath).states
         self.maps = Maps(*map(self._rounded, self._maps(condensed, outputs, rates, u0, first_rate, rest)))
         self.scaled_rate = self._rounded(scaled_rate)
         self.knots = np.array(design.decision_instants, real)
         self.knots_to_samples = self._rounded(weights)
         instants = np.array(design.decision_instants, DOUBLE)
         self.shifts = self._rounded(
-            np.array([shift(instants, ticks / TICKS_PER_SAMPLE) for ticks in range(SHIFTS + 1)])
+            np.array([shift(instants, ticks / self.longest_ticks) for ticks in range(self.longest_ticks + 1)])
         )
         self.bands = self._rounded(np.array([design.output_low, design.output_high, design.violation_weight]))
         self.resting_outputs = self._rounded(np.tile(y0, design.horizon))
@@ -119,8 +126,10 @@ class PredictiveProblem:
     ) -> Maps:  # fmt: skip
         scale = np.asarray(self.design.input_scale)
         low_u, high_u = (np.asarray(self.limits.low) - u0) / scale, (np.asarray(self.limits.high) - u0) / scale
-        slacks = N_SLACKS * self.n_knots
-        held = np.tile(np.eye(len(rest), N_INPUTS), self.n_knots)  # profiles that hold an input of the target
+        slacks = self.design.n_slacks * self.n_knots
+        held = np.tile(
+            np.eye(len(rest), self.design.n_inputs), self.n_knots
+        )  # profiles that hold an input of the target
         return Maps(
             phi=condensed.phi_map,
             constant=condensed.constant_map,
@@ -146,12 +155,17 @@ class PredictiveProblem:
             ValueError: The state is not one of this problem's model; kernels would read and write beyond it.
         """
         self._check(parameters)
-        share = self._real(self.limits.rate_share(parameters.elapsed_ticks))
-        target = np.zeros(N_INPUTS, self._real) if parameters.target is None else parameters.target
+        share = self._share(parameters)
+        target = np.zeros(self.design.n_inputs, self._real) if parameters.target is None else parameters.target
         phi, gamma, low, high, constant = instance(
             self.maps, parameters.x, parameters.w, parameters.u_before, share, target
         )
         return QuadraticProblem(self.Phi, phi, self.Gamma, gamma, low, high, self._real(constant))
+
+    def _share(self, parameters: QpParameters) -> float:
+        """Return the share of the rate limit that an update may use."""
+        share: float = self._real(self.limits.rate_share(parameters.elapsed_ticks))
+        return share
 
     def _check(self, parameters: QpParameters) -> None:
         n_states = self.stacked_outputs_x.shape[0]
@@ -166,13 +180,13 @@ class PredictiveProblem:
 
     def shifted(self, z: Array, ticks: int) -> Array:
         """Return the profile z shifted by `ticks` ticks."""
-        if ticks <= SHIFTS:
+        if ticks <= self.longest_ticks:
             return shifted(self.shifts[ticks], z, self.n_inputs)
-        return shifted(shift(self.knots, self._real(ticks) / self._real(TICKS_PER_SAMPLE)), z, self.n_inputs)
+        return shifted(shift(self.knots, self._real(ticks) / self._real(self.longest_ticks)), z, self.n_inputs)
 
     def within_first_rate(self, z: Array, parameters: QpParameters) -> Array:
         """Return the profile z with its first knot within the rate of the input before it, as it can be sent."""
-        share = self._real(self.limits.rate_share(parameters.elapsed_ticks))
+        share = self._share(parameters)
         result = z.copy()
         keep_first_rate(self.maps, self.scaled_rate, parameters.u_before, share, result)
         return result

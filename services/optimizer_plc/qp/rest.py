@@ -4,7 +4,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
-from coldloop.process.signals import BATH, OUTPUT_NAMES
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.prediction import PredictionModel
 
@@ -28,10 +27,11 @@ def rest_map(prediction: PredictionModel, real: Real = DOUBLE) -> Array:
     A, B, F = A[np.ix_(moved, moved)], B[moved], F[moved]
     zeros = np.zeros((len(moved), 1))
     found = np.zeros((n + 1, B.shape[1] + 2))
-    if BATH is None:
+    process = prediction.process
+    if process.bath is None:
         found[moved] = np.linalg.pinv(np.eye(len(moved)) - A) @ np.hstack([B, F, zeros])
         return found.astype(real, copy=False)
-    level = [OUTPUT_NAMES.index(BATH.level)]
+    level = [process.output_names.index(process.bath.level)]
     C, D, G = (M[level] for M in (prediction.C, prediction.D, prediction.G))
     left = np.block([[np.eye(len(moved)) - A, -F], [C[:, moved], G]])
     right = np.block([[B, F, zeros], [-D, -G, np.ones((1, 1))]])

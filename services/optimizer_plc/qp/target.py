@@ -16,16 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
+from coldloop.process.declaration import Bath
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import BATH, CONTROLLED, INPUT_NAMES, OUTPUT_NAMES
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
-from optimizer_plc.qp.design import N_INPUTS, ControlDesign, Target
+from optimizer_plc.qp.design import ControlDesign, Target
 from optimizer_plc.qp.prediction import PredictionModel, state_cost
 from optimizer_plc.qp.rest import rest_map
 
 Array = NDArray[np.float64]
 
-TURBINE_OUTLET, FEED = (OUTPUT_NAMES.index(BATH.turbine_outlet), INPUT_NAMES.index(BATH.feed)) if BATH else (0, 0)
 TOLERANCES = {8: 1e-8, 4: 1e-4}
 """What a bound may be missed by, scaled, by the bytes of a number: in single precision a corner of bounds is met no
 better than within 1e-5."""
@@ -78,13 +77,14 @@ class TargetSearch(NamedTuple):
     """Which input fills the bath; kernels are shared by processes, and have no places of theirs in them."""
 
 
-def rest_of(prediction: PredictionModel, design: ControlDesign) -> Rest:
+def rest_of(prediction: PredictionModel, design: ControlDesign, bath: Bath) -> Rest:
     """Return where the model of a plant with a bath rests."""
+    outlet, n_inputs = prediction.process.output_names.index(bath.turbine_outlet), design.n_inputs
     n, scale = len(prediction.model.x0), np.array(design.input_scale)
-    by_inputs = rest_map(prediction)[:, :N_INPUTS] * scale
-    states = np.zeros((N_INPUTS, prediction.n_states + 1))
+    by_inputs = rest_map(prediction)[:, :n_inputs] * scale
+    states = np.zeros((n_inputs, prediction.n_states + 1))
     states[:, :n], states[:, -1] = by_inputs[:n].T, by_inputs[n]
-    C, D, G = (M[TURBINE_OUTLET] for M in (prediction.C, prediction.D, prediction.G))
+    C, D, G = (M[outlet] for M in (prediction.C, prediction.D, prediction.G))
     return Rest(states, states[:, :-1] @ C + D * scale + states[:, -1] * G)
 
 
@@ -92,19 +92,21 @@ def target_search(
     prediction: PredictionModel, design: ControlDesign, limits: InputLimits, real: Real = DOUBLE
 ) -> TargetSearch:
     """Return what targets of this problem are found with."""
-    if BATH is None:
-        return no_target_search(real)
-    rest, n, scale = rest_of(prediction, design), len(prediction.model.x0), np.array(design.input_scale)
+    process = prediction.process
+    if process.bath is None:
+        return no_target_search(design.n_inputs, real)
+    outlet, feed = process.output_names.index(process.bath.turbine_outlet), process.input_names.index(process.bath.feed)
+    rest, n, scale = rest_of(prediction, design, process.bath), len(prediction.model.x0), np.array(design.input_scale)
     held, states = rest.states[:, -1], rest.states[:, :n]
     cost = states @ state_cost(prediction.model, design) @ states.T + np.diag(scale**2 * design.input_weight)
     inverse = np.linalg.inv(cost)
     across = np.linalg.svd(held[None])[2][1:].T
     root = np.linalg.cholesky(across.T @ cost @ across)
     plane = np.ascontiguousarray(np.linalg.solve(root, across.T).T)
-    band = CONTROLLED.index(TURBINE_OUTLET)
-    y0, margin, u0 = float(prediction.y0[TURBINE_OUTLET]), design.band_margin[band], np.array(prediction.u0)
+    band = process.controlled.index(outlet)
+    y0, margin, u0 = float(prediction.y0[outlet]), design.band_margin[band], np.array(prediction.u0)
     places = {signal: n + place for place, signal in enumerate(prediction.disturbances)}
-    signals = (*range(len(prediction.y0), len(prediction.y0) + N_INPUTS), TURBINE_OUTLET)
+    signals = (*range(len(prediction.y0), len(prediction.y0) + design.n_inputs), outlet)
     arrays = {
         "held": held,
         "cheapest": inverse @ held / (held @ inverse @ held),
@@ -122,18 +124,18 @@ def target_search(
         margin=real(margin),
         constants=np.array([places.get(signal, -1) for signal in signals]),
         tolerance=real(TOLERANCES[np.dtype(real).itemsize]),
-        feed=FEED,
+        feed=feed,
         **{name: np.ascontiguousarray(array).astype(real, copy=False) for name, array in arrays.items()},
     )
 
 
-def no_target_search(real: Real) -> TargetSearch:
+def no_target_search(n_inputs: int, real: Real) -> TargetSearch:
     """Return the search of a process that has no target but its operating point."""
-    inputs, rows = np.zeros(N_INPUTS, real), np.zeros(N_INPUTS + 1, real)
+    inputs, rows = np.zeros(n_inputs, real), np.zeros(n_inputs + 1, real)
     return TargetSearch(
         followed=False, limited=False, of_load=real(0.0), held=inputs, cheapest=inputs,
-        plane=np.zeros((N_INPUTS, 2), real), rows=np.zeros((N_INPUTS + 1, 2), real), temperature=inputs, low=rows,
-        high=rows, margin=real(0.0), constants=np.full(N_INPUTS + 1, -1), scale=rows, tolerance=real(0.0), feed=0,
+        plane=np.zeros((n_inputs, 2), real), rows=np.zeros((n_inputs + 1, 2), real), temperature=inputs, low=rows,
+        high=rows, margin=real(0.0), constants=np.full(n_inputs + 1, -1), scale=rows, tolerance=real(0.0), feed=0,
     )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from coldloop.kernels.compiled import kernel
 from optimizer_plc.computing_settings import HybridSettings, InteriorPointSettings, OdeSettings
 from optimizer_plc.qp.costs import matrices_of
-from optimizer_plc.qp.penalties import DEFAULT_PENALTIES, PenaltySettings
+from optimizer_plc.qp.penalties import PenaltySettings
 from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers import interior_point, ode
 from optimizer_plc.solvers.interface import Answer, Costs
@@ -55,7 +55,7 @@ def hybrid_solver(
     far: InteriorPointSettings,
     quiet: OdeSettings,
     floor: float,
-    penalties: PenaltySettings = DEFAULT_PENALTIES,
+    penalties: PenaltySettings | None = None,
 ) -> KernelSolver:
     """Return the solver, which keeps the costs of guess and answer from one problem to the next.
 

@@ -16,7 +16,7 @@ from optimizer_plc.computing_settings import OdeSettings
 from optimizer_plc.qp.arithmetic import Real
 from optimizer_plc.qp.costs import Matrices, cost_with_excess, excess_by_columns, gradient_with_excess, matrices_of
 from optimizer_plc.qp.linear_algebra import cholesky, cholesky_solve
-from optimizer_plc.qp.penalties import DEFAULT_PENALTIES, PenaltySettings
+from optimizer_plc.qp.penalties import PenaltySettings
 from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.interface import Answer, Costs
 from optimizer_plc.solvers.kernel_solver import KernelSolver, solves_by
@@ -52,7 +52,7 @@ class Flow(NamedTuple):
     """Step size that is never exceeded, far below the largest number there is: its products stay finite."""
 
 
-def flow_in(settings: OdeSettings, penalties: PenaltySettings, real: Real) -> Flow:
+def flow_in(settings: OdeSettings, penalties: PenaltySettings | None, real: Real) -> Flow:
     """Return the constants as scalars of a floating-point type."""
     return Flow(
         alpha=real(settings.alpha),
@@ -60,7 +60,7 @@ def flow_in(settings: OdeSettings, penalties: PenaltySettings, real: Real) -> Fl
         tolerance=real(settings.tolerance),
         growth=real(settings.growth),
         rejection=real(settings.rejection),
-        box=real(penalties.box * settings.alpha),
+        box=real((penalties or PenaltySettings()).box * settings.alpha),
         look_ahead_rows=settings.look_ahead_rows,
         hold_at_bounds=settings.hold_at_bounds,
         longest=real(np.sqrt(np.finfo(real).max)),
@@ -74,7 +74,7 @@ class OdeMethod(NamedTuple):
     flow: Flow
 
 
-def ode_solver(settings: OdeSettings, penalties: PenaltySettings = DEFAULT_PENALTIES) -> KernelSolver:
+def ode_solver(settings: OdeSettings, penalties: PenaltySettings | None = None) -> KernelSolver:
     """Return the solver, which keeps nothing from one problem to the next."""
 
     def method(problem: QuadraticProblem) -> OdeMethod:

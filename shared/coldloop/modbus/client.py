@@ -25,6 +25,7 @@ from coldloop.modbus.requests import (
 )
 from coldloop.modbus.settings import TlsSettings
 from coldloop.modbus.transport import REQUESTS_AT_ONCE, NoAnswerError, Transport
+from coldloop.process.declaration import Process
 from coldloop.registers.codec import RecordCodec, WordOrder, codec_of
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap
@@ -82,7 +83,7 @@ class RegisterClient:
         order: WordOrder = WordOrder.HIGH_FIRST,
         tls: TlsSettings | None = None,
     ) -> None:
-        self._map = register_map
+        self.map = register_map
         self._order = order
         self._timeout_s = timeout_s
         context = _secured(tls, f"tls of the client of {register_map.service} at {host}:{port}") if tls else None
@@ -108,6 +109,11 @@ class RegisterClient:
             order=endpoint.word_order,
             tls=endpoint.tls,
         )
+
+    @property
+    def process(self) -> Process:
+        """The process whose registers it reads."""
+        return self.map.process
 
     @property
     def peer(self) -> str:
@@ -145,7 +151,7 @@ class RegisterClient:
                     f"{self.peer}: another program answers there (no identity block): check host and port"
                 ) from error
             else:
-                check_peer(raw, self._map, self._order, self.peer)
+                check_peer(raw, self.map, self._order, self.peer)
                 return
 
     async def read(self, record: type[R]) -> R:

@@ -1,15 +1,15 @@
 """What operators can ask for: checked here, described in words, and carried out elsewhere."""
 
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import Annotated, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
 
 from coldloop.errors import LoadFileError, UsageError
 from coldloop.number_text import value_text
-from coldloop.process.declaration import LAST_TICK
-from coldloop.process.load_profile import LOAD_SPAN, LOAD_UNIT, LOAD_WORD, LoadProfile, load_profile_of
+from coldloop.process.declaration import LAST_TICK, Process
+from coldloop.process.load_profile import LoadProfile, load_profile_of
 from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
+from coldloop.process.settings import ProcessSettings, one_of, settings_of, settings_process, within
 from coldloop.registers.plant import SensorFaultKind
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmKind
 from coldloop.service.event_text import alarm_word, word
@@ -18,11 +18,6 @@ LONGEST_FILE: Final = 1_000_000
 """Characters of a load file."""
 MOST_STEPS: Final = 4000
 """Steps of a load that are sent at once; the plant keeps 4096."""
-
-if TYPE_CHECKING:
-    InputName = str
-else:
-    InputName = Literal[INPUT_NAMES]
 
 
 def duration_text(seconds: float) -> str:
@@ -40,7 +35,7 @@ def clock_text(seconds: float) -> str:
     return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02}"
 
 
-class _Command(BaseModel):
+class _Command(ProcessSettings):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
@@ -64,60 +59,68 @@ class SetSetpoint(_Command):
     """An input in manual mode."""
 
     kind: Literal["setpoint"]
-    input: InputName
+    input: Annotated[str, one_of("input", lambda process: process.input_names)]
     value: float
+
+    @property
+    def place(self) -> int:
+        """Which of the inputs."""
+        return self.process.input_names.index(self.input)
+
+    @property
+    def unit(self) -> str:
+        """Of the value."""
+        return self.process.inputs[self.place].unit
 
     @property
     def text(self) -> str:
         """The command in words."""
-        return (
-            f"Move the setpoint of {self.input} to {value_text(self.value, INPUT_UNITS[INPUT_NAMES.index(self.input)])}"
-        )
+        return f"Move the setpoint of {self.input} to {value_text(self.value, self.unit)}"
 
 
 class SetLoad(_Command):
     """The load from a tick on, in its unit: the heat load of the cold box, W."""
 
     kind: Literal["load"]
-    watts: Annotated[float, Field(ge=LOAD_SPAN[0], le=LOAD_SPAN[1])]
+    watts: Annotated[float, within(lambda process: process.load.stored_span)]
     tick: Annotated[int, Field(ge=0, le=LAST_TICK)] = 0
     """0 is the next one."""
 
     @property
     def text(self) -> str:
         """The command in words."""
-        begin = clock_text(self.tick * TICK_S) if self.tick else "the next tick"
-        return f"Change the {LOAD_WORD} to {value_text(self.watts, LOAD_UNIT)} from {begin} on"
+        load, tick_s = self.process.load, self.process.tick_s
+        begin = clock_text(self.tick * tick_s) if self.tick else "the next tick"
+        return f"Change the {load.title} to {value_text(self.watts, load.unit)} from {begin} on"
+
+
+def _readable(content: str) -> str:
+    try:
+        steps = len(load_profile_of(content, "load file", settings_process()).times)
+    except LoadFileError as error:
+        raise ValueError(str(error)) from None
+    if steps > MOST_STEPS:
+        raise ValueError(f"the load file has {steps} steps, more than {MOST_STEPS}: use `coldloop set load FILE`")
+    return content
 
 
 class PlayLoad(_Command):
     """A load file `time_s,load_w` (`load` in another unit) that begins now."""
 
     kind: Literal["load_file"]
-    content: Annotated[str, Field(max_length=LONGEST_FILE)]
-
-    @field_validator("content")
-    @classmethod
-    def _readable(cls, content: str) -> str:
-        try:
-            steps = len(load_profile_of(content, "load file").times)
-        except LoadFileError as error:
-            raise ValueError(str(error)) from None
-        if steps > MOST_STEPS:
-            raise ValueError(f"the load file has {steps} steps, more than {MOST_STEPS}: use `coldloop set load FILE`")
-        return content
+    content: Annotated[str, Field(max_length=LONGEST_FILE), AfterValidator(_readable)]
 
     @property
     def profile(self) -> LoadProfile:
         """The load in the file."""
-        return load_profile_of(self.content, "load file")
+        return load_profile_of(self.content, "load file", self.process)
 
     @property
     def text(self) -> str:
         """The command in words."""
         times = self.profile.times
         return (
-            f"Play a load of {len(times)} steps, {duration_text(times[-1] * TICK_S)} long, from now on; its last "
+            f"Play a load of {len(times)} steps, {duration_text(times[-1] * self.process.tick_s)} long, from now on; its last "
             "value is held"
         )
 
@@ -168,7 +171,7 @@ class TreatAlarm(_Command):
     @property
     def text(self) -> str:
         """The command in words."""
-        name = "all alarms" if self.alarm == ALL_ALARMS else f"alarm {alarm_word(self.alarm)}"
+        name = "all alarms" if self.alarm == ALL_ALARMS else f"alarm {alarm_word(self.alarm, self.process)}"
         time = f" for {duration_text(self.time_s)}" if self.action == AlarmAction.SHELVE and self.time_s else ""
         return f"{word(AlarmAction(self.action)).capitalize()}: {name}{time}"
 
@@ -177,16 +180,9 @@ class FaultSensor(_Command):
     """Puts a fault into a sensor, for training."""
 
     kind: Literal["sensor_fault"]
-    output: str
+    output: Annotated[str, one_of("output", lambda process: process.output_names)]
     fault: Annotated[int, Field(ge=0, le=3)]
     value: float = 0.0
-
-    @field_validator("output")
-    @classmethod
-    def _known(cls, output: str) -> str:
-        if output not in OUTPUT_NAMES:
-            raise ValueError(f"unknown output {output}")
-        return output
 
     @property
     def text(self) -> str:
@@ -199,16 +195,17 @@ Command = SetMode | SetSetpoint | SetLoad | PlayLoad | SetFactor | SetPaused | T
 _COMMAND: Final[TypeAdapter[Command]] = TypeAdapter(Annotated[Command, Field(discriminator="kind")])
 
 
-def read_command(document: object) -> Command:
-    """Return a command as it was sent.
+def read_command(document: object, process: Process = PROCESS) -> Command:
+    """Return a command for a process as it was sent.
 
     Raises:
         UsageError: It is none; one line that says what is wrong with it.
     """
-    if not PROCESS.has_load and isinstance(document, dict) and document.get("kind") in {"load", "load_file"}:
-        raise UsageError(f"{PROCESS.name} has no load")
+    if not process.has_load and isinstance(document, dict) and document.get("kind") in {"load", "load_file"}:
+        raise UsageError(f"{process.name} has no load")
     try:
-        return _COMMAND.validate_python(document)
+        with settings_of(process):
+            return _COMMAND.validate_python(document)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"][1:]) or "command"

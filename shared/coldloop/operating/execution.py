@@ -23,11 +23,12 @@ from coldloop.operating.commands import (
     clock_text,
 )
 from coldloop.operating.load_stream import LoadStream
-from coldloop.process.load_profile import LOAD_UNIT, LoadProfile
-from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
+from coldloop.process.declaration import Process
+from coldloop.process.load_profile import LoadProfile
+from coldloop.process.loaded import PROCESS
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
-from coldloop.registers.maps import MAPS, PLANT_MAP
+from coldloop.registers.maps import Maps, maps_of
 from coldloop.registers.plant import LiveLoad, LoadStatus, SensorFault, SensorFaultKind
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.registers.seal import sealed
@@ -73,9 +74,10 @@ Clients = Mapping[str, CommandClient]
 """One for each service that a command concerns; connected."""
 
 
-def clients_of(endpoints: Mapping[str, Endpoint]) -> dict[str, CommandClient]:
-    """Return clients of services, not connected yet."""
-    return {service: CommandClient.at(MAPS[service], endpoint) for service, endpoint in endpoints.items()}
+def clients_of(endpoints: Mapping[str, Endpoint], process: Process = PROCESS) -> dict[str, CommandClient]:
+    """Return clients of services of a process, not connected yet."""
+    maps = maps_of(process).by_service
+    return {service: CommandClient.at(maps[service], endpoint) for service, endpoint in endpoints.items()}
 
 
 @asynccontextmanager
@@ -127,7 +129,7 @@ def check_bounds(command: SetSetpoint, low: float, high: float) -> None:
     Raises:
         UsageError: It is beyond them.
     """
-    unit = INPUT_UNITS[INPUT_NAMES.index(command.input)]
+    unit = command.unit
     if not low <= command.value <= high:
         span = f"{value_text(low)} to {value_text(high, unit)}"
         raise UsageError(f"{command.input} = {value_text(command.value, unit)} is not from {span}")
@@ -147,11 +149,11 @@ async def check_manual(client: RegisterClient) -> Operator:
 
 async def set_setpoint(clients: Clients, command: SetSetpoint) -> str:
     """Write one setpoint; the others stay as they are."""
-    client, place = clients["control_plc"], INPUT_NAMES.index(command.input)
+    client, place, unit = clients["control_plc"], command.place, command.unit
     operator = await check_manual(client)
     values = [command.value if i == place else present for i, present in enumerate(operator.u)]
     await client.write(Operator(operator.mode, tuple(values)))
-    back, unit = await client.read(Operator), INPUT_UNITS[place]
+    back = await client.read(Operator)
     was = f"was {value_text(operator.u[place], unit)}"
     now = f"setpoint of {command.input} {value_text(back.u[place], unit)}"
     return f"{now} ({was}); approached within the rate limit"
@@ -166,15 +168,15 @@ async def set_load(clients: Clients, command: SetLoad) -> str:
     client = clients["plant"]
     before, now = await client.read(LoadStatus), (await client.read(Identity)).tick
     if 0 < command.tick <= now:
-        raise UsageError(f"plant time is {now * TICK_S:g} s already: name a later one")
-    await client.write(sealed(LiveLoad(command.tick, command.watts), PLANT_MAP))
+        raise UsageError(f"plant time is {now * client.process.tick_s:g} s already: name a later one")
+    await client.write(sealed(LiveLoad(command.tick, command.watts), client.map))
     status = await client.read(LoadStatus)
     for _ in range(0 if command.tick else round(EFFECT_S / LOOK_S)):
         if math.isclose(status.watts, command.watts, rel_tol=1e-6):
             break
         await asyncio.sleep(LOOK_S)
         status = await client.read(LoadStatus)
-    return f"{_load_text(command, status)} (was {value_text(before.watts, LOAD_UNIT)})"
+    return f"{_load_text(command, status)} (was {value_text(before.watts, command.process.load.unit)})"
 
 
 def _load_text(command: SetLoad, status: LoadStatus) -> str:
@@ -183,14 +185,15 @@ def _load_text(command: SetLoad, status: LoadStatus) -> str:
     Raises:
         LinkError: It knows another one.
     """
+    unit, tick_s = command.process.load.unit, command.process.tick_s
     if not status.upcoming:
-        return f"load {value_text(status.watts, LOAD_UNIT)} now"
+        return f"load {value_text(status.watts, unit)} now"
     if command.tick and status.last_tick != command.tick:
-        raise LinkError(f"the load from {command.tick * TICK_S:g} s on is different: another client has overwritten it")
-    text = f"load {value_text(command.watts, LOAD_UNIT)} from {status.last_tick * TICK_S:g} s on"
+        raise LinkError(f"the load from {command.tick * tick_s:g} s on is different: another client has overwritten it")
+    text = f"load {value_text(command.watts, unit)} from {status.last_tick * tick_s:g} s on"
     if status.next_tick == status.last_tick:
         return text
-    return f"{text}, before it {value_text(status.next_watts, LOAD_UNIT)} from {status.next_tick * TICK_S:g} s on"
+    return f"{text}, before it {value_text(status.next_watts, unit)} from {status.next_tick * tick_s:g} s on"
 
 
 async def play_load(clients: Clients, command: PlayLoad) -> str:
@@ -231,20 +234,20 @@ async def _stream(plant: RegisterClient, load: LoadProfile, tick: int) -> tuple[
     if not identity.session:
         raise UsageError("the plant has no session")
     if 0 < tick <= identity.tick:
-        raise UsageError(f"plant time is {identity.tick * TICK_S:g} s already: name a later one")
-    begin = tick or identity.tick + lead_ticks(await plant.read(SessionPace))
+        raise UsageError(f"plant time is {identity.tick * plant.process.tick_s:g} s already: name a later one")
+    begin = tick or identity.tick + lead_ticks(await plant.read(SessionPace), plant.process.tick_s)
     return LoadStream(plant, identity.session, load, begin=begin), begin
 
 
 async def _streamed(plant: RegisterClient, stream: LoadStream, begin: int) -> str:
-    status = await plant.read(LoadStatus)
-    times = f"{begin * TICK_S:g} s to {status.last_tick * TICK_S:g} s"
+    status, tick_s = await plant.read(LoadStatus), plant.process.tick_s
+    times = f"{begin * tick_s:g} s to {status.last_tick * tick_s:g} s"
     return f"load of {stream.steps} steps from {times}; its last value is held"
 
 
-def lead_ticks(pace: SessionPace) -> int:
+def lead_ticks(pace: SessionPace, tick_s: float) -> int:
     """Return how many ticks ahead of now a load is to begin."""
-    return max(LEAD_TICKS, math.ceil(LEAD_S * pace.factor / TICK_S)) if pace.realtime else LEAD_TICKS
+    return max(LEAD_TICKS, math.ceil(LEAD_S * pace.factor / tick_s)) if pace.realtime else LEAD_TICKS
 
 
 async def treat_alarm(clients: Clients, command: TreatAlarm) -> str:
@@ -260,7 +263,7 @@ async def treat_alarm(clients: Clients, command: TreatAlarm) -> str:
             if not kinds:
                 return "no alarm waits to be acknowledged"
     else:
-        kinds, raised_again = _seen(before, kinds, command.seen)
+        kinds, raised_again = _seen(before, kinds, command)
         for kind in kinds:
             await client.write(AlarmCommand(kind, action, command.time_s))
     rows = await client.read_rows(Alarm, 0, len(AlarmKind))
@@ -269,24 +272,25 @@ async def treat_alarm(clients: Clients, command: TreatAlarm) -> str:
             break
         await asyncio.sleep(LOOK_S)
         rows = await client.read_rows(Alarm, 0, len(AlarmKind))
-    return _treated(action, rows, kinds, raised_again)
+    return _treated(command, rows, kinds, raised_again)
 
 
 def _seen(
-    rows: Sequence[Alarm], kinds: Sequence[AlarmKind], seen: Mapping[str, int]
+    rows: Sequence[Alarm], kinds: Sequence[AlarmKind], command: TreatAlarm
 ) -> tuple[list[AlarmKind], list[AlarmKind]]:
     """Return the alarms that are as the operator has seen them, and those that were raised again since.
 
     Raises:
         UsageError: None is as it was seen.
     """
-    waiting = [kind for kind in kinds if alarm_word(kind) in seen or rows[kind].state in WAITING]
-    same = [kind for kind in waiting if seen.get(alarm_word(kind)) == rows[kind].times]
+    process, seen = command.process, command.seen or {}
+    waiting = [kind for kind in kinds if alarm_word(kind, process) in seen or rows[kind].state in WAITING]
+    same = [kind for kind in waiting if seen.get(alarm_word(kind, process)) == rows[kind].times]
     again = [kind for kind in waiting if kind not in same]
     if not waiting:
         raise UsageError("no alarm waits for an acknowledgement any more")
     if not same:
-        raise UsageError(f"raised again since it was shown: {_names(again)}; look at it first")
+        raise UsageError(f"raised again since it was shown: {_names(again, process)}; look at it first")
     return same, again
 
 
@@ -299,34 +303,35 @@ def _is_done(action: AlarmAction, state: int) -> bool:
 
 
 def _treated(
-    action: AlarmAction, rows: Sequence[Alarm], kinds: Sequence[AlarmKind], raised_again: Sequence[AlarmKind]
+    command: TreatAlarm, rows: Sequence[Alarm], kinds: Sequence[AlarmKind], raised_again: Sequence[AlarmKind]
 ) -> str:
     """Return what has become of alarms.
 
     Raises:
         NotTakenError: Nothing of the command took effect.
     """
+    action, process = AlarmAction(command.action), command.process
     left = [kind for kind in kinds if not _is_done(action, rows[kind].state)]
     if len(left) == len(kinds):
         states = ", ".join(sorted({word(AlarmState(rows[kind].state)) for kind in left}))
-        raise NotTakenError(f"{_names(left)}: {states}; the control PLC did not take it")
+        raise NotTakenError(f"{_names(left, process)}: {states}; the control PLC did not take it")
     done = [kind for kind in kinds if kind not in left]
     if len(kinds) == 1:
         row = rows[kinds[0]]
-        until = f" until {clock_text(row.shelved_until * TICK_S)}" if row.state == AlarmState.SHELVED else ""
+        until = f" until {clock_text(row.shelved_until * process.tick_s)}" if row.state == AlarmState.SHELVED else ""
         over = action is AlarmAction.ACKNOWLEDGE and row.state == AlarmState.NORMAL
         state = word(AlarmState(row.state))
-        text = f"alarm {alarm_word(kinds[0])}: {'acknowledged, now ' if over else ''}{state}{until}"
+        text = f"alarm {alarm_word(kinds[0], process)}: {'acknowledged, now ' if over else ''}{state}{until}"
     elif len(kinds) <= MOST_NAMES:
-        states = "; ".join(f"now {word(state)}: {_names(each)}" for state, each in _by_state(rows, done))
+        states = "; ".join(f"now {word(state)}: {_names(each, process)}" for state, each in _by_state(rows, done))
         text = f"acknowledged; {states}" if action is AlarmAction.ACKNOWLEDGE else states
     else:
         counted = ", ".join(f"{len(each)} {word(state)}" for state, each in _by_state(rows, done))
         text = f"of {len(kinds)} alarms {counted}"
     if left:
-        text += f"; not {_names(left)}"
+        text += f"; not {_names(left, process)}"
     if raised_again:
-        text += f"; raised again since they were shown, and left: {_names(raised_again)}"
+        text += f"; raised again since they were shown, and left: {_names(raised_again, process)}"
     return text
 
 
@@ -336,13 +341,13 @@ def _by_state(rows: Sequence[Alarm], kinds: Sequence[AlarmKind]) -> list[tuple[A
     return [(state, each) for state, each in sorted_out if each]
 
 
-def _names(kinds: Sequence[AlarmKind]) -> str:
-    return ", ".join(alarm_word(kind) for kind in kinds)
+def _names(kinds: Sequence[AlarmKind], process: Process) -> str:
+    return ", ".join(alarm_word(kind, process) for kind in kinds)
 
 
 async def fault_sensor(clients: Clients, command: FaultSensor) -> str:
     """Put a fault into a sensor."""
-    client, row = clients["plant"], OUTPUT_NAMES.index(command.output)
+    client, row = clients["plant"], command.process.output_names.index(command.output)
     await client.write_rows([SensorFault(command.fault, command.value)], row)
     (back,) = await client.read_rows(SensorFault, row, 1)
     return f"sensor of {command.output}: {word(SensorFaultKind(back.kind))}"
@@ -367,7 +372,8 @@ async def _set_pace(clients: Clients, change: Callable[[SessionPace], SessionPac
         raise UsageError("the session is in lock-step: time advances as it is granted")
     await write_pace(clients, pace)
     back, tick = await plant.read(SessionPace), (await plant.read(Identity)).tick
-    return f"{'paused' if back.paused else 'running'} at {tick * TICK_S:g} s, factor {value_text(back.factor)}"
+    state, time_s = "paused" if back.paused else "running", tick * plant.process.tick_s
+    return f"{state} at {time_s:g} s, factor {value_text(back.factor)}"
 
 
 async def write_pace(clients: Mapping[str, RegisterClient], pace: SessionPace) -> None:
@@ -392,7 +398,7 @@ async def write_pace(clients: Mapping[str, RegisterClient], pace: SessionPace) -
 
 
 Work = Callable[[Clients, Any], Awaitable[str]]
-ALL_SERVICES: Final = tuple(MAPS)
+ALL_SERVICES: Final = Maps._fields
 WORK: Final[Mapping[type[Command], tuple[tuple[str, ...], Work]]] = {
     SetMode: (("control_plc",), set_mode),
     SetSetpoint: (("control_plc",), set_setpoint),

@@ -5,9 +5,7 @@ from typing import Final
 
 from coldloop.errors import LinkError, PeerUnreachableError, UsageError
 from coldloop.modbus.client import RegisterClient
-from coldloop.process.load_profile import LOAD_UNIT, LoadProfile
-from coldloop.process.signals import TICK_S
-from coldloop.registers.maps import PLANT_MAP
+from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.plant import AHEAD_STEPS, LOAD_ROWS, LoadAhead, LoadStatus, LoadStep
 from coldloop.registers.seal import sealed
 
@@ -89,14 +87,15 @@ class LoadStream:
         record = LoadAhead.first_of(self._session, self._times[some], self._watts[some])
         self._unanswered = record.length
         try:
-            await self._plant.write(sealed(record, PLANT_MAP))
+            await self._plant.write(sealed(record, self._plant.map))
         except LinkError as error:
             if not self._sent:
                 raise
             kind = PeerUnreachableError if isinstance(error, PeerUnreachableError) else LinkError
+            unit, since_s = self._plant.process.load.unit, self._times[self._sent - 1] * self._plant.process.tick_s
             raise kind(
                 f"{error}; of {self.steps} steps the plant has taken at least the first {self._sent}, and holds "
-                f"{self._watts[self._sent - 1]:g} {LOAD_UNIT} from {self._times[self._sent - 1] * TICK_S:g} s on"
+                f"{self._watts[self._sent - 1]:g} {unit} from {since_s:g} s on"
             ) from None
         self._sent, self._unanswered = self._sent + record.length, 0
         return record.length

@@ -22,6 +22,12 @@ LAST_TICK: Final = 2**32 - 2**16 - 1
 LAST_NUMBER: Final = LAST_TICK
 """Largest number of an update, or of a sequence."""
 
+LOAD_IN_WATTS: Final = "load_w"
+"""Column of a load in watts; in a file it is understood for any load."""
+
+REFERENCE_TICK_S: Final = 0.25
+"""Tick that default times of the settings are for: the cold box's, tau_1 of the paper (section IV)."""
+
 Range = tuple[float, float]
 
 
@@ -133,6 +139,16 @@ class Load:
     """What operators call it; its name where this is empty."""
     bar: Range | None = None
     """Ends of its bar on the operator's page; its span where they are not given."""
+
+    @property
+    def title(self) -> str:
+        """What operators call it."""
+        return self.word or self.name
+
+    @property
+    def column(self) -> str:
+        """Its column in files and traces."""
+        return LOAD_IN_WATTS if self.unit == "W" else "load"
 
     @property
     def stored_span(self) -> Range:
@@ -379,6 +395,11 @@ class Process:
     def sampling_period_s(self) -> float:
         """Sampling period of the prediction model, s of plant time; the longest updating period."""
         return self.ticks_per_sample * self.tick_s
+
+    @property
+    def stretch(self) -> float:
+        """How much longer a tick is than that which default times of the settings are for."""
+        return self.tick_s / REFERENCE_TICK_S
 
     @property
     def tick_unit(self) -> str:

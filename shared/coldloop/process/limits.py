@@ -3,11 +3,9 @@
 from enum import StrEnum
 from typing import Annotated, Final, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import model_validator
 
-from coldloop.process.loaded import PROCESS
-from coldloop.process.per_signal import PerInput
-from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.settings import PerInput, ProcessSettings, declared, within
 
 LARGEST: Final = 1e38
 """Of a bound."""
@@ -22,32 +20,32 @@ class RateReference(StrEnum):
     """The limit scaled by the time since the update before, tau_u / 5 s."""
 
 
-class InputLimits(BaseModel):
+class InputLimits(ProcessSettings):
     """Bounds and rates of the inputs, in their order: of the cold box CV155 %, NCR22_A W, CV156 % (paper, table I)."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    low: PerInput = tuple(one.low for one in PROCESS.inputs)
+    low: PerInput = declared(lambda process: tuple(one.low for one in process.inputs))
     """Least value."""
-    high: PerInput = tuple(one.high for one in PROCESS.inputs)
+    high: PerInput = declared(lambda process: tuple(one.high for one in process.inputs))
     """Largest value."""
-    rate: PerInput = tuple(one.rate for one in PROCESS.inputs)
+    rate: PerInput = declared(lambda process: tuple(one.rate for one in process.inputs))
     """Largest change in one sampling period, up or down."""
     rate_reference: RateReference = RateReference.PER_UPDATE
-    slew_s: Annotated[float, Field(ge=TICK_S, le=TICKS_PER_SAMPLE * TICK_S)] = 2 * TICK_S
+    slew_s: Annotated[float, within(lambda process: (process.tick_s, process.sampling_period_s))] = declared(
+        lambda process: 2 * process.tick_s
+    )
     """Absolute slew limit, however often updates follow one another: within any time shorter than this an input moves
     by at most `rate`. The default is the shortest updating period that there is: it never binds on our optimiser."""
 
     @property
     def slew_ticks(self) -> int:
         """That time, in ticks."""
-        return max(1, round(self.slew_s / TICK_S))
+        return max(1, round(self.slew_s / self.process.tick_s))
 
     def rate_share(self, elapsed_ticks: int) -> float:
         """Return the share of `rate` that an update may use, `elapsed_ticks` ticks after the one before."""
         if self.rate_reference is RateReference.PER_UPDATE:
             return 1.0
-        return min(1.0, elapsed_ticks / TICKS_PER_SAMPLE)
+        return min(1.0, elapsed_ticks / self.process.ticks_per_sample)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

@@ -1,25 +1,22 @@
 """The load over time, and the CSV files that hold it."""
 
 import math
-import struct
 from bisect import bisect_right
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from coldloop.errors import LoadFileError
-from coldloop.process.declaration import LAST_TICK
+from coldloop.process.declaration import LAST_TICK, LOAD_IN_WATTS, Process
 from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import TICK_S
 from coldloop.table import TIME, Table, read_table, table_of
 
-LOAD_SPAN: Final[tuple[float, float]] = struct.unpack("2f", struct.pack("2f", *PROCESS.load.span))
+LOAD_SPAN: Final = PROCESS.load.stored_span
 """Lowest and highest load, as registers have them."""
 LOAD_UNIT: Final = PROCESS.load.unit
 LOAD_WORD: Final = PROCESS.load.word or PROCESS.load.name
 """What operators call the load."""
-IN_WATTS: Final = "load_w"
-LOAD_COLUMN: Final = IN_WATTS if LOAD_UNIT == "W" else "load"
+LOAD_COLUMN: Final = PROCESS.load.column
 """Of files and traces. In a file the name that a load in watts has is understood for any."""
 
 
@@ -52,46 +49,49 @@ class LoadProfile:
         return self.watts[bisect_right(self.times, tick) - 1]
 
 
-def read_load_file(path: Path) -> LoadProfile:
+def read_load_file(path: Path, process: Process = PROCESS) -> LoadProfile:
     """Return the load of a CSV file with the columns time_s and load_w, or load in another unit, steps held.
 
     Raises:
         LoadFileError: One line that names file, line and remedy.
     """
-    return _profile(read_table(path, (TIME, LOAD_COLUMN, IN_WATTS), "name a readable CSV file", LoadFileError))
+    columns = (TIME, process.load.column, LOAD_IN_WATTS)
+    return _profile(read_table(path, columns, "name a readable CSV file", LoadFileError), process)
 
 
-def load_profile_of(text: str, where: str) -> LoadProfile:
+def load_profile_of(text: str, where: str, process: Process = PROCESS) -> LoadProfile:
     """Return the load in a CSV text; `where` names it in messages.
 
     Raises:
         LoadFileError: One line that names place, line and remedy.
     """
-    return _profile(table_of(text, where, (TIME, LOAD_COLUMN, IN_WATTS), LoadFileError))
+    return _profile(table_of(text, where, (TIME, process.load.column, LOAD_IN_WATTS), LoadFileError), process)
 
 
-def _profile(table: Table) -> LoadProfile:
-    column = LOAD_COLUMN if table.place(LOAD_COLUMN) is not None or table.place(IN_WATTS) is None else IN_WATTS
+def _profile(table: Table, process: Process) -> LoadProfile:
+    own = process.load.column
+    column = own if table.place(own) is not None or table.place(LOAD_IN_WATTS) is None else LOAD_IN_WATTS
     ticks: list[int] = []
     loads = table.columns([TIME, column])
     for (line, _), time, load in zip(table.rows, *loads, strict=True):
-        ticks.append(_step(time, load, ticks, f"{table.where}, line {line}"))
+        ticks.append(_step(time, load, ticks, f"{table.where}, line {line}", process))
     return LoadProfile(tuple(ticks), tuple(loads[1]))
 
 
-def _step(time: float, load: float, before: list[int], where: str) -> int:
+def _step(time: float, load: float, before: list[int], where: str, process: Process) -> int:
     """Return the tick of a step, if it may follow those before."""
-    if not 0 <= time < LAST_TICK * TICK_S:
-        raise LoadFileError(f"{where}: {time:g} s is outside 0 to {LAST_TICK * TICK_S:g} s")
-    low, high = LOAD_SPAN
+    tick_s = process.tick_s
+    if not 0 <= time < LAST_TICK * tick_s:
+        raise LoadFileError(f"{where}: {time:g} s is outside 0 to {LAST_TICK * tick_s:g} s")
+    low, high = process.load.stored_span
     if not low <= load <= high:
-        unit = PROCESS.load.unit
+        unit = process.load.unit
         raise LoadFileError(f"{where}: {load:g} {unit} is outside {low:g} to {high:g} {unit}")
-    tick = round(time / TICK_S)
-    if abs(tick * TICK_S - time) > 1e-6:
-        raise LoadFileError(f"{where}: {time:g} s is not a multiple of {TICK_S} s")
+    tick = round(time / tick_s)
+    if abs(tick * tick_s - time) > 1e-6:
+        raise LoadFileError(f"{where}: {time:g} s is not a multiple of {tick_s} s")
     if not before and tick != 0:
         raise LoadFileError(f"{where}: the first step is at {time:g} s; begin at 0 s")
     if before and tick <= before[-1]:
-        raise LoadFileError(f"{where}: {time:g} s does not come after {before[-1] * TICK_S:g} s; sort by time_s")
+        raise LoadFileError(f"{where}: {time:g} s does not come after {before[-1] * tick_s:g} s; sort by time_s")
     return tick

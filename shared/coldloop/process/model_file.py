@@ -5,9 +5,10 @@ Needs the standard library only, so that the control PLC can check which model i
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from coldloop.errors import ModelFileError
 from coldloop.parsing import parsed_json
@@ -18,6 +19,7 @@ from coldloop.whole_file import whole_text
 
 FORMAT = 1
 REMEDY = "make a new one with `python -m plant.cold_box.model FILE`"
+PROCESS_REMEDY: Final = "make one with `coldloop process FILE --out MODEL`"
 COLD_BOX = "cold-box"
 """The plant of a model file that names none."""
 
@@ -85,6 +87,27 @@ def read_header(path: Path) -> ModelHeader:
     return header_of(read_document(path), path)
 
 
+def declared_process(document: Mapping[str, Any], path: Path) -> Process:
+    """Return the process of a document that `read_document` has verified: the cold box if it declares none.
+
+    Raises:
+        ModelFileError: What it declares is no process.
+    """
+    if not document.get("process"):
+        return THE_COLD_BOX
+    try:
+        return Process.of(document["process"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ModelFileError(f"{path}: process: {error}; {PROCESS_REMEDY}") from error
+
+
+def _disturbances(document: Mapping[str, Any]) -> list[str]:
+    """Return which outputs measure a disturbance by a model file of version 0.3: those of states that nothing moves."""
+    rows = zip(document["state_names"], document["A"], document["B"], document["F"], strict=True)
+    holding = {name for name, A, B, F in rows if not any((*A, *B, F))}
+    return [name for name in document["output_names"] if name in holding]
+
+
 def header_of(document: dict[str, Any], path: Path) -> ModelHeader:
     """Return the header part of a document that `read_document` has verified; `path` is for the message."""
     try:
@@ -132,6 +155,8 @@ def read_document(path: Path, remedy: str = REMEDY) -> dict[str, Any]:
         raise ModelFileError(f"{path}: a number that is not finite; {remedy}") from error
     if document.get("digest") != found:
         raise ModelFileError(f"{path}: digest mismatch, the file was changed after it was made; {remedy}")
+    if document.get("process"):
+        document["process"] = {"disturbances": _disturbances(document)} | document["process"]
     return document
 
 

@@ -3,10 +3,7 @@
 import math
 from typing import Final, NamedTuple
 
-from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
-
 SHORTEST_TICKS: Final = 2
-LONGEST_TICKS: Final = TICKS_PER_SAMPLE
 ROUNDING: Final = 1e-5
 """Share of an iteration that may be missing: times come through registers in single precision."""
 
@@ -16,21 +13,24 @@ MOST_ITERATIONS: Final = 0xFFFF
 
 
 class ComputingTimes(NamedTuple):
-    """Times of one solver on its PLC, s."""
+    """Times of one solver on its PLC, s, and what updating periods are made of."""
 
     slots: float
     """Kept free in an updating period for the preparation."""
     preparation: float
     iteration: float
+    tick_s: float
+    longest_ticks: int
+    """Of an updating period: a sampling period."""
 
     def iterations(self, ticks: int) -> int:
         """Return the iterations that fit into an updating period; at least one is always done."""
-        fitting = (ticks * TICK_S - self.slots) / self.iteration + ROUNDING
+        fitting = (ticks * self.tick_s - self.slots) / self.iteration + ROUNDING
         return max(1, math.floor(min(fitting, MOST_ITERATIONS)))
 
     def holds(self, ticks: int) -> bool:
         """Return whether one iteration fits into an updating period."""
-        return ticks * TICK_S - self.slots >= self.iteration * (1.0 - ROUNDING)
+        return ticks * self.tick_s - self.slots >= self.iteration * (1.0 - ROUNDING)
 
     def ladder(self) -> tuple[int, ...]:
         """Return the updating periods, in ticks, that hold more iterations than any shorter one.
@@ -39,10 +39,10 @@ class ComputingTimes(NamedTuple):
         or longer, it is the number of iterations as well; a faster solver does more in the same period.
         """
         found: list[int] = []
-        for ticks in range(SHORTEST_TICKS, LONGEST_TICKS + 1):
+        for ticks in range(SHORTEST_TICKS, self.longest_ticks + 1):
             if self.holds(ticks) and not (found and self.iterations(ticks) == self.iterations(found[-1])):
                 found.append(ticks)
-        return tuple(found) or (LONGEST_TICKS,)
+        return tuple(found) or (self.longest_ticks,)
 
     def period(self, q: int) -> int:
         """Return the updating period of a q, in ticks; of one beyond the ladder its longest."""

@@ -325,6 +325,11 @@ class RegisterMap:
             end = block.end
 
     @property
+    def process(self) -> Process:
+        """The process that it is for."""
+        return self.blocks[0].process
+
+    @property
     def end(self) -> int:
         """First address behind the last block."""
         return self.blocks[-1].end

@@ -5,16 +5,15 @@ say it in words. A number without a word stays a number: a newer peer may have m
 """
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
-from enum import IntEnum
+from enum import Enum, IntEnum
+from functools import cache
 from typing import Final, NamedTuple
 
-from coldloop.process.declaration import Output
-from coldloop.process.load_profile import LOAD_UNIT
+from coldloop.process.declaration import Output, Process
 from coldloop.process.loaded import PROCESS
 from coldloop.process.range_bits import ModelRange
-from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import (
     Cause,
@@ -33,9 +32,9 @@ Words = Callable[[int], str]
 """Returns the word for a number."""
 
 
-def word(member: IntEnum) -> str:
+def word(member: Enum) -> str:
     """Return the name of a member in plain words: ALARM_RAISED is "alarm raised"."""
-    return member.name.lower().replace("_", " ")
+    return str(member.name).lower().replace("_", " ")
 
 
 def word_of(kind: type[IntEnum], number: int) -> str:
@@ -52,26 +51,6 @@ def _members(kind: type[IntEnum]) -> Words:
     return lambda number: words.get(number, str(number))
 
 
-def _alarm_words() -> dict[int, str]:
-    """Return the words for alarms; those of bands are of the first output that has one, and of the others."""
-    bands = {AlarmKind.LEVEL_BAND: PROCESS.banded[:1], AlarmKind.T5_BAND: PROCESS.banded[1:]}
-    return {kind.value: word(kind) for kind in AlarmKind} | {kind: _band_word(of) for kind, of in bands.items()}
-
-
-def _band_word(outputs: Sequence[Output]) -> str:
-    declared = [output.band.alarm_word for output in outputs if output.band and output.band.alarm_word]
-    names = " or ".join(output.name for output in outputs) or "further output"
-    return declared[0] if declared else f"{names} outside its band"
-
-
-_ALARM_WORDS: Final = _alarm_words()
-
-
-def alarm_word(number: int) -> str:
-    """Return the word for an alarm."""
-    return _ALARM_WORDS.get(number, str(number))
-
-
 def _causes(kind: type[IntEnum]) -> Words:
     """Return the words for causes, of which 0 is none."""
     words = _members(kind)
@@ -82,10 +61,6 @@ def _nothing(number: int) -> str:
     return str(number) if number else ""
 
 
-def _time_out(ticks: int) -> str:
-    return f"{ticks * TICK_S:g} s" if ticks else "off"
-
-
 def _row(number: int) -> str:
     return f"row {number}"
 
@@ -94,6 +69,11 @@ WARNINGS: Final = frozenset(
     {EventKind.MODE, EventKind.ALARM_RAISED, EventKind.WATCHDOG_TIME, EventKind.WATCHDOG_EXPIRED, EventKind.LOST}
 )
 """Events that the log has as warnings."""
+OF_ALARMS: Final = frozenset({EventKind.ALARM_RAISED, EventKind.ALARM_RETURNED, EventKind.ALARM_ACKNOWLEDGED})
+"""Events of an alarm with its cause."""
+SUPPRESSIONS: Final = frozenset(
+    {EventKind.ALARM_SHELVED, EventKind.ALARM_UNSHELVED, EventKind.ALARM_OUT_OF_SERVICE, EventKind.ALARM_IN_SERVICE}
+)
 
 
 class _Wording(NamedTuple):
@@ -105,67 +85,106 @@ class _Wording(NamedTuple):
     """Of the value; None when the kind has none."""
 
 
-_ALARM: Final = _Wording(alarm_word)
-_SUPPRESSION: Final = _ALARM._replace(cause=lambda _: "")  # that of an alarm that may never have been raised
-_SHELVING: Final = _SUPPRESSION._replace(unit="s")
-_WORDINGS: Final[Mapping[int, _Wording]] = {
-    EventKind.MODE: _Wording(_members(Mode), _causes(Cause)),
-    EventKind.ALARM_RAISED: _ALARM,
-    EventKind.ALARM_RETURNED: _ALARM,
-    EventKind.ALARM_ACKNOWLEDGED: _ALARM,
-    EventKind.ALARM_SHELVED: _SHELVING,
-    EventKind.ALARM_UNSHELVED: _SUPPRESSION,
-    EventKind.ALARM_OUT_OF_SERVICE: _SUPPRESSION,
-    EventKind.ALARM_IN_SERVICE: _SUPPRESSION,
-    EventKind.BOOT: _Wording(
-        _listed(("fresh", "with a retained state")), _listed(("", "the previous state was set aside"))
-    ),
-    EventKind.SESSION: _Wording(_listed(("lock-step", "real time")), unit="x real time"),
-    EventKind.OPERATOR_MODE: _Wording(_members(OperatorMode)),
-    EventKind.SETPOINT: _Wording(_listed(INPUT_NAMES), unit=""),
-    EventKind.WATCHDOG_TIME: _Wording(_time_out, lambda ticks: f"was {_time_out(ticks)}"),
-    EventKind.PLANT_LINK: _Wording(_members(PlantLinkState), _causes(LinkCause)),
-    EventKind.LEASE: _Wording(_listed(("ended", "granted", "a second writer was refused"))),
-    EventKind.SENSOR_FAULT: _Wording(_listed(OUTPUT_NAMES), _members(SensorFaultKind)),
-    EventKind.LOAD: _Wording(_row, unit=LOAD_UNIT),
-    EventKind.CERTIFICATE: _Wording(_listed(("", "expires soon", "has expired")), unit="days left"),
-    EventKind.LOST: _Wording(unit="events or lines"),
-    EventKind.SENSOR: _Wording(_listed(OUTPUT_NAMES), _listed(("good again", "bad", "suspect"))),
-    EventKind.LIVE_LOAD: _Wording(_listed(("from one tick on", "steps ahead")), unit=LOAD_UNIT),
-    EventKind.STATION_ALARM: _Wording(
-        _listed([str(alarm.name).lower().replace("_", " ") for alarm in StationAlarm]), _listed(("returned", "raised"))
-    ),
-    EventKind.STATION_MODE: _Wording(_members(StationMode)),
-    EventKind.SURROUNDINGS: _Wording(_listed(Surroundings._fields), unit=""),
-    EventKind.MODEL_RANGE: _Wording(
-        _listed([str(part.name).lower().replace("_", " ") for part in ModelRange]), _listed(("returned", "left"))
-    ),
-    EventKind.COOL_DOWN: _Wording(_members(CoolDownStep)),
-    EventKind.PACE: _Wording(_listed(("lock-step", "real time", "paused")), unit="x real time"),
-}
-_FURTHER_BANDS: Final = [output.name for output in PROCESS.banded[1:]]
-_SHORTAGE: Final = (
+SHORTAGE: Final = (
     "",
     "too much load: reduce it, or the bath will run dry",
     "too little load: raise it, or the turbine gets too cold and the bath floods",
 )
 """Of a plant with a bath: of others it is not known."""
-_ALARM_CAUSES: Final[Mapping[int, Words]] = {
-    AlarmKind.T5_BAND: _listed(_FURTHER_BANDS if len(_FURTHER_BANDS) > 1 else ("",)),
-    AlarmKind.STATE_NOT_RETAINED: _listed(("", "the previous one was set aside")),
-    AlarmKind.MODE: _causes(Cause),
-    AlarmKind.SENSOR_BAD: _listed(OUTPUT_NAMES),
-    AlarmKind.SENSOR_SUSPECT: _listed(OUTPUT_NAMES),
-    AlarmKind.INPUT_WITHOUT_EFFECT: _listed(INPUT_NAMES),
-    AlarmKind.CAPACITY: _listed(_SHORTAGE),
-    AlarmKind.SEQUENCE_REJECTED: _causes(Verdict),
-    AlarmKind.PLANT_LOST: _causes(LinkCause),
-    AlarmKind.PLANT_OTHER_MASTER: _causes(LinkCause),
-    AlarmKind.PLANT_FROZEN: _causes(LinkCause),
-    AlarmKind.OUTPUTS_REJECTED: _causes(LinkCause),
-    AlarmKind.CLOCK_SKEW: _causes(LinkCause),
-    AlarmKind.CERTIFICATE: _listed(("", "expires soon", "has expired", "unreadable")),
-}
+
+
+class _Words:
+    """How events of a process are put into words."""
+
+    def __init__(self, process: Process) -> None:
+        self.process = process
+        self.alarms = {kind.value: word(kind) for kind in AlarmKind} | {
+            kind: _band_word(outputs)
+            for kind, outputs in {
+                AlarmKind.LEVEL_BAND: process.banded[:1],
+                AlarmKind.T5_BAND: process.banded[1:],
+            }.items()
+        }
+        self.alarm_causes = self._alarm_causes()
+        alarm = _Wording(self.alarm_word)
+        suppression = alarm._replace(cause=lambda _: "")  # that of an alarm that may never have been raised
+        shelving = suppression._replace(unit="s")
+        self.wordings = self._wordings() | {
+            EventKind.ALARM_RAISED: alarm,
+            EventKind.ALARM_RETURNED: alarm,
+            EventKind.ALARM_ACKNOWLEDGED: alarm,
+            EventKind.ALARM_SHELVED: shelving,
+            EventKind.ALARM_UNSHELVED: suppression,
+            EventKind.ALARM_OUT_OF_SERVICE: suppression,
+            EventKind.ALARM_IN_SERVICE: suppression,
+        }
+
+    def alarm_word(self, number: int) -> str:
+        return self.alarms.get(number, str(number))
+
+    def _time_out(self, ticks: int) -> str:
+        return f"{ticks * self.process.tick_s:g} s" if ticks else "off"
+
+    def _wordings(self) -> dict[int, _Wording]:
+        inputs, outputs = _listed(self.process.input_names), _listed(self.process.output_names)
+        unit = self.process.load.unit
+        return {
+            EventKind.MODE: _Wording(_members(Mode), _causes(Cause)),
+            EventKind.BOOT: _Wording(
+                _listed(("fresh", "with a retained state")), _listed(("", "the previous state was set aside"))
+            ),
+            EventKind.SESSION: _Wording(_listed(("lock-step", "real time")), unit="x real time"),
+            EventKind.OPERATOR_MODE: _Wording(_members(OperatorMode)),
+            EventKind.SETPOINT: _Wording(inputs, unit=""),
+            EventKind.WATCHDOG_TIME: _Wording(self._time_out, lambda ticks: f"was {self._time_out(ticks)}"),
+            EventKind.PLANT_LINK: _Wording(_members(PlantLinkState), _causes(LinkCause)),
+            EventKind.LEASE: _Wording(_listed(("ended", "granted", "a second writer was refused"))),
+            EventKind.SENSOR_FAULT: _Wording(outputs, _members(SensorFaultKind)),
+            EventKind.LOAD: _Wording(_row, unit=unit),
+            EventKind.CERTIFICATE: _Wording(_listed(("", "expires soon", "has expired")), unit="days left"),
+            EventKind.LOST: _Wording(unit="events or lines"),
+            EventKind.SENSOR: _Wording(outputs, _listed(("good again", "bad", "suspect"))),
+            EventKind.LIVE_LOAD: _Wording(_listed(("from one tick on", "steps ahead")), unit=unit),
+            EventKind.STATION_ALARM: _Wording(
+                _listed([word(alarm) for alarm in StationAlarm]), _listed(("returned", "raised"))
+            ),
+            EventKind.STATION_MODE: _Wording(_members(StationMode)),
+            EventKind.SURROUNDINGS: _Wording(_listed(Surroundings._fields), unit=""),
+            EventKind.MODEL_RANGE: _Wording(
+                _listed([word(part) for part in ModelRange]), _listed(("returned", "left"))
+            ),
+            EventKind.COOL_DOWN: _Wording(_members(CoolDownStep)),
+            EventKind.PACE: _Wording(_listed(("lock-step", "real time", "paused")), unit="x real time"),
+        }
+
+    def _alarm_causes(self) -> dict[int, Words]:
+        further = [output.name for output in self.process.banded[1:]]
+        inputs, outputs = _listed(self.process.input_names), _listed(self.process.output_names)
+        return {
+            AlarmKind.T5_BAND: _listed(further if len(further) > 1 else ("",)),
+            AlarmKind.STATE_NOT_RETAINED: _listed(("", "the previous one was set aside")),
+            AlarmKind.MODE: _causes(Cause),
+            AlarmKind.SENSOR_BAD: outputs,
+            AlarmKind.SENSOR_SUSPECT: outputs,
+            AlarmKind.INPUT_WITHOUT_EFFECT: inputs,
+            AlarmKind.CAPACITY: _listed(SHORTAGE),
+            AlarmKind.SEQUENCE_REJECTED: _causes(Verdict),
+            AlarmKind.PLANT_LOST: _causes(LinkCause),
+            AlarmKind.PLANT_OTHER_MASTER: _causes(LinkCause),
+            AlarmKind.PLANT_FROZEN: _causes(LinkCause),
+            AlarmKind.OUTPUTS_REJECTED: _causes(LinkCause),
+            AlarmKind.CLOCK_SKEW: _causes(LinkCause),
+            AlarmKind.CERTIFICATE: _listed(("", "expires soon", "has expired", "unreadable")),
+        }
+
+
+_words_of: Final = cache(_Words)
+
+
+def _band_word(outputs: Sequence[Output]) -> str:
+    declared = [output.band.alarm_word for output in outputs if output.band and output.band.alarm_word]
+    names = " or ".join(output.name for output in outputs) or "further output"
+    return declared[0] if declared else f"{names} outside its band"
 
 
 kind_word: Final = _members(EventKind)
@@ -192,36 +211,43 @@ class EventText(NamedTuple):
         return f"{self.kind}{': ' if self.subject else ''}{self.subject}{details}{value}{who}"
 
 
-def alarm_cause(alarm: int, cause: int) -> str:
+def alarm_word(number: int, process: Process = PROCESS) -> str:
+    """Return the word for an alarm of a process: of bands those of the first output that has one, and of the others."""
+    return _words_of(process).alarm_word(number)
+
+
+def alarm_cause(alarm: int, cause: int, process: Process = PROCESS) -> str:
     """Return the cause of an alarm in words; empty when there is none."""
-    return _ALARM_CAUSES.get(alarm, _nothing)(cause)
+    return _words_of(process).alarm_causes.get(alarm, _nothing)(cause)
 
 
-def describe(event: Event) -> EventText:
-    """Return an event in words."""
-    wording = _WORDINGS.get(event.kind, _Wording())
+def describe(event: Event, process: Process = PROCESS) -> EventText:
+    """Return an event of a process in words."""
+    wording = _words_of(process).wordings.get(event.kind, _Wording())
     unit = wording.unit
-    if event.kind == EventKind.SETPOINT and event.subject < len(INPUT_UNITS):
-        unit = INPUT_UNITS[event.subject]
+    if event.kind == EventKind.SETPOINT and event.subject < len(process.inputs):
+        unit = process.inputs[event.subject].unit
     elif event.kind == EventKind.ALARM_RAISED and event.subject == AlarmKind.CAPACITY:
-        unit = LOAD_UNIT
+        unit = process.load.unit
     return EventText(
         kind=kind_word(event.kind),
         subject=wording.subject(event.subject),
-        cause=alarm_cause(event.subject, event.cause) if wording is _ALARM else wording.cause(event.cause),
+        cause=alarm_cause(event.subject, event.cause, process)
+        if event.kind in OF_ALARMS
+        else wording.cause(event.cause),
         value="" if unit is None else f"{event.value:.7g}",
         unit=unit or "",
         who=from_words(event.who),
     )
 
 
-def log_event(log: logging.Logger, event: Event) -> None:
-    """Write an event to a log."""
-    text = describe(event)
+def log_event(log: logging.Logger, event: Event, process: Process = PROCESS) -> None:
+    """Write an event of a process to a log."""
+    text = describe(event, process)
     if event.kind == EventKind.MODE:
         subject = "mode"
     else:
-        subject = "alarm" if _WORDINGS.get(event.kind) in (_ALARM, _SHELVING, _SUPPRESSION) else "subject"
+        subject = "alarm" if event.kind in OF_ALARMS | SUPPRESSIONS else "subject"
     fields = {subject: text.subject, "cause": text.cause, "value": text.value, "who": text.who}
     given = {name: field for name, field in fields.items() if field}
     level = logging.WARNING if event.kind in WARNINGS else logging.INFO
