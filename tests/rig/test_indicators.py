@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from coldloop.process.cold_box import L1, STATE_NAMES, T5
 from coldloop.process.lti_model import LtiModel, load
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from optimizer_plc.qp.design import ControlDesign

@@ -10,7 +10,7 @@ import pytest
 from coldloop.errors import StudyError
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from optimizer_plc.computing_settings import QpoasesSettings
 from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.penalties import Preset
