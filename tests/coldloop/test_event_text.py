@@ -31,7 +31,7 @@ def event(kind: int, subject: int = 0, cause: int = 0, value: float = 0.0, who: 
          "alarm returned: sequence rejected (plant lost)"),
         (event(EventKind.ALARM_RAISED, AlarmKind.PLANT_OTHER_MASTER, LinkCause.SECOND_MASTER),
          "alarm raised: plant other master (second master)"),
-        (event(EventKind.ALARM_ACKNOWLEDGED, AlarmKind.T5_BAND, who="10.0.0.5:1"),
+        (event(EventKind.ALARM_ACKNOWLEDGED, AlarmKind.SECOND_BAND, who="10.0.0.5:1"),
          "alarm acknowledged: t5 band, by 10.0.0.5:1"),
         (event(EventKind.ALARM_SHELVED, AlarmKind.SENSOR_BAD, value=900), "alarm shelved: sensor bad, 900 s"),
         (event(EventKind.BOOT, 1), "boot: with a retained state"),

@@ -15,7 +15,7 @@ from coldloop.service.journal import Journal
 from control_plc.alarm_settings import DEFAULT_RULES, OF_THE_PROCESS, AlarmSettings
 from control_plc.alarms import TRANSITIONS, AlarmPanel
 
-KIND = AlarmKind.LEVEL_BAND
+KIND = AlarmKind.FIRST_BAND
 NAME = KIND.name.lower()
 
 
@@ -356,7 +356,7 @@ def test_each_alarm_has_a_rule_and_the_configuration_changes_what_it_names() -> 
         {"rules": {"sensor_bad": {"priority": "low"}, "T5_BAND": {"on_delay_s": 1}}}
     )
     assert settings.rule(AlarmKind.SENSOR_BAD) == (AlarmPriority.LOW, 0.0, 0.0)
-    assert settings.rule(AlarmKind.T5_BAND) == (AlarmPriority.HIGH, 1.0, 0.0)
+    assert settings.rule(AlarmKind.SECOND_BAND) == (AlarmPriority.HIGH, 1.0, 0.0)
     assert settings.rule(KIND) == (AlarmPriority.HIGH, 5.0, 0.0)
     assert AlarmPanel(Journal(), settings).rows[AlarmKind.SENSOR_BAD].priority == AlarmPriority.LOW
 

@@ -228,11 +228,11 @@ async def test_what_an_operator_says_before_the_rack_is_found_holds(tmp_path: Pa
         async with running(SmallRack(4), control_plc=settings) as plc:
             if asked is not None:
                 ask(plc, asked)
-                ask(plc, AlarmCommand(AlarmKind.T5_BAND, AlarmAction.SHELVE, 600))
+                ask(plc, AlarmCommand(AlarmKind.SECOND_BAND, AlarmAction.SHELVE, 600))
             await until(lambda: plc.sessions.running)
             assert plc.bank.get(Identity).session == 4
             assert plc.bank.get(Operator).mode == OperatorMode.MANUAL
-            assert alarm(plc, AlarmKind.T5_BAND) is AlarmState.SHELVED
+            assert alarm(plc, AlarmKind.SECOND_BAND) is AlarmState.SHELVED
             assert alarm(plc, AlarmKind.CLOCK_SKEW) is AlarmState.SHELVED
 
 

@@ -70,7 +70,7 @@ LEFT_TO_PROGRAMS: Final[dict[str, tuple[str, ...]]] = {
 }
 """Whose ticks alone are compiled, where that is worth while."""
 UNUSUAL: Final[dict[str, tuple[str, ...]]] = {
-    "narrow alarm bands": ("control_plc.alarms.level_band=[59.9,60.1]", "control_plc.alarms.t5_band=[12,13]"),
+    "narrow alarm bands": ("control_plc.alarms.bands.L1=[59.9,60.1]", "control_plc.alarms.bands.T5=[12,13]"),
     "sensors out of range": ("control_plc.sensors.level=[59.9,60.1]",),
     "sensors that freeze soon": ("control_plc.sensors.frozen_s=0.5",),
     "sequences that are refused": ("limits.slew_s=4",),

@@ -107,7 +107,7 @@ def desk(monkeypatch: pytest.MonkeyPatch) -> Desk:
 
 
 def alarm(
-    action: AlarmAction, kind: int = AlarmKind.T5_BAND, *, time_s: int = 0, seen: dict[str, int] | None = None
+    action: AlarmAction, kind: int = AlarmKind.SECOND_BAND, *, time_s: int = 0, seen: dict[str, int] | None = None
 ) -> TreatAlarm:
     return TreatAlarm(kind="alarm", alarm=int(kind), action=int(action), time_s=time_s, seen=seen)
 
@@ -208,7 +208,7 @@ async def test_what_the_control_plc_ignores_is_not_told_as_applied(desk: Desk) -
 
 
 async def test_an_alarm_that_was_raised_again_is_not_acknowledged_unseen(desk: Desk) -> None:
-    desk.control.panel.raised(AlarmKind.T5_BAND)
+    desk.control.panel.raised(AlarmKind.SECOND_BAND)
     desk.control.panel.raised(AlarmKind.MODE, 1)
     seen = {"t5 band": 1, "mode": 1}
     desk.control.panel.raised(AlarmKind.MODE, 2)

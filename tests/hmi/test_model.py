@@ -313,7 +313,7 @@ def test_marks_are_all_of_the_window_or_since_when_is_said(model: Model, count: 
 def test_active_alarms_come_first_and_returned_ones_hide_none(model: Model) -> None:
     rows = [Alarm(priority=AlarmPriority.LOW) for _ in AlarmKind]
     rows[AlarmKind.MODE] = Alarm(AlarmState.ACKNOWLEDGED, 1, priority=AlarmPriority.CRITICAL)
-    rows[AlarmKind.T5_BAND] = Alarm(AlarmState.RETURNED, 0, priority=AlarmPriority.HIGH)
+    rows[AlarmKind.SECOND_BAND] = Alarm(AlarmState.RETURNED, 0, priority=AlarmPriority.HIGH)
     rows[AlarmKind.SCAN_OVERRUN] = Alarm(AlarmState.UNACKNOWLEDGED, 1, priority=AlarmPriority.LOW)
     model.put_alarms(rows)
     assert [one["name"] for one in alarms_document(model)][:3] == ["scan overrun", "mode", "t5 band"]

@@ -11,7 +11,7 @@ from coldloop.process.load_profile import LoadProfile, load_profile_of
 from coldloop.process.loaded import PROCESS
 from coldloop.process.settings import ProcessSettings, one_of, settings_of, settings_process, within
 from coldloop.registers.plant import SensorFaultKind
-from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmKind
+from coldloop.registers.safety import ALL_ALARMS, AlarmAction, alarms_of
 from coldloop.service.event_text import alarm_word, word
 
 LONGEST_FILE: Final = 1_000_000
@@ -164,7 +164,7 @@ class TreatAlarm(_Command):
     @field_validator("alarm")
     @classmethod
     def _known(cls, alarm: int) -> int:
-        if alarm != ALL_ALARMS and alarm not in AlarmKind.__members__.values():
+        if alarm != ALL_ALARMS and alarm not in alarms_of(settings_process()):
             raise ValueError(f"unknown alarm {alarm}")
         return alarm
 

@@ -11,7 +11,7 @@ from enum import Enum, IntEnum
 from functools import cache
 from typing import Final, NamedTuple
 
-from coldloop.process.declaration import Output, Process
+from coldloop.process.declaration import Process
 from coldloop.process.loaded import PROCESS
 from coldloop.process.range_bits import ModelRange
 from coldloop.registers.audit import Event, EventKind
@@ -25,7 +25,7 @@ from coldloop.registers.control_plc import (
     Verdict,
 )
 from coldloop.registers.plant import SensorFaultKind, StationAlarm, StationMode, Surroundings
-from coldloop.registers.safety import AlarmKind
+from coldloop.registers.safety import AlarmKind, band_alarms
 from coldloop.registers.text import from_words
 
 Words = Callable[[int], str]
@@ -99,11 +99,8 @@ class _Words:
     def __init__(self, process: Process) -> None:
         self.process = process
         self.alarms = {kind.value: word(kind) for kind in AlarmKind} | {
-            kind: _band_word(outputs)
-            for kind, outputs in {
-                AlarmKind.LEVEL_BAND: process.banded[:1],
-                AlarmKind.T5_BAND: process.banded[1:],
-            }.items()
+            number: (one.band and one.band.alarm_word) or f"{one.name} outside its band"
+            for number, one in zip(band_alarms(process), process.banded, strict=True)
         }
         self.alarm_causes = self._alarm_causes()
         alarm = _Wording(self.alarm_word)
@@ -158,10 +155,8 @@ class _Words:
         }
 
     def _alarm_causes(self) -> dict[int, Words]:
-        further = [output.name for output in self.process.banded[1:]]
         inputs, outputs = _listed(self.process.input_names), _listed(self.process.output_names)
         return {
-            AlarmKind.T5_BAND: _listed(further if len(further) > 1 else ("",)),
             AlarmKind.STATE_NOT_RETAINED: _listed(("", "the previous one was set aside")),
             AlarmKind.MODE: _causes(Cause),
             AlarmKind.SENSOR_BAD: outputs,
@@ -179,12 +174,6 @@ class _Words:
 
 
 _words_of: Final = cache(_Words)
-
-
-def _band_word(outputs: Sequence[Output]) -> str:
-    declared = [output.band.alarm_word for output in outputs if output.band and output.band.alarm_word]
-    names = " or ".join(output.name for output in outputs) or "further output"
-    return declared[0] if declared else f"{names} outside its band"
 
 
 kind_word: Final = _members(EventKind)
@@ -212,7 +201,7 @@ class EventText(NamedTuple):
 
 
 def alarm_word(number: int, process: Process = PROCESS) -> str:
-    """Return the word for an alarm of a process: of bands those of the first output that has one, and of the others."""
+    """Return the word for an alarm of a process."""
     return _words_of(process).alarm_word(number)
 
 
