@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from coldloop.errors import NOT_FINITE
-from coldloop.process.loaded import PROCESS
+from coldloop.process.declaration import Process
 from coldloop.process.lti_model import load as load_model
 from rig.cosim.job import Job
 from rig.figures.worker import FigureProcess
@@ -37,7 +37,7 @@ def record(job: Job, options: argparse.Namespace, figure: FigureProcess) -> int:
     sys.stdout.flush()
     with _progress(job) as sinks:
         summary = run_into(out, job, plain_arguments(options), figure, sinks)
-    _tell(out, summary)
+    _tell(out, summary, job.effective.settings.process)
     if not summary["failed_updates"]:
         return 0
     sys.stderr.write(f"coldloop: {_failure(summary, job)}\n")
@@ -52,7 +52,7 @@ def _progress(job: Job) -> Iterator[list[Sink]]:
         return
     from rig.progress import RunProgress  # noqa: PLC0415 a short run starts without it
 
-    with RunProgress(job.scenario.ticks) as progress:
+    with RunProgress(job.scenario.ticks, job.effective.settings.process) as progress:
         yield [progress]
 
 
@@ -62,16 +62,16 @@ def _failure(summary: dict[str, Any], job: Job) -> str:
     failed, model = summary["failed_updates"], load_model(job.effective.settings.model.file)
     return "; ".join(filter(None, (
         f"{failed} of {failed + summary['updates']} updates have no answer: what the optimiser computed is not finite",
-        unheld(PROCESS.banded, model.A),
+        unheld(job.effective.settings.process.banded, model.A),
         "`coldloop docs fail-safe#no-answer`",
     )))  # fmt: skip
 
 
-def _tell(out: Path, summary: dict[str, Any]) -> None:
+def _tell(out: Path, summary: dict[str, Any], process: Process) -> None:
     updates = "no updates"
     if summary["updates"]:
         updates = f"{summary['updates']} updates, tau_u {summary['tau_u_mean']:.2f} s on average over time"
-    outside = ", ".join(f"{one.name} {summary[f'{one.name}_outside_dead_band_pct']:.2f} %" for one in PROCESS.banded)
+    outside = ", ".join(f"{one.name} {summary[f'{one.name}_outside_dead_band_pct']:.2f} %" for one in process.banded)
     sys.stdout.write(
         f"{summary['ticks']} ticks, {updates}, {summary['realtime_factor'] or 0:,.0f} x real time\n"
         f"outside the bands: {outside}; "

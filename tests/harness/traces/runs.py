@@ -17,7 +17,7 @@ import scipy
 
 from coldloop.config import load_configuration
 from coldloop.process.load_profile import LOAD_SPAN, LoadProfile
-from coldloop.process.loaded import FILE
+from coldloop.process.loaded import FILE, PROCESS
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import read_header
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
@@ -80,7 +80,7 @@ def left_by(configuration: Configuration) -> Left:
             f"{SERVICES.index(service)} {event.kind:d} {event.tick} {event.subject} {event.cause}"
             for service, event in memory.events
         ],
-        indicators=[repr(float(value)) for value in evaluation.indicators],
+        indicators=[repr(float(value)) for value in evaluation.indicators.by_name.values()],
     )
     if configuration.process != COLD_BOX:  # whose model is a file; those of others were just computed, by LAPACK
         left["processor"] = processor()
@@ -119,7 +119,7 @@ def names() -> Names:
     return Names(
         trace=["load", *INPUT_NAMES, *OUTPUT_NAMES, *STATE_NAMES, *(station if FILE is None else ())],
         updates=[*Optimization._fields],
-        indicators=[*Indicators._fields],
+        indicators=[*Indicators._fields[:-1], *(f"{one.name}_outside_band_pct" for one in PROCESS.banded)],
     )
 
 
