@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from coldloop.config import Configuration, flattened, load_configuration
+from rig.process_file.model_of import model_file_of
 from rig.settings import Settings
 
 Period = float | Literal["adaptive"]
@@ -19,6 +20,7 @@ def configured(
     seed: int | None,
     config: str | Path | None,
     sections: Sections,
+    process: str | Path | None = None,
     mode: str | None = None,
     factor: float | None = None,
 ) -> Configuration[Settings]:
@@ -28,6 +30,7 @@ def configured(
         UsageError: An argument cannot be used; one line that says why.
     """
     arguments: dict[str, tuple[object, str]] = {
+        "model.file": (None if process is None else str(model_file_of(Path(process))), "process"),
         "plant.load": (None if load is None else str(load), "load"),
         "plant.seed": (seed, "seed"),
         "optimizer_plc.program.solver": (solver, "solver"),

@@ -12,7 +12,7 @@ from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind
 from optimizer_plc.qp.design import ControlDesign
 from rig.chaos.trace import ChaosTrace
-from rig.results.indicators import DEAD_BANDS, excess_of
+from rig.results.indicators import excess_of
 from rig.results.recording import Recording
 
 PerInput = tuple[float, ...]
@@ -141,7 +141,7 @@ def _largest(steps: NDArray[np.float64]) -> PerInput:
 
 def _outside(recording: Recording, design: ControlDesign) -> NDArray[np.bool_]:
     """Return for each tick whether outputs are outside their bands, (N, bands); False for unknown ticks."""
-    outside: NDArray[np.bool_] = excess_of(recording.y, design) > DEAD_BANDS
+    outside: NDArray[np.bool_] = excess_of(recording.y, design) > design.process.dead_bands
     return outside
 
 

@@ -5,7 +5,6 @@ from itertools import cycle
 from pathlib import Path
 from typing import Final
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -20,13 +19,12 @@ from rig.chaos.trace import ChaosTrace
 from rig.figures.plot import (
     ACCENT,
     BAND,
-    BANDED,
     INK,
-    LABELS,
     THIRD,
     Series,
     label_marks,
     legend_above,
+    styled,
     view,
     with_unit,
 )
@@ -47,14 +45,14 @@ def plot_chaos(path: Path, trace: ChaosTrace, undisturbed: Recording, design: Co
     minutes = np.arange(trace.ticks) * TICK_S / 60
     recording = trace.recording()
     bands = list(zip(design.output_low, design.output_high, strict=True))
-    with mpl.rc_context({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False}):
+    with styled({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False}):
         figure = Figure(figsize=(10, 10), layout="constrained")
         units = _inputs_by_unit()
         *panels, ribbon = figure.subplots(
             len(bands) + len(units) + 1, 1, sharex=True, height_ratios=[*[3] * (len(bands) + len(units)), 1]
         )
         axes: list[Axes] = panels
-        labels = [LABELS[name] for name in BANDED]
+        labels = [with_unit(one.name, one.unit) for one in design.process.banded]
         for place, output, band, label in zip(axes[: len(bands)], CONTROLLED, bands, labels, strict=True):
             place.axhspan(*band, color=BAND, alpha=0.35, label=f"band {ends_text(*band)}")
             place.plot(minutes, undisturbed.y[:, output], color=THIRD, linewidth=0.8, label="undisturbed")

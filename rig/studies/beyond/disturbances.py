@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import Final, NamedTuple
 
-from coldloop.process.signals import TICK_S
+from coldloop.process.cold_box import TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.plant import StationAlarm, StationMode
@@ -115,7 +115,7 @@ def _measures(run: Outcome) -> tuple[str | float, ...]:
     }
     lost = round(float(run.series("lost")[-1]), 3)
     return (
-        i.J_BF, i.L1_outside_band_pct, i.T5_outside_band_pct, *spans, lost, ", ".join(modes),
+        i.J_BF, *i.outside_band_pct.values(), *spans, lost, ", ".join(modes),
         ", ".join(sorted(raised)) or "none", _ladder(run), ", ".join(_alarms(run)) or "none",
     )  # fmt: skip
 

@@ -81,7 +81,7 @@ def left_by(configuration: Configuration, models: Path) -> tuple[Process, Left]:
             f"{SERVICES.index(service)} {event.kind:d} {event.tick} {event.subject} {event.cause}"
             for service, event in memory.events
         ],
-        indicators=[repr(float(value)) for value in evaluation.indicators],
+        indicators=[repr(float(value)) for value in evaluation.indicators.by_name.values()],
     )
     if configuration.process != COLD_BOX:  # whose model is a file; those of others were just computed, by LAPACK
         left["processor"] = processor()
@@ -129,7 +129,7 @@ def names(process: Process) -> Names:
     return Names(
         trace=["load", *process.input_names, *process.output_names, *process.state_names, *station],
         updates=[*Optimization._fields],
-        indicators=[*Indicators._fields],
+        indicators=[*Indicators._fields[:-1], *(f"{one.name}_outside_band_pct" for one in process.banded)],
     )
 
 
