@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import LinkError, PeerUnreachableError
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus
 from coldloop.registers.maps import maps_of
@@ -176,7 +177,7 @@ async def _keep_page(page: PageProcess) -> None:
 def addresses(settings: Settings, ports: Sequence[int], folder: Path, services: Sequence[str]) -> str:
     """Return where everything is, with a line to paste."""
     process = settings.process
-    base = "" if "cold-box" in process.plants else f" --process {settings.model.file}"
+    base = "" if process == COLD_BOX else f" --process {settings.model.file}"
     base += "" if tuple(ports) == DEFAULT_PORTS else f" --port-base {ports[0]}"
     shown = process.banded[-1]
     measured = maps_of(process).plant.block_of(Measurement).registers()
