@@ -19,6 +19,7 @@ import aiohttp
 from coldloop.config import load_configuration
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.cold_box import TICK_S
+from hmi.settings import HmiSettings
 from plant.load import find_load
 from rig.cosim.local_services import LocalServices
 from rig.cosim.ports import ReservedPorts
@@ -80,10 +81,10 @@ async def measure(options: argparse.Namespace, browsers: int | None, folder: Pat
             rig.close()
             return recorder.link, ""
         with ReservedPorts(1) as reserved:
-            section = settings.hmi.model_copy(update={"port": reserved.numbers[0]})
-        async with PageProcess(section, services.endpoints, folder) as page:
+            page_settings = HmiSettings(hmi=settings.hmi.model_copy(update={"port": reserved.numbers[0]}))
+        async with PageProcess(page_settings, services.endpoints, folder) as page:
             await page.is_served()
-            others = await start_crowd(options, browsers, section.port) if browsers else None
+            others = await start_crowd(options, browsers, page_settings.hmi.port) if browsers else None
             await rig.run(scenario, recorder)
             rig.close()
             met = (await others.communicate())[0].decode().strip() if others else ""

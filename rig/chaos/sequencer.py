@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Final
 
 from coldloop.errors import LinkError
-from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import LadderStatus
 from coldloop.registers.safety import Alarm, AlarmKind
@@ -122,9 +121,10 @@ class FaultSequencer:
                 bearable = min(bearable, fault.duration_s)
             if not self._plan.realtime and stopped_s > bearable:
                 return self._timeline.take(end)
-        if not self._timeline.on and stopped_s > max(STANDSTILL_PATIENCE_S, 4 * TICK_S / self._plan.factor):
+        tick_s = self._plan.process.tick_s
+        if not self._timeline.on and stopped_s > max(STANDSTILL_PATIENCE_S, 4 * tick_s / self._plan.factor):
             raise LinkError(
-                f"plan {self._plan.name}: the plant has been at {self.tick * TICK_S:g} s for {stopped_s:.0f} s "
+                f"plan {self._plan.name}: the plant has been at {self.tick * tick_s:g} s for {stopped_s:.0f} s "
                 f"without a fault: see {self._services.log('control_plc')}"
             )
         return None
