@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 from coldloop.config import load_configuration
 from coldloop.modbus.client import RegisterClient
-from coldloop.process.cold_box import TICK_S
+from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus, Status
-from coldloop.registers.maps import CONTROL_MAP
+from coldloop.registers.maps import maps_of
 from coldloop.service.start import run_event_loop
 from plant.load import find_load
 from plant.own_model import own_header
@@ -20,6 +20,8 @@ from rig.cosim.scenario import Scenario
 from rig.cosim.session_client import SessionClient
 from rig.cosim.wiring import START_PATIENCE_S
 from rig.settings import Settings
+
+CONTROL_MAP = maps_of(COLD_BOX).control_plc
 
 
 class Followed(NamedTuple):

@@ -17,8 +17,8 @@ from pathlib import Path
 import aiohttp
 
 from coldloop.config import load_configuration
-from coldloop.process.lti_model import load as load_model
 from coldloop.process.cold_box import TICK_S
+from coldloop.process.lti_model import load as load_model
 from hmi.settings import HmiSettings
 from plant.load import find_load
 from rig.cosim.local_services import LocalServices

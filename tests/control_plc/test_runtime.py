@@ -29,7 +29,6 @@ from coldloop.registers.control_plc import (
     PlantLinkStatus,
 )
 from coldloop.registers.declaration import Block
-from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.safety.retained import RetainedFile
@@ -41,7 +40,7 @@ from control_plc.sessions import ADOPT_AFTER_S
 from control_plc.settings import ControlSettings
 from rig.cli.certificates import Authority
 from rig.cosim.ports import ReservedPorts
-from tests.harness.records import sealed
+from tests.harness.records import CONTROL_MAP, PLANT_MAP, sealed
 
 WITHIN_S = 60.0
 HEADER = read_header(DEFAULT_MODEL_FILE)

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from coldloop.registers.common import MAGIC
 from coldloop.registers.control_plc import Verdict
-from coldloop.registers.maps import CONTROL_MAP
 from coldloop.registers.safety import AlarmKind
 from coldloop.service.event_text import word
 from control_plc.alarm_settings import PASSING, AlarmSettings
+from tests.harness.records import CONTROL_MAP
 
 DOCS = Path(__file__).parents[2] / "docs"
 

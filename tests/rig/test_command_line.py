@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from coldloop.process.loaded import PROCESS
 
 from coldloop.process.declaration import NO_LOAD
-from coldloop.process.loaded import PROCESS
-from coldloop.registers.maps import MAPS
 from coldloop.session.settings import TimeMode
 from optimizer_plc.qp.penalties import Preset
 from optimizer_plc.settings import SolverName
@@ -25,6 +24,7 @@ from rig.cli.register_listing import FORMATS
 from rig.cli.tag_exports import EXPORTS
 from rig.studies import APART, STUDIES
 from tests.harness.processes import Ended, Processes
+from tests.harness.records import MAPS
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop

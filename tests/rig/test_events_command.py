@@ -21,12 +21,12 @@ from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.declaration import Block, RegisterMap
-from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
 from coldloop.registers.safety import AlarmKind
 from coldloop.service.journal import KEPT, Journal, JournalPublication
 from rig.cli.commands.events import COLUMNS
 from rig.cosim.journal_reader import JournalReader
 from tests.harness.processes import Processes
+from tests.harness.records import CONTROL_MAP, PLANT_MAP
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop

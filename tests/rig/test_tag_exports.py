@@ -15,12 +15,12 @@ from coldloop.registers.bank import RegisterBank
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import IDENTITY_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, f32
-from coldloop.registers.maps import CONTROL_MAP, MAPS, PLANT_MAP
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import AlarmKind
 from coldloop.service.metrics import metric_name
 from rig.cli.tag_exports import exported, runs
 from tests.conftest import Coldloop
+from tests.harness.records import CONTROL_MAP, MAPS, PLANT_MAP
 
 T5_ADDRESS = 216
 GRAFANA = Path(__file__).parents[2] / "docs" / "grafana.json"

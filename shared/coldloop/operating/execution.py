@@ -25,7 +25,6 @@ from coldloop.operating.commands import (
 from coldloop.operating.load_stream import LoadStream
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.loaded import PROCESS
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
 from coldloop.registers.maps import Maps, maps_of
@@ -74,7 +73,7 @@ Clients = Mapping[str, CommandClient]
 """One for each service that a command concerns; connected."""
 
 
-def clients_of(endpoints: Mapping[str, Endpoint], process: Process = PROCESS) -> dict[str, CommandClient]:
+def clients_of(endpoints: Mapping[str, Endpoint], process: Process) -> dict[str, CommandClient]:
     """Return clients of services of a process, not connected yet."""
     maps = maps_of(process).by_service
     return {service: CommandClient.at(maps[service], endpoint) for service, endpoint in endpoints.items()}

@@ -12,7 +12,6 @@ from functools import cache
 from typing import Final, NamedTuple
 
 from coldloop.process.declaration import Process
-from coldloop.process.loaded import PROCESS
 from coldloop.process.range_bits import ModelRange
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import (
@@ -200,17 +199,17 @@ class EventText(NamedTuple):
         return f"{self.kind}{': ' if self.subject else ''}{self.subject}{details}{value}{who}"
 
 
-def alarm_word(number: int, process: Process = PROCESS) -> str:
+def alarm_word(number: int, process: Process) -> str:
     """Return the word for an alarm of a process."""
     return _words_of(process).alarm_word(number)
 
 
-def alarm_cause(alarm: int, cause: int, process: Process = PROCESS) -> str:
+def alarm_cause(alarm: int, cause: int, process: Process) -> str:
     """Return the cause of an alarm in words; empty when there is none."""
     return _words_of(process).alarm_causes.get(alarm, _nothing)(cause)
 
 
-def describe(event: Event, process: Process = PROCESS) -> EventText:
+def describe(event: Event, process: Process) -> EventText:
     """Return an event of a process in words."""
     wording = _words_of(process).wordings.get(event.kind, _Wording())
     unit = wording.unit
@@ -230,7 +229,7 @@ def describe(event: Event, process: Process = PROCESS) -> EventText:
     )
 
 
-def log_event(log: logging.Logger, event: Event, process: Process = PROCESS) -> None:
+def log_event(log: logging.Logger, event: Event, process: Process) -> None:
     """Write an event of a process to a log."""
     text = describe(event, process)
     if event.kind == EventKind.MODE:
