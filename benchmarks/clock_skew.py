@@ -37,7 +37,7 @@ async def follow(ppm: float, factor: float, hours: float, folder: Path) -> Follo
     """Run a session with a rack whose clock is off."""
     settings = load_configuration(Settings, environment={}, assignments=[f"plant.clock_error_ppm={ppm}"]).settings
     ticks = round(hours * 3600 / TICK_S)
-    load = find_load("8h", own_header(settings.model.file).w0)
+    load = find_load("8h", own_header(settings.model.file).w0, COLD_BOX)
     async with LocalServices(settings, folder) as services:
         rig = SessionClient(services.endpoints, settings)
         client = RegisterClient.at(CONTROL_MAP, services.endpoints.control_plc)

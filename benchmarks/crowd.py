@@ -100,7 +100,7 @@ async def measure(options: argparse.Namespace, clients: int, logs: Path) -> tupl
     limit = f"control_plc.server.connection_limit={clients + OURS + options.flood}"
     settings = load_configuration(Settings, environment={}, assignments=[limit, *roles]).settings
     ticks = round(options.seconds / TICK_S)
-    scenario = Scenario(ticks, find_load("a", load_model(settings.model.file).w0), 0.0, 1, realtime=True)
+    scenario = Scenario(ticks, find_load("a", load_model(settings.model.file).w0, COLD_BOX), 0.0, 1, realtime=True)
     recorder = Recorder(ticks)
     async with LocalServices(settings, logs) as services:
         rig = SessionClient(services.endpoints, settings)

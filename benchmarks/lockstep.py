@@ -45,7 +45,7 @@ async def measure(ticks: int, period_s: float) -> int:
     """Measure both on one rig, and print."""
     settings = Settings()
     mean = load(settings.model.file).w0
-    scenario = Scenario(ticks, find_load("2h", mean), period_s, seed=1)
+    scenario = Scenario(ticks, find_load("2h", mean, COLD_BOX), period_s, seed=1)
     with tempfile.TemporaryDirectory() as folder:
         async with LocalServices(settings, Path(folder)) as services:
             rig = SessionClient(services.endpoints, settings)

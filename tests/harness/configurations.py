@@ -2,6 +2,7 @@
 
 from typing import Final
 
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import LoadProfile
 from plant.load import find_load
 
@@ -86,5 +87,5 @@ UNUSUAL: Final[dict[str, tuple[str, ...]]] = {
 
 def lively(mean_load: float) -> LoadProfile:
     """Return a load that moves from the first minute on, about the load of the operating point, W."""
-    e = find_load("e", mean_load)
+    e = find_load("e", mean_load, COLD_BOX)
     return LoadProfile((0, *(time - e.times[1] + 60 for time in e.times[1:])), e.watts)

@@ -60,7 +60,7 @@ def test_descriptions_that_number_their_meanings_become_words_and_others_do_not(
 
 
 def test_every_register_of_a_block_with_one_row_is_a_signal() -> None:
-    for register_map in MAPS:
+    for register_map in MAPS.values():
         names = {signal.name for signal in signals_of(register_map)}
         assert len(names) == len(signals_of(register_map))
         for block in register_map.blocks:
