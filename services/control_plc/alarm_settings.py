@@ -98,10 +98,15 @@ def _bands_of(process: Process) -> dict[str, Range]:
 
 def _with_declared(given: object) -> object:
     """Return bands by output, those of the process where none are given."""
-    declared_bands = _bands_of(settings_process())
-    if isinstance(given, Mapping) and (unknown := [name for name in given if name not in declared_bands]):
-        raise ValueError(f"{unknown[0]}: no output with a band; choose from {', '.join(declared_bands)}")
-    return {**declared_bands, **given} if isinstance(given, Mapping) else given
+    if not isinstance(given, Mapping):
+        return given
+    found: dict[str, object] = {**_bands_of(settings_process())}
+    names = {name.lower(): name for name in found}  # the environment has no capitals
+    for name, band in given.items():
+        if str(name).lower() not in names:
+            raise ValueError(f"{name}: no output with a band; choose from {', '.join(found)}")
+        found[names[str(name).lower()]] = band
+    return found
 
 
 class AlarmSettings(ProcessSettings):
