@@ -10,6 +10,8 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from functools import cached_property
+from importlib.metadata import entry_points
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Self, get_args, get_type_hints
 
@@ -446,6 +448,21 @@ class Process:
     def dead_bands(self) -> tuple[float, ...]:
         """Their dead bands."""
         return tuple(band.dead_band for band in self.bands)
+
+    @classmethod
+    def read(cls, path: str | Path) -> "Process":
+        """Return the process of a process file, or of a model file.
+
+        Raises:
+            ColdloopError: The file cannot be used; one line that says why.
+        """
+        from coldloop.process.settings import process_of  # noqa: PLC0415 it is made of this
+
+        file = Path(path)
+        if file.suffix == ".toml":  # which the rig reads
+            (reads,) = entry_points(group="coldloop.front_door", name="model_file_of")
+            file, _ = reads.load()(file)
+        return process_of(file)
 
     def document(self) -> dict[str, Any]:
         """Return this as plain data, tuples as lists."""
