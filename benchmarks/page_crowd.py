@@ -17,8 +17,8 @@ from pathlib import Path
 import aiohttp
 
 from coldloop.config import load_configuration
+from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.signals import TICK_S
 from hmi.settings import HmiSettings
 from plant.load import find_load
 from rig.cosim.local_services import LocalServices
@@ -71,7 +71,7 @@ async def measure(options: argparse.Namespace, browsers: int | None, folder: Pat
     """Run the loop under so many browsers, or without the page; return its timing and what they received."""
     settings = load_configuration(Settings, environment={}).settings
     ticks = round(options.seconds / TICK_S)
-    scenario = Scenario(ticks, find_load("a", load_model(settings.model.file).w0), 0.0, 1, realtime=True)
+    scenario = Scenario(ticks, find_load("a", load_model(settings.model.file).w0, COLD_BOX), 0.0, 1, realtime=True)
     recorder = Recorder(ticks)
     async with LocalServices(settings, folder) as services:
         rig = SessionClient(services.endpoints, settings)

@@ -5,6 +5,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from coldloop.process.cold_box import TICK_S
 from rig.durations import duration
 from rig.studies import STUDIES
 from rig.studies.execution import Workers
@@ -26,7 +27,7 @@ def main() -> None:
     parser.add_argument("--duration", type=duration, help="plant time of each run (default: eight hours)")
     parser.add_argument("--seeds", type=int, default=1)
     arguments = parser.parse_args()
-    options = StudyOptions(arguments.seeds, arguments.duration)
+    options = StudyOptions(arguments.seeds, arguments.duration and arguments.duration.ticks(TICK_S))
     one, two = (seconds(workers, options) for workers in (1, 2))
     print(f"36 runs a draw: one worker {one:.0f} s, two workers {two:.0f} s, ratio {one / two:.2f}")
 

@@ -14,8 +14,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import CONTROLLED, TICK_S
+from coldloop.process.declaration import Process
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
 from rig.results.recording import Sink
@@ -58,7 +57,7 @@ def make_console() -> Console:
 class RunProgress(PlantTimeBar, Sink):
     """A progress bar on standard error, with the loop's live line on a wide terminal."""
 
-    def __init__(self, ticks: int) -> None:
+    def __init__(self, ticks: int, process: Process) -> None:
         console = make_console()
         columns: list[ProgressColumn] = [TextColumn("{task.fields[clock]}"), TaskProgressColumn()]
         if console.width >= NARROW:
@@ -68,7 +67,7 @@ class RunProgress(PlantTimeBar, Sink):
             columns.append(TextColumn("[dim]{task.fields[line]}"))
         self._bar = Progress(*columns, console=console, auto_refresh=False)
         self._task = self._bar.add_task("", total=ticks, clock="0:00:00", speed="", line="")
-        self._ticks = ticks
+        self._ticks, self._process = ticks, process
         self._done = 0
         self._updating = ""
         self._began = self._shown = time.monotonic()
@@ -79,7 +78,7 @@ class RunProgress(PlantTimeBar, Sink):
 
     def reported(self, update: Optimization) -> None:
         """Remember what the optimiser does."""
-        self._updating = f"  tau_u {update.tau_u * TICK_S:.2f} s  J {update.j_effective:.3g}"
+        self._updating = f"  tau_u {update.tau_u * self._process.tick_s:.2f} s  J {update.j_effective:.3g}"
 
     def sample(self, sample: PlantSample) -> None:
         """Show where the run is, a few times a second."""
@@ -94,8 +93,8 @@ class RunProgress(PlantTimeBar, Sink):
 
     def _show(self, sample: PlantSample, elapsed_s: float) -> None:
         self._bar.start()  # not before there is something to show: an error is then shown alone
-        seconds = self._done * TICK_S
-        values = zip(PROCESS.banded[:SHOWN_OUTPUTS], CONTROLLED, strict=False)
+        seconds = self._done * self._process.tick_s
+        values = zip(self._process.banded[:SHOWN_OUTPUTS], self._process.controlled, strict=False)
         outputs = "  ".join(f"{one.name} {sample.y[place]:.2f} {one.unit}".rstrip() for one, place in values)
         self._bar.update(
             self._task,

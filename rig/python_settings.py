@@ -1,10 +1,12 @@
 """The configuration that Python arguments describe, for `simulate` and for rigs of tests."""
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
 from coldloop.config import Configuration, flattened, load_configuration
+from rig.process_file.model_of import model_file_of
 from rig.settings import Settings
 
 Period = float | Literal["adaptive"]
@@ -19,6 +21,7 @@ def configured(
     seed: int | None,
     config: str | Path | None,
     sections: Sections,
+    process: str | Path | None = None,
     mode: str | None = None,
     factor: float | None = None,
 ) -> Configuration[Settings]:
@@ -27,7 +30,11 @@ def configured(
     Raises:
         UsageError: An argument cannot be used; one line that says why.
     """
+    model, told = (None, []) if process is None else model_file_of(Path(process))
+    for line in told:
+        warnings.warn(f"{process}: {line}", stacklevel=3)
     arguments: dict[str, tuple[object, str]] = {
+        "model.file": (model and str(model), "process"),
         "plant.load": (None if load is None else str(load), "load"),
         "plant.seed": (seed, "seed"),
         "optimizer_plc.program.solver": (solver, "solver"),

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Mode
-from coldloop.registers.safety import AlarmKind
+from coldloop.registers.safety import alarm_key
 from optimizer_plc.qp.design import ControlDesign
 from rig.chaos.trace import ChaosTrace
 from rig.results.indicators import excess_of
@@ -97,7 +97,7 @@ def _row(
         modes=tuple(mode.name for mode in _different([*before, *(Mode(event.subject) for event in changes)])),
         alarms=tuple(
             RaisedAlarm(
-                AlarmKind(event.subject).name,
+                alarm_key(event.subject, trace.process).upper(),
                 max(0, event.tick - mark.begin) * tick_s,
                 max(0, event.tick - (mark.begin if mark.done is None else mark.done)) * tick_s,
             )
@@ -140,7 +140,7 @@ def _largest(steps: NDArray[np.float64]) -> PerInput:
 
 def _outside(recording: Recording, design: ControlDesign) -> NDArray[np.bool_]:
     """Return for each tick whether outputs are outside their bands, (N, bands); False for unknown ticks."""
-    outside: NDArray[np.bool_] = excess_of(recording.y, design) > np.array(design.process.dead_bands)
+    outside: NDArray[np.bool_] = excess_of(recording.y, design) > design.process.dead_bands
     return outside
 
 

@@ -5,7 +5,6 @@ from itertools import cycle
 from pathlib import Path
 from typing import Final
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -25,6 +24,7 @@ from rig.figures.plot import (
     Series,
     label_marks,
     legend_above,
+    styled,
     view,
     with_unit,
 )
@@ -46,7 +46,7 @@ def plot_chaos(path: Path, trace: ChaosTrace, undisturbed: Recording, design: Co
     minutes = np.arange(trace.ticks) * process.tick_s / 60
     recording = trace.recording()
     bands = list(zip(design.output_low, design.output_high, strict=True))
-    with mpl.rc_context({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False}):
+    with styled({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False}):
         figure = Figure(figsize=(10, 10), layout="constrained")
         units = _inputs_by_unit(process)
         *panels, ribbon = figure.subplots(

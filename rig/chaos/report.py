@@ -8,7 +8,7 @@ from typing import Any, Final
 from coldloop.parsing import parsed_json
 from coldloop.process.declaration import Process
 from coldloop.registers.control_plc import Mode
-from coldloop.registers.safety import AlarmKind, AlarmState
+from coldloop.registers.safety import AlarmState, alarm_key, alarms_of
 from coldloop.service.event_text import alarm_word
 from coldloop.whole_file import whole_text
 from rig.chaos.evaluation import Evaluation, RaisedAlarm, Row
@@ -56,7 +56,7 @@ def document(
         "missing_ticks": evaluation.missing_ticks,
         "lost_contacts": trace.lost_contacts,
         "ladder": trace.ladder._asdict() if trace.ladder else None,
-        "alarms": {AlarmKind(i).name: alarm._asdict() for i, alarm in enumerate(trace.alarms)},
+        "alarms": {alarm_key(i, trace.process).upper(): alarm._asdict() for i, alarm in enumerate(trace.alarms)},
         "events": [event._asdict() for event in trace.events],
         "resources": [sample._asdict() for sample in trace.resources],
         "log_lines": trace.log_lines,
@@ -135,7 +135,8 @@ def _modes(modes: Sequence[str]) -> str:
 
 def _alarms(alarms: Sequence[RaisedAlarm], process: Process) -> str:
     """Return each alarm once: when it was first raised, and how often if more than once."""
-    named = [(alarm_word(AlarmKind[alarm.name], process), alarm.after_s) for alarm in alarms]
+    words = {alarm_key(alarm, process).upper(): alarm_word(alarm, process) for alarm in alarms_of(process)}
+    named = [(words[alarm.name], alarm.after_s) for alarm in alarms]
     times, first = Counter(name for name, _ in named), dict(reversed(named))
     cells = [f"{name} {first[name]:g}" + (f" (x{count})" if count > 1 else "") for name, count in times.items()]
     return ", ".join(cells) or "none"

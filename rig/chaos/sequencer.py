@@ -9,7 +9,7 @@ from typing import Final
 from coldloop.errors import LinkError
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import LadderStatus
-from coldloop.registers.safety import Alarm, AlarmKind
+from coldloop.registers.safety import Alarm, alarms_of
 from rig.chaos.faults import AnyFault, ProcessFault, WrongModel
 from rig.chaos.injection import Injector
 from rig.chaos.plan import ChaosPlan
@@ -62,7 +62,9 @@ class FaultSequencer:
             else:
                 await self._end(moment)
             self._stopped_since = time.monotonic()
-        alarms = await self._client.contact(self._client.control.read_rows(Alarm, 0, len(AlarmKind)))
+        alarms = await self._client.contact(
+            self._client.control.read_rows(Alarm, 0, len(alarms_of(self._client.control.process)))
+        )
         self._trace.alarms = alarms or []
         await self._client.conclude()
 

@@ -52,7 +52,7 @@ def _progress(job: Job) -> Iterator[list[Sink]]:
         return
     from rig.progress import RunProgress  # noqa: PLC0415 a short run starts without it
 
-    with RunProgress(job.scenario.ticks) as progress:
+    with RunProgress(job.scenario.ticks, job.effective.settings.process) as progress:
         yield [progress]
 
 

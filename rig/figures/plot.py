@@ -1,7 +1,10 @@
 """The picture of a run, in the manner of the paper's time figures."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cache
 from string import ascii_lowercase, ascii_uppercase
+from threading import RLock
 from typing import Any, Final, NamedTuple
 
 import matplotlib as mpl
@@ -13,9 +16,7 @@ from matplotlib.ticker import ScalarFormatter
 from numpy.typing import NDArray
 
 from coldloop.number_text import axis_labels, ends_text
-from coldloop.process.load_profile import LOAD_COLUMN, LOAD_WORD
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, SAMPLING_PERIOD_S
+from coldloop.process.declaration import Input, Output, Process
 
 Series = NDArray[np.floating]
 
@@ -30,10 +31,6 @@ STYLE: Final[Any] = {
     "legend.frameon": False, "legend.fontsize": 8, "svg.hashsalt": "coldloop", "axes.formatter.useoffset": False,
     "pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "none",  # text that journals take and editors find
 }  # fmt: skip
-BANDED: Final = {one.name: one.unit for one in PROCESS.banded}
-"""Outputs that are drawn, those that have a band, and their units."""
-MOVED: Final = dict(zip(INPUT_NAMES, INPUT_UNITS, strict=True))
-"""Inputs and their units."""
 
 
 def with_unit(name: str, unit: str) -> str:
@@ -41,22 +38,31 @@ def with_unit(name: str, unit: str) -> str:
     return f"{name} ({unit})" if unit else name
 
 
-LABELS: Final[Mapping[str, str]] = {
-    **({LOAD_COLUMN: with_unit(LOAD_WORD, PROCESS.load.unit)} if PROCESS.has_load else {}),
-    **{one.name: with_unit(one.name, one.unit) for one in PROCESS.measured_disturbances},
-    **{name: with_unit(name, unit) for name, unit in {**BANDED, **MOVED}.items()},
-    "tau_u_s": "tau_u (s)",
-    "stage_cost": "stage cost (1)",
-}
-"""Columns of the trace that are drawn, and the labels of their axes."""
-DRAWN: Final = tuple(LABELS)
+@cache
+def labels_of(process: Process) -> Mapping[str, str]:
+    """Return the columns of the trace that are drawn, in their order, with the labels of their axes."""
+    load = {process.load.column: with_unit(process.load.title, process.load.unit)} if process.has_load else {}
+    signals: tuple[Input | Output, ...] = (*process.measured_disturbances, *process.banded, *process.inputs)
+    named = {one.name: with_unit(one.name, one.unit) for one in signals}
+    return {**load, **named, "tau_u_s": "tau_u (s)", "stage_cost": "stage cost (1)"}
+
+
+@contextmanager
+def styled(style: Any = STYLE) -> Iterator[None]:  # noqa: ANN401 parameters of matplotlib
+    """Draw in a style within the context; matplotlib has one style at a time for all threads."""
+    with _STYLED, mpl.rc_context(style):
+        yield
+
+
+_STYLED: Final = RLock()
+NOT_CURVES: Final = ("tau_u_s", "stage_cost")
+"""The last of these columns, which are drawn in their own ways."""
 LEAST_COST: Final = 1e-6
 """Stage costs below it are drawn as it: at rest the cost is rounding."""
 NARROWEST: Final = 1 / 2000
 """Share of the whole time that can be seen."""
 SMOOTHING_S: Final = 60.0
 """Window of the mean of tau_u: adaptive periods change at nearly every update."""
-LONGEST_TAU_U_S: Final = SAMPLING_PERIOD_S
 PANELS: Final = {"left": 0.083, "right": 0.993, "top": 0.962, "bottom": 0.048, "hspace": 0.3}
 """Where the panels are, in shares of the figure. Matplotlib's layout engine would draw the figure three times more."""
 LETTERS: Final = ascii_lowercase + ascii_uppercase
@@ -72,19 +78,21 @@ class Bounds(NamedTuple):
     inputs: Mapping[str, tuple[float, float]]
 
     @classmethod
-    def of(cls, configuration: Mapping[str, Any]) -> "Bounds":
+    def of(cls, configuration: Mapping[str, Any], process: Process) -> "Bounds":
         """Return the bounds of a configuration by dotted key."""
         design = "optimizer_plc.program.design.output_"
         bands = zip(configuration[f"{design}low"], configuration[f"{design}high"], strict=True)
         inputs = zip(configuration["limits.low"], configuration["limits.high"], strict=True)
-        return cls(dict(zip(BANDED, bands, strict=True)), dict(zip(INPUT_NAMES, inputs, strict=True)))
+        names = tuple(one.name for one in process.banded)
+        return cls(dict(zip(names, bands, strict=True)), dict(zip(process.input_names, inputs, strict=True)))
 
 
 class RunCurves(NamedTuple):
     """What is drawn of a run."""
 
+    process: Process
     series: Mapping[str, Series]
-    """`time_s` and the columns `DRAWN`."""
+    """`time_s` and the columns of `labels_of`."""
     events: Sequence[Mapping[str, Any]]
     bounds: Bounds
     title: str
@@ -98,27 +106,28 @@ def draw_run(curves: RunCurves) -> Figure:
     """Return load, disturbances, outputs with their bands, inputs with their bounds, tau_u, cost, modes and alarms."""
     scale_s, unit = time_unit(curves.series["time_s"])
     time = curves.series["time_s"] / scale_s
-    heights = [1.0] * (len(DRAWN) + len(curves.pressures)) + ([0.45] if curves.events else [])
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.5, 13.5 + 1.6 * (len(DRAWN) + len(curves.pressures) - 8)))
+    process, labels = curves.process, labels_of(curves.process)
+    heights = [1.0] * (len(labels) + len(curves.pressures)) + ([0.45] if curves.events else [])
+    units = dict(
+        zip(process.output_names + process.input_names, process.output_units + process.input_units, strict=True)
+    )
+    with styled():
+        figure = Figure(figsize=(9.5, 13.5 + 1.6 * (len(labels) + len(curves.pressures) - 8)))
         axes: list[Axes] = list(
             figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, gridspec_kw=PANELS)
         )
-        outside = DRAWN[: DRAWN.index(next(iter(BANDED)))]  # load and disturbances
-        for place, name in zip(axes, outside, strict=False):
-            _curve(place, time, curves.series[name], LABELS[name], PROCESS.load.name if name == LOAD_COLUMN else name)
-        first = len(outside) + len(BANDED)
-        for place, (name, band) in zip(axes[len(outside) : first], curves.bounds.bands.items(), strict=True):
-            _curve(place, time, curves.series[name], LABELS[name], name)
-            limit(place, curves.series[name], band, f"band {ends_text(*band)} {BANDED[name]}".rstrip())
-        behind = first + len(MOVED)
-        for place, (name, bound) in zip(axes[first:behind], curves.bounds.inputs.items(), strict=True):
-            _curve(place, time, curves.series[name], LABELS[name], name)
-            limit(place, curves.series[name], bound, f"bounds {ends_text(*bound)} {MOVED[name]}".rstrip())
+        for place, (name, label) in zip(axes, labels.items(), strict=False):
+            if name not in NOT_CURVES:
+                word = process.load.name if name == process.load.column else name
+                _curve(place, time, curves.series[name], label, word)
+            for what, edges in (("band", curves.bounds.bands.get(name)), ("bounds", curves.bounds.inputs.get(name))):
+                if edges is not None:
+                    limit(place, curves.series[name], edges, f"{what} {ends_text(*edges)} {units[name]}".rstrip())
+        behind = len(labels) - len(NOT_CURVES)
         for place, (name, ends) in zip(axes[behind:], curves.pressures.items(), strict=False):
             _curve(place, time, curves.series[name], f"{name} (bar)", name)
             limit(place, curves.series[name], ends, f"no alarm from {ends_text(*ends)} bar")
-        _updating_period(axes[behind + len(curves.pressures)], time, curves.series)
+        _updating_period(axes[behind + len(curves.pressures)], time, curves.series, process.sampling_period_s)
         _cost(axes[behind + len(curves.pressures) + 1], time, curves.series["stage_cost"])
         if curves.events:
             _ribbons(axes[-1], curves.events, scale_s, float(time[-1]))
@@ -201,10 +210,10 @@ def view(values: Series) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def _updating_period(axes: Axes, time: Series, series: Mapping[str, Series]) -> None:
+def _updating_period(axes: Axes, time: Series, series: Mapping[str, Series], longest_s: float) -> None:
     tau_u = series["tau_u_s"]
     axes.set_ylabel("tau_u (s)")
-    axes.set_ylim(0, LONGEST_TAU_U_S + 0.3)
+    axes.set_ylim(0, longest_s + 0.3)
     if np.isnan(tau_u).all():
         axes.text(0.5, 0.5, "no updates", transform=axes.transAxes, ha="center", va="center", color=ACCENT)
         return

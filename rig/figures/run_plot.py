@@ -5,16 +5,15 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import INPUT_NAMES
+from coldloop.process.cold_box import COLD_BOX
+from coldloop.process.declaration import Process
 from coldloop.whole_file import whole_file
-from rig.figures.plot import BANDED, DRAWN, STYLE, Bounds, RunCurves, draw_run
-from rig.results.columns import STATION_FILE
+from rig.figures.plot import Bounds, RunCurves, draw_run, labels_of, styled
+from rig.results.columns import STATION
 from rig.results.run_folder import Curves, RunFolder
 from rig.results.way import Way
 
@@ -39,9 +38,8 @@ def plot_run(folder: Path, formats: Sequence[str]) -> list[Path]:
 
 def draw_nothing() -> None:
     """Draw one tick into memory: fonts, and what else the first figure of a process needs, are loaded then."""
-    series = {name: np.zeros(1) for name in ("time_s", *DRAWN)}
-    bounds = Bounds(dict.fromkeys(BANDED, (0.0, 1.0)), dict.fromkeys(INPUT_NAMES, (0.0, 1.0)))
-    draw_run(RunCurves(series, [], bounds, "", "")).savefig(BytesIO(), dpi=DPI)
+    series, edges = {name: np.zeros(1) for name in ("time_s", *labels_of(COLD_BOX))}, {"L1": (0.0, 1.0)}
+    draw_run(RunCurves(COLD_BOX, series, [], Bounds(edges, {}), "", "")).savefig(BytesIO(), dpi=DPI)
 
 
 def save_figure(figure: Figure, path: Path) -> None:
@@ -49,21 +47,23 @@ def save_figure(figure: Figure, path: Path) -> None:
     extension = path.suffix.removeprefix(".")
     metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(extension)
     dpi = max(DPI, LEAST_PIXELS / figure.get_figwidth())
-    with mpl.rc_context(STYLE):
+    with styled():
         whole_file(path, lambda draft: figure.savefig(draft, dpi=dpi, format=extension, metadata=metadata))
 
 
 def curves_of(run: RunFolder) -> RunCurves:
     """Return what is drawn of a run."""
-    pressures = pressure_limits(run.configuration) if (run.path / STATION_FILE).exists() else {}
-    series = run.series(DRAWN)
+    pressures = pressure_limits(run.configuration) if (run.path / STATION).exists() else {}
+    process = run.process
+    series = run.series([*labels_of(process)])
     if pressures:
-        series |= at_times(run.series(list(pressures), file_name=STATION_FILE), series["time_s"])
+        series |= at_times(run.series(list(pressures), file_name=STATION), series["time_s"])
     return RunCurves(
+        process,
         series,
         run.events(),
-        Bounds.of(run.configuration),
-        title_of(run.configuration, run.manifest["way"]),
+        Bounds.of(run.configuration, process),
+        title_of(run.configuration, process, run.manifest["way"]),
         identity_of(run.manifest),
         pressures,
     )
@@ -84,9 +84,9 @@ def at_times(series: Curves, times_s: NDArray[np.float64]) -> Curves:
     return {n: np.interp(times_s, known, curve, np.nan, np.nan) for n, curve in series.items() if n != "time_s"}
 
 
-def title_of(configuration: Mapping[str, Any], way: str = "") -> str:
+def title_of(configuration: Mapping[str, Any], process: Process, way: str = "") -> str:
     """Return what a run was, in a few words; of a session that was recorded, the load is not known by name."""
-    named = f"load {Path(configuration['plant.load']).name}" if PROCESS.has_load else PROCESS.name
+    named = f"load {Path(configuration['plant.load']).name}" if process.has_load else process.name
     load = "session under way" if way == Way.RECORDED else named
     if configuration["control_plc.driver"] == "classical":
         return f"{load}, classical loops"

@@ -24,7 +24,7 @@ from optimizer_plc.budget import PlcBudget
 from optimizer_plc.rules import make_rule
 from optimizer_plc.settings import OptimizerSettings
 from optimizer_plc.solvers import make_solver
-from rig.results.columns import STATION_FILE
+from rig.results.columns import STATION
 from rig.results.recorded_alarms import alarms_after
 from rig.results.run_folder import MOST_IN_MEMORY, MOST_LISTED, RunFolder
 
@@ -63,9 +63,9 @@ class RecordedPage:
 
     def _read_station(self) -> NDArray[np.float32] | None:
         """Return signals, mode and alarms of the station, a row a tick; None of a cold box alone."""
-        if not (self._folder.path / STATION_FILE).exists():
+        if not (self._folder.path / STATION).exists():
             return None
-        with self._folder.reading(STATION_FILE, MOST_IN_MEMORY) as file:
+        with self._folder.reading(STATION, MOST_IN_MEMORY) as file:
             table = file.read(columns=[*STATION_SIGNAL_NAMES, "mode", "alarms"])
         return np.column_stack([column.to_numpy() for column in table.columns]).astype(np.float32)
 
@@ -143,7 +143,7 @@ class RecordedPage:
 
     def alarms(self, events: Sequence[JournalEntry]) -> list[Alarm]:
         """Return the alarms after these events."""
-        return alarms_after(events)
+        return alarms_after(events, self._folder.process)
 
     def _station_at(self, tick: int) -> StationSample | None:
         if self._station is None or tick >= len(self._station):

@@ -13,7 +13,7 @@ from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode, ProcessNow
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import LoadStatus
-from coldloop.registers.safety import Alarm, AlarmKind, AlarmState
+from coldloop.registers.safety import Alarm, AlarmState, alarms_of
 from coldloop.service.event_text import alarm_cause, alarm_word, word_of
 from rig.cosim.answer_time import answered_in_time
 from rig.terminal import Colour, coloured
@@ -87,10 +87,8 @@ async def _plant(client: CommandClient) -> PlantStatus:
 
 async def _control(client: CommandClient) -> ControlStatus:
     await client.connect(0.0)
-    rows = await client.read_rows(Alarm, 0, len(AlarmKind))
-    alarms = tuple(
-        _alarm(kind, row, client.process) for kind, row in zip(AlarmKind, rows, strict=True) if row.state not in QUIET
-    )
+    rows = await client.read_rows(Alarm, 0, len(alarms_of(client.process)))
+    alarms = tuple(_alarm(kind, row, client.process) for kind, row in enumerate(rows) if row.state not in QUIET)
     return ControlStatus(
         await client.read(LadderStatus), await client.read(Operator), (await client.read(ProcessNow)).y, alarms
     )
@@ -101,7 +99,7 @@ async def _update(client: CommandClient) -> Optimization | None:
     return await last_update(client, await client.read(Identity))
 
 
-def _alarm(kind: AlarmKind, row: Alarm, process: Process) -> str:
+def _alarm(kind: int, row: Alarm, process: Process) -> str:
     cause = alarm_cause(kind, row.cause, process)
     state = word_of(AlarmState, row.state)
     return f"{alarm_word(kind, process)}{f' ({cause})' if cause else ''}, {state}"

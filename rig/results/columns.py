@@ -1,24 +1,25 @@
 """The columns of the files of a run: names, types, units, descriptions; `tables.py` fills them, in the same order."""
 
-from collections.abc import Sequence
 from enum import IntEnum
+from functools import cache
 from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
 
-from coldloop.process.load_profile import LOAD_COLUMN
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS, TICK_UNIT
+from coldloop.process.declaration import Process
 from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS
 from coldloop.registers.audit import Event
 from coldloop.registers.control_plc import Verdict
-from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
+from coldloop.registers.maps import Maps, maps_of
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import ModelRangeStatus, PlantSample, StationMode, StationSample
-from rig.results.driving import SHOWN
 
 FORMAT: Final = 2
 """Version of the files of a run."""
+TRACE, UPDATES, EVENTS = "trace.parquet", "updates.parquet", "events.parquet"
+STATION: Final = "station.parquet"
+"""Only where the plant is a refrigerator."""
+FILES: Final = (TRACE, UPDATES, EVENTS, STATION)
 
 
 class Column(NamedTuple):
@@ -37,132 +38,145 @@ class Column(NamedTuple):
         return pa.field(self.name, self.kind, metadata={"unit": self.unit, "description": self.description})
 
 
-_TICK: Final = Column("tick", pa.int64(), "1", f"Tick since the start of the session, of {TICK_UNIT}")
-_TIME: Final = Column("time_s", pa.float64(), "s", "Plant time since the start of the session")
+class RunFile(NamedTuple):
+    """A file of a run."""
+
+    description: str
+    columns: tuple[Column, ...]
+
+    @property
+    def schema(self) -> pa.Schema:
+        """Its Arrow schema."""
+        return pa.schema([column.field for column in self.columns], metadata={"coldloop_format": str(FORMAT)})
+
+
+@cache
+def files_of(process: Process) -> dict[str, RunFile]:
+    """Return the files of a run of a process, by name."""
+    maps, tick = maps_of(process), process.tick_unit
+    return {
+        TRACE: RunFile(f"One row a tick of {tick}", _trace(process, maps)),
+        UPDATES: RunFile("One row an update whose sequence was played", _updates(process, maps)),
+        EVENTS: RunFile("One row an event of the journals: modes, alarms, commands", _events(process, maps)),
+        STATION: RunFile(
+            "One row a tick: compression station and nitrogen; only where the plant is a refrigerator",
+            _station(process, maps),
+        ),
+    }
+
+
+def _when(process: Process) -> tuple[Column, Column]:
+    return (
+        Column("tick", pa.int64(), "1", f"Tick since the start of the session, of {process.tick_unit}"),
+        Column("time_s", pa.float64(), "s", "Plant time since the start of the session"),
+    )
+
+
 _TAU_U: Final = Column("tau_u_s", pa.float64(), "s", "Updating period t_{i+1} - t_i")
-_UPDATE: Final = OPTIMIZER_MAP.block_of(Optimization).fields
-_EVENT: Final = CONTROL_MAP.block_of(Event).fields
-
-MODEL_RANGE_COLUMN: Final = Column(
-    "model_range", pa.int32(), "1", PLANT_MAP.block_of(ModelRangeStatus).fields["outside"].description
-)
-
-PHYSICAL_COLUMNS: Final = (
-    Column(
-        LOAD_COLUMN, pa.float32(), PROCESS.load.unit or "1", PLANT_MAP.block_of(PlantSample).fields["load"].description
-    ),
-    *(
-        Column(one.name, pa.float32(), one.unit, f"{one.description}; applied from this tick on")
-        for one in PROCESS.inputs
-    ),
-    *(
-        Column(name, pa.float32(), unit, f"Output {name}: with the noise of its sensor, without a sensor fault")
-        for name, unit in zip(OUTPUT_NAMES, OUTPUT_UNITS, strict=True)
-    ),
-    *(
-        Column(f"x_{name}", pa.float32(), unit, f"Simulated state {name}")
-        for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True)
-    ),
-)
-"""Load, inputs, outputs and states, in the order of the digest of a trace."""
-
-HELD_COLUMNS: Final = (
-    Column("update", pa.int64(), "1", "Last update whose sequence was played; null before the first"),
-    _TAU_U,
-    Column("iterations", pa.int32(), "1", _UPDATE["iterations"].description),
-    Column("J", pa.float32(), "1", _UPDATE["j_effective"].description),
-)
-"""What the optimiser was doing."""
-
-DRIVING_COLUMNS: Final = (
+_DRIVING: Final = (
     Column("mode", pa.string(), "", "Mode of the fail-safe ladder: mpc, rest, hold, classical, manual"),
     Column("cause", pa.string(), "", "Why the control PLC is in this mode"),
     Column("driver", pa.string(), "", "Whose inputs are applied: optimizer, loops, operator, or nobody (held)"),
     Column("bad_sensors", pa.string(), "", "Outputs whose measurement the control PLC substitutes; empty when none"),
-)
-"""What the control PLC was doing, by its events."""
-
-MEASURED_COLUMNS: Final = tuple(
-    Column(f"{OUTPUT_NAMES[output]}_measured", pa.float32(), OUTPUT_UNITS[output],
-           f"What the sensor of {OUTPUT_NAMES[output]} showed, with its faults; null when it was no number")
-    for output in SHOWN
-)  # fmt: skip
-
-TRACE: Final = (
-    _TICK,
-    _TIME,
-    *PHYSICAL_COLUMNS,
-    *MEASURED_COLUMNS,
-    *DRIVING_COLUMNS,
     Column("stage_cost", pa.float64(), "1", "Stage cost of what was reached: deviations and violations of the bands"),
-    *HELD_COLUMNS,
-    MODEL_RANGE_COLUMN,
 )
-
-UPDATES: Final = (
-    Column("update", pa.int64(), "1", "Number of the update"),
-    _TICK._replace(description="Tick of the updating instant t_i"),
-    _TIME._replace(description="Plant time of the updating instant t_i"),
-    _TAU_U,
-    *(
-        Column(name, pa.float32() if field.kind.label == "float32" else pa.int32(), field.unit or "1",
-               field.description, Verdict if name == "verdict" else None)
-        for name, field in _UPDATE.items() if name not in ("update", "tick", "tau_u")
-    ),
-)  # fmt: skip
-
-EVENTS: Final = (
-    Column("service", pa.string(), "", "Whose journal: control_plc or plant"),
-    Column("number", pa.int64(), "1", _EVENT["number"].description),
-    Column("boot", pa.int32(), "1", _EVENT["boot"].description),
-    Column("utc", pa.string(), "", "UTC, ISO 8601 with milliseconds"),
-    _TICK,
-    _TIME,
-    Column("kind", pa.string(), "", "What happened: mode, alarm raised, setpoint, ..."),
-    Column("subject", pa.string(), "", "The new mode, the alarm, the input, ...: depends on the kind"),
-    Column("cause", pa.string(), "", "Why; empty when there is no cause"),
-    Column("value", pa.float32(), "", "A value; null when the kind has none"),
-    Column("unit", pa.string(), "", "Unit of the value; empty when it has none"),
-    Column("who", pa.string(), "", "Client that made the request: address, role, certificate; empty if there is none"),
-)
-
-FILES: Final = {
-    "trace.parquet": (f"One row a tick of {TICK_UNIT}", TRACE),
-    "updates.parquet": ("One row an update whose sequence was played", UPDATES),
-    "events.parquet": ("One row an event of the journals: modes, alarms, commands", EVENTS),
-}
-
-_STATION: Final = PLANT_MAP.block_of(StationSample).fields
-STATION: Final = (
-    _TICK,
-    _TIME,
-    *(
-        Column(name, pa.float32(), unit, _STATION["signals"].description)
-        for name, unit in zip(STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, strict=True)
-    ),
-    Column("mode", pa.int32(), "1", _STATION["mode"].description, StationMode),
-    Column("alarms", pa.int32(), "1", _STATION["alarms"].description),
-)
-STATION_FILE: Final = "station.parquet"
-STATION_FILES: Final = {
-    STATION_FILE: ("One row a tick: compression station and nitrogen; only where the plant is a refrigerator", STATION)
-}
-ALL_FILES: Final = {**FILES, **STATION_FILES}
+"""What the control PLC was doing, by its events, and what that cost."""
 
 
-def arrow_schema(columns: Sequence[Column]) -> pa.Schema:
-    """Return the Arrow schema of a file."""
-    return pa.schema([column.field for column in columns], metadata={"coldloop_format": str(FORMAT)})
+def _physical(process: Process, maps: Maps) -> tuple[Column, ...]:
+    """Return load, inputs, outputs and states, in the order of the digest of a trace; then what sensors showed."""
+    load = maps.plant.block_of(PlantSample).fields["load"].description
+    return (
+        Column(process.load.column, pa.float32(), process.load.unit or "1", load),
+        *(
+            Column(one.name, pa.float32(), one.unit, f"{one.description}; applied from this tick on")
+            for one in process.inputs
+        ),
+        *(
+            Column(one.name, pa.float32(), one.unit,
+                   f"Output {one.name}: with the noise of its sensor, without a sensor fault")
+            for one in process.outputs
+        ),
+        *(Column(f"x_{one.name}", pa.float32(), one.unit, f"Simulated state {one.name}") for one in process.states),
+        *(
+            Column(f"{one.name}_measured", pa.float32(), one.unit,
+                   f"What the sensor of {one.name} showed, with its faults; null when it was no number")
+            for one in process.banded
+        ),
+    )  # fmt: skip
 
 
-def schema_document(*, station: bool = False) -> dict[str, Any]:
+def _trace(process: Process, maps: Maps) -> tuple[Column, ...]:
+    update = maps.optimizer_plc.block_of(Optimization).fields
+    outside = maps.plant.block_of(ModelRangeStatus).fields["outside"].description
+    return (
+        *_when(process),
+        *_physical(process, maps),
+        *_DRIVING,
+        Column("update", pa.int64(), "1", "Last update whose sequence was played; null before the first"),
+        _TAU_U,
+        Column("iterations", pa.int32(), "1", update["iterations"].description),
+        Column("J", pa.float32(), "1", update["j_effective"].description),
+        Column("model_range", pa.int32(), "1", outside),
+    )
+
+
+def _updates(process: Process, maps: Maps) -> tuple[Column, ...]:
+    tick, time = _when(process)
+    return (
+        Column("update", pa.int64(), "1", "Number of the update"),
+        tick._replace(description="Tick of the updating instant t_i"),
+        time._replace(description="Plant time of the updating instant t_i"),
+        _TAU_U,
+        *(
+            Column(name, pa.float32() if field.kind.label == "float32" else pa.int32(), field.unit or "1",
+                   field.description, Verdict if name == "verdict" else None)
+            for name, field in maps.optimizer_plc.block_of(Optimization).fields.items()
+            if name not in ("update", "tick", "tau_u")
+        ),
+    )  # fmt: skip
+
+
+def _events(process: Process, maps: Maps) -> tuple[Column, ...]:
+    event = maps.control_plc.block_of(Event).fields
+    return (
+        Column("service", pa.string(), "", "Whose journal: control_plc or plant"),
+        Column("number", pa.int64(), "1", event["number"].description),
+        Column("boot", pa.int32(), "1", event["boot"].description),
+        Column("utc", pa.string(), "", "UTC, ISO 8601 with milliseconds"),
+        *_when(process),
+        Column("kind", pa.string(), "", "What happened: mode, alarm raised, setpoint, ..."),
+        Column("subject", pa.string(), "", "The new mode, the alarm, the input, ...: depends on the kind"),
+        Column("cause", pa.string(), "", "Why; empty when there is no cause"),
+        Column("value", pa.float32(), "", "A value; null when the kind has none"),
+        Column("unit", pa.string(), "", "Unit of the value; empty when it has none"),
+        Column(
+            "who", pa.string(), "", "Client that made the request: address, role, certificate; empty if there is none"
+        ),
+    )
+
+
+def _station(process: Process, maps: Maps) -> tuple[Column, ...]:
+    fields = maps.plant.block_of(StationSample).fields
+    return (
+        *_when(process),
+        *(
+            Column(name, pa.float32(), unit, fields["signals"].description)
+            for name, unit in zip(STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, strict=True)
+        ),
+        Column("mode", pa.int32(), "1", fields["mode"].description, StationMode),
+        Column("alarms", pa.int32(), "1", fields["alarms"].description),
+    )
+
+
+def schema_document(process: Process, *, station: bool = False) -> dict[str, Any]:
     """Return the content of `schema.json`; with the station's file where there is one."""
-    files = ALL_FILES if station else FILES
     return {
         "format": FORMAT,
         "files": {
-            name: {"description": description, "columns": [_described(column) for column in columns]}
-            for name, (description, columns) in files.items()
+            name: {"description": file.description, "columns": [_described(column) for column in file.columns]}
+            for name, file in files_of(process).items()
+            if station or name != STATION
         },
     }
 

@@ -2,14 +2,14 @@
 
 import math
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from coldloop.process.signals import CONTROLLED, OUTPUT_NAMES
+from coldloop.process.declaration import Process
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.plant import SensorFaultKind
@@ -27,8 +27,6 @@ DRIVERS: Final[Mapping[int, str]] = {
     Mode.MANUAL: "operator",
 }
 """Source of the applied inputs in each mode; "nobody" while the last ones are held."""
-SHOWN: Final = CONTROLLED
-"""Outputs of which the trace has what the sensor showed."""
 
 
 class Driving(NamedTuple):
@@ -50,29 +48,30 @@ class SensorFaultRecord(NamedTuple):
 
 
 class DrivingHistory:
-    """Takes events in the order of each journal; returns the columns of ticks that do not come back.
+    """Takes events of a process in the order of each journal; returns the columns of ticks that do not come back.
 
     A restarted control PLC may resume some ticks back: its later events hold from there on.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, process: Process) -> None:
+        self.process = process
         self._states = [Driving()]
-        self._faults: dict[int, list[SensorFaultRecord]] = {output: [] for output in SHOWN}
-        self._held = dict.fromkeys(SHOWN, math.nan)
+        self._faults: dict[int, list[SensorFaultRecord]] = {output: [] for output in process.controlled}
+        self._held = dict.fromkeys(process.controlled, math.nan)
         """What a frozen sensor shows."""
 
     def event(self, service: str, event: Event) -> None:
         """Take an event."""
         if service == PLANT:
             if event.kind == EventKind.SESSION:  # it begins with healthy sensors
-                self._faults = {output: [] for output in SHOWN}
+                self._faults = {output: [] for output in self._faults}
             elif event.kind == EventKind.SENSOR_FAULT and event.subject in self._faults:
                 self._faults[event.subject].append(SensorFaultRecord(event.tick, event.cause, event.value))
             return
         last = self._states[-1]
         if event.kind == EventKind.MODE:
             self._change(last._replace(tick=event.tick, mode=event.subject, cause=event.cause))
-        elif event.kind == EventKind.SENSOR and event.subject < len(OUTPUT_NAMES):
+        elif event.kind == EventKind.SENSOR and event.subject < len(self.process.outputs):
             bad = last.bad | {event.subject} if event.cause else last.bad - {event.subject}
             self._change(last._replace(tick=event.tick, bad=bad))
 
@@ -85,17 +84,17 @@ class DrivingHistory:
         """Return mode, cause, driver and bad sensors at these ticks, which are in a row."""
         starts = [state.tick for state in self._states[1:]]
         places = np.searchsorted(starts, ticks, side="right")
-        texts = [_texts(state) for state in self._states]
+        texts = [_texts(state, self.process.output_names) for state in self._states]
         return [text_array([text[name] for text in texts], places) for name in _TEXTS]
 
     def measured(self, ticks: NDArray[np.int64], y: NDArray[np.float32]) -> list[pa.Array]:
-        """Return what the sensors of `SHOWN` showed; null where it was not a number.
+        """Return what the sensors of outputs with a band showed; null where it was not a number.
 
         Args:
             ticks: N ticks in a row.
-            y: Outputs without faults, shape (N, 22).
+            y: Outputs without faults, shape (N, outputs).
         """
-        shown = [self._shown(output, ticks, y[:, output].copy()) for output in SHOWN]
+        shown = [self._shown(output, ticks, y[:, output].copy()) for output in self._faults]
         return [number_array(column, pa.float32(), np.isnan(column)) for column in shown]
 
     def _shown(self, output: int, ticks: NDArray[np.int64], values: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -124,8 +123,8 @@ class DrivingHistory:
 _TEXTS: Final = ("mode", "cause", "driver", "bad_sensors")
 
 
-def _texts(state: Driving) -> dict[str, str | None]:
-    bad = " ".join(OUTPUT_NAMES[output] for output in sorted(state.bad))
+def _texts(state: Driving, output_names: Sequence[str]) -> dict[str, str | None]:
+    bad = " ".join(output_names[output] for output in sorted(state.bad))
     if state.mode is None:
         return dict(zip(_TEXTS, (None, None, None, bad), strict=True))
     words = (word_of(Mode, state.mode), word_of(Cause, state.cause), DRIVERS.get(state.mode), bad)

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from coldloop.errors import UsageError
 from coldloop.whole_file import whole_file
 from rig.durations import LONGEST_TICKS
-from rig.results.columns import ALL_FILES, FILES
+from rig.results.columns import FILES, STATION
 from rig.results.folders import prepare_folder, writing
 from rig.results.run_folder import MOST_IN_MEMORY, RunFolder
 
@@ -49,7 +49,7 @@ Writers = dict[str, Callable[[Path], object]]
 
 
 def _tables(run: RunFolder, most: int = LONGEST_TICKS) -> Tables:
-    present = [name for name in ALL_FILES if name in FILES or (run.path / name).exists()]
+    present = [name for name in FILES if name != STATION or (run.path / name).exists()]
     return {name.removesuffix(".parquet"): run.file(name, most) for name in present}
 
 

@@ -9,9 +9,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from coldloop.errors import ResultsError
+from coldloop.process.declaration import Process
 from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
-from rig.results.columns import ALL_FILES, STATION_FILE, arrow_schema
+from rig.results.columns import EVENTS, STATION, TRACE, UPDATES, files_of
 from rig.results.disk_reserve import DiskReserve, ReservedFile
 from rig.results.driving import DrivingHistory
 from rig.results.indicators import StageCost
@@ -34,11 +35,11 @@ GROUP_ROWS: Final = 16_384
 class ParquetFile:
     """A file of a run, with the columns that are declared for its name."""
 
-    def __init__(self, path: Path, reserve: DiskReserve) -> None:
+    def __init__(self, path: Path, reserve: DiskReserve, process: Process) -> None:
         self._file = ReservedFile(path, reserve)
         self._reserve = reserve
         self._path = path
-        schema = arrow_schema(ALL_FILES[path.name][1])
+        schema = files_of(process)[path.name].schema
         self._writer = pq.ParquetWriter(
             pa.PythonFile(self._file, mode="w"), schema, compression="zstd", write_statistics=SEARCHED,
             use_dictionary=[field.name for field in schema if pa.types.is_string(field.type)],
@@ -73,10 +74,10 @@ class TraceSink(Sink):
     """Writes `trace.parquet`."""
 
     def __init__(self, folder: Path, reserve: DiskReserve, cost: StageCost) -> None:
-        self._file = ParquetFile(folder / "trace.parquet", reserve)
+        self._file = ParquetFile(folder / TRACE, reserve, cost.process)
         self._cost = cost
         self._blocks: list[SampleBlock] = []
-        self._driving = DrivingHistory()
+        self._driving = DrivingHistory(cost.process)
         self._updates: deque[Optimization] = deque()
 
     def update(self, update: Optimization) -> None:
@@ -116,8 +117,8 @@ class TraceSink(Sink):
 class StationSink(Sink):
     """Writes `station.parquet`, if there is a station."""
 
-    def __init__(self, folder: Path, reserve: DiskReserve) -> None:
-        self._path, self._reserve = folder / STATION_FILE, reserve
+    def __init__(self, folder: Path, reserve: DiskReserve, process: Process) -> None:
+        self._path, self._reserve, self._process = folder / STATION, reserve, process
         self._file: ParquetFile | None = None
         self._blocks: list[SampleBlock] = []
 
@@ -126,7 +127,7 @@ class StationSink(Sink):
         if not block.station.size:
             return
         if self._file is None:
-            self._file = ParquetFile(self._path, self._reserve)
+            self._file = ParquetFile(self._path, self._reserve, self._process)
         self._blocks.append(block)
         if sum(len(one.load) for one in self._blocks) >= GROUP_TICKS:
             self._write(self._file)
@@ -134,7 +135,7 @@ class StationSink(Sink):
 
     def _write(self, file: ParquetFile) -> None:
         blocks, self._blocks = self._blocks, []
-        file.write(station_table(joined(blocks)))
+        file.write(station_table(joined(blocks), self._process))
 
     def close(self) -> None:
         """Write the rest."""
@@ -149,9 +150,11 @@ class StationSink(Sink):
 class _RowFile(Generic[T]):
     """A file of rows that come one by one."""
 
-    def __init__(self, path: Path, reserve: DiskReserve, as_table: Callable[[Sequence[T]], pa.Table]) -> None:
-        self._file = ParquetFile(path, reserve)
-        self._as_table = as_table
+    def __init__(
+        self, path: Path, reserve: DiskReserve, process: Process, as_table: Callable[[Sequence[T], Process], pa.Table]
+    ) -> None:
+        self._file = ParquetFile(path, reserve, process)
+        self._process, self._as_table = process, as_table
         self._rows: list[T] = []
 
     def add(self, row: T) -> None:
@@ -163,7 +166,7 @@ class _RowFile(Generic[T]):
 
     def _write(self) -> None:
         rows, self._rows = self._rows, []
-        self._file.write(self._as_table(rows))
+        self._file.write(self._as_table(rows, self._process))
 
     def close(self) -> None:
         """Write the rest."""
@@ -177,8 +180,8 @@ class _RowFile(Generic[T]):
 class UpdatesSink(Sink):
     """Writes `updates.parquet`."""
 
-    def __init__(self, folder: Path, reserve: DiskReserve) -> None:
-        self._rows = _RowFile(folder / "updates.parquet", reserve, updates_table)
+    def __init__(self, folder: Path, reserve: DiskReserve, process: Process) -> None:
+        self._rows = _RowFile(folder / UPDATES, reserve, process, updates_table)
 
     def update(self, update: Optimization) -> None:
         """Write an update."""
@@ -192,8 +195,8 @@ class UpdatesSink(Sink):
 class EventsSink(Sink):
     """Writes `events.parquet`."""
 
-    def __init__(self, folder: Path, reserve: DiskReserve) -> None:
-        self._rows = _RowFile(folder / "events.parquet", reserve, events_table)
+    def __init__(self, folder: Path, reserve: DiskReserve, process: Process) -> None:
+        self._rows = _RowFile(folder / EVENTS, reserve, process, events_table)
 
     def event(self, service: str, event: Event) -> None:
         """Write an event."""

@@ -2,15 +2,14 @@
 
 import hashlib
 import math
-from collections import namedtuple
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.loaded import PROCESS
+from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import CONTROLLED, STATE_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from optimizer_plc.qp.design import ControlDesign
@@ -18,7 +17,7 @@ from optimizer_plc.qp.prediction import state_weights
 from rig.results.recording import BLOCK_TICKS, Recording, SampleBlock, Sink
 
 
-class _Indicators(NamedTuple):
+class Indicators(NamedTuple):
     """Costs are in the units of the predictive problem's J; sums run over the problems solved, as in the paper.
 
     What does not exist is NaN: without updates all that is predicted, without ticks all that is measured.
@@ -42,57 +41,44 @@ class _Indicators(NamedTuple):
     tau_u_mean_per_update: float
     """Mean updating period over the updates, s, in which short periods count more often."""
     iterations_total: int
+    outside_band_pct: Mapping[str, float]
+    """For each output that has a band, by name, the share of the ticks that are known, %, in which it was outside."""
 
-
-if TYPE_CHECKING:
-
-    class Indicators(_Indicators):
-        """Those, and for each output that has a band the share of the ticks that are known, %, in which it was outside.
-
-        Their names are made of the outputs'; those of the cold box are here.
-        """
-
-        L1_outside_band_pct: float
-        T5_outside_band_pct: float
-
-        def __new__(cls, *values: float, **named: float) -> Self: ...  # noqa: D102
-
-else:
-    Indicators = namedtuple(  # noqa: PYI024 the fields vary
-        "Indicators", (*_Indicators._fields, *(f"{one.name}_outside_band_pct" for one in PROCESS.banded))
-    )
-
-
-DEAD_BANDS: Final = np.array(PROCESS.dead_bands)
-"""Shape (bands,)."""
+    @property
+    def by_name(self) -> dict[str, float]:
+        """All of them, by the names that they have in `summary.json`."""
+        shares = {f"{name}_outside_band_pct": share for name, share in self.outside_band_pct.items()}
+        return {**dict(zip(self._fields[:-1], self[:-1], strict=True)), **shares}
 
 
 def excess_of(y: NDArray[Any], design: ControlDesign) -> NDArray[np.float64]:
     """Return by how much outputs (N, outputs) are beyond their bands, shape (N, bands); NaN where one is unknown.
 
-    An output is outside where that is more than its dead band, of `DEAD_BANDS`.
+    An output is outside where that is more than its dead band.
     """
-    constrained = y[:, CONTROLLED].astype(float)
+    constrained = y[:, design.process.controlled].astype(float)
     beyond = np.maximum(constrained - design.output_high, design.output_low - constrained)
     return np.maximum(beyond, 0.0)
 
 
-EXCESS_KEYS: Final = tuple(
-    f"{one.name}_{what}"
-    for one in PROCESS.banded
-    for what in ("outside_dead_band_pct", "largest_excess", "excess_integral")
-)
-"""Of each output with a band: share of the known ticks in which it was beyond by more than its dead band, %; largest
-excess over the band itself, in its unit; the time integral of that, in its unit times s."""
+def excess_keys(process: Process) -> list[str]:
+    """Return the names of what is known of the excess of each output with a band.
+
+    They are the share of the known ticks in which it was beyond by more than its dead band, %; the largest excess over
+    the band itself, in its unit; the time integral of that, in its unit times s.
+    """
+    known = ("outside_dead_band_pct", "largest_excess", "excess_integral")
+    return [f"{one.name}_{what}" for one in process.banded for what in known]
 
 
 class StageCost:
     """The stage cost of what was really reached: deviations from the operating point, and violations of the bands."""
 
     def __init__(self, model: LtiModel, design: ControlDesign) -> None:
-        n = len(STATE_NAMES)  # a model of the whole refrigerator has further ones, which weigh nothing
+        self.process = design.process
+        n = len(self.process.states)  # a model of the whole refrigerator has further ones, which weigh nothing
         self._x0, self._u0, self._y0 = model.x0[:n], model.u0, model.y0
-        self._output_weights = np.array([output.weight for output in PROCESS.outputs])
+        self._output_weights = np.array([output.weight for output in self.process.outputs])
         self._outputs_weigh = bool(self._output_weights.any())
         self._state_weights = state_weights(model, design)[:n]
         self._design = design
@@ -122,10 +108,10 @@ class RunEvaluation(Sink):
 
     def __init__(self, model: LtiModel, design: ControlDesign) -> None:
         self._cost = StageCost(model, design)
-        self._design = design
+        self.process, self._design = design.process, design
         self._digest = hashlib.sha256()
-        self._outside = np.zeros(len(CONTROLLED), dtype=int)
-        self._beyond, self._furthest, self._excess = np.zeros((3, len(CONTROLLED)))
+        self._outside = np.zeros(len(self.process.banded), dtype=int)
+        self._beyond, self._furthest, self._excess = np.zeros((3, len(self.process.banded)))
         self._stage_costs = 0.0
         self._j_dev = self._j_cst = self._weighted = self._violations = self._largest = 0.0
         self._taus = self._squared_taus = self._delivered = self._known = 0
@@ -133,13 +119,13 @@ class RunEvaluation(Sink):
 
     def block(self, block: SampleBlock) -> None:
         """Take ticks."""
-        constrained = block.y[:, CONTROLLED]
+        constrained = block.y[:, self.process.controlled]
         outside = (constrained < self._design.output_low) | (constrained > self._design.output_high)
         self._outside += outside.sum(axis=0)
         excess = excess_of(block.y, self._design)
-        self._beyond += (excess > DEAD_BANDS).sum(axis=0)
+        self._beyond += (excess > self.process.dead_bands).sum(axis=0)
         self._furthest = np.fmax(self._furthest, np.fmax.reduce(excess, axis=0, initial=0.0))
-        self._excess += np.nansum(excess, axis=0) * TICK_S
+        self._excess += np.nansum(excess, axis=0) * self.process.tick_s
         self._known += int(np.isfinite(block.load).sum())
         self._stage_costs += float(np.nansum(self._cost.of(block)))
         self._digest.update(block.digested)
@@ -169,29 +155,29 @@ class RunEvaluation(Sink):
 
     @property
     def excesses(self) -> dict[str, float]:
-        """How far each output with a band was beyond it, by `EXCESS_KEYS`; NaN where no tick is known."""
+        """How far each output with a band was beyond it, by `excess_keys`; NaN where no tick is known."""
         known = self._known or math.nan
         exists = known / known
         by_band = zip(100.0 * self._beyond / known, self._furthest * exists, self._excess * exists, strict=True)
-        return dict(zip(EXCESS_KEYS, [float(value) for values in by_band for value in values], strict=True))
+        return dict(zip(excess_keys(self.process), [float(one) for values in by_band for one in values], strict=True))
 
     @property
     def indicators(self) -> Indicators:
         """The indicators of what was taken so far."""
         count, known = self.updates or math.nan, self._known or math.nan
-        exists = 1.0 if self.updates else math.nan
-        names, shares = Indicators._fields[-len(CONTROLLED) :], (100.0 * self._outside / known).tolist()
+        exists, tick_s = 1.0 if self.updates else math.nan, self.process.tick_s
+        shares = (100.0 * self._outside / known).tolist()
         return Indicators(
             J_dev=self._j_dev * exists,
             J_cst=self._j_cst * exists,
             J_open_mean=self._weighted / (self._delivered or math.nan),
-            J_BF=self._stage_costs / TICKS_PER_SAMPLE if self._known else math.nan,
+            J_BF=self._stage_costs / self.process.ticks_per_sample if self._known else math.nan,
             c1=self._largest * exists,
             c2=self._violations / count,
-            tau_u_mean=self._squared_taus * TICK_S / (self._taus or math.nan),
-            tau_u_mean_per_update=self._taus * TICK_S / count,
+            tau_u_mean=self._squared_taus * tick_s / (self._taus or math.nan),
+            tau_u_mean_per_update=self._taus * tick_s / count,
             iterations_total=self.iterations,
-            **dict(zip(names, shares, strict=True)),
+            outside_band_pct={one.name: share for one, share in zip(self.process.banded, shares, strict=True)},
         )
 
 

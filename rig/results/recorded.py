@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
@@ -36,11 +35,11 @@ class SampleBlock(NamedTuple):
     load: FloatArray
     """W, shape (N,)."""
     u: FloatArray
-    """Inputs applied, shape (N, 3)."""
+    """Inputs applied, shape (N, inputs)."""
     y: FloatArray
-    """Measured outputs, shape (N, 22)."""
+    """Measured outputs, shape (N, outputs)."""
     x: FloatArray
-    """Simulated states, shape (N, 28)."""
+    """Simulated states, shape (N, states)."""
     station: FloatArray = NO_STATION
     """Signals, mode and alarms of the compression station, shape (N, 21); (0, 0) for a cold box alone."""
 
@@ -48,7 +47,7 @@ class SampleBlock(NamedTuple):
     def of(cls, samples: Sequence[PlantSample]) -> "SampleBlock":
         """Return samples that follow each other as a block."""
         pending = PendingTicks(samples[0].tick)
-        pending.extend(len(samples))
+        pending.extend(len(samples), samples[0])
         for sample in samples:
             pending.put(sample, None)
         return pending.take(len(samples))
@@ -63,7 +62,7 @@ class SampleBlock(NamedTuple):
 
     @property
     def rows(self) -> NDArray[np.float32]:
-        """Load, inputs, outputs and states side by side, shape (N, 54)."""
+        """Load, inputs, outputs and states side by side, shape (N, signals)."""
         side_by_side = np.hstack([self.load[:, None], self.u, self.y, self.x])
         return np.ascontiguousarray(side_by_side, dtype="<f4")
 
@@ -79,14 +78,16 @@ class PendingTicks:
     """The newest ticks of a run, in a row, which may still be replaced; `first` is the oldest of them."""
 
     def __init__(self, first: int = 0) -> None:
-        sizes = (1, len(INPUT_NAMES), len(OUTPUT_NAMES), len(STATE_NAMES), STATION_COLUMNS)
-        self._parts = [np.empty((2048, size), np.float32) for size in sizes]
+        self._parts: list[FloatArray] = []
         self._has_station = False
         self.first, self.count = first, 0
 
-    def extend(self, ticks: int) -> None:
-        """Add ticks of which nothing is known."""
+    def extend(self, ticks: int, like: PlantSample | SampleBlock) -> None:
+        """Add ticks of which nothing is known, of as many signals as a sample or a block has."""
         end = self.count + ticks
+        if not self._parts:
+            sizes = (1, *(np.shape(part)[-1] for part in (like.u, like.y, like.x)), STATION_COLUMNS)
+            self._parts = [np.empty((max(2048, end), size), np.float32) for size in sizes]
         if end > len(self._parts[0]):
             self._parts = [np.resize(part, (2 * end, part.shape[1])) for part in self._parts]
         for part in self._parts:
@@ -126,8 +127,7 @@ class PendingTicks:
 def joined(blocks: Sequence[SampleBlock]) -> SampleBlock:
     """Return blocks that follow each other as one."""
     if not blocks:
-        sizes = (len(INPUT_NAMES), len(OUTPUT_NAMES), len(STATE_NAMES))
-        return SampleBlock(0, np.empty(0, np.float32), *(np.empty((0, size), np.float32) for size in sizes))
+        return SampleBlock(0, np.empty(0, np.float32), *(np.empty((0, 0), np.float32) for _ in range(3)))
     columns = (np.concatenate(parts) for parts in zip(*(block[1:] for block in blocks), strict=True))
     return SampleBlock(blocks[0].first, *columns)
 
@@ -138,11 +138,11 @@ class Recording(NamedTuple):
     load: FloatArray
     """W, shape (N,)."""
     u: FloatArray
-    """Inputs applied, shape (N, 3)."""
+    """Inputs applied, shape (N, inputs)."""
     y: FloatArray
-    """Measured outputs, shape (N, 22)."""
+    """Measured outputs, shape (N, outputs)."""
     x: FloatArray
-    """Simulated states, shape (N, 28)."""
+    """Simulated states, shape (N, states)."""
     updates: list[Optimization]
     link: LinkStatistics
     station: FloatArray = NO_STATION

@@ -155,7 +155,7 @@ class Recorder:
         missing = max(0, sample.tick - self.next_tick)
         again = sample.tick < self.next_tick
         if not again:
-            self._pending.extend(missing + 1)
+            self._pending.extend(missing + 1, sample)
             self.next_tick = sample.tick + 1
         unknown = self._pending.put(sample, self._stations.pop(sample.tick, None))
         self.missing_ticks += missing - (again and unknown)
@@ -169,7 +169,7 @@ class Recorder:
         """
         for update in updates:
             self.update(update)
-        self._pending.extend(len(block.load))
+        self._pending.extend(len(block.load), block)
         self._pending.put_block(block)
         self.next_tick += len(block.load)
         load, u, y, x = (part[-1].tolist() for part in (block.load, block.u, block.y, block.x))

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -17,14 +18,13 @@ from coldloop.errors import UsageError, printable
 from coldloop.parsing import parsed_json
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
-from coldloop.process.loaded import PROCESS
 from coldloop.process.model_file import read_document
 from coldloop.registers.control_plc import Mode
 from coldloop.service.event_text import word
 from coldloop.text_file import held_file, read_text
 from rig.durations import LONGEST_TICKS
 from rig.results.arrow_arrays import numbers_of
-from rig.results.columns import ALL_FILES, EVENTS, FORMAT
+from rig.results.columns import EVENTS, FORMAT, TRACE, files_of
 
 Curves = dict[str, NDArray[np.float64]]
 """Columns by name; what is null is NaN."""
@@ -43,7 +43,6 @@ GONE: Final = frozenset(
 )
 """Settings of a rule that was replaced, which are in the manifests of runs that did not use it, too."""
 TAU_U: Final = "tau_u_s"
-EVENTS_FILE: Final = "events.parquet"
 DRAWN_TICKS: Final = 60_000
 """A longer trace is drawn by the least and the largest value of many ticks."""
 
@@ -64,10 +63,6 @@ MOST_IN_MEMORY: Final = 2_000_000
 """Rows of a file that is read as a whole: 139 h of ticks."""
 MOST_LISTED: Final = 500_000
 """Rows of a file of which each becomes an object of Python: events and updates."""
-KINDS: Final = {
-    name: {column.name: column.kind for column in columns} for name, (_, columns) in ALL_FILES.items()
-}  # fmt: skip
-"""Types of the columns of each file."""
 Ticks = Annotated[int, Field(ge=0, le=LONGEST_TICKS)]
 
 
@@ -188,7 +183,7 @@ class RunFolder:
         path = self.held(name)
         try:
             file = pq.ParquetFile(path)
-            wrong = self._excess(name, file.metadata, most) or _other_type(name, file.schema_arrow)
+            wrong = self._excess(name, file.metadata, most) or self._other_type(name, file.schema_arrow)
             if not wrong and _has_long_text(path, file.schema_arrow):
                 wrong = f"a text of more than {MOST_TEXT} bytes"
         except (OSError, pa.ArrowException) as error:
@@ -201,9 +196,9 @@ class RunFolder:
         """Return what a file has too much of, by its footer."""
         rows, ticks = footer.num_rows, self.manifest["recorded_ticks"]
         size = sum(footer.row_group(group).total_byte_size for group in range(footer.num_row_groups))
-        if name != EVENTS_FILE and rows > ticks:
+        if name != EVENTS and rows > ticks:
             return f"{rows} rows, and manifest.json says {ticks} ticks"
-        if not rows and name == "trace.parquet":
+        if not rows and name == TRACE:
             return "no rows"
         if rows > most:
             return f"{rows} rows; {most} at most are read into memory"
@@ -211,47 +206,33 @@ class RunFolder:
             return f"{footer.num_columns} columns of {size} bytes in {rows} rows"
         return ""
 
-    @property
+    def _other_type(self, name: str, schema: pa.Schema) -> str:
+        """Return which column has another type than in our file, or one that no column of it has."""
+        kinds = {column.name: column.kind for column in files_of(self.process)[name].columns}
+        for field in schema:
+            if field.type not in ({kinds[field.name]} if field.name in kinds else {*kinds.values()}):
+                return f"{printable(field.name[:MOST_TEXT])} is {str(field.type)[:80]}"
+        return ""
+
+    @cached_property
     def process(self) -> Process:
         """The process that was run, as it was then.
 
         Raises:
             UsageError: Its declaration is none that this version makes.
         """
+        declared = self.model.get("process")
         try:
-            return Process.of(self._process) if self._process else COLD_BOX
+            return Process.of(declared) if declared else COLD_BOX
         except (KeyError, TypeError, ValueError) as error:
-            raise UsageError(
-                f"{self.path / str(self._model)}: process: {error}; use the version of Coldloop that made this run"
-            ) from None
+            place = self.path / self.manifest["inputs"]["model"]["file"]
+            raise UsageError(f"{place}: process: {error}; use the version of Coldloop that made this run") from None
 
     @property
-    def remedy(self) -> str:
-        """What to do where it is not the one that is loaded."""
-        if not self._process:
-            return "leave out --process"
-        return "name its file with --process; rerun --trust executes the plant that the folder holds"
-
-    @property
-    def model_digest(self) -> str | None:
-        """Digest of the copy of its model; None for the shipped one of the cold box."""
-        return self._document_of_model.get("digest")
-
-    @property
-    def _process(self) -> dict[str, Any]:
-        """Declaration of the process, from the copy of its model; empty for the cold box."""
-        found: dict[str, Any] = self._document_of_model.get("process", {})
-        return found
-
-    @property
-    def _document_of_model(self) -> dict[str, Any]:
-        return read_document(self.held(self._model), "restore it") if self._model else {}
-
-    @property
-    def _model(self) -> str | None:
-        """Place of the copy of its model; None for the shipped one of the cold box."""
-        place: str | None = self.manifest["inputs"].get("model", {}).get("file")
-        return place
+    def model(self) -> dict[str, Any]:
+        """The copy of its model file; empty where there is none, as of the cold box that is shipped."""
+        place: str | None = self.manifest["inputs"]["model"]["file"]
+        return read_document(self.held(place), "restore it") if place else {}
 
     @contextmanager
     def reading(self, name: str, most: int = LONGEST_TICKS) -> Iterator[pq.ParquetFile]:
@@ -264,14 +245,10 @@ class RunFolder:
             with self.file(name, most) as file:
                 yield file
         except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
-            if self.process.name != PROCESS.name:
-                raise UsageError(
-                    f"{self.path}: a run of {self.process.name}, and not of {PROCESS.name}; {self.remedy}"
-                ) from None
             reason = (str(error) or type(error).__name__).splitlines()[0]
             raise UsageError(f"{self.path / name}: damaged, or of something else: {reason}") from None
 
-    def series(self, columns: Sequence[str], longest: int = DRAWN_TICKS, file_name: str = "trace.parquet") -> Curves:
+    def series(self, columns: Sequence[str], longest: int = DRAWN_TICKS, file_name: str = TRACE) -> Curves:
         """Return columns of the trace, or of another file with a row a tick, for drawing: `time_s` and these.
 
         It takes constant memory.
@@ -288,7 +265,7 @@ class RunFolder:
             series = {name: np.concatenate([part[name] for part in parts] or [np.empty(0)]) for name in names}
             if not np.isfinite(series["time_s"]).all() or (np.diff(series["time_s"]) < 0).any():
                 raise ValueError("time_s does not rise")
-        for keys, signals in ((BANDS, PROCESS.banded), (BOUNDS, PROCESS.inputs)):
+        for keys, signals in ((BANDS, self.process.banded), (BOUNDS, self.process.inputs)):
             for key in keys:
                 if len(self.configuration[key]) != len(signals):
                     raise UsageError(f"{self.path / 'manifest.json'}: {key} is not of {len(signals)} numbers")
@@ -296,22 +273,13 @@ class RunFolder:
 
     def events(self) -> list[dict[str, Any]]:
         """Return the events."""
-        with self.reading(EVENTS_FILE, MOST_LISTED) as file:
-            table = file.read(columns=[column.name for column in EVENTS])
+        with self.reading(EVENTS, MOST_LISTED) as file:
+            table = file.read(columns=[column.name for column in files_of(self.process)[EVENTS].columns])
             missing = [name for name in table.column_names if name != "value" and table[name].null_count]
             if missing:
                 raise ValueError(f"{missing[0]} is missing in a row")
             rows: list[dict[str, Any]] = table.to_pylist()
         return rows
-
-
-def _other_type(name: str, schema: pa.Schema) -> str:
-    """Return which column has another type than in our file, or one that no column of it has."""
-    kinds = KINDS[name]
-    for field in schema:
-        if field.type not in ({kinds[field.name]} if field.name in kinds else {*kinds.values()}):
-            return f"{printable(field.name[:MOST_TEXT])} is {str(field.type)[:80]}"
-    return ""
 
 
 def _has_long_text(path: Path, schema: pa.Schema) -> bool:

@@ -6,14 +6,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from coldloop.process.loaded import PROCESS
+from coldloop.process.declaration import Process
 from coldloop.process.model_range import recorded_model_range
-from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.service.event_text import describe, utc_text
 from rig.results.arrow_arrays import number_array, text_array
-from rig.results.columns import EVENTS, HELD_COLUMNS, MODEL_RANGE_COLUMN, STATION, TRACE, UPDATES, arrow_schema
+from rig.results.columns import EVENTS, STATION, TRACE, UPDATES, RunFile, files_of
 from rig.results.driving import DrivingHistory
 from rig.results.indicators import StageCost
 from rig.results.recording import SampleBlock
@@ -30,37 +29,37 @@ def trace_table(
         cost: Computes the stage cost.
         driving: Has the events of these ticks.
     """
-    ticks = block.first + np.arange(len(block.load))
+    ticks, process = block.first + np.arange(len(block.load)), driving.process
+    outside: Any = recorded_model_range(block.x, block.station) if process.has_station else np.zeros(len(ticks))
     columns = [
-        ticks, ticks * TICK_S, *block.rows.T, *driving.measured(ticks, block.y), *driving.columns(ticks),
-        cost.of(block), *_held(ticks, updates), _model_range(block),
+        ticks, ticks * process.tick_s, *block.rows.T, *driving.measured(ticks, block.y), *driving.columns(ticks),
+        cost.of(block), *_held(ticks, updates, process.tick_s), (outside, np.isnan(block.load)),
     ]  # fmt: skip
-    schema = arrow_schema(TRACE)
-    arrays = [
-        data if isinstance(data, pa.Array) else number_array(data, field.type)
-        for field, data in zip(schema, columns, strict=True)
-    ]
-    return pa.table(arrays, schema)
+    return _of_arrays(columns, files_of(process)[TRACE])
 
 
-def _model_range(block: SampleBlock) -> pa.Array:
-    """Return what was outside the property tables; null at unknown ticks."""
-    bits = recorded_model_range(block.x, block.station) if PROCESS.has_station else np.zeros(len(block.load), np.int32)
-    return number_array(bits, MODEL_RANGE_COLUMN.kind, np.isnan(block.load))
-
-
-def station_table(block: SampleBlock) -> pa.Table:
+def station_table(block: SampleBlock, process: Process) -> pa.Table:
     """Return what is known of the station at the ticks of a block that has one."""
     ticks = block.first + np.arange(len(block.load))
     unknown = np.isnan(block.station[:, 0])
-    schema = arrow_schema(STATION)
-    columns = [(ticks, None), (ticks * TICK_S, None), *((np.nan_to_num(column), unknown) for column in block.station.T)]
-    arrays = [number_array(data, field.type, mask) for field, (data, mask) in zip(schema, columns, strict=True)]
+    known = ((np.nan_to_num(column), unknown) for column in block.station.T)
+    return _of_arrays([ticks, ticks * process.tick_s, *known], files_of(process)[STATION])
+
+
+def _of_arrays(columns: Sequence[Any], file: RunFile) -> pa.Table:
+    """Return the table of columns: Arrow arrays, numbers, or numbers with a mask of those that are unknown."""
+    schema = file.schema
+    arrays = [
+        data if isinstance(data, pa.Array)
+        else number_array(data[0], field.type, data[1]) if isinstance(data, tuple)
+        else number_array(data, field.type)
+        for field, data in zip(schema, columns, strict=True)
+    ]  # fmt: skip
     return pa.table(arrays, schema)
 
 
-def _held(ticks: Any, updates: Sequence[Optimization]) -> list[pa.Array]:  # noqa: ANN401 an array of integers
-    """Return the columns that change at updating instants only.
+def _held(ticks: Any, updates: Sequence[Optimization], tick_s: float) -> list[Any]:  # noqa: ANN401 an array of integers
+    """Return the columns that change at updating instants only, with a mask of the ticks before the first.
 
     The time of an update that a load step has cut off belongs to the one before.
     """
@@ -68,41 +67,36 @@ def _held(ticks: Any, updates: Sequence[Optimization]) -> list[pa.Array]:  # noq
     none = latest < 0
     values: list[list[float]] = [
         [row.update for row in updates],
-        [row.tau_u * TICK_S for row in updates],
+        [row.tau_u * tick_s for row in updates],
         [row.iterations for row in updates],
         [row.j_effective for row in updates],
     ]
-    held = [np.asarray(column or [0])[np.maximum(latest, 0)] for column in values]
-    types = [column.kind for column in HELD_COLUMNS]
-    return [number_array(column, kind, none) for column, kind in zip(held, types, strict=True)]
+    return [(np.asarray(column or [0])[np.maximum(latest, 0)], none) for column in values]
 
 
-def updates_table(updates: Sequence[Optimization]) -> pa.Table:
+def updates_table(updates: Sequence[Optimization], process: Process) -> pa.Table:
     """Return the table of updates."""
-    rows = [
-        {**row._asdict(), "time_s": row.tick * TICK_S, "tau_u_s": row.tau_u * TICK_S} for row in updates
-    ]  # fmt: skip
-    return _table(rows, UPDATES)
+    tick_s = process.tick_s
+    rows = [{**row._asdict(), "time_s": row.tick * tick_s, "tau_u_s": row.tau_u * tick_s} for row in updates]
+    return _of_rows(rows, files_of(process)[UPDATES])
 
 
-def events_table(events: Sequence[tuple[str, Event]]) -> pa.Table:
+def events_table(events: Sequence[tuple[str, Event]], process: Process) -> pa.Table:
     """Return the table of events."""
-    return _table([_event_row(service, event) for service, event in events], EVENTS)
+    return _of_rows([_event_row(service, event, process) for service, event in events], files_of(process)[EVENTS])
 
 
-def _event_row(service: str, event: Event) -> dict[str, Any]:
-    text = describe(event)
+def _event_row(service: str, event: Event, process: Process) -> dict[str, Any]:
+    text = describe(event, process)
     return {
         **text._asdict(), "service": service, "number": event.number, "boot": event.boot, "utc": utc_text(event),
-        "tick": event.tick,
-        "time_s": event.tick * TICK_S, "value": event.value if text.value else None,
+        "tick": event.tick, "time_s": event.tick * process.tick_s,
+        "value": event.value if text.value else None,
     }  # fmt: skip
 
 
-def _table(rows: Sequence[dict[str, Any]], columns: Any) -> pa.Table:  # noqa: ANN401 a tuple of columns
-    return pa.table(
-        [_array([row[column.name] for row in rows], column.kind) for column in columns], arrow_schema(columns)
-    )
+def _of_rows(rows: Sequence[dict[str, Any]], file: RunFile) -> pa.Table:
+    return pa.table([_array([row[column.name] for row in rows], column.kind) for column in file.columns], file.schema)
 
 
 def _array(values: Sequence[Any], kind: pa.DataType) -> pa.Array:

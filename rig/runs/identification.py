@@ -14,10 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from coldloop.errors import UsageError
-from coldloop.process.load_profile import LOAD_COLUMN
-from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import LtiModel, RealArray
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S, TICKS_PER_SAMPLE
 from rig.durations import LONGEST_TICKS
 from rig.results.run_folder import RunFolder
 
@@ -83,24 +80,26 @@ def read_record(run: RunFolder, model: LtiModel) -> Record:
     Raises:
         UsageError: There is no trace, it is too short or has gaps, or the model has other signals.
     """
-    if (model.input_names, model.output_names) != (INPUT_NAMES, OUTPUT_NAMES):
+    process = run.process
+    if (model.input_names, model.output_names) != (process.input_names, process.output_names):
         raise UsageError(
             f"{run.path}: a model of {len(model.input_names)} inputs and {len(model.output_names)} outputs, whose names"
             " are not those of the trace; name another with --model"
         )
-    curves = run.series((LOAD_COLUMN, *INPUT_NAMES, *OUTPUT_NAMES), LONGEST_TICKS)
-    recorded_s = len(curves["time_s"]) * TICK_S
+    moved = (*process.input_names, process.load.column)
+    curves = run.series((*moved, *process.output_names), LONGEST_TICKS)
+    recorded_s = len(curves["time_s"]) * process.tick_s
     if recorded_s < LEAST_S:
         raise UsageError(f"{run.path}: a record of {recorded_s:g} s is too short; name one of {LEAST_S:g} s or more")
-    inputs = np.column_stack([curves[name] for name in (*INPUT_NAMES, LOAD_COLUMN)])
-    y = np.column_stack([curves[name] for name in OUTPUT_NAMES])
+    inputs = np.column_stack([curves[name] for name in moved])
+    y = np.column_stack([curves[name] for name in process.output_names])
     gaps = int((~np.isfinite(np.hstack([inputs, y])).all(axis=1)).sum())
     if gaps:
         raise UsageError(f"{run.path}: {gaps} ticks of the trace are not known; name a run without them")
     key = "optimizer_plc.program.estimator."
     sensors = [
         run.configuration[f"{key}{output.quantity}_sensor"] if output.quantity else output.noise
-        for output in PROCESS.outputs
+        for output in process.outputs
     ]
     return Record(inputs, y, np.array(sensors))
 
@@ -117,25 +116,27 @@ def responses(model: LtiModel, inputs: RealArray) -> RealArray:
     """
     moves = inputs - np.append(model.u0, model.w0)
     gains, feedthrough = np.column_stack([model.B_tick, model.F_tick]), np.column_stack([model.D, model.G])
-    before = _samples(np.vstack([moves[:1], moves[:-1]]))  # an output shows the inputs that were held until then
+    ticks = model.declared.ticks_per_sample
+    before = _samples(np.vstack([moves[:1], moves[:-1]]), ticks)  # outputs show the inputs that were held until then
     x, sums = np.zeros(gains.shape), np.zeros((len(before), *gains.shape))
-    for tick, held in enumerate(moves[: len(before) * TICKS_PER_SAMPLE]):
-        sums[tick // TICKS_PER_SAMPLE] += x
+    for tick, held in enumerate(moves[: len(before) * ticks]):
+        sums[tick // ticks] += x
         x = model.A_tick @ x + gains * held
-    return model.C @ (sums / TICKS_PER_SAMPLE) + feedthrough * before[:, np.newaxis, :]
+    return model.C @ (sums / ticks) + feedthrough * before[:, np.newaxis, :]
 
 
 def identify(model: LtiModel, record: Record) -> Identification:
     """Fit the factors on the first half of a record of `LEAST_S` or more, and judge them on the second."""
-    skipped, window = round(SETTLING_S / SAMPLING_PERIOD_S), round(WINDOW_S / SAMPLING_PERIOD_S)
-    predicted, measured = responses(model, record.inputs), _samples(record.y)
+    sampling_s, ticks = model.declared.sampling_period_s, model.declared.ticks_per_sample
+    skipped, window = round(SETTLING_S / sampling_s), round(WINDOW_S / sampling_s)
+    predicted, measured = responses(model, record.inputs), _samples(record.y, ticks)
     effects, changes = (each[skipped:] - each[skipped - window : -window] for each in (predicted, measured))
     half = len(changes) // 2
     fit, held = slice(half), slice(half + window, None)  # no sample is in the windows of both
     spread = np.maximum(changes[fit].std(axis=0), record.sensors)
     moments = _moments(_centred(effects[fit]) / spread[:, np.newaxis], _centred(changes[fit]) / spread)
     reach = (np.abs(effects[fit]) / record.sensors[:, np.newaxis]).max(axis=(0, 1))
-    begin, end = skipped * TICKS_PER_SAMPLE, (skipped + half) * TICKS_PER_SAMPLE
+    begin, end = skipped * ticks, (skipped + half) * ticks
     moved = np.ptp(record.inputs[begin:end], axis=0)
     factors = _factors(model, moments, reach, moved)
     errors = [_centred(changes[held] - effects[held] @ values) for values in (
@@ -154,10 +155,10 @@ def scaled(model: LtiModel, factors: tuple[Factor, ...], note: str) -> LtiModel:
     )  # fmt: skip
 
 
-def _samples(rows: RealArray) -> RealArray:
-    """Return the means over whole samples, shape (samples, columns)."""
-    count = len(rows) // TICKS_PER_SAMPLE
-    means: RealArray = rows[: count * TICKS_PER_SAMPLE].reshape(count, TICKS_PER_SAMPLE, -1).mean(axis=1)
+def _samples(rows: RealArray, ticks: int) -> RealArray:
+    """Return the means over whole samples of so many ticks, shape (samples, columns)."""
+    count = len(rows) // ticks
+    means: RealArray = rows[: count * ticks].reshape(count, ticks, -1).mean(axis=1)
     return means
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import SHIPPED_MODELS
 from coldloop.text_file import held_file, read_bytes
 from rig.cosim.scenario import INPUTS, LOAD_COPY, with_copied_load
 from rig.settings import Settings
@@ -32,7 +32,7 @@ def copy_inputs(settings: Settings, profile: LoadProfile, folder: Path) -> dict[
     if with_copied_load(settings, profile, folder) is not settings:
         load |= {"file": LOAD_COPY, "sha256": file_digest(folder / LOAD_COPY)}
     model = _copied(model_file, folder, MODEL_COPY)
-    if model_file == DEFAULT_MODEL_FILE:
+    if model_file == SHIPPED_MODELS["cold-box"]:
         model["source"] = "shipped"
     rest = settings.plant.refrigerator.file
     more = {} if rest is None else {"refrigerator": _copied(rest, folder, REFRIGERATOR_COPY)}

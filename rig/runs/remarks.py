@@ -6,9 +6,7 @@ import numpy as np
 
 from coldloop.config import Configuration
 from coldloop.errors import UsageError
-from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import load
-from coldloop.process.signals import SAMPLING_PERIOD_S, TICK_S
 from coldloop.session.settings import TimeMode
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.qp.arithmetic import real_of
@@ -27,7 +25,8 @@ def remarks(effective: Configuration[Settings]) -> list[str]:
         UsageError: In real time no answer would ever be there in time.
     """
     program, realtime = effective.settings.optimizer_plc.program, effective.settings.session.mode is TimeMode.REALTIME
-    ticks, budget = round(program.updating_period_s / TICK_S), _budget(program)
+    process, budget = effective.settings.process, _budget(program)
+    ticks = round(program.updating_period_s / process.tick_s)
     if realtime and ticks and not budget.is_enough(ticks):
         raise UsageError(
             f"{PERIOD} = {program.updating_period_s:g}: this PLC (P = {program.budget.power:g}) needs"
@@ -35,8 +34,8 @@ def remarks(effective: Configuration[Settings]) -> list[str]:
             " sooner: give a longer period, adaptive, or --enforce"
         )
     found, left_out = [too_slow(program), certificate(effective.settings)], effective.notes()
-    if not PROCESS.has_load and "plant.load" in effective.sources:
-        found.append(f"load {effective.settings.plant.load}: the {PROCESS.name} has no load; only the length is taken")
+    if not process.has_load and "plant.load" in effective.sources:
+        found.append(f"load {effective.settings.plant.load}: the {process.name} has no load; only the length is taken")
     adaptive = program.adaptive
     unused = {"q_first", "q_min", "q_max", "delta"} & adaptive.model_fields_set
     if adaptive.rule is RuleName.CONTRACTION and any(getattr(adaptive, one) != UNSET[one].default for one in unused):
@@ -50,7 +49,7 @@ def remarks(effective: Configuration[Settings]) -> list[str]:
 
 def too_slow(program: ProgramSettings) -> str:
     """Return that the PLC cannot do what is simulated; empty where it can."""
-    why = _budget(program).too_slow(round(program.updating_period_s / TICK_S))
+    why = _budget(program).too_slow(round(program.updating_period_s / program.process.tick_s))
     return why and (
         f"this PLC (P = {program.budget.power:g}) cannot do what is simulated: with {program.solver_name} {why}; "
         "one iteration is granted all the same (--enforce: not)"
@@ -62,17 +61,17 @@ def certificate(settings: Settings, *, only_lost: bool = False) -> str:
 
     Where it is adaptive or too short for the PLC it is the PLC's shortest. With `only_lost` it is empty where held.
     """
-    limits, program, more = settings.limits, settings.optimizer_plc.program, ""
+    limits, program, process, more = settings.limits, settings.optimizer_plc.program, settings.process, ""
     reach, shortest_s = np.array([limits.low, limits.high, limits.rate]), _shortest_s(program)
-    needs, fixed_s = waiting(load(settings.model.file), PROCESS, reach, limits.rate_share), program.updating_period_s
+    needs, fixed_s = waiting(load(settings.model.file), process, reach, limits.rate_share), program.updating_period_s
     rule = "adaptive.contraction" if program.adaptive.rule is RuleName.CONTRACTION else "adaptive"
     most = program.adaptive.contraction.q_max if rule == "adaptive.contraction" else program.adaptive.q_max
-    period_s, longest_s = max(fixed_s, shortest_s), _budget(program).times.period(most) * TICK_S
+    period_s, longest_s = max(fixed_s, shortest_s), _budget(program).times.period(most) * process.tick_s
     if not needs or (only_lost and period_s <= needs.limit_s):
         return ""
     if not fixed_s and longest_s > needs.longest_s >= shortest_s:
         more += f"; adaptive ones go up to {longest_s:.3g} s: lower optimizer_plc.program.{rule}.q_max"
-    horizon_s = program.design.horizon * SAMPLING_PERIOD_S
+    horizon_s = program.design.horizon * process.sampling_period_s
     if horizon_s > (most_s := digits_last_s(needs.growth, real_of(program.arithmetic))):
         more += (
             f"; the horizon of {horizon_s:.3g} s leaves the problem no digits, in {program.arithmetic} beyond "
@@ -88,7 +87,7 @@ def enforced(effective: Configuration[Settings]) -> Configuration[Settings]:
     Raises:
         UsageError: The longest updating period is too short for the PLC, or the shortest too long for the plant.
     """
-    program = effective.settings.optimizer_plc.program
+    program, tick_s = effective.settings.optimizer_plc.program, effective.settings.process.tick_s
     shortest_s = _shortest_s(program)
     if why := _budget(program).too_slow():
         raise UsageError(
@@ -97,7 +96,7 @@ def enforced(effective: Configuration[Settings]) -> Configuration[Settings]:
         )
     if why := certificate(effective.settings, only_lost=True):
         raise UsageError(f"--enforce: {why}; take a faster PLC, a shorter period, or inputs that reach further")
-    if not 0 < round(program.updating_period_s / TICK_S) < round(shortest_s / TICK_S):
+    if not 0 < round(program.updating_period_s / tick_s) < round(shortest_s / tick_s):
         return effective
     settings = effective.settings.with_program(updating_period_s=shortest_s)
     return replace(effective, settings=settings, sources={**effective.sources, PERIOD: "--enforce"})
@@ -105,7 +104,7 @@ def enforced(effective: Configuration[Settings]) -> Configuration[Settings]:
 
 def _shortest_s(program: ProgramSettings) -> float:
     times = _budget(program).times
-    return shortest_period_s(times.slots + times.iteration, TICK_S)
+    return shortest_period_s(times.slots + times.iteration, times.tick_s)
 
 
 def _budget(program: ProgramSettings) -> PlcBudget:

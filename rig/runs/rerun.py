@@ -11,7 +11,6 @@ from typing import Any
 from coldloop import __version__
 from coldloop.config import Configuration, load_configuration
 from coldloop.errors import UsageError, printable
-from coldloop.process.loaded import FILE, PROCESS
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import read_document
 from plant.load import named_families
@@ -31,10 +30,18 @@ from rig.runs.running import make_scenario, run_into
 from rig.settings import Settings
 
 SOURCE = "manifest"
+REMEDY = "name its file with --process; rerun --trust executes the plant that the folder holds"
 
 
-def repeat(folder: Path, out: Path | None, *, force: bool) -> tuple[bool, str]:
+def repeat(folder: Path, out: Path | None, *, force: bool, trusted: Path | None) -> tuple[bool, str]:
     """Repeat the run of a folder; return whether the traces are the same, and what to print.
+
+    Args:
+        folder: Of the run.
+        out: Folder for the results of the repetition; None keeps none.
+        force: Whether a run in it may be replaced.
+        trusted: A model file with the same model as that of a run of another process than the cold box, which may
+            hold code that a plant executes; None trusts the folder.
 
     Raises:
         UsageError: There is no run to repeat, or an input or the configuration was changed since.
@@ -52,12 +59,12 @@ def repeat(folder: Path, out: Path | None, *, force: bool) -> tuple[bool, str]:
     changed = changed_inputs(manifest, folder)
     if changed:
         raise UsageError("; ".join(changed))
-    if run.process != PROCESS or (FILE is not None and read_document(FILE)["digest"] != run.model_digest):
-        raise UsageError(f"{folder}: a run of {run.process.name}, with another model than now; {run.remedy}")
+    if trusted is not None:
+        own, ours = run.model, read_document(trusted)
+        if (own.get("process") or ours.get("process")) and own.get("digest") != ours["digest"]:
+            remedy = REMEDY if own.get("process") else "leave out --process"
+            raise UsageError(f"{folder}: a run of {run.process.name}, with another model than now; {remedy}")
     effective = _configuration(run)
-    loaded = read_document(effective.settings.model.file)
-    if bool(loaded.get("process")) != (FILE is not None):  # a plant that carries code is not the shipped cold box
-        raise UsageError(f"{folder}: its model is of another kind of plant than it says; {run.remedy}")
     scenario = make_scenario(effective.settings, manifest["recorded_ticks"])
     if profile_digest(scenario.load) != manifest["inputs"]["load"]["profile_sha256"]:
         raise UsageError(f"load {manifest['inputs']['load']['source']}: this version has another load of that name")
@@ -84,7 +91,8 @@ def _configuration(run: RunFolder) -> Configuration[Settings]:
 
 
 def _trace(effective: Configuration[Settings], scenario: Scenario, out: Path | None, *, force: bool) -> str:
-    with RunProgress(scenario.ticks) as progress, FigureProcess(["png"]) as figure:
+    process = effective.settings.process
+    with RunProgress(scenario.ticks, process) as progress, FigureProcess(["png"]) as figure:
         if out is not None:
             claim_folder(out, force=force)
             summary = run_into(out, Job(effective, scenario, Way.IN_PROCESS), {}, figure, [progress])

@@ -10,11 +10,10 @@ from typing import Any, Final
 from coldloop.config import Configuration
 from coldloop.errors import ColdloopError, ResultsError, UsageError
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.signals import TICK_S
 from plant.settings import PlantKind
 from rig.cosim.scenario import INPUTS, Scenario
 from rig.figures.worker import FigureProcess
-from rig.results.columns import ALL_FILES, schema_document
+from rig.results.columns import FILES, schema_document
 from rig.results.disk_reserve import DiskReserve
 from rig.results.file_sinks import EventsSink, StationSink, TraceSink, UpdatesSink
 from rig.results.folders import write_json
@@ -25,9 +24,9 @@ from rig.runs.manifest import final_manifest, first_manifest
 from rig.settings import Settings
 
 NAMES: Final = (
-    "manifest.json", "summary.json", "schema.json", *ALL_FILES, "run.png", "run.pdf", "run.svg",
+    "manifest.json", "summary.json", "schema.json", *FILES, "run.png", "run.pdf", "run.svg",
     "chaos.json", "chaos.md", "chaos.png",
-    "report.html", "run.mat", "run.h5", *(f"{Path(name).stem}.csv" for name in ALL_FILES),
+    "report.html", "run.mat", "run.h5", *(f"{Path(name).stem}.csv" for name in FILES),
 )  # fmt: skip
 """Files of an earlier run, and what was made of them, which a new one in the same folder replaces."""
 
@@ -56,7 +55,11 @@ class RunFiles:
         for file in (settings.model.file, Path(settings.plant.load)):
             if file.is_file() and file.resolve().is_relative_to((folder / INPUTS).resolve()):
                 raise UsageError(f"{file}: the run replaces what is in {folder}; name another --out")
-        model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
+        model, design, process = (
+            load_model(settings.model.file),
+            settings.optimizer_plc.program.design,
+            settings.process,
+        )
         self.folder = folder
         self._evaluation = RunEvaluation(model, design)
         self._discard()
@@ -68,12 +71,13 @@ class RunFiles:
                 effective, scenario, copy_inputs(settings, scenario.load, folder), way, arguments
             )
             write_json(folder / "manifest.json", self._manifest)
-            write_json(folder / "schema.json", schema_document(station=settings.plant.kind is PlantKind.REFRIGERATOR))
+            is_whole = settings.plant.kind is PlantKind.REFRIGERATOR
+            write_json(folder / "schema.json", schema_document(process, station=is_whole))
             files = (
                 TraceSink(folder, self._reserve, StageCost(model, design)),
-                UpdatesSink(folder, self._reserve),
-                EventsSink(folder, self._reserve),
-                StationSink(folder, self._reserve),
+                UpdatesSink(folder, self._reserve, process),
+                EventsSink(folder, self._reserve, process),
+                StationSink(folder, self._reserve, process),
             )
             failed.pop_all()
         self.recorder = Recorder(scenario.ticks, [self._evaluation, *files, *sinks])
@@ -135,12 +139,12 @@ def summary_of(evaluation: RunEvaluation, recorder: Recorder, *, realtime: bool,
         "updates": evaluation.updates,
         "failed_updates": evaluation.failed_updates,
         "trace_sha256": evaluation.trace_sha256,
-        **evaluation.indicators._asdict(),
+        **evaluation.indicators.by_name,
         **evaluation.excesses,
         **lateness,
         "deadline_misses": link.deadline_misses,
         "wall_seconds": round(wall_s, 3),
-        "realtime_factor": round(evaluation.ticks * TICK_S / wall_s, 2) if wall_s else None,
+        "realtime_factor": round(evaluation.ticks * evaluation.process.tick_s / wall_s, 2) if wall_s else None,
     }
     return {name: None if _missing(value) else value for name, value in figures.items()}
 

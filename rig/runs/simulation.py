@@ -22,13 +22,13 @@ from matplotlib.figure import Figure
 from coldloop import __version__
 from coldloop.config import Configuration
 from coldloop.errors import UsageError
+from coldloop.process.declaration import Process
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.signals import TICK_S
-from coldloop.process.whole_ticks import whole_ticks
+from coldloop.process.settings import whole_ticks
 from coldloop.registers.audit import Event
 from rig.cosim.one_process import OneProcessRig
 from rig.durations import duration
-from rig.figures.plot import DRAWN, Bounds, RunCurves, draw_run
+from rig.figures.plot import Bounds, RunCurves, draw_run, labels_of
 from rig.figures.run_plot import at_times, pressure_limits, save_figure, title_of
 from rig.python_settings import Period, configured
 from rig.results.driving import DrivingHistory
@@ -79,6 +79,8 @@ class Simulation:
     """What `summary.json` has."""
     configuration: dict[str, Any]
     """The effective configuration by dotted key."""
+    process: Process
+    """What was run."""
     _cost: StageCost
     _events: tuple[tuple[str, Event], ...]
 
@@ -95,7 +97,7 @@ class Simulation:
     @cached_property
     def trace(self) -> Table:
         """One row a tick."""
-        history = DrivingHistory()
+        history = DrivingHistory(self.process)
         for service, event in self._events:
             history.event(service, event)
         return Table(trace_table(self.recording.block, self.recording.updates, self._cost, history))
@@ -103,26 +105,27 @@ class Simulation:
     @cached_property
     def updates(self) -> Table:
         """One row an update whose sequence was played."""
-        return Table(updates_table(self.recording.updates))
+        return Table(updates_table(self.recording.updates, self.process))
 
     @cached_property
     def events(self) -> Table:
         """One row a change of mode or of an alarm."""
-        return Table(events_table(self._events))
+        return Table(events_table(self._events, self.process))
 
     def plot(self, path: str | Path | None = None) -> Figure:
         """Return the figure of the run; with a path it is written there too, as .png, .pdf or .svg."""
-        (batch,) = self.trace.arrow.select(["time_s", *DRAWN]).to_batches()
+        (batch,) = self.trace.arrow.select(["time_s", *labels_of(self.process)]).to_batches()
         series, block = batch_series(batch), self.recording.block
         pressures = pressure_limits(self.configuration) if block.station.size else {}
         if pressures:
-            (station,) = station_table(block).select(["time_s", *pressures]).to_batches()
+            (station,) = station_table(block, self.process).select(["time_s", *pressures]).to_batches()
             series |= at_times(batch_series(station), series["time_s"])
         curves = RunCurves(
+            self.process,
             series,
             self.events.arrow.to_pylist(),
-            Bounds.of(self.configuration),
-            title_of(self.configuration),
+            Bounds.of(self.configuration, self.process),
+            title_of(self.configuration, self.process),
             f"trace {self.summary['trace_sha256'][:12]}  ·  coldloop {__version__}  ·  in-process",
             pressures,
         )
@@ -137,6 +140,7 @@ def simulate(
     solver: str | None = None,
     updating_period: Period | None = None,
     *,
+    process: str | Path | None = None,
     duration_s: float | str | None = None,
     seed: int | None = None,
     config: str | Path | None = None,
@@ -149,7 +153,8 @@ def simulate(
         load: Named load such as `a`, or a CSV file with the columns time_s and load_w; by default `2h`.
         solver: `ode`, `qpoases`, `osqp`, `fast-gradient`, `interior-point`, `hybrid` or `daqp`; by default `ode`.
         updating_period: Seconds, from 2 ticks to a sampling period (0.5 to 5 s); `adaptive`, the default.
-        duration_s: Plant time in seconds, multiples of 0.25, or a text such as `10min`; by default that of the load.
+        process: Process file, or a model file that was made from one; by default the cold box.
+        duration_s: Plant time in seconds, multiples of a tick, or a text such as `10min`; by default that of the load.
         seed: Seed of the sensors' noise; by default 1.
         config: TOML file with further settings, such as one that `coldloop config` has written. An argument that is
             given comes before it.
@@ -162,27 +167,28 @@ def simulate(
         UsageError: An argument cannot be used; one line that says why.
     """
     effective = configured(
-        load=load, solver=solver, updating_period=updating_period, seed=seed, config=config, sections=settings
-    )
+        load=load, solver=solver, updating_period=updating_period, seed=seed, config=config, sections=settings,
+        process=process,
+    )  # fmt: skip
     if enforce:
         effective = enforced(effective)
     slow, lost = too_slow(effective.settings.optimizer_plc.program), certificate(effective.settings, only_lost=True)
     for line in filter(None, (slow, lost)):
         warnings.warn(line, stacklevel=2)
-    return _run(effective, _ticks(duration_s))
+    return _run(effective, _ticks(duration_s, effective.settings.process.tick_s))
 
 
-def _ticks(duration_s: float | str | None) -> int | None:
+def _ticks(duration_s: float | str | None, tick_s: float) -> int | None:
     if duration_s is None:
         return None
     if isinstance(duration_s, str):
         try:
-            return duration(duration_s)
+            return duration(duration_s).ticks(tick_s, "duration_s")
         except ArgumentTypeError as error:
             raise UsageError(f"duration_s: {error}") from None
-    ticks = whole_ticks(duration_s)
+    ticks = whole_ticks(duration_s, tick_s)
     if ticks is None or ticks <= 0:
-        raise UsageError(f"duration_s={duration_s}: not a positive multiple of {TICK_S} s")
+        raise UsageError(f"duration_s={duration_s}: not a positive multiple of {tick_s} s")
     return ticks
 
 
@@ -198,6 +204,7 @@ def _run(effective: Configuration[Settings], ticks: int | None) -> Simulation:
         recording=memory.recording(recorder.link),
         summary=summary_of(evaluation, recorder, realtime=False, reason=None),
         configuration={key: value for key, value, _ in effective.effective() if value is not None},
+        process=settings.process,
         _cost=StageCost(model, design),
         _events=tuple(memory.events),
     )

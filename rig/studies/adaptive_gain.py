@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.declaration import Process
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from optimizer_plc.budget import PlcBudget
 from rig.cosim.one_process import OneProcessRig
@@ -15,12 +15,14 @@ from rig.settings import Settings
 from rig.studies.intervals import Interval, geometric_mean, mean_ratio
 from rig.studies.loop_cost import ADAPTIVE, loop_cost, require_costs
 
-FIXED_S: Final = tuple(
-    ticks * TICK_S
-    for ticks in sorted({round(share * TICKS_PER_SAMPLE) for share in (0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)})
-    if ticks >= SHORTEST_TICKS
-)
-"""Updating periods, s, that are compared, unless one is given."""
+SHARES: Final = (0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
+"""Of a sampling period: updating periods that are compared, unless one is given."""
+
+
+def fixed_periods(process: Process) -> tuple[float, ...]:
+    """Return the updating periods, s, that are compared."""
+    ticks = sorted({round(share * process.ticks_per_sample) for share in SHARES})
+    return tuple(each * process.tick_s for each in ticks if each >= SHORTEST_TICKS)
 
 
 def adaptive_gain(
@@ -33,13 +35,14 @@ def adaptive_gain(
     Args:
         settings: With the power of the PLC.
         names: Loads, named ones or files.
-        period_s: The fixed period to compare with; None for the best of `FIXED_S` in which an iteration fits.
+        period_s: The fixed period to compare with; None for the best of `fixed_periods` in which an iteration fits.
         done: Is called with the number of runs done and that of all.
     """
     program = settings.optimizer_plc.program
     budget = PlcBudget(program.budget, program.iteration_s)
-    fitting = [period for period in FIXED_S if budget.times.holds(round(period / TICK_S))]
-    fixed = fitting or [FIXED_S[-1]] if period_s is None else [period_s]
+    periods = fixed_periods(settings.process)
+    fitting = [period for period in periods if budget.times.holds(round(period / settings.process.tick_s))]
+    fixed = fitting or [periods[-1]] if period_s is None else [period_s]
     rig, runs = OneProcessRig(settings), list(product((ADAPTIVE, *fixed), names))
     costs = []
     for number, (period, name) in enumerate(runs):

@@ -6,25 +6,24 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from coldloop.number_text import ends_text
+from coldloop.process.cold_box import SAMPLING_PERIOD_S, TICK_S
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import TICK_S
 from coldloop.registers.plant import StationMode
 from rig.figures.plot import (
     COLOURS,
     DASHES,
     INK,
-    LONGEST_TAU_U_S,
     STYLE,
     draw_tau_u,
     label_marks,
     limit,
+    styled,
 )
 from rig.studies.intervals import Interval
 from rig.studies.request import Outcome
@@ -39,7 +38,7 @@ JOURNAL: Final = STYLE | {"font.size": 8, "axes.titlesize": 8, "legend.fontsize"
 @contextmanager
 def panels(rows: int, columns: int, height_in: float, *, sharex: bool = False) -> Iterator[tuple[Figure, list[Axes]]]:
     """Give a figure with its panels, row by row; those of a column share their x where asked to."""
-    with mpl.rc_context(JOURNAL):
+    with styled(JOURNAL):
         figure = Figure(figsize=(COLUMN_IN if columns == 1 else PAGE_IN, height_in), layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, sharex="col" if sharex else False)
         yield figure, list(np.ravel(axes))
@@ -131,7 +130,7 @@ def _updates(place: Mapping[str, Axes], label: str, outcome: Outcome, colour: st
     place["iterations"].step(hours, iterations, where="post", color=colour, linewidth=0.7, label=label)
     if "tau_u" in place:
         draw_tau_u(place["tau_u"], hours, tau_u * TICK_S, ticks * TICK_S, colour, label)
-        place["tau_u"].set_ylim(0, LONGEST_TAU_U_S + 0.3)
+        place["tau_u"].set_ylim(0, SAMPLING_PERIOD_S + 0.3)
 
 
 def over_time(title: str, runs: Sequence[tuple[str, Outcome]], shown: Mapping[str, str], height: float) -> Figure:

@@ -7,7 +7,6 @@ the same in the run with another number that is large enough: from P = 7 on, qpO
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from coldloop.process.signals import TICK_S
 from optimizer_plc.budget import BudgetSettings, PlcBudget
 from optimizer_plc.solvers import make_solver
 from rig.studies.request import Outcome, Procedure, RunRequest, decisive_digest
@@ -25,7 +24,7 @@ def iteration_limit(request: RunRequest) -> int | None:
     if not in_one_process or not request.updating_period_s or program.interrupting_load_step_w:
         return None
     budget = PlcBudget(program.budget, make_solver(program).tau_1_s)
-    return budget.iterations(round(request.updating_period_s / TICK_S))
+    return budget.iterations(round(request.updating_period_s / program.process.tick_s))
 
 
 def never_cut_off(outcome: Outcome, limit: int) -> bool:

@@ -10,7 +10,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from coldloop.process.signals import SAMPLING_PERIOD_S, TICKS_PER_SAMPLE
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.qp.design import ControlDesign
 from rig.cosim.ideal_loop import run_ideal_loop
@@ -93,7 +92,8 @@ def _judged(settings: Settings, label: str, names: Sequence[str], configured: fl
     """Return a set with what it costs; `configured`: operations of an iteration with the configured one, if not it."""
     program = settings.optimizer_plc.program
     problem, prediction = problem_of(settings)
-    run = partial(run_ideal_loop, settings, ticks=TICKS_PER_SAMPLE)
+    ticks = settings.process.ticks_per_sample
+    run = partial(run_ideal_loop, settings, ticks=ticks)
     flops = SOLVERS[program.solver].operations(counted_sizes(problem).without_zeros).flops
     plc = PlcBudget(program.budget, program.iteration_s * flops / (configured or flops))
     costs = tuple(loop_cost(settings, name, ADAPTIVE, run) for name in names)
@@ -101,7 +101,7 @@ def _judged(settings: Settings, label: str, names: Sequence[str], configured: fl
     return Judged(
         label, program.design, problem.size, len(problem.Gamma), float(np.linalg.cond(problem.Phi.astype(float))),
         flops, footprint(problem, estimator_memory(prediction, program.estimator), program.solver).total,
-        plc.iterations(TICKS_PER_SAMPLE) if plc.is_enough(TICKS_PER_SAMPLE) else 0, costs,
+        plc.iterations(ticks) if plc.is_enough(ticks) else 0, costs,
     )  # fmt: skip
 
 
@@ -125,8 +125,9 @@ def table(found: Sequence[Judged], names: Sequence[str]) -> str:
          f"{one.iterations}", f"{one.memory / 1e3:.0f}", *(f"{cost:.4g}" for cost in one.costs), f"{loss:.3f}")
         for one, loss in zip(found, losses(found), strict=True)
     ]  # fmt: skip
+    period_s = found[0].design.process.sampling_period_s
     return (
-        f"{aligned(rows, numbers=True)}iterations: in {SAMPLING_PERIOD_S:g} s on the configured PLC\n\n"
+        f"{aligned(rows, numbers=True)}iterations: in {period_s:g} s on the configured PLC\n\n"
         f"the smallest with a loss up to {ENOUGH:g}:\n{configuration(found)}"
     )
 

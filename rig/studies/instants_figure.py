@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 from matplotlib.figure import Figure
 
-from coldloop.process.signals import SAMPLING_PERIOD_S
 from rig.figures.plot import COLOURS, DASHES, INK
 from rig.studies.drawing import legend_outside, panels
 from rig.studies.instants import ENOUGH, Judged, losses, proposed
@@ -39,7 +38,7 @@ def drawn(found: Sequence[Judged], names: Sequence[str]) -> Figure:
                 axes.plot(one.variables, value, color=INK, marker=marker, markerfacecolor="none", markersize=9,
                           linestyle="", label=label)  # fmt: skip
         loss.set_ylabel("loss: J_BF over the fullest (1)")
-        iterations.set_ylabel(f"iterations in {SAMPLING_PERIOD_S:g} s (1)")
+        iterations.set_ylabel(f"iterations in {found[0].design.process.sampling_period_s:g} s (1)")
         iterations.set_xlabel("variables (1)")
         iterations.set_xscale("log")  # the fullest set has several times the variables of the others
         marks = [mark for mark in (10, 20, 50, 100, 200, 500) if sizes[0] <= mark <= sizes[-1]]

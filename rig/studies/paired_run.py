@@ -1,7 +1,7 @@
 """A solver and the problems of a converged loop, one after the other: what `rig.studies.paper.open_loop` compares."""
 
 import math
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,12 +82,12 @@ def equal_counts(program: ProgramSettings, solver: Solver) -> dict[int, int]:
 
 def paired_indicators(columns: Columns, period_s: float) -> Indicators:
     """Return the indicators that problems without a loop have; the others are not numbers."""
+    none: dict[str, Any] = {**dict.fromkeys(Indicators._fields, math.nan), "outside_band_pct": {}}
     if not columns.get("j_dev"):
-        return Indicators._make(math.nan for _ in Indicators._fields)
+        return Indicators(**none)
     j_dev, j_cst, violation = (np.array(columns[name]) for name in ("j_dev", "j_cst", "violation"))
-    known: dict[str, float] = {
+    return Indicators(**none | {
         "J_dev": float(j_dev.sum()), "J_cst": float(j_cst.sum()), "J_open_mean": float((j_dev + j_cst).mean()),
         "c1": float(violation.max()), "c2": float(violation.mean()), "tau_u_mean": period_s,
         "tau_u_mean_per_update": period_s, "iterations_total": round(sum(columns["iterations"])),
-    }  # fmt: skip
-    return Indicators._make(known.get(name, math.nan) for name in Indicators._fields)
+    })  # fmt: skip

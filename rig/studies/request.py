@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from coldloop.errors import UsageError
 from coldloop.kernels.reach import digest
 from coldloop.parsing import parsed_json
-from coldloop.process.cold_box import COLD_BOX, L1, T5
+from coldloop.process.cold_box import COLD_BOX, L1, T5, TICK_S
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.signals import TICK_S
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.service.start import main as start_service
 from optimizer_plc.solvers import make_solver
@@ -202,9 +201,11 @@ def check(request: RunRequest) -> None:
     Raises:
         UsageError: A run is too short, or a solver is not there.
     """
+    program = settings_of(request.assignments).optimizer_plc.program
     if request.ticks < SHORTEST_TICKS:
-        raise UsageError(f"{request.ticks * TICK_S:g} s are too short for a study: choose a --duration of 15 s or more")
-    make_solver(settings_of(request.assignments).optimizer_plc.program)
+        duration_s, least_s = (ticks * program.process.tick_s for ticks in (request.ticks, SHORTEST_TICKS))
+        raise UsageError(f"{duration_s:g} s are too short for a study: choose a --duration of {least_s:g} s or more")
+    make_solver(program)
 
 
 def perform(request: RunRequest) -> str:

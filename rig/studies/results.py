@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from coldloop import __version__
-from coldloop.process.signals import TICK_S
 from coldloop.whole_file import whole_text
 from rig.figures.run_plot import save_figure
 from rig.results.folders import installed_version, write_json, writing
@@ -45,7 +44,7 @@ def _manifest(study: Study, options: StudyOptions, requests: Sequence[RunRequest
         outside |= outside_digests(settings_of(assignments).optimizer_plc.program.outside)
     runs = [
         {
-            "load": request.load, "draw": request.draw, "duration_s": request.ticks * TICK_S,
+            "load": request.load, "draw": request.draw, "duration_s": request.ticks * options.process.tick_s,
             "updating_period_s": request.updating_period_s or "adaptive", "settings": request.assignments,
             "outcome": f"{request.digest}.json",
         }

@@ -6,12 +6,13 @@ from typing import Final, NamedTuple, Protocol
 
 from matplotlib.figure import Figure
 
+from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from plant.load import find_load, named_families
 from rig.cosim.scenario import natural_ticks
 from rig.studies.request import Outcome, Procedure, RunRequest
+from rig.studies.settings import settings_of
 from rig.text_tables import Cell
 
 Outcomes = Mapping[RunRequest, Outcome]
@@ -57,6 +58,13 @@ class StudyOptions:
     """One seed, ten minutes, fewer points: to see that it works."""
     variants: tuple[Variant, ...] = ()
     """Of the study `compare`; the first is the reference."""
+    settings: tuple[str, ...] = ()
+    """Of all runs, as `section.key=value`: `model.file` of another process than the cold box."""
+
+    @property
+    def process(self) -> Process:
+        """The process of all runs."""
+        return settings_of(self.settings).process
 
     @property
     def draws(self) -> range:
@@ -81,7 +89,8 @@ class Load:
     draw: int
     profile: LoadProfile
     ticks: int
-    noise: tuple[str, ...] = ()
+    settings: tuple[str, ...] = ()
+    """Of its runs: those of the study, and noise."""
 
     def request(
         self,
@@ -94,7 +103,7 @@ class Load:
         """Return the request for a run under this load."""
         return RunRequest(
             self.name, self.profile.times, self.profile.watts, self.ticks, updating_period_s,
-            (*self.noise, *assignments), self.draw, networked, trace_ticks, procedure,
+            (*self.settings, *assignments), self.draw, networked, trace_ticks, procedure,
         )  # fmt: skip
 
 
@@ -102,12 +111,13 @@ def draw_of(name: str, draw: int, options: StudyOptions) -> Load:
     """Return a draw of a load; the draws of a file differ by their noise, which there is when there are several."""
     named = named_families(name) is not None
     drawn = f"{name}@{draw}" if named and draw > 1 else name
-    profile = find_load(drawn, load_model(DEFAULT_MODEL_FILE).w0)
+    settings = settings_of(options.settings)
+    profile = find_load(drawn, load_model(settings.model.file).w0, settings.process)
     ticks = options.ticks or natural_ticks(drawn, profile)
     if options.quick:
         ticks = min(ticks, QUICK_TICKS)
     noise = NOISE if not named and len(options.draws) > 1 else ()
-    return Load(drawn if named or draw == 1 else f"{name}#{draw}", draw, profile, ticks, noise)
+    return Load(drawn if named or draw == 1 else f"{name}#{draw}", draw, profile, ticks, options.settings + noise)
 
 
 def loads(options: StudyOptions, *names: str, usual: int = USUAL_DRAWS, longest_ticks: int | None = None) -> list[Load]:

@@ -33,10 +33,11 @@ NOT_IN_NAMES: Final = frozenset("$|\\")
 """Characters that figures and Markdown tables read as marks."""
 
 
-def read_variants(file: Path) -> tuple[Variant, ...]:
+def read_variants(file: Path, own: tuple[str, ...] = ()) -> tuple[Variant, ...]:
     """Return the variants of a file, two or more; the first is the reference.
 
-    A variant changes the preset `tuned`, which is the default of `coldloop run`. The environment has no influence.
+    A variant changes the preset `tuned`, which is the default of `coldloop run`, and the settings `own` of the study.
+    The environment has no influence.
 
     Raises:
         UsageError: The file cannot be read, or a variant is none: one line with the file, the variant and the remedy.
@@ -47,7 +48,7 @@ def read_variants(file: Path) -> tuple[Variant, ...]:
         content = parsed_toml(read_text(file, remedy, UsageError, MOST_BYTES))
     except ValueError as error:
         raise UsageError(f"{file}: not TOML: {error}; {remedy}") from None
-    variants = tuple(_variant(file, name, table) for name, table in content.items())
+    variants = tuple(_variant(file, name, table, own) for name, table in content.items())
     if len(variants) < 2:
         raise UsageError(f"{file}: {len(variants)} variant{'s' if not variants else ''}; write the table of the "
                          "reference first, then one for each variant to compare")  # fmt: skip
@@ -58,7 +59,7 @@ def read_variants(file: Path) -> tuple[Variant, ...]:
     return variants
 
 
-def _variant(file: Path, name: str, table: Any) -> Variant:  # noqa: ANN401 what a user wrote
+def _variant(file: Path, name: str, table: Any, own: tuple[str, ...]) -> Variant:  # noqa: ANN401 what a user wrote
     place = f"{file} [{name}]"
     if not isinstance(table, Mapping):
         raise UsageError(f"{file}: {name} is not in the table of a variant; write [NAME] above it")
@@ -74,7 +75,7 @@ def _variant(file: Path, name: str, table: Any) -> Variant:  # noqa: ANN401 what
                 raise UsageError(f"{place}: {key}: has no effect on this study: {instead}")
     options = {key: (value, place) for key, value in settings.items()}
     try:
-        effective = load_configuration(Settings, environment={}, assignments=(PAPER, TUNED), options=options)
+        effective = load_configuration(Settings, environment={}, assignments=(PAPER, *own, TUNED), options=options)
         outside_digests(effective.settings.optimizer_plc.program.outside)
     except ConfigurationError as error:
         said = str(error).removeprefix(f"{place}: ")

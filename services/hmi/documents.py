@@ -21,7 +21,7 @@ from coldloop.registers.optimizer_plc import (
     Prediction,
     outputs_of,
 )
-from coldloop.registers.safety import Alarm, AlarmAction, AlarmKind, AlarmPriority, AlarmState
+from coldloop.registers.safety import Alarm, AlarmAction, AlarmPriority, AlarmState
 from coldloop.service.event_text import alarm_cause, alarm_word, word, word_of
 from hmi.compression_station import plant_document
 from hmi.explanation import explain
@@ -96,7 +96,7 @@ def catalog(model: Model, *, training: bool, replay: bool) -> Document:
     }  # fmt: skip
 
 
-def alarm_document(kind: AlarmKind, alarm: Alarm, process: Process) -> Document:
+def alarm_document(kind: int, alarm: Alarm, process: Process) -> Document:
     """Return one alarm in words."""
     return {
         "number": int(kind),

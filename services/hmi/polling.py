@@ -16,7 +16,7 @@ from coldloop.registers.configuration import ConfigurationDigest, ConfigurationL
 from coldloop.registers.control_plc import LadderStatus, Operator, PlantLinkStatus, ProcessNow, Status
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, ControlLinkStatus, Optimization, Prediction
 from coldloop.registers.plant import LoadStatus, SensorFault, StationStatus
-from coldloop.registers.safety import Alarm, AlarmKind
+from coldloop.registers.safety import Alarm, alarms_of
 from hmi.compression_station import KIND, REFRIGERATOR
 from hmi.process_image import JournalEntry, Model
 from hmi.signals import shown_blocks
@@ -110,7 +110,7 @@ class Poller:
         now = time.monotonic()
         if service == "control_plc" and now - self._alarms_at >= ALARMS_S:
             self._alarms_at = now
-            model.put_alarms(await self._client.read_rows(Alarm, 0, len(AlarmKind)))
+            model.put_alarms(await self._client.read_rows(Alarm, 0, len(alarms_of(self._client.process))))
         if now - self._slow_at >= SLOW_S:
             self._slow_at = now
             await self._read_slow()

@@ -17,7 +17,7 @@ from coldloop.registers.control_plc import LadderStatus, Mode, Plan, ProcessNow
 from coldloop.registers.maps import maps_of
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Prediction, UpdatingRuleStatus
 from coldloop.registers.plant import StationStatus
-from coldloop.registers.safety import Alarm, AlarmKind
+from coldloop.registers.safety import Alarm
 from coldloop.service.event_text import EventText, describe, utc_text
 from hmi.quality import Doubts
 from hmi.signals import values_of
@@ -279,9 +279,9 @@ class Model:
         """Whether the newest prediction is played: the optimiser is heard, and its sequence drives the outputs."""
         return self.mode == Mode.MPC and self.is_live("control_plc") and self.is_live("optimizer_plc")
 
-    def alarm_rows(self) -> list[tuple[AlarmKind, Alarm]]:
+    def alarm_rows(self) -> list[tuple[int, Alarm]]:
         """Return the alarms with their kinds."""
-        return list(zip(AlarmKind, self.alarms, strict=False))
+        return list(enumerate(self.alarms))
 
 
 STEP_BACK: Final = 20

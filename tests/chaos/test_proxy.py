@@ -18,7 +18,7 @@ from coldloop.registers.control_plc import Grant
 from coldloop.registers.declaration import Block
 from rig.chaos.faults import Delay, Direction, Drop, Duplicate, Freeze, Reset, Truncate
 from rig.chaos.proxy import MOST_FROZEN, LinkProxy
-from tests.harness.records import MAPS
+from tests.harness.records import CONTROL_MAP
 
 COMMON = {"link": "optimizer", "duration_s": 1.0}
 READ_THREE = bytes.fromhex("0001 0000 0006 ff 03 0000 0003")
@@ -34,8 +34,8 @@ class Line(NamedTuple):
 
 @contextlib.asynccontextmanager
 async def line(timeout_s: float = 60.0) -> AsyncIterator[Line]:
-    bank = RegisterBank(MAPS.control_plc)
-    bank.put(Identity(map_digest=MAPS.control_plc.digest, map_version=MAPS.control_plc.version))
+    bank = RegisterBank(CONTROL_MAP)
+    bank.put(Identity(map_digest=CONTROL_MAP.digest, map_version=CONTROL_MAP.version))
     grants: list[int] = []
 
     def on_write(block: Block, _caller: Caller) -> None:
@@ -48,7 +48,7 @@ async def line(timeout_s: float = 60.0) -> AsyncIterator[Line]:
     await server.start()
     proxy = LinkProxy(0, Endpoint(port=server.port), "1")
     await proxy.start()
-    client = RegisterClient(MAPS.control_plc, host="127.0.0.1", port=proxy.port, timeout_s=timeout_s)
+    client = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=proxy.port, timeout_s=timeout_s)
     try:
         yield Line(proxy, client, grants)
     finally:
@@ -189,7 +189,7 @@ async def test_without_a_server_behind_it_a_client_is_told_so() -> None:
     async with line() as it:
         dead = LinkProxy(0, Endpoint(port=1), "1")
         await dead.start()
-        client = RegisterClient(MAPS.control_plc, host="127.0.0.1", port=dead.port, timeout_s=60.0)
+        client = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=dead.port, timeout_s=60.0)
         with pytest.raises(PeerUnreachableError):
             await client.read(Grant)
         client.close()

@@ -84,11 +84,11 @@ class Desk:
         self.model = Model(COLD_BOX, self.clock, 300)
         pace = SessionPace(1, 1, 1.0, 0)
         self.model.put("plant", pace)
-        self.plant = Peer(MAPS.plant, Identity(session=1, tick=1000), pace, LoadStatus(watts=400.0, free=4096))
+        self.plant = Peer(MAPS["plant"], Identity(session=1, tick=1000), pace, LoadStatus(watts=400.0, free=4096))
         auto = Operator(OperatorMode.AUTO, (43.0, 75.0, 36.0))
         ladder = LadderStatus(Mode.MPC, Cause.NONE, 0, 1, 0, 0)
-        self.control = Peer(MAPS.control_plc, Identity(session=1, tick=1000), auto, ladder)
-        self.optimizer = Peer(MAPS.optimizer_plc, Identity(session=1))
+        self.control = Peer(MAPS["control_plc"], Identity(session=1, tick=1000), auto, ladder)
+        self.optimizer = Peer(MAPS["optimizer_plc"], Identity(session=1))
         self.desk = OperatorDesk({}, self.model, self.clock, training=False)
         peers = {"plant": self.plant, "control_plc": self.control, "optimizer_plc": self.optimizer}
         monkeypatch.setattr(self.desk, "_clients", lambda services: {service: peers[service] for service in services})
@@ -111,7 +111,7 @@ def desk(monkeypatch: pytest.MonkeyPatch) -> Desk:
 
 
 def alarm(
-    action: AlarmAction, kind: int = AlarmKind.T5_BAND, *, time_s: int = 0, seen: dict[str, int] | None = None
+    action: AlarmAction, kind: int = AlarmKind.SECOND_BAND, *, time_s: int = 0, seen: dict[str, int] | None = None
 ) -> TreatAlarm:
     return TreatAlarm(kind="alarm", alarm=int(kind), action=int(action), time_s=time_s, seen=seen)
 
@@ -212,7 +212,7 @@ async def test_what_the_control_plc_ignores_is_not_told_as_applied(desk: Desk) -
 
 
 async def test_an_alarm_that_was_raised_again_is_not_acknowledged_unseen(desk: Desk) -> None:
-    desk.control.panel.raised(AlarmKind.T5_BAND)
+    desk.control.panel.raised(AlarmKind.SECOND_BAND)
     desk.control.panel.raised(AlarmKind.MODE, 1)
     seen = {"t5 band": 1, "mode": 1}
     desk.control.panel.raised(AlarmKind.MODE, 2)

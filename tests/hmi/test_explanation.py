@@ -279,7 +279,7 @@ def test_a_slope_where_k_rounds_to_one_is_not_told_as_the_slope_of_k() -> None:
     assert "dK/dn" not in text
 
 
-NO_DEVIATION = blank(ModelDeviation, MAPS.optimizer_plc)
+NO_DEVIATION = blank(ModelDeviation, MAPS["optimizer_plc"])
 
 
 def test_a_plant_that_differs_from_its_model_is_described_the_most_notable_first() -> None:

@@ -60,7 +60,7 @@ def test_descriptions_that_number_their_meanings_become_words_and_others_do_not(
 
 
 def test_every_register_of_a_block_with_one_row_is_a_signal() -> None:
-    for register_map in MAPS:
+    for register_map in MAPS.values():
         names = {signal.name for signal in signals_of(register_map)}
         assert len(names) == len(signals_of(register_map))
         for block in register_map.blocks:
@@ -330,7 +330,7 @@ def test_marks_are_all_of_the_window_or_since_when_is_said(model: Model, count: 
 def test_active_alarms_come_first_and_returned_ones_hide_none(model: Model) -> None:
     rows = [Alarm(priority=AlarmPriority.LOW) for _ in AlarmKind]
     rows[AlarmKind.MODE] = Alarm(AlarmState.ACKNOWLEDGED, 1, priority=AlarmPriority.CRITICAL)
-    rows[AlarmKind.T5_BAND] = Alarm(AlarmState.RETURNED, 0, priority=AlarmPriority.HIGH)
+    rows[AlarmKind.SECOND_BAND] = Alarm(AlarmState.RETURNED, 0, priority=AlarmPriority.HIGH)
     rows[AlarmKind.SCAN_OVERRUN] = Alarm(AlarmState.UNACKNOWLEDGED, 1, priority=AlarmPriority.LOW)
     model.put_alarms(rows)
     assert [one["name"] for one in alarms_document(model)][:3] == ["scan overrun", "mode", "t5 band"]

@@ -12,15 +12,14 @@ import pytest
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
 from coldloop.process.limits import InputLimits
 from coldloop.process.model_file import read_header
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import ControlSession, Grant, LinkCause, PlantLinkState
 from coldloop.registers.declaration import Block
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import AlarmKind
-from tests.harness.records import sealed
+from tests.harness.records import PLANT_MAP, sealed
 from tests.harness.waiting import until
 
 if TYPE_CHECKING:

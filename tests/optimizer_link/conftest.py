@@ -13,7 +13,7 @@ import pytest
 
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
 from coldloop.process.lti_model import LtiModel, load
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import (
@@ -28,7 +28,6 @@ from coldloop.registers.control_plc import (
     Verdict,
 )
 from coldloop.registers.declaration import Block, RegisterMap
-from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
 from coldloop.safety.lease import Lease
 from coldloop.safety.sequence import InputSequence, checksum
@@ -36,7 +35,7 @@ from optimizer_plc.runtime import OptimizerPlc
 from optimizer_plc.settings import OptimizerSettings
 from rig.chaos.faults import Direction
 from rig.chaos.proxy import reset
-from tests.harness.records import sealed
+from tests.harness.records import CONTROL_MAP, PLANT_MAP, sealed
 from tests.harness.treated_link import TreatedLink
 
 WITHIN_S = 60.0

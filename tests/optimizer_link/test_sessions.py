@@ -16,11 +16,11 @@ from coldloop.registers.bank import Caller, IllegalValueError, RefusedAccessErro
 from coldloop.registers.codec import WordOrder, blank
 from coldloop.registers.common import SessionPace
 from coldloop.registers.declaration import Role
-from coldloop.registers.maps import OPTIMIZER_MAP
 from coldloop.registers.optimizer_plc import OperatingLimits, OptimizerSession
 from coldloop.registers.text import from_words
 from optimizer_plc.budget import BudgetSettings, PlcBudget
 from optimizer_plc.publication import OptimizerPublication
+from tests.harness.records import OPTIMIZER_MAP
 
 if TYPE_CHECKING:
     from tests.optimizer_link.conftest import Connect, Link, PlayedControlPlc, Until
@@ -32,7 +32,9 @@ UPDATING_PERIOD = BLOCK.end - 1
 
 def shown(power: float = 1.0, tau_1_s: float = 0.25) -> OptimizerPublication:
     budget = PlcBudget(BudgetSettings(power=power), tau_1_s)
-    return OptimizerPublication(WordOrder.HIGH_FIRST, budget, blank(OperatingLimits, OPTIMIZER_MAP), 1, 1)
+    return OptimizerPublication(
+        OPTIMIZER_MAP, WordOrder.HIGH_FIRST, budget, blank(OperatingLimits, OPTIMIZER_MAP), 1, 1
+    )
 
 
 @asynccontextmanager

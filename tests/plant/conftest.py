@@ -11,12 +11,11 @@ from coldloop.modbus.identification import DeviceIdentity
 from coldloop.modbus.requests import RequestHandler, Written
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_file import read_header
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.audit import EVENT_ROWS, Event, EventKind
 from coldloop.registers.bank import ALL_ROLES, Caller, RefusedAccessError
 from coldloop.registers.codec import codec_of
 from coldloop.registers.declaration import Role
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.registers.seal import Seal, seal_of
 from plant.cold_box.physics import REFERENCE, ColdBox, derivative, outputs
@@ -26,7 +25,7 @@ from plant.kinds import plant_maker
 from plant.numeric import RealArray
 from plant.rack.registers import RackRegisters
 from plant.settings import PlantSettings
-from tests.harness.records import sealed
+from tests.harness.records import PLANT_MAP, sealed
 
 R = TypeVar("R", bound=tuple[Any, ...])
 

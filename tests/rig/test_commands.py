@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from coldloop.process.lti_model import load
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
-from coldloop.registers.maps import MAPS
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from rig.cli.register_listing import COLUMNS
+from tests.harness.records import MAPS
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from coldloop.process.cold_box import L1, OUTPUT_NAMES
+from coldloop.process.cold_box import COLD_BOX, L1, OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.plant import SensorFaultKind
@@ -25,7 +25,7 @@ def fault(tick: int, kind: SensorFaultKind, value: float = 0.0) -> Event:
 
 
 def history(service: str, *events: Event) -> DrivingHistory:
-    taken = DrivingHistory()
+    taken = DrivingHistory(COLD_BOX)
     for event in events:
         taken.event(service, event)
     return taken

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from coldloop.process.cold_box import INPUT_NAMES, L1, OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_file import read_header
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import SHIPPED_MODELS
 from plant.cold_box.model import build_model
 from plant.cold_box.physics import REFERENCE
 from plant.components.valve import Valve
@@ -53,7 +53,7 @@ Feedback = Callable[[float], float]
 
 @pytest.fixture(scope="module")
 def model() -> LtiModel:
-    return load(DEFAULT_MODEL_FILE)
+    return load(SHIPPED_MODELS["cold-box"])
 
 
 def with_gains(model: LtiModel, factors: Array, note: str = "") -> LtiModel:

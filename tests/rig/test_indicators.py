@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from coldloop.process.cold_box import L1, STATE_NAMES, T5
 from coldloop.process.lti_model import LtiModel, load
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import SHIPPED_MODELS
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from optimizer_plc.qp.design import ControlDesign
@@ -21,7 +21,7 @@ PRESSURE, VOLUME, FIRST_TEMPERATURE = 0, 1, 2
 
 @pytest.fixture(scope="module")
 def model() -> LtiModel:
-    return load(DEFAULT_MODEL_FILE)
+    return load(SHIPPED_MODELS["cold-box"])
 
 
 def at_rest(model: LtiModel, ticks: int) -> SampleBlock:
@@ -89,7 +89,7 @@ def test_j_bf_sums_over_sampling_periods_and_bands_count_ticks(model: LtiModel) 
     block.y[36:, T5] = 18.0  # 1 s at a cost of 400
     found = evaluated(model, block)
     assert pytest.approx((10 * 25.0 + 4 * 400.0) / 20) == found.J_BF
-    assert (found.L1_outside_band_pct, found.T5_outside_band_pct) == (25.0, 10.0)
+    assert found.outside_band_pct == {"L1": 25.0, "T5": 10.0}
 
 
 def test_on_the_edge_of_a_band_is_inside(model: LtiModel) -> None:
@@ -97,7 +97,7 @@ def test_on_the_edge_of_a_band_is_inside(model: LtiModel) -> None:
     block.y[:, L1] = [59.0, 61.0, 58.999, 61.001]
     block.y[:, T5] = [9.0, 16.0, 9.0, 16.001]
     found = evaluated(model, block)
-    assert (found.L1_outside_band_pct, found.T5_outside_band_pct) == (50.0, 25.0)
+    assert found.outside_band_pct == {"L1": 50.0, "T5": 25.0}
 
 
 def test_ticks_of_which_nothing_is_known_count_neither_as_inside_nor_as_outside(model: LtiModel) -> None:
@@ -107,8 +107,8 @@ def test_ticks_of_which_nothing_is_known_count_neither_as_inside_nor_as_outside(
         series[4:] = np.nan
     found = evaluated(model, block)
     assert pytest.approx(100.0 / 20) == found.J_BF
-    assert found.L1_outside_band_pct == 25.0, "one of the four that are known"
-    assert found.T5_outside_band_pct == 0.0
+    assert found.outside_band_pct["L1"] == 25.0, "one of the four that are known"
+    assert found.outside_band_pct["T5"] == 0.0
 
 
 # -- what was predicted -----------------------------------------------------------------------------------------------
@@ -160,7 +160,7 @@ def test_what_does_not_exist_is_not_a_number(model: LtiModel) -> None:
     of_updates = (found.J_dev, found.J_open_mean, found.c2, found.tau_u_mean, found.tau_u_mean_per_update)
     assert all(map(math.isnan, of_updates))
     nothing = RunEvaluation(model, DESIGN).indicators
-    assert all(map(math.isnan, (nothing.J_BF, nothing.L1_outside_band_pct, nothing.T5_outside_band_pct)))
+    assert all(map(math.isnan, (nothing.J_BF, *nothing.outside_band_pct.values())))
 
 
 def test_an_excess_within_the_dead_band_is_no_time_outside(model: LtiModel) -> None:
@@ -169,7 +169,7 @@ def test_an_excess_within_the_dead_band_is_no_time_outside(model: LtiModel) -> N
     evaluation = RunEvaluation(model, DESIGN)
     evaluation.block(block)
     found = evaluation.excesses
-    assert evaluation.indicators.L1_outside_band_pct == pytest.approx(100.0 * 5 / 8)
+    assert evaluation.indicators.outside_band_pct["L1"] == pytest.approx(100.0 * 5 / 8)
     assert found["L1_outside_dead_band_pct"] == pytest.approx(100.0 * 2 / 8)
     assert found["L1_largest_excess"] == pytest.approx(0.5)
     assert found["L1_excess_integral"] == pytest.approx(0.25 * (0.03 + 0.5 + 0.03 + 0.5), abs=1e-4)

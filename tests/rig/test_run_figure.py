@@ -9,8 +9,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
-from coldloop.process.cold_box import INPUT_NAMES
-from rig.figures.plot import DRAWN, Bounds, RunCurves, draw_run, label_marks
+from coldloop.process.cold_box import COLD_BOX, INPUT_NAMES
+from rig.figures.plot import Bounds, RunCurves, draw_run, label_marks, labels_of
 from rig.figures.run_plot import curves_of
 from rig.results.run_folder import RunFolder, _in_force
 from rig.studies.drawing import _updates
@@ -21,7 +21,7 @@ TICKS = 4000
 
 
 def curves(level: float = 60.0, **pressures: tuple[float, float]) -> RunCurves:
-    series = {name: np.ones(TICKS) for name in (*DRAWN, *pressures)}
+    series = {name: np.ones(TICKS) for name in (*labels_of(COLD_BOX), *pressures)}
     series |= {"time_s": np.arange(TICKS) * 0.25, "L1": np.full(TICKS, level), "T5": np.full(TICKS, 10.0)}
     bounds = Bounds({"L1": (59.0, 61.0), "T5": (9.0, 16.0)}, dict.fromkeys(INPUT_NAMES, (0.0, 100.0)))
     events = [
@@ -29,7 +29,7 @@ def curves(level: float = 60.0, **pressures: tuple[float, float]) -> RunCurves:
         {"time_s": 0.25, "kind": "mode", "subject": "mpc"},
         {"time_s": 500.0, "kind": "mode", "subject": "classical"},
     ]
-    return RunCurves(series, events, bounds, "", "", pressures)
+    return RunCurves(COLD_BOX, series, events, bounds, "", "", pressures)
 
 
 def legends(figure: Figure) -> list[list[str]]:

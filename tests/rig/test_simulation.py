@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from coldloop.errors import UsageError
+from coldloop.process.cold_box import COLD_BOX
 from rig import Simulation, simulate
-from rig.results.columns import TRACE
+from rig.results.columns import TRACE, files_of
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,7 @@ def test_a_simulation_has_the_trace_of_the_command(minute: Simulation, tmp_path:
 
 def test_the_trace_is_a_data_frame_that_knows_its_units(minute: Simulation) -> None:
     frame = minute.trace.to_pandas()
-    assert list(frame.columns) == [column.name for column in TRACE]
+    assert list(frame.columns) == [column.name for column in files_of(COLD_BOX)[TRACE].columns]
     assert frame["time_s"].iloc[-1] == 59.75
     assert frame.attrs["units"]["T5"] == "K"
 

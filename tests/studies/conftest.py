@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Final
 
 import pytest
 from distributed import Client
@@ -78,6 +79,9 @@ def conducted(tmp_path: Path) -> Conducted:
 MakeOutcome = Callable[..., Outcome]
 
 
+NOTHING: Final = Indicators(*[0.0] * 8, 0, {"L1": 0.0, "T5": 0.0})
+
+
 @pytest.fixture(scope="session")
 def made_up() -> MakeOutcome:
     """Return an outcome with these columns of updates and of the trace; all indicators are 0 but those named."""
@@ -86,9 +90,9 @@ def made_up() -> MakeOutcome:
         updates: Mapping[str, Sequence[float]] | None = None,
         trace: Mapping[str, Sequence[float]] | None = None,
         sha: str = "",
-        **named: float,
+        **named: object,
     ) -> Outcome:
-        indicators = Indicators(*([0.0] * len(Indicators._fields)))._replace(**named)  # type: ignore[arg-type]
+        indicators = NOTHING._replace(**named)  # type: ignore[arg-type]
         columns = {name: [float(value) for value in values] for name, values in (updates or {}).items()}
         length = len(next(iter(columns.values()), ()))
         columns = {name: columns.get(name, [0.0] * length) for name in UPDATE_COLUMNS} | columns

@@ -40,7 +40,7 @@ def test_costs_are_compared_draw_by_draw(tmp_path: Path, made_up: "MakeOutcome")
     assert [(run.load, run.updating_period_s) for run in asked] == [("a", 0), ("a@2", 0), ("a", 2.5), ("a@2", 2.5)]
     shares = (0.0, 0.0, 1.0, 3.0)
     outcomes = {
-        run: made_up(J_BF=cost, L1_outside_band_pct=share)
+        run: made_up(J_BF=cost, outside_band_pct={"L1": share, "T5": 0.0})
         for run, cost, share in zip(asked, (1.0, 10.0, 2.0, 24.2), shares, strict=True)
     }
     result = CompareStudy().evaluate(options, outcomes)

@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rig.results.indicators import Indicators
 from rig.studies.beyond.contest import REFERENCE, SOLVERS, WAYS, ContestStudy
 from rig.studies.request import Outcome, RunRequest
 from rig.studies.settings import settings_of
 from rig.studies.study import StudyOptions
+from tests.studies.conftest import NOTHING
 
 if TYPE_CHECKING:
     from tests.studies.conftest import Conducted
@@ -18,8 +18,7 @@ STUDY = ContestStudy()
 
 
 def outcome(closed: float, opened: float) -> Outcome:
-    nothing = Indicators(*[0] * len(Indicators._fields))
-    return Outcome("", nothing._replace(J_open_mean=opened, J_BF=closed), "", 0, {}, {})
+    return Outcome("", NOTHING._replace(J_open_mean=opened, J_BF=closed), "", 0, {}, {})
 
 
 def test_costs_are_ratios_to_the_ode_based_solver_under_algorithm_1_hour_by_hour() -> None:

@@ -70,7 +70,7 @@ def test_a_bias_of_the_sensors_is_not_taken_for_a_cost() -> None:
     """At rest, exact, nothing costs anything; 1.5 % too much on the level would be 0.5 % outside the band."""
     load = Load("rest", 1, LoadProfile((0,), (MODEL.w0,)), 60)
     biased = Outcome.from_json(perform(load.request(5.0, "plant.sensors.level_bias=1.5")))
-    assert biased.indicators.L1_outside_band_pct == 0.0
+    assert biased.indicators.outside_band_pct["L1"] == 0.0
     assert biased.trace_sha256 != Outcome.from_json(perform(load.request(5.0))).trace_sha256
     noisy = Outcome.from_json(perform(load.request(5.0, "plant.sensors.level=1.5")))
-    assert noisy.indicators.L1_outside_band_pct == pytest.approx(50.0, abs=25.0)
+    assert noisy.indicators.outside_band_pct["L1"] == pytest.approx(50.0, abs=25.0)

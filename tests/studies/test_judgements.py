@@ -84,7 +84,7 @@ def test_unlimited_qpoases_is_judged_by_its_bands_and_its_iterations(
 ) -> None:
     run = made_up(
         {"tick": [0, 400, 420, 1000], "iterations": [1, 9, 3, 1], "tau_u": [20] * 4},
-        courses(L1=[60.0] * 7 + [61.75]), L1_outside_band_pct=12.5, T5_outside_band_pct=4.0, J_BF=3.0,
+        courses(L1=[60.0] * 7 + [61.75]), outside_band_pct={"L1": 12.5, "T5": 4.0}, J_BF=3.0,
     )  # fmt: skip
     assert evaluated("unlimited", under, [run]).values == {
         "unlimited: furthest outside": [0.75],
@@ -195,9 +195,9 @@ def test_what_happens_to_a_refrigerator_is_told_by_its_ranges_modes_and_alarms(
     happened = [
         ("control_plc", 0, EventKind.MODE, Mode.HOLD), ("control_plc", 8, EventKind.MODE, Mode.MPC),
         ("control_plc", 2400, EventKind.ALARM_RAISED, AlarmKind.CAPACITY),
-        ("control_plc", 2500, EventKind.ALARM_RAISED, AlarmKind.LEVEL_BAND),
+        ("control_plc", 2500, EventKind.ALARM_RAISED, AlarmKind.FIRST_BAND),
         ("control_plc", 2600, EventKind.ALARM_RAISED, AlarmKind.CAPACITY),
-        ("plant", 2600, EventKind.ALARM_RAISED, AlarmKind.T5_BAND),
+        ("plant", 2600, EventKind.ALARM_RAISED, AlarmKind.SECOND_BAND),
     ]  # fmt: skip
     run = replace(run, events=[Happening(*event) for event in happened])
     asked = STUDIES["disturbances"].requests(under)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from coldloop.errors import StudyError
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import SHIPPED_MODELS
 from optimizer_plc.computing_settings import QpoasesSettings
 from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.penalties import Preset
@@ -45,7 +46,7 @@ def with_solver(name: str) -> ProgramSettings:
 
 @pytest.fixture(scope="module")
 def problem() -> PredictiveProblem:
-    return PredictiveProblem(PredictionModel(load_model(DEFAULT_MODEL_FILE)), ControlDesign(), InputLimits())
+    return PredictiveProblem(PredictionModel(load_model(SHIPPED_MODELS["cold-box"])), ControlDesign(), InputLimits())
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +56,7 @@ def profiles(problem: PredictiveProblem) -> PlayedProfiles:
 
 def situation(rng: np.random.Generator) -> QpParameters:
     """Return a state some kPa, % and K away, and any load and input in reach."""
-    model = load_model(DEFAULT_MODEL_FILE)
+    model = load_model(SHIPPED_MODELS["cold-box"])
     scale = np.full(len(model.x0), 1.0)
     scale[0], scale[1] = 2000.0, 1.0 / model.C[0, 1]
     return QpParameters(
@@ -66,7 +67,7 @@ def situation(rng: np.random.Generator) -> QpParameters:
 @pytest.fixture(scope="module")
 def sequence() -> ProblemSequence:
     """The problems of five minutes of load e, the first load steps among them."""
-    load = find_load("e", load_model(DEFAULT_MODEL_FILE).w0)
+    load = find_load("e", load_model(SHIPPED_MODELS["cold-box"]).w0, COLD_BOX)
     return problem_sequence(Scenario(1200, load, 5.0, seed=1), ())
 
 

@@ -9,7 +9,6 @@ import pytest
 
 from coldloop.errors import StudyError
 from coldloop.process.load_profile import LoadProfile
-from rig.results.indicators import Indicators
 from rig.studies.beyond.penalties import PenaltiesStudy, misfit
 from rig.studies.beyond.penalty_variants import (
     OWN,
@@ -27,6 +26,7 @@ from rig.studies.paper.updating_period import is_inside
 from rig.studies.request import Outcome, RunRequest
 from rig.studies.settings import settings_of
 from rig.studies.study import Load, StudyOptions, first_and_fresh
+from tests.studies.conftest import NOTHING
 
 if TYPE_CHECKING:
     from tests.studies.conftest import Conducted
@@ -45,9 +45,8 @@ def test_each_variant_changes_what_its_preset_has() -> None:
 
 
 def of(total: float, lowest: float, c1: float = 0.0) -> Outcome:
-    nothing = Indicators(*[0] * len(Indicators._fields))
     columns = {"j_dev": [total / 4], "j_cst": [3 * total / 4], "lowest": [lowest]}
-    return Outcome("", nothing._replace(J_dev=total / 4, J_cst=3 * total / 4, c1=c1), "", 0, columns, {})
+    return Outcome("", NOTHING._replace(J_dev=total / 4, J_cst=3 * total / 4, c1=c1), "", 0, columns, {})
 
 
 def found(totals: dict[tuple[PenaltyVariant | None, float], float]) -> Paired:

@@ -59,8 +59,8 @@ def test_named_loads_are_drawn_anew_for_each_seed_and_files_get_noise(tmp_path: 
     assert first.profile != second.profile
     own = loads(StudyOptions(seeds=2, loads=(file,)))
     assert own[0].profile == own[1].profile
-    assert own[0].noise == NOISE
-    assert loads(StudyOptions(seeds=1, loads=(file,)))[0].noise == ()
+    assert own[0].settings == NOISE
+    assert loads(StudyOptions(seeds=1, loads=(file,)))[0].settings == ()
 
 
 def test_a_quick_study_has_one_draw_of_ten_minutes() -> None:

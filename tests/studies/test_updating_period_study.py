@@ -117,7 +117,7 @@ def test_the_two_hours_are_judged_by_their_hashes_bands_and_response(
     trace = {name: [1.0, 2.0] for name in ("time_s", "load", "L1", "T5", "CV155", "NCR22_A", "CV156", "cost")}
 
     def run(sha: str, level: float, temperature: float) -> "Outcome":
-        return made_up(responding.updates, trace, sha, L1_outside_band_pct=level, T5_outside_band_pct=temperature)
+        return made_up(responding.updates, trace, sha, outside_band_pct={"L1": level, "T5": temperature})
 
     study = STUDIES["adaptive-2h"]
     runs = [run("same", 1.0, 2.0), run("same", 1.0, 2.0), run("one", 3.5, 0.5), run("other", 0.0, 0.0)]

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coldloop.errors import LinkError, UsageError
-from coldloop.process.settings import settings_process
 from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.choices import FIGURE_FORMATS, MODES, plans
 from rig.cli.commands.options import OWN_PORTS, PLACES, check_load, configuration, refuse_ineffective
@@ -110,7 +109,7 @@ def _report(out: Path, plan: "ChaosPlan", experiment: "Experiment") -> None:
 def _changes(options: argparse.Namespace) -> dict[str, Any]:
     given = {
         "seed": options.plan_seed,
-        "duration_s": None if options.duration is None else options.duration * settings_process().tick_s,
+        "duration_s": options.duration and options.duration.seconds,
         "load": options.plan_load,
         "mode": options.plan_mode,
         "factor": options.plan_factor,

@@ -39,4 +39,5 @@ def _job(options: argparse.Namespace) -> "Job":
     effective = configuration(options)
     ends = tuple(rig_endpoints(options, effective.settings))
     effective = as_attached(effective, ends)
-    return Job(effective, session_under_way(effective, ends).scenario(options.duration), Way.RECORDED, ends)
+    ticks = options.duration.ticks(effective.settings.process.tick_s)
+    return Job(effective, session_under_way(effective, ends).scenario(ticks), Way.RECORDED, ends)

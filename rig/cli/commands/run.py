@@ -70,7 +70,8 @@ def _job(options: argparse.Namespace) -> "Job":
     factor_from = effective.sources.get("session.factor")
     if factor_from and not realtime and (settings.session.factor != 1.0 or factor_from.startswith("--")):
         raise UsageError(f"{factor_from}: a factor has no effect in lock-step; add --mode realtime")
-    scenario = make_scenario(settings, options.duration)
+    ticks = options.duration.ticks(settings.process.tick_s) if options.duration else None
+    scenario = make_scenario(settings, ticks)
     if options.attach:
         from rig.cosim.answer_time import QUIET_S
         from rig.cosim.networked_run import as_attached

@@ -3,6 +3,7 @@
 import argparse
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -71,7 +72,11 @@ def study_options(options: argparse.Namespace) -> "StudyOptions":
 
     given = vars(options)
     variants = read_variants(options.variants) if given.get("variants") else ()
-    return StudyOptions(options.seeds, given.get("duration"), tuple(given.get("load", ())), options.quick, variants)
+    asked, duration = (
+        StudyOptions(options.seeds, None, tuple(given.get("load", ())), options.quick, variants),
+        given.get("duration"),
+    )
+    return replace(asked, ticks=duration.ticks(asked.process.tick_s)) if duration else asked
 
 
 def execute(options: argparse.Namespace) -> int:

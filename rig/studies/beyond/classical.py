@@ -30,7 +30,7 @@ class ClassicalStudy:
         for load in loads(options, *"abcdef"):
             runs = [outcomes[request].indicators for request in _runs(load)]
             for label, run in zip(CASES, runs, strict=True):
-                result.rows.append((load.name, label, run.J_BF, run.L1_outside_band_pct, run.T5_outside_band_pct))
+                result.rows.append((load.name, label, run.J_BF, *run.outside_band_pct.values()))
             result.note("J_BF of the classical loops over MPC at 2.5 s", runs[0].J_BF / runs[1].J_BF)
         result.figures["closed-loop cost"] = cost_bars(result, CASES, 0.25, logarithmic=True)
         result.remarks.append(_table(result))

@@ -6,7 +6,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from coldloop.process.loaded import PROCESS
 from rig.studies.drawing import ratio_rows, spans_decade
 from rig.studies.intervals import Interval, mean_ratio
 from rig.studies.loop_cost import require_costs
@@ -17,10 +16,7 @@ from rig.text_tables import markdown_table
 
 Array = NDArray[np.float64]
 
-COLUMNS: Final = (
-    "variant", "load", "mean tau_u (s)", "J_BF", "J_BF over the reference",
-    *(f"{one.name} outside (%)" for one in PROCESS.banded),
-)  # fmt: skip
+COLUMNS: Final = ("variant", "load", "mean tau_u (s)", "J_BF", "J_BF over the reference")
 
 
 class CompareStudy:
@@ -36,17 +32,18 @@ class CompareStudy:
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Compare the cost of each variant with that of the first, draw by draw, and say what leaves its band."""
-        drawn, variants, result = loads(options, *options.hours), options.variants, StudyResult(COLUMNS, [], {})
+        drawn, variants = loads(options, *options.hours), options.variants
+        shares = tuple(f"{one.name} outside (%)" for one in options.process.banded)
+        result = StudyResult((*COLUMNS, *shares), [], {})
         found = [[outcomes[_run(load, variant)].indicators for load in drawn] for variant in variants]
         costs = np.array([[run.J_BF for run in runs] for runs in found])
         ratios = over_reference(costs)
         reference, summary = variants[0].name, []
         for variant, runs, over, ratio in zip(variants, found, costs / costs[0], ratios, strict=True):
-            outside = np.array([[getattr(run, f"{one.name}_outside_band_pct") for one in PROCESS.banded]
-                                for run in runs])  # fmt: skip
+            outside = np.array([[*run.outside_band_pct.values()] for run in runs])
             result.rows += [
-                (variant.name, load.name, run.tau_u_mean, run.J_BF, float(one), *map(float, shares))
-                for load, run, one, shares in zip(drawn, runs, over, outside, strict=True)
+                (variant.name, load.name, run.tau_u_mean, run.J_BF, float(one), *map(float, each))
+                for load, run, one, each in zip(drawn, runs, over, outside, strict=True)
             ]
             means = (f"{share:.3g}" for share in outside.mean(axis=0))
             is_reference = variant is variants[0]
@@ -55,7 +52,7 @@ class CompareStudy:
             if not is_reference:
                 what = f"J_BF of {variant.name} over that of {reference} {ratio.text()}, {in_words(ratio)}; by draw"
                 result.values[what] = over.tolist()
-        header = ("variant", f"J_BF over that of {reference}", "in words", *COLUMNS[5:])
+        header = ("variant", f"J_BF over that of {reference}", "in words", *shares)
         caption = (
             f"Geometric mean of {len(drawn)} paired runs with its 95 % interval; shares of the time outside, their mean"
         )
@@ -83,7 +80,7 @@ def in_words(ratio: Interval) -> str:
 
 
 def _run(load: Load, variant: Variant) -> RunRequest:
-    period_s = settings_of(variant.assignments).optimizer_plc.program.updating_period_s
+    period_s = settings_of((*load.settings, *variant.assignments)).optimizer_plc.program.updating_period_s
     return load.request(period_s, *variant.assignments)
 
 

@@ -40,9 +40,7 @@ class CouplingStudy:
             runs = [outcomes[request] for request in _runs(load)]
             for label, run in zip(CASES, runs, strict=True):
                 i = run.indicators
-                result.rows.append(
-                    (load.name, label, i.J_BF, i.L1_outside_band_pct, i.T5_outside_band_pct, i.tau_u_mean, *warm(run))
-                )
+                result.rows.append((load.name, label, i.J_BF, *i.outside_band_pct.values(), i.tau_u_mean, *warm(run)))
             for label, run in list(zip(CASES, runs, strict=True))[1:]:
                 ratio = run.indicators.J_BF / runs[0].indicators.J_BF
                 result.note(f"J_BF on the {label}, over the cold box alone", ratio)

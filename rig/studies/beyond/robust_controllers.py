@@ -41,7 +41,7 @@ class HoursUnder(NamedTuple):
     @classmethod
     def of(cls, runs: Sequence[Indicators]) -> Self:
         """Gather them from the runs, one for each hour."""
-        return cls(*np.array([(run.J_BF, run.L1_outside_band_pct, run.T5_outside_band_pct) for run in runs]).T)
+        return cls(*np.array([(run.J_BF, *run.outside_band_pct.values()) for run in runs]).T)
 
     @property
     def outside(self) -> str:

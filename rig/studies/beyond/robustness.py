@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from coldloop.process.signals import TICK_S
+from coldloop.process.cold_box import TICK_S
 from rig.results.indicators import Indicators
 from rig.studies.beyond.conditions import CONDITIONS, ESTIMATED, NOMINAL
 from rig.studies.beyond.robust_controllers import (
@@ -58,7 +58,7 @@ class RobustnessStudy:
         runs: dict[tuple[str, str], list[Indicators]] = {}
         for condition, name, load, request in _cases(options):
             run, minutes = outcomes[request].indicators, load.ticks * TICK_S / 60
-            outside = (run.L1_outside_band_pct, run.T5_outside_band_pct)
+            outside = tuple(run.outside_band_pct.values())
             result.rows.append((condition, load.name, name, minutes, run.J_open_mean, *outside, run.J_BF))
             runs.setdefault((condition, name), []).append(run)
         found = {key: HoursUnder.of(some) for key, some in runs.items()}

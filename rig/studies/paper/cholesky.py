@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import SHIPPED_MODELS
 from optimizer_plc.computing_settings import Arithmetic, EstimatorSettings
 from optimizer_plc.qp import linear_algebra
 from optimizer_plc.qp.arithmetic import real_of
@@ -109,7 +109,7 @@ def _counted_s(curve: SpeedCurve, count: operations.Operations) -> float:
 
 
 def _footprints() -> tuple[Footprint, Footprint]:
-    prediction = PredictionModel(load_model(DEFAULT_MODEL_FILE))
+    prediction = PredictionModel(load_model(SHIPPED_MODELS["cold-box"]))
     design, limits, real = ControlDesign(), InputLimits(), real_of(Arithmetic.FLOAT32)
     estimator = estimator_memory(prediction, EstimatorSettings())
     reduced, trivial = (

@@ -42,12 +42,12 @@ class ExperimentStudy:
                 for rig, run in (("networked", networked), ("one process", alone)):
                     i = run.indicators
                     result.rows.append(
-                        (load.name, label, rig, i.J_BF, i.L1_outside_band_pct, i.T5_outside_band_pct, i.tau_u_mean,
+                        (load.name, label, rig, i.J_BF, *i.outside_band_pct.values(), i.tau_u_mean,
                          i.tau_u_mean_per_update, run.trace_sha256)
                     )  # fmt: skip
                 same = networked.trace_sha256 == alone.trace_sha256
                 result.note(f"{self.name}: same trace, {label}", same)
-                outside = max(networked.indicators.L1_outside_band_pct, networked.indicators.T5_outside_band_pct)
+                outside = max(networked.indicators.outside_band_pct.values())
                 result.note(f"{self.name}: time outside the bands, {label}", outside)
                 if not period:
                     for what, value in response([(networked, load)], label).items():

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from coldloop.process.signals import SAMPLING_PERIOD_S, TICK_S
+from coldloop.process.cold_box import SAMPLING_PERIOD_S, TICK_S
 from rig.figures.plot import COLOURS, DASHES
 from rig.studies.drawing import legend_outside, panels
 from rig.studies.paper.trajectories import load_steps, seconds_since_step

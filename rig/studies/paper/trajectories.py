@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.signals import TICK_S
+from coldloop.process.cold_box import TICK_S
 from optimizer_plc.qp.design import ControlDesign
 from rig.studies.drawing import time_panels
 from rig.studies.request import Outcome, RunRequest, Series
@@ -55,15 +55,15 @@ class TrajectoryStudy:
             for label, run in labelled:
                 after, quiet = iterations_by_event(run, load)
                 result.rows.append(
-                    (load.name, label, run.indicators.J_BF, run.indicators.L1_outside_band_pct,
-                     run.indicators.T5_outside_band_pct, furthest_outside(run), after, quiet)
+                    (load.name, label, run.indicators.J_BF, *run.indicators.outside_band_pct.values(),
+                     furthest_outside(run), after, quiet)
                 )  # fmt: skip
             self._judge(result, load, runs)
         return result
 
     def _judge(self, result: StudyResult, load: Load, runs: Sequence[Outcome]) -> None:
         reference = runs[-1]
-        outside = reference.indicators.L1_outside_band_pct, reference.indicators.T5_outside_band_pct
+        outside = tuple(reference.indicators.outside_band_pct.values())
         after, quiet = iterations_by_event(reference, load)
         values: dict[str, float] = {}
         if len(runs) == 1:
