@@ -3,7 +3,7 @@
 import math
 from typing import Any, Final
 
-from coldloop.process.declaration import Input, Output, Process, Range
+from coldloop.process.declaration import Output, Process, Range
 
 BESIDE_BAND: Final = 1.5
 """What a bar shows beside a band, on each side, over the width of the band."""
@@ -23,7 +23,7 @@ def process_document(process: Process) -> dict[str, Any]:
         "sample_s": process.sampling_period_s,
         "inputs": [
             {"name": one.name, "label": one.name[: len(one.register)], "register": one.register, "unit": one.unit,
-             "bounds": [one.low, one.high], "bar": one.bar or _input_bar(one)}
+             "bounds": [one.low, one.high], "bar": one.bar or _widened(one.low, one.high, BESIDE_BOUNDS)}
             for one in process.inputs
         ],
         "controlled": [_output(one) for one in process.banded],
@@ -47,10 +47,6 @@ def _output_bar(one: Output) -> Range:
         return one.range
     low, high = _widened(one.band.low, one.band.high, BESIDE_BAND)
     return (low, high) if one.range[0] == one.range[1] else (max(low, one.range[0]), min(high, one.range[1]))
-
-
-def _input_bar(one: Input) -> Range:
-    return _widened(one.low, one.high, BESIDE_BOUNDS)
 
 
 def _widened(low: float, high: float, share: float) -> Range:
