@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from coldloop.config import load_configuration
 from coldloop.modbus.client import RegisterClient
-from coldloop.process.signals import TICK_S
+from coldloop.process.cold_box import TICK_S
 from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus, Status
 from coldloop.registers.maps import CONTROL_MAP
 from coldloop.service.start import run_event_loop

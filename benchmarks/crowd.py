@@ -20,7 +20,7 @@ from pathlib import Path
 from coldloop.config import load_configuration
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.signals import TICK_S
+from coldloop.process.cold_box import TICK_S
 from coldloop.registers.common import ServerStatistics
 from coldloop.registers.control_plc import ProcessNow
 from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP

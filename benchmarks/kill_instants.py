@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 
 from coldloop.config import Configuration, load_configuration
-from coldloop.process.signals import TICK_S
+from coldloop.process.cold_box import TICK_S
 from coldloop.session.settings import TimeMode
 from rig.chaos.evaluation import Evaluation
 from rig.chaos.experiment import perform

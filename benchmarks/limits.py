@@ -13,7 +13,7 @@ import numpy as np
 from qp_solvers import RecordedProblem, record
 
 from coldloop.process.lti_model import load
-from coldloop.process.signals import TICK_S
+from coldloop.process.cold_box import TICK_S
 from optimizer_plc.computing_settings import OdeSettings
 from optimizer_plc.qp.costs import matrices_of
 from optimizer_plc.qp.penalties import DEFAULT_PENALTIES

@@ -18,7 +18,7 @@ import aiohttp
 
 from coldloop.config import load_configuration
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.signals import TICK_S
+from coldloop.process.cold_box import TICK_S
 from plant.load import find_load
 from rig.cosim.local_services import LocalServices
 from rig.cosim.ports import ReservedPorts

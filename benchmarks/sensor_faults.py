@@ -14,7 +14,7 @@ from typing import NamedTuple, cast
 
 from coldloop.process.cold_box import L1, T5
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.signals import OUTPUT_NAMES, OUTPUT_UNITS, TICK_S
+from coldloop.process.cold_box import OUTPUT_NAMES, OUTPUT_UNITS, TICK_S
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Mode
 from optimizer_plc.qp.design import ControlDesign

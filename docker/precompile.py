@@ -51,7 +51,7 @@ def default_plant() -> None:
 def _make_plant(kind: "PlantKind") -> None:
     from coldloop.process.load_profile import LoadProfile  # noqa: PLC0415
     from coldloop.process.model_file import read_header  # noqa: PLC0415
-    from coldloop.process.model_settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
+    from coldloop.process.settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
     from plant.kinds import plant_maker  # noqa: PLC0415
     from plant.settings import PlantSection  # noqa: PLC0415
 
@@ -110,7 +110,7 @@ def default_solver() -> None:
 def _make_optimizer(settings: "ProgramSettings", kind: "type[OptimizerProgram] | None" = None) -> None:
     from coldloop.process.limits import InputLimits  # noqa: PLC0415
     from coldloop.process.lti_model import load  # noqa: PLC0415
-    from coldloop.process.model_settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
+    from coldloop.process.settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
     from optimizer_plc.program import OptimizerProgram  # noqa: PLC0415
 
     (kind or OptimizerProgram)(load(DEFAULT_MODEL_FILE), settings, InputLimits())
@@ -134,7 +134,7 @@ def in_one_process(**changes: Any) -> Callable[[], None]:  # noqa: ANN401 sectio
 
 def linear_models() -> None:
     """Linearise both plants, which takes kernels of complex numbers."""
-    from coldloop.process.model_settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
+    from coldloop.process.settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
     from optimizer_plc.qp.design import ControlDesign  # noqa: PLC0415
     from plant.cold_box.plant_file import PlantFile  # noqa: PLC0415
     from plant.refrigerator.model import make_refrigerator_file  # noqa: PLC0415

@@ -1,12 +1,13 @@
 """What an operator's commands read of the configuration; it imports no service, for they are to answer at once."""
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from coldloop.modbus.settings import TlsSettings
 from coldloop.process.limits import InputLimits
+from coldloop.process.settings import RootSettings
 from coldloop.registers.codec import WordOrder
 
-OTHERS = ("model", "session", "telemetry", "hmi")
+OTHERS = ("session", "telemetry", "hmi")
 """Sections that a configuration may have and an operator's client does not read."""
 
 
@@ -27,12 +28,10 @@ class ServerPlace(BaseModel):
     word_order: WordOrder = WordOrder.HIGH_FIRST
 
 
-class OperatorSettings(BaseModel):
+class OperatorSettings(RootSettings):
     """What an operator's client reads of a configuration."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    limits: InputLimits = InputLimits()
+    limits: InputLimits = Field(default_factory=InputLimits)
     plant: ServerPlace = ServerPlace()
     control_plc: ServerPlace = ServerPlace()
     optimizer_plc: ServerPlace = ServerPlace()

@@ -5,9 +5,7 @@ from collections.abc import Iterable, Sequence
 from itertools import groupby
 from typing import Any, Final, NamedTuple
 
-from coldloop.process.load_profile import LOAD_UNIT
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import TICK_UNIT
+from coldloop.process.declaration import Process
 
 WIDTH: Final = 24
 """Of a board, in Grafana's units."""
@@ -35,8 +33,6 @@ STATE: Final = (
     Panel("Deadlines missed", "short", (("coldloop_control_plc_status_deadline_misses", "missed"),)),
 )  # fmt: skip
 OPTIMISER: Final = (
-    Panel(f"Updating period, ticks of {TICK_UNIT}", "short",
-          (("coldloop_update_tau_u", "tau_u"), ("coldloop_update_iterations", "iterations"))),
     Panel("Cost", "short",
           (("coldloop_update_j_effective", "J reached"), ("coldloop_update_j_delivered", "J predicted"))),
     Panel("Lateness of scans", "ms",
@@ -46,9 +42,14 @@ OPTIMISER: Final = (
 )  # fmt: skip
 
 
-def board() -> str:
-    """Return the dashboard of the process, as JSON to import."""
-    panels = [*_laid_out(STATE, "stat", 0, 4, 4), *_laid_out((*_process(), *OPTIMISER), "timeseries", 4, 2, 7)]
+def board(process: Process) -> str:
+    """Return the dashboard of a process, as JSON to import."""
+    period = Panel(f"Updating period, ticks of {process.tick_unit}", "short",
+                   (("coldloop_update_tau_u", "tau_u"), ("coldloop_update_iterations", "iterations")))  # fmt: skip
+    panels = [
+        *_laid_out(STATE, "stat", 0, 4, 4),
+        *_laid_out((*_process(process), period, *OPTIMISER), "timeseries", 4, 2, 7),
+    ]
     document = {
         "title": "Coldloop", "uid": "coldloop", "schemaVersion": 39, "version": 1, "editable": True, "refresh": "5s",
         "time": {"from": "now-30m", "to": "now"}, "tags": ["coldloop"],
@@ -59,21 +60,22 @@ def board() -> str:
     return json.dumps(document, indent=1) + "\n"
 
 
-def _process() -> Iterable[Panel]:
+def _process(process: Process) -> Iterable[Panel]:
     """Yield outputs with their bands, then the inputs by unit, those in the unit of the load with it."""
     limits = "coldloop_optimizer_plc_operating_limits_output"
-    for one in PROCESS.banded:
+    for one in process.banded:
         bounds = ((f"{limits}_{end}{_of(one.name)}", end) for end in ("low", "high"))
         yield _panel(one.name, one.unit, ((f"coldloop_control_plc_process_y{_of(one.name)}", one.name), *bounds))
-    curves = {LOAD_UNIT: [("coldloop_control_plc_process_load", "load")]}
-    for unit, group in groupby(sorted(PROCESS.inputs, key=lambda one: one.unit), key=lambda one: one.unit):
+    unit_of_load = process.load.unit
+    curves = {unit_of_load: [("coldloop_control_plc_process_load", "load")]}
+    for unit, group in groupby(sorted(process.inputs, key=lambda one: one.unit), key=lambda one: one.unit):
         curves.setdefault(unit, []).extend(
             (f"coldloop_control_plc_process_u{_of(one.name)}", one.name) for one in group
         )
-    with_load = curves.pop(LOAD_UNIT)
+    with_load = curves.pop(unit_of_load)
     for unit, each in curves.items():
         yield _panel("Inputs", unit, tuple(each))
-    yield _panel("Load", LOAD_UNIT, tuple(with_load))
+    yield _panel("Load", unit_of_load, tuple(with_load))
 
 
 def _panel(title: str, unit: str, curves: tuple[Curve, ...]) -> Panel:

@@ -15,10 +15,8 @@ from coldloop.config import selected
 from coldloop.errors import UsageError
 from coldloop.parsing import parsed_json
 from coldloop.process.limits import RateReference
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import INPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.process.updating_periods import SHORTEST_TICKS
-from coldloop.registers.control_plc import SEQUENCE_ROWS
+from coldloop.registers.control_plc import SEQUENCE_ROWS, control_map
 from optimizer_plc.settings import SHOWN
 from rig.plc_export.c.bit_flips import require_compiler, scored
 from rig.plc_export.c.bus_registers import bus_files
@@ -64,8 +62,6 @@ REFERENCES: Final = {
     RateReference.PER_UPDATE: "Each update may use this rate, however soon it follows the one before.",
     RateReference.ELAPSED: "An update may use the share of this rate for which the outputs have stood still before it.",
 }
-FIXED_TICKS: Final = max(SHORTEST_TICKS, TICKS_PER_SAMPLE // 2)
-"""Updating period of the second half of the golden updates; that of the first is adaptive."""
 CUT: Final = Cut(WORK, PIECE)
 """How calls are cut in Structured Text; in C each does all of an iteration."""
 CUTTING: Final = {"WORK": f"{WORK:,}", "PIECE": f"{PIECE:,}"}
@@ -93,12 +89,17 @@ def export_plc(
     refuse_taken(folder)
     if score:
         require_compiler()
-    if not PROCESS.forecasts:
+    if not settings.process.forecasts:
         refuse(settings.optimizer_plc.program)
-    recorded = record(ticks or TICKS)
+    of_paper = paper_settings(settings.model.file)
+    recorded = record(of_paper, ticks or TICKS)
     vectors = telling(recorded, ticks)
-    texts = c99(recorded, vectors, profile) if target == "c" else structured_text(recorded, vectors, profile, target)
-    if not PROCESS.forecasts:
+    texts = (
+        c99(of_paper, recorded, vectors, profile)
+        if target == "c"
+        else structured_text(of_paper, recorded, vectors, profile, target)
+    )
+    if not settings.process.forecasts:
         written = whole_optimizer(target, settings, ticks, profile)
         texts |= {f"{OPTIMIZER}/{name}": text for name, text in written.items()}
     texts |= {f"{GUARD}/{name}": text for name, text in output_guard(target, settings).items()}
@@ -124,7 +125,7 @@ def telling(recorded: GoldenVectors, ticks: int | None) -> list[GoldenVector]:
 
 
 def structured_text(
-    recorded: GoldenVectors, vectors: list[GoldenVector], profile: PlcProfile | None, target: str
+    settings: Settings, recorded: GoldenVectors, vectors: list[GoldenVector], profile: PlcProfile | None, target: str
 ) -> dict[str, str]:  # fmt: skip
     """Return the files of Structured Text by their names: sources, or one of PLCopen XML."""
     export = StructuredTextExport(recorded.method, vectors[0].problem, vectors)
@@ -134,20 +135,24 @@ def structured_text(
     parts = {**loading(target), "AT_ONCE": str(AT_ONCE), **CUTTING, "VERDICT": verdict_table(export.outputs)}
     needed = {"constants": sizes.constants, "an instance of `cl_solver`, with its problem": sizes.solver,
               "self-test and golden vectors": sizes.self_test}  # fmt: skip
-    return described("structured_text/readme_solver.md", recorded, vectors, texts, parts, needed, profile, CUT)
+    return described(
+        "structured_text/readme_solver.md", settings, recorded, vectors, texts, parts, needed, profile, CUT
+    )
 
 
-def c99(recorded: GoldenVectors, vectors: list[GoldenVector], profile: PlcProfile | None) -> dict[str, str]:
+def c99(
+    settings: Settings, recorded: GoldenVectors, vectors: list[GoldenVector], profile: PlcProfile | None
+) -> dict[str, str]:  # fmt: skip
     """Return the files of C99 by their names."""
     export = OdeExport(recorded.method, vectors[0].problem, np.arange(1, len(vectors[0].answer.costs) + 1))
     texts, sizes = export.files(vectors), export.sizes(vectors)
     needed = {"constants": sizes.constants, "stack of `solve_problem`, arrays and numbers": sizes.stack,
               "self-test and golden vectors": sizes.self_test}  # fmt: skip
-    return described("c/readme_solver.md", recorded, vectors, texts, {}, needed, profile, WHOLE)
+    return described("c/readme_solver.md", settings, recorded, vectors, texts, {}, needed, profile, WHOLE)
 
 
 def described(
-    name: str, recorded: GoldenVectors, vectors: list[GoldenVector], texts: Mapping[str, str],
+    name: str, settings: Settings, recorded: GoldenVectors, vectors: list[GoldenVector], texts: Mapping[str, str],
     parts: Mapping[str, str], needed: dict[str, int], profile: PlcProfile | None, cut: Cut,
 ) -> dict[str, str]:  # fmt: skip
     """Return the files with a README, the template of this name with its figures, and a manifest with what it costs."""
@@ -155,11 +160,11 @@ def described(
     iterations = len(vectors) * len(vectors[0].answer.costs)
     tested = {"iterations": iterations, "operations": count.total}
     cost = ExportCost(variables=len(problem.phi), operations={ITERATION: cost_of(count)}, bytes=needed,
-                      self_test=tested, work=cut.work, piece=cut.piece)  # fmt: skip
+                      self_test=tested, work=cut.work, piece=cut.piece, longest_period_s=settings.process.sampling_period_s)  # fmt: skip
     readme = filled(template(name), {
         **parts, "COST": cost_text(cost, profile), "RECORDED": str(iterations),
-        "PROBLEM": problem_layout(*problem_of(paper_settings())),
-        "OPTIMIZER": ALONE if PROCESS.forecasts else BESIDE,
+        "PROBLEM": problem_layout(*problem_of(settings)),
+        "OPTIMIZER": ALONE if settings.process.forecasts else BESIDE,
         "N": str(len(problem.phi)), "M": str(len(problem.gamma)), "K": str(len(vectors[0].answer.costs)),
         "VECTORS": str(len(vectors)), "FILES": ", ".join(f"`{name}`" for name in texts),
     })  # fmt: skip
@@ -188,17 +193,19 @@ def whole_optimizer(
 ) -> dict[str, str]:  # fmt: skip
     """Return the files of the whole optimiser by their names, with its golden updates."""
     recorder = UpdateRecorder(settings)
-    periods_s = (0.0, FIXED_TICKS * TICK_S)
+    process = settings.process
+    fixed_ticks = max(SHORTEST_TICKS, process.ticks_per_sample // 2)
+    periods_s = (0.0, fixed_ticks * process.tick_s)  # the first half of the golden updates is adaptive
     golden = [each for period_s in periods_s for each in recorder.record(ticks or TICKS, LOAD, period_s)]
     write = optimizer_in_c if target == "c" else optimizer_in_text
     name, texts, parts, needed = write(target, settings, recorder, golden)
-    recorded = record(ticks or TICKS, settings=settings)
+    recorded = record(settings, ticks or TICKS)
     count = counted_iterations(recorded.method, telling(recorded, ticks))
     others = {call: CallCost(**found._asdict()) for call, found in
               counted_updates(recorder.optimizer, golden[:COUNTED]).items()}  # fmt: skip
     cut = WHOLE if target == "c" else CUT
     cost = ExportCost(variables=len(recorded.vectors[0].guess), operations={**others, ITERATION: cost_of(count)},
-                      bytes=needed, work=cut.work, piece=cut.piece)  # fmt: skip
+                      bytes=needed, work=cut.work, piece=cut.piece, longest_period_s=settings.process.sampling_period_s)  # fmt: skip
     texts[README] = filled(template(name), {
         **parts, "COST": cost_text(cost, profile),
         "GOLDEN": str(len(golden)), "COUNTED": str(min(COUNTED, len(golden))),
@@ -230,7 +237,7 @@ def optimizer_in_text(
     texts, sizes = export.files(), export.sizes()
     if target == "plcopen":
         texts = {f"{OPTIMIZER}.xml": plcopen_xml(texts.values(), "the whole optimiser and a self-test")}
-    texts["registers.md"] = register_table() + "\n"
+    texts["registers.md"] = register_table(control_map(recorder.optimizer.process)) + "\n"
     needed = {"constants": sizes.constants, "state": sizes.state, "instances of the four blocks": sizes.blocks,
               "self-test and golden updates": sizes.self_test}  # fmt: skip
     parts = {**loading(target), **CUTTING, "DIGEST": str(recorder.optimizer.model_digest),
@@ -243,24 +250,25 @@ def optimizer_in_text(
 
 def output_guard(target: str, settings: Settings) -> dict[str, str]:
     """Return the files of the control PLC's output guard by their names, with its golden calls."""
+    process = settings.process
     kernels, golden = GuardKernels(settings.limits), golden_calls(settings.limits)
-    export = GuardExport(kernels, golden) if target == "c" else GuardText(kernels, golden)
+    export = GuardExport(kernels, golden, process.tick_s) if target == "c" else GuardText(kernels, golden)
     texts, name = export.files(), "c" if target == "c" else "structured_text"
     if target == "plcopen":
         texts = {f"{GUARD}.xml": plcopen_xml(texts.values(), "the output guard and a self-test")}
     counts = {call: CallCost(**found._asdict()) for call, found in counted_guard(kernels, golden).items()}
     counts["judgement"] = counts["judgement"].model_copy(update={"worst": counted_longest(kernels)})
-    cost = ExportCost(variables=len(INPUT_NAMES), operations=counts, bytes=export.sizes())
+    cost = ExportCost(variables=len(process.inputs), operations=counts, bytes=export.sizes())
     said = {} if target == "c" else {**loading(target), "VERDICT": verdict_table(GuardText.outputs)}
     parts = {each: of_guard(text) for each, text in said.items()}
     texts[README] = filled(template(f"{name}/{GUARD}/readme.md"), {
         **parts, "COST": cost_text(cost), "GOLDEN": str(len(golden)), "ROWS": str(SEQUENCE_ROWS),
         "FILES": ", ".join(f"`{each}`" for each in texts),
-        "LIMITS": markdown_table(("input", "low", "high", f"most in {TICKS_PER_SAMPLE * TICK_S:g} s"), [
+        "LIMITS": markdown_table(("input", "low", "high", f"most in {process.sampling_period_s:g} s"), [
             (signal, *(f"{each:g}" for each in limits))
-            for signal, *limits in zip(INPUT_NAMES, *kernels.limits[:3], strict=True)
+            for signal, *limits in zip(process.input_names, *kernels.limits[:3], strict=True)
         ]),
-        "REFERENCE": REFERENCES[settings.limits.rate_reference], "SLEW_S": f"{kernels.limits.slew_ticks * TICK_S:g}",
+        "REFERENCE": REFERENCES[settings.limits.rate_reference], "SLEW_S": f"{kernels.limits.slew_ticks * process.tick_s:g}",
     })  # fmt: skip
     return texts
 

@@ -51,7 +51,7 @@ def _named(register_map: RegisterMap) -> Iterator[Tag]:
             continue
         if block.record is Alarm:
             for kind in AlarmKind:
-                yield from _tags(block, int(kind), f"{block.name}_{alarm_word(kind)}")
+                yield from _tags(block, int(kind), f"{block.name}_{alarm_word(kind, register_map.process)}")
         elif block.rows == 1:
             yield from _tags(block, 0, block.name)
 
@@ -220,5 +220,5 @@ EXPORTS: Final[Mapping[str, Callable[[Sequence[RegisterMap], Places], str]]] = {
     "node-red": as_node_red,
     "fuxa": as_fuxa,
     "ignition": as_ignition,
-    "grafana": lambda _maps, _places: board(),  # of metrics, which have the names of the registers
+    "grafana": lambda maps, _places: board(maps[0].process),  # of metrics, which have the names of the registers
 }

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from coldloop.process.lti_model import load
 from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import SequenceRow
-from coldloop.registers.maps import CONTROL_MAP
+from coldloop.registers.control_plc import SequenceRow, control_map
 from coldloop.registers.plant import PlantSample
 from control_plc.guard import OutputGuard
 from optimizer_plc.computing_settings import EstimatorKind
@@ -59,7 +58,7 @@ def run_ideal_loop(
     estimator, belief = estimator_of(prediction, kalman), no_belief(prediction.n_states, len(prediction.y0))
     solver = DaqpSolver(program.daqp)
     plant = plant_maker(header, settings.plant)(scenario.load, scenario.seed)
-    applied = as_transmitted(SequenceRow(tuple(model.u0.tolist())), CONTROL_MAP).u
+    applied = as_transmitted(SequenceRow(tuple(model.u0.tolist())), control_map(settings.process)).u
     guard = OutputGuard(settings.limits, applied)
     z = problem.hold(np.zeros(len(applied)))
     recorder.begin()

@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from coldloop.errors import LoadFileError
 from coldloop.kernels.first_use import kernels_of
-from coldloop.process.load_profile import LOAD_SPAN, LOAD_UNIT, LoadProfile
-from coldloop.process.loaded import PROCESS
+from coldloop.process.declaration import Process
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Update, Verdict
-from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
+from coldloop.registers.maps import Maps, maps_of
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.plant import LoadStep, Measurement, PlantSample, StationSample
+from coldloop.registers.plant import LoadStep, Measurement, PlantSample, StationSample, plant_map
 from control_plc.program import ControlProgram
 from control_plc.program import make_program as make_control_program
 from optimizer_plc.program import OptimizerProgram
@@ -50,6 +50,7 @@ class Programs(NamedTuple):
     plant: PlantProgram
     control: ControlProgram
     optimizer: OptimizerProgram
+    maps: Maps
 
     def tick(self, listener: Listener) -> None:
         """Do one tick."""
@@ -59,41 +60,42 @@ class Programs(NamedTuple):
             self.control.optimizer_seen()  # an optimiser that idles goes on to send heartbeats
         update = self._scan(listener)
         if update is not None:
-            self.control.accept_plan(
-                as_transmitted(self.optimizer.plan(as_transmitted(update, CONTROL_MAP)), CONTROL_MAP)
-            )
+            to_control = self.maps.control_plc
+            plan = self.optimizer.plan(as_transmitted(update, to_control))
+            self.control.accept_plan(as_transmitted(plan, to_control))
 
     def _deliver(self, listener: Listener) -> None:
         sequence = self.optimizer.solve()
         answer = self.control.offer(sequence)
         self.optimizer.answered(late=False)
-        listener.update(as_transmitted(self.optimizer.report(Verdict(answer.verdict)), OPTIMIZER_MAP))
+        listener.update(as_transmitted(self.optimizer.report(Verdict(answer.verdict)), self.maps.optimizer_plc))
 
     def _scan(self, listener: Listener) -> Update | None:
-        plant = self.plant
-        actuators = as_transmitted(self.control.begin_scan(), PLANT_MAP)
+        plant, to_plant = self.plant, self.maps.plant
+        actuators = as_transmitted(self.control.begin_scan(), to_plant)
         u = actuators.u
         plant.apply(u)
         measurement = as_transmitted(
-            Measurement(plant.tick, plant.load, plant.measure(), plant.state, actuators.session, u), PLANT_MAP
+            Measurement(plant.tick, plant.load, plant.measure(), plant.state, actuators.session, u), to_plant
         )
         if plant.station is not None:
-            listener.station(as_transmitted(plant.station, PLANT_MAP))
+            listener.station(as_transmitted(plant.station, to_plant))
         listener.sample(PlantSample(plant.tick, measurement.load, u, measurement.y, measurement.x))
         plant.advance()
         return self.control.end_scan(measurement)
 
 
-def load_table(load: LoadProfile) -> LoadProfile:
-    """Return a load as the plant's table has it after crossing the bus.
+def load_table(load: LoadProfile, process: Process) -> LoadProfile:
+    """Return a load of a process as the plant's table has it after crossing the bus.
 
     Raises:
         LoadFileError: The table does not take it.
     """
-    steps = [as_transmitted(LoadStep(*step), PLANT_MAP) for step in zip(load.times, load.watts, strict=True)]
-    low, high = LOAD_SPAN
+    registers = plant_map(process)
+    steps = [as_transmitted(LoadStep(*step), registers) for step in zip(load.times, load.watts, strict=True)]
+    low, high = process.load.stored_span
     if not all(low <= step.watts <= high for step in steps):
-        raise LoadFileError(f"a load is outside {low:g} to {high:g} {LOAD_UNIT}")
+        raise LoadFileError(f"a load is outside {low:g} to {high:g} {process.load.unit}")
     return LoadProfile(tuple(step.tick for step in steps), tuple(step.watts for step in steps))
 
 
@@ -124,7 +126,7 @@ class OneProcessRig:
     def _kernels(self) -> AbstractContextManager[None]:
         """Announce what is compiled as the kernels of a run like this one."""
         kind, solver = self._settings.plant.kind, self._settings.optimizer_plc.program.solver_name
-        plant = kind if kind is PlantKind.REFRIGERATOR else PROCESS.name
+        plant = kind if kind is PlantKind.REFRIGERATOR else self._settings.process.name
         return kernels_of(f"the {plant.replace('-', ' ')} and the {solver} solver in one process", about_s=50)
 
     def _plant(self, load: LoadProfile, seed: int) -> PlantProgram:
@@ -144,9 +146,9 @@ class OneProcessRig:
         return CompiledStretches(plant, compiled, self.control, self.optimizer, load, may_compile=may_compile)
 
     def _run(self, scenario: Scenario, recorder: Recorder) -> None:
-        load = load_table(scenario.load)
+        load = load_table(scenario.load, self._settings.process)
         plant = self._plant(load, scenario.seed)
-        programs = Programs(plant, self.control, self.optimizer)
+        programs = Programs(plant, self.control, self.optimizer, maps_of(self._settings.process))
         self.optimizer.restart(scenario.updating_period_s)
         noted = self.control.journal.count
         self.control.restart(session=1)

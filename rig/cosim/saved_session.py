@@ -7,10 +7,8 @@ from coldloop.errors import LinkError
 from coldloop.operating.execution import lead_ticks, write_pace
 from coldloop.operating.load_stream import LoadStream
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Operator, OperatorMode
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import LOAD_ROWS, LiveLoad, LoadStatus, LoadStep, PlantSession
 from coldloop.registers.seal import sealed
 from rig.cosim.session_client import SessionClient
@@ -70,7 +68,7 @@ async def restore_session(rig: SessionClient, saved: SavedSession | None, sessio
         if saved.operator.mode != OperatorMode.AUTO:
             await rig.control.write(saved.operator)
         tick = (await rig.plant.read(Identity)).tick
-        await rig.plant.write(sealed(LiveLoad(0, saved.load.watts[0]), PLANT_MAP))
+        await rig.plant.write(sealed(LiveLoad(0, saved.load.watts[0]), rig.plant.map))
         coming = LoadProfile(saved.load.times, saved.load.watts)
         await LoadStream(
             rig.plant, session, coming, begin=tick + lead_ticks(saved.pace, rig.plant.process.tick_s)
@@ -78,4 +76,4 @@ async def restore_session(rig: SessionClient, saved: SavedSession | None, sessio
     except LinkError as error:
         log.warning("the rig was not restored: %s", error)
     else:
-        log.info("restored at %g s", tick * TICK_S)
+        log.info("restored at %g s", tick * rig.plant.process.tick_s)

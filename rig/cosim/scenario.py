@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from coldloop.process.load_profile import LOAD_COLUMN, LoadProfile
-from coldloop.process.signals import TICK_S
+from coldloop.process.load_profile import LoadProfile
 from coldloop.table import TIME
 from coldloop.whole_file import whole_text
 from plant.load import HOUR_TICKS, named_families
@@ -44,8 +43,8 @@ def with_copied_load(settings: Settings, profile: LoadProfile, folder: Path) -> 
     if named_families(settings.plant.load) is not None:
         return settings
     (folder / INPUTS).mkdir(exist_ok=True)
-    steps = zip(profile.times, profile.watts, strict=True)
-    rows = "".join(f"{tick * TICK_S!r},{watts!r}\n" for tick, watts in steps)
-    whole_text(folder / LOAD_COPY, f"{TIME},{LOAD_COLUMN}\n{rows}")
+    process, steps = settings.process, zip(profile.times, profile.watts, strict=True)
+    rows = "".join(f"{tick * process.tick_s!r},{watts!r}\n" for tick, watts in steps)
+    whole_text(folder / LOAD_COPY, f"{TIME},{process.load.column}\n{rows}")
     plant = settings.plant.model_copy(update={"load": str(folder / LOAD_COPY)})
     return settings.model_copy(update={"plant": plant})

@@ -12,10 +12,9 @@ from typing import Final, TypeVar
 from coldloop.errors import LinkError, ModelFileError, PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
 from coldloop.operating.load_stream import LoadStream, write_table
-from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import ControlSession, Grant, LadderStatus, Mode, Status
-from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
+from coldloop.registers.maps import maps_of
 from coldloop.registers.optimizer_plc import OptimizerSession
 from coldloop.registers.plant import HISTORY_ROWS, STATION_ROWS, PlantSession
 from plant.own_model import own_header
@@ -74,9 +73,8 @@ class SessionClient:
     ) -> None:
         self._settings = settings
         self._tolerant = tolerant
-        self.plant = RegisterClient.at(PLANT_MAP, endpoints.plant)
-        self.control = RegisterClient.at(CONTROL_MAP, endpoints.control_plc)
-        self.optimizer = RegisterClient.at(OPTIMIZER_MAP, endpoints.optimizer_plc)
+        self.plant, self.control, self.optimizer = map(RegisterClient.at, maps_of(settings.process), endpoints)
+        self._tick_s = settings.process.tick_s
         every = {"plant": self.plant, "control_plc": self.control, "optimizer_plc": self.optimizer}
         self.clients = {service: every[service] for service in services}
         self.session = 0
@@ -149,7 +147,7 @@ class SessionClient:
         realtime = int(scenario.realtime)
         if "optimizer_plc" in self.clients:
             await self.optimizer.write(
-                OptimizerSession(session, realtime, scenario.factor, round(scenario.updating_period_s / TICK_S))
+                OptimizerSession(session, realtime, scenario.factor, round(scenario.updating_period_s / self._tick_s))
             )
         rows = await write_table(self.plant, scenario.load)
         await self.plant.write(PlantSession(session, realtime, scenario.factor, scenario.seed, rows))
@@ -218,14 +216,14 @@ class SessionClient:
     async def _follow(self) -> None:
         scenario, recorder = self._scenario, self._recorder
         quiet_since = time.monotonic()
-        pause_s = min(20 * TICK_S / scenario.factor, LONGEST_PAUSE_S) if scenario.realtime else SHORTEST_PAUSE_S
+        pause_s = min(20 * self._tick_s / scenario.factor, LONGEST_PAUSE_S) if scenario.realtime else SHORTEST_PAUSE_S
         while (done := recorder.next_tick) < scenario.ticks:
             await self.grant(scenario.ticks)
             await self.look()
             now = time.monotonic()
             if recorder.next_tick > done:
                 quiet_since = now
-            elif now - quiet_since > max(QUIET_S, 4 * TICK_S / scenario.factor):
+            elif now - quiet_since > max(QUIET_S, 4 * self._tick_s / scenario.factor):
                 raise LinkError(
                     f"{self.plant.peer} has been at tick {done} for {now - quiet_since:.0f} s: "
                     "see the logs of the control PLC and of the optimiser"

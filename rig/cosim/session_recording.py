@@ -11,7 +11,6 @@ from typing import Final, NamedTuple
 from coldloop.errors import LinkError, UsageError
 from coldloop.operating.rings import last_update
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Status
@@ -129,7 +128,7 @@ async def record_session(rig: SessionClient, scenario: Scenario, recorder: Recor
             await rig.contact(updates.read())
             await rig.contact(events.look(CONTROL, PLANT))
             recorder.link = late.after(await rig.contact(rig.control.read(Status)))
-            pause_s = TICK_S / scenario.factor if scenario.realtime else SHORTEST_PAUSE_S
+            pause_s = rig.plant.process.tick_s / scenario.factor if scenario.realtime else SHORTEST_PAUSE_S
             await asyncio.sleep(min(max(pause_s, SHORTEST_PAUSE_S), LONGEST_PAUSE_S))
     finally:  # what ended the recording is reported, not that the last of it cannot be read
         for read in (updates.read, partial(events.read, CONTROL), partial(events.read, PLANT)):

@@ -1,12 +1,11 @@
 """What the reference PLC can do in an updating period, and whether its memory holds the problem, as text."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from coldloop.process.lti_model import load
-from coldloop.process.signals import SAMPLING_PERIOD_S, TICK_S
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.computing_settings import Arithmetic, EstimatorKind
 from optimizer_plc.estimator import check_detectability
@@ -36,7 +35,8 @@ from rig.plc_sizing.verdict import fits, power_of, verdict
 from rig.settings import Settings
 from rig.text_tables import aligned
 
-PERIODS_S = tuple(share * SAMPLING_PERIOD_S for share in (0.2, 0.5, 1.0))
+SHARES: Final = (0.2, 0.5, 1.0)
+"""Of a sampling period: updating periods that are shown."""
 SOLVER_COLUMNS = ("solver", "paper s", "dense s", "without zeros s", "tau_1_s", "default follows")
 
 
@@ -185,14 +185,16 @@ def solver_table(
         rows.append((
             name, "" if solver.paper_s is None else f"{solver.paper_s:.2f}",
             *(f"{solver.operations(one).flops / speed:.3f}" for one in sizes), f"{tau_1_s:g}", solver.default,
-            str(len(plc.ladder)), *(str(plc.iterations(round(period / TICK_S))) for period in periods_s),
+            str(len(plc.ladder)), *(str(plc.iterations(round(period / plc.times.tick_s))) for period in periods_s),
             f"{memory[name] / 1e3:.1f}",
         ))  # fmt: skip
     return rows
 
 
 def _iterations(program: ProgramSettings, problem: PredictiveProblem, period_s: float | None) -> str:
-    table = solver_table(program, problem, PERIODS_S if period_s is None else (period_s,))
+    longest_s = program.process.sampling_period_s
+    periods_s = [share * longest_s for share in SHARES] if period_s is None else [period_s]
+    table = solver_table(program, problem, periods_s)
     return f"seconds at P = 1, iterations done at P = {program.budget.power:.3g}\n{aligned(table, numbers=True)}"
 
 

@@ -23,7 +23,6 @@ from scipy.special import betaincinv
 
 from coldloop.errors import ConfigurationError
 from coldloop.process.lti_model import load
-from coldloop.process.signals import TICKS_PER_SAMPLE
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.qp.costs import augmented_cost
 from optimizer_plc.qp.problem import QuadraticProblem
@@ -113,7 +112,7 @@ def scenario_problems(settings: Settings, number: int) -> list[Problem]:
     problems: list[Problem] = []
     scenario = Scenario(SCENARIO_TICKS, profile, 0.0, number)
     run_ideal_loop(
-        settings, scenario, Recorder(SCENARIO_TICKS, []), TICKS_PER_SAMPLE,
+        settings, scenario, Recorder(SCENARIO_TICKS, []), settings.process.ticks_per_sample,
         lambda qp, guess, optimum: problems.append(Problem(qp, guess, optimum)),
     )  # fmt: skip
     return problems[1:]  # the first is at rest, and a chain of qpOASES begins with it
@@ -148,7 +147,12 @@ def certify(
             needs[name].append(scenario_needs(solver, problems, number, tolerance, floor))
         progress(number + 1)
     return [
-        _certificate(name, PlcBudget(program.budget, solver.tau_1_s).iterations(TICKS_PER_SAMPLE), needs[name], beta)
+        _certificate(
+            name,
+            PlcBudget(program.budget, solver.tau_1_s).iterations(program.process.ticks_per_sample),
+            needs[name],
+            beta,
+        )
         for name, solver in solvers.items()
     ]
 

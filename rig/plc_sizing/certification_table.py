@@ -1,6 +1,5 @@
 """Certified iterations as text."""
 
-from coldloop.process.signals import SAMPLING_PERIOD_S
 from rig.plc_sizing.certification import LONGEST, SCENARIO_TICKS, Certificate, certify, failure_bound
 from rig.progress import make_console
 from rig.settings import Settings
@@ -23,16 +22,24 @@ def certification_table(settings: Settings, scenarios: int, tolerance_pct: float
             lambda done: status.update(f"{done} of {scenarios} scenarios"),
         )  # fmt: skip
     none_failed = 100.0 * failure_bound(0, scenarios, beta)
-    power = settings.optimizer_plc.program.budget.power
+    power, period_s = settings.optimizer_plc.program.budget.power, settings.process.sampling_period_s
     heading = (
         f"{scenarios} independent scenarios of {SCENARIO_TICKS // 240} min under random telegraphs, problems "
-        f"every {SAMPLING_PERIOD_S:g} s; good is an answer within {tolerance_pct:g} % of the optimal J\n"
+        f"every {period_s:g} s; good is an answer within {tolerance_pct:g} % of the optimal J\n"
         f"with confidence {confidence_pct:g} %: at most so many problems at a random instant are not good after "
-        f"the iterations that fit into {SAMPLING_PERIOD_S:g} s at P = {power:g};\n"
+        f"the iterations that fit into {period_s:g} s at P = {power:g};\n"
         "at most so many scenarios have one that is not; and at most "
         f"{none_failed:.2f} % have one that needs more iterations than the most needed\n\n"
     )
-    header = ("solver", "fit into 5 s", "problems failed", "at most", "scenarios failed", "at most", "most needed")
+    header = (
+        "solver",
+        f"fit into {period_s:g} s",
+        "problems failed",
+        "at most",
+        "scenarios failed",
+        "at most",
+        "most needed",
+    )
     return heading + aligned([header, *(_row(one, scenarios) for one in found)], numbers=True)
 
 

@@ -3,11 +3,10 @@
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError
 
 from coldloop.errors import UsageError
 from coldloop.parsing import parsed_json
-from coldloop.process.signals import SAMPLING_PERIOD_S
 from coldloop.text_file import held_file, read_bytes
 from rig.plc_sizing.profile import PlcProfile
 from rig.text_tables import markdown_table
@@ -65,6 +64,8 @@ class ExportCost(BaseModel):
     work: Annotated[int, Field(ge=0)] = WHOLE.work
     piece: Annotated[int, Field(ge=0)] = WHOLE.piece
     """Of `Cut`."""
+    longest_period_s: PositiveFloat = 5.0
+    """Longest updating period; exports that do not say it are of the cold box."""
 
     @property
     def calls(self) -> dict[str, float]:
@@ -128,15 +129,14 @@ def misfits(cost: ExportCost, profile: PlcProfile) -> list[str]:
         if profile.cycle_s is not None and longest_s > profile.cycle_s:
             found.append(f"{profile.name}: a {call} takes up to {longest_s:.3g} s, and its cycle monitoring"
                          f" stops a program after {profile.cycle_s:g} s: {remedy}")  # fmt: skip
-    once_s, longest_s = cost.seconds(sum(call.bound for call in cost.operations.values()), profile), _longest_s()
+    once_s, longest_s = (
+        cost.seconds(sum(call.bound for call in cost.operations.values()), profile),
+        cost.longest_period_s,
+    )
     if once_s > longest_s:
         found.append(f"{profile.name}: time: with one iteration it takes up to {once_s:.3g} s, and the longest updating"
                      f" period is {longest_s:g} s")  # fmt: skip
     return found
-
-
-def _longest_s() -> float:
-    return SAMPLING_PERIOD_S
 
 
 def profile_of(cost: ExportCost, total_us: float) -> str:

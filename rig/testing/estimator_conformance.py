@@ -7,9 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.loaded import PROCESS
+from coldloop.process.declaration import Process
 from coldloop.process.lti_model import load
-from coldloop.process.signals import TICKS_PER_SAMPLE
 from optimizer_plc.outside_estimator import Measured, OutsideCorrection, PlantModel, plant_model
 from optimizer_plc.qp.prediction import prediction_of
 from rig.settings import Settings
@@ -22,7 +21,6 @@ Estimate = tuple[Array, float]
 SEEDS: Final = range(5)
 PERIODS: Final = 400
 """Updating periods of a session; of half a sampling period each, as far as ticks go."""
-TICKS: Final = TICKS_PER_SAMPLE // 2
 AHEAD: Final = 60
 """Periods over which outputs are predicted from an estimate."""
 LEFT: Final = 0.1
@@ -32,7 +30,7 @@ LOST: Final = range(20, 40)
 
 
 def estimator_requirements(make: Made, settings: Settings) -> list[Requirement]:
-    """Return what the estimators that are made keep, in a session each of several plants of the loaded process."""
+    """Return what the estimators that are made keep, in a session each of several plants of the process of the settings."""
     program = settings.optimizer_plc.program
     prediction = prediction_of(load(settings.model.file), program.estimator.disturbed, program.design)
 
@@ -46,7 +44,7 @@ def estimator_requirements(make: Made, settings: Settings) -> list[Requirement]:
     )  # fmt: skip
     finite, missing, left, converges, same, fresh = failed
     for seed in SEEDS:
-        world, lossy = (World(model(), seed, loses=loses) for loses in (False, True))
+        world, lossy = (World(model(), settings.process, seed, loses=loses) for loses in (False, True))
         twin = make(model())
         first = world.session(make(model()))
         failed[finite] += not all(is_estimate(one, world.n) for one in first)
@@ -75,7 +73,8 @@ class World:
     Its inputs move; its constant errors are some of its sensors' standard deviations, and a part of its load is unseen.
     """
 
-    def __init__(self, model: PlantModel, seed: int, *, loses: bool) -> None:
+    def __init__(self, model: PlantModel, process: Process, seed: int, *, loses: bool) -> None:
+        self._process, self._ticks = process, process.ticks_per_sample // 2
         self._model, self._seed, self._loses = model, seed, loses
         self.n = len(model.A)
         self.touched = False
@@ -86,11 +85,11 @@ class World:
     def session(self, estimator: OutsideCorrection) -> list[Estimate]:
         """Return the estimates of a session; what is none is followed by the prediction, as in the program."""
         m, random = self._model, np.random.default_rng(self._seed)
-        A, B, F = over(m, TICKS)
-        scale = math.sqrt(TICKS_PER_SAMPLE) * m.walks
+        A, B, F = over(m, self._ticks)
+        scale = math.sqrt(self._process.ticks_per_sample) * m.walks
         x = random.normal(size=self.n) * 10.0 * scale[:-1]
-        unseen = float(random.normal()) * 10.0 * scale[-1] * PROCESS.has_load
-        size = np.array([0.02 * (one.high - one.low) for one in PROCESS.inputs])
+        unseen = float(random.normal()) * 10.0 * scale[-1] * self._process.has_load
+        size = np.array([0.02 * (one.high - one.low) for one in self._process.inputs])
         predicted, mismatch, found = np.zeros(self.n), 0.0, []
         before = self._error(x, unseen, predicted, mismatch)
         u = np.zeros(len(size))
@@ -98,7 +97,7 @@ class World:
             y = m.C @ x + m.D @ u + m.G[:, 0] * unseen
             if self._loses and period in LOST:
                 y[: 1 if period != LOST[len(LOST) // 2] else None] = np.nan
-            measured = Measured(TICKS, u.copy(), 0.0, y.copy())
+            measured = Measured(self._ticks, u.copy(), 0.0, y.copy())
             given = predicted.copy()
             estimate = estimator.correct(given, mismatch, measured)
             self.touched |= not (
@@ -116,7 +115,7 @@ class World:
 
     def _error(self, x: Array, unseen: float, found: Array, mismatch: float) -> float:
         """Return the error of outputs predicted from an estimate, over the sensors' noise, root mean square."""
-        m, (A, _, F) = self._model, over(self._model, TICKS)
+        m, (A, _, F) = self._model, over(self._model, self._ticks)
         e, w, errors = x - found, unseen - mismatch, []
         for _ in range(AHEAD):
             e = A @ e + F[:, 0] * w

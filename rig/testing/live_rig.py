@@ -13,9 +13,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from coldloop.errors import LinkError, PeerUnreachableError, UsageError
 from coldloop.modbus.client import RegisterClient
-from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity
-from coldloop.registers.maps import MAPS
+from coldloop.registers.maps import maps_of
 from rig.chaos.faults import AnyFault, WrongModel
 from rig.chaos.injection import Injector
 from rig.chaos.models import WRONG_MODEL, save_wrong_model
@@ -51,6 +50,7 @@ class LiveRig:
     def __init__(self, settings: Settings, folder: Path) -> None:
         self.settings = settings
         """Their configuration, but for the ports."""
+        maps, self._tick_s = maps_of(settings.process), settings.process.tick_s
         self._scenario = make_scenario(settings)
         self._folder = folder
         self._proxied = ProxiedServices(settings, folder, str(settings.plant.seed))
@@ -61,11 +61,11 @@ class LiveRig:
         self._driver = SessionClient(self.endpoints, settings)
         self._clients = {
             service: RegisterClient.at(register_map, endpoint)
-            for service, register_map, endpoint in zip(SERVICES, MAPS.values(), self.endpoints, strict=True)
+            for service, register_map, endpoint in zip(SERVICES, maps, self.endpoints, strict=True)
         }
         self.plant, self.control_plc, self.optimizer_plc = (
             NamedRegisters(register_map, endpoint, self._clients[service], self._call)
-            for service, register_map, endpoint in zip(SERVICES, MAPS.values(), self.endpoints, strict=True)
+            for service, register_map, endpoint in zip(SERVICES, maps, self.endpoints, strict=True)
         )
         self._injector = Injector(self._proxied.services, self._proxied.proxies, self._clients["plant"], folder)
 
@@ -74,7 +74,7 @@ class LiveRig:
     @property
     def time_s(self) -> float:
         """Plant time of the session, s."""
-        return float(self.plant.read("identity.tick")) * TICK_S
+        return float(self.plant.read("identity.tick")) * self._tick_s
 
     def advance(self, seconds: float) -> float:
         """Let `seconds` of plant time pass (a multiple of 0.25); return the plant time at the end.
@@ -82,10 +82,10 @@ class LiveRig:
         Raises:
             LinkError: Plant time does not move for 20 s.
         """
-        ticks = seconds / TICK_S
+        ticks = seconds / self._tick_s
         if not ticks > 0 or ticks != round(ticks):
-            raise UsageError(f"advance({seconds}): not a positive multiple of {TICK_S} s")
-        return float(self._call(self._advanced(round(ticks)))) * TICK_S
+            raise UsageError(f"advance({seconds}): not a positive multiple of {self._tick_s} s")
+        return float(self._call(self._advanced(round(ticks)))) * self._tick_s
 
     async def _advanced(self, ticks: int) -> int:
         tick = (await self._clients["plant"].read(Identity)).tick
@@ -97,9 +97,9 @@ class LiveRig:
             before, tick = tick, (await self._clients["plant"].read(Identity)).tick
             if tick != before:
                 moved = time.monotonic()
-            elif time.monotonic() - moved > max(QUIET_S, 4 * TICK_S / self._scenario.factor):
+            elif time.monotonic() - moved > max(QUIET_S, 4 * self._tick_s / self._scenario.factor):
                 raise LinkError(
-                    f"the plant is at {tick * TICK_S:g} s of plant time for {QUIET_S:g} s: see the logs in "
+                    f"the plant is at {tick * self._tick_s:g} s of plant time for {QUIET_S:g} s: see the logs in "
                     f"{self._folder / 'logs'}"
                 )
         return tick
@@ -117,7 +117,7 @@ class LiveRig:
         while seen := self._unmet(condition):
             tick = self._tick_or_none()
             start = tick if start is None else start
-            if tick is not None and start is not None and (tick - start) * TICK_S >= within_s:
+            if tick is not None and start is not None and (tick - start) * self._tick_s >= within_s:
                 raise TimeoutError(f"the condition was not met within {within_s:g} s of plant time: {seen}")
             if self._scenario.realtime or tick is None:
                 if time.monotonic() > deadline:
@@ -126,7 +126,7 @@ class LiveRig:
                     )
                 time.sleep(LOOK_S)
             else:
-                self.advance(TICK_S)
+                self.advance(self._tick_s)
         return self.time_s
 
     def _unmet(self, condition: Callable[[], bool]) -> str:

@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.declaration import REFERENCE_TICK_S
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from optimizer_plc.rules import Observation, assess
 from optimizer_plc.rules.outside import OutsideDecision
@@ -13,8 +13,10 @@ from rig.testing.requirement import Requirement
 
 DECISIONS: Final = 200
 """In each session."""
+LONGEST_TICKS: Final = 20
+"""Of a sampling period, as the cold box has it; a ladder says what periods there are."""
 LADDERS: Final = (
-    tuple(range(SHORTEST_TICKS, TICKS_PER_SAMPLE + 1)), (SHORTEST_TICKS, TICKS_PER_SAMPLE), (TICKS_PER_SAMPLE,),
+    tuple(range(SHORTEST_TICKS, LONGEST_TICKS + 1)), (SHORTEST_TICKS, LONGEST_TICKS), (LONGEST_TICKS,),
 )  # fmt: skip
 """Every period, two, and a single one: on a slow PLC there is no other."""
 Made = Callable[[Sequence[int]], OutsideDecision]
@@ -56,6 +58,6 @@ def session(rule: OutsideDecision, ladder: Sequence[int]) -> list[float]:
         before, hot_start, delivered, effective = (10.0 ** random.uniform(0.0, 12.0, 4)).tolist()
         last_but_one = delivered * (1.0 + abs(float(random.normal())))
         ticks = ladder[q - 1]
-        o = Observation(q, 4 * ticks, ticks * TICK_S, before, hot_start, last_but_one, delivered, effective)
+        o = Observation(q, 4 * ticks, ticks * REFERENCE_TICK_S, before, hot_start, last_but_one, delivered, effective)
         decided.append(rule.decide(o, assess(o)))
     return decided

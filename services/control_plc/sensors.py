@@ -278,7 +278,7 @@ class SensorMonitor:
         self._tick = self._now = tick
         history = zip(self.unchanged, self.rests, self.least, strict=True)
         frozen: Collection[int] = [output for output, each in enumerate(history) if is_frozen(*each)]
-        frozen = [output for output in frozen if output not in standing and not self._may_stand(output, y)]
+        frozen = [output for output in frozen if output not in standing and not self.may_stand(output, y)]
         if self.each_may_rest:
             note_moves(self.unchanged, self.inputs, self.inputs_moved, inputs, self.moves, tick)
             frozen = [output for output in frozen if is_to_move(self.inputs_moved[output], tick, self.least[output])]
@@ -293,7 +293,7 @@ class SensorMonitor:
                 self._good[output] = value
         return tuple(self._good)
 
-    def _may_stand(self, output: int, y: Sequence[float]) -> bool:
+    def may_stand(self, output: int, y: Sequence[float]) -> bool:
         """Return whether an output is the speed of a turbine that stands, for all that the pressures say."""
         if self._turbine is None or output != self._turbine[0] or y[output] != 0.0:
             return False

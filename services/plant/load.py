@@ -13,7 +13,8 @@ from typing import Final, NamedTuple
 
 from coldloop.errors import LoadFileError
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.load_profile import LOAD_SPAN, LoadProfile, read_load_file
+from coldloop.process.declaration import Process
+from coldloop.process.load_profile import LoadProfile, read_load_file
 from coldloop.process.loaded import PROCESS
 
 SECOND_TICKS: Final = int(1.0 / COLD_BOX.tick_s)
@@ -117,31 +118,31 @@ def named_families(name: str) -> list[LoadFamily] | None:
     return [HOURS[hour]._replace(seed=HOURS[hour].seed + seeds) for hour in NAMED[base]]
 
 
-def _stretched(family: LoadFamily, name: str, mean: float) -> LoadFamily:
+def _stretched(family: LoadFamily, name: str, mean: float, process: Process) -> LoadFamily:
     """Return a family whose largest step is the way from the mean to the nearer end of the load's span.
 
     Raises:
         LoadFileError: Its steps are larger than those of the six hours.
     """
-    low, high = PROCESS.load.span
+    low, high = process.load.span
     if max(map(abs, family.steps)) > LARGEST_STEP:
         raise LoadFileError(f"load {name}: of a refrigerator; name another, or a CSV file with loads of this plant")
     scale = min(mean - low, high - mean) / LARGEST_STEP
     return family._replace(steps=tuple(scale * step for step in family.steps))
 
 
-def find_load(name: str, mean_w: float) -> LoadProfile:
-    """Return the load of a name or of a CSV file.
+def find_load(name: str, mean_w: float, process: Process = PROCESS) -> LoadProfile:
+    """Return the load of a name or of a CSV file for a process.
 
     Raises:
         LoadFileError: There is neither such a name nor a file that can be read, or the mean is too low for its steps.
     """
     families = named_families(name)
-    if families is not None and not PROCESS.load.has_named_loads:
-        return concatenated([telegraph(_stretched(family, name, mean_w), mean_w) for family in families])
+    if families is not None and not process.load.has_named_loads:
+        return concatenated([telegraph(_stretched(family, name, mean_w, process), mean_w) for family in families])
     if families is not None:
         lowest = mean_w + min(step for family in families for step in family.steps)
-        if lowest < LOAD_SPAN[0]:
+        if lowest < process.load.stored_span[0]:
             raise LoadFileError(
                 f"load {name}: would go down to {lowest:.0f} W about {mean_w:.0f} W, the load of the model's operating"
                 " point; name a CSV file with loads of this plant"
@@ -150,4 +151,4 @@ def find_load(name: str, mean_w: float) -> LoadProfile:
     path = Path(name)
     if not path.exists():
         raise LoadFileError(f"load {name}: neither a file nor one of {', '.join(NAMED)}")
-    return read_load_file(path)
+    return read_load_file(path, process)

@@ -8,9 +8,7 @@ from pydantic import ValidationError
 
 from coldloop.config import explained
 from coldloop.errors import ModelFileError
-from coldloop.process.cold_box import COLD_BOX as THE_COLD_BOX
 from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
-from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.model_file import COLD_BOX, ModelHeader, read_header
 from plant.cold_box.model import parameters_digest
@@ -31,10 +29,10 @@ def own_header(file: Path) -> ModelHeader:
         ModelFileError: The file cannot be read, its parameters cannot be used, or the model was made from others.
     """
     header = read_header(file)
-    if header.process or PROCESS != THE_COLD_BOX:
-        from plant.own.maker import check_signals  # noqa: PLC0415 a cold box starts without it
+    if header.process:
+        from plant.own.maker import check_files  # noqa: PLC0415 a cold box starts without it
 
-        check_signals(header)
+        check_files(header)
         return header
     names = (header.state_names[: len(STATE_NAMES)], header.input_names, header.output_names)
     if header.plant == COLD_BOX:

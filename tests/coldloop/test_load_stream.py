@@ -9,11 +9,14 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.operating.load_stream import LoadStream
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import LoadProfile
+from coldloop.registers.maps import maps_of
 from coldloop.registers.plant import LoadAhead, LoadStatus
 from plant.rack.load_schedule import MOST_UPCOMING, LoadSchedule
 
 
 class FakePlant:
+    map, process = maps_of(COLD_BOX).plant, COLD_BOX
+
     """The plant's load behind a client; it refuses as the plant does."""
 
     def __init__(self) -> None:

@@ -11,7 +11,7 @@ from coldloop.process.cold_box import L1, T5, TICK_S
 from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import read_header
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.plant import Measurement
 from control_plc.classical import ClassicalLoops, ClassicalSettings, LevelLoop, PiController, PiSettings

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from coldloop.errors import DamagedAnswerError, LinkError, PeerUnreachableError, RequestRefusedError
-from coldloop.process.cold_box import TICK_S
+from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.bank import BusyError, Caller
 from coldloop.registers.control_plc import (
     Operator,
@@ -224,7 +224,11 @@ class RackLink(RuleBasedStateMachine):
         if reading.session != self.session:
             return False
         self.accepted = None
-        kept = RetainedControlState.parsed(self.kept, COLD_BOX) if self.kept and self.kept["session"] == reading.session else None
+        kept = (
+            RetainedControlState.parsed(self.kept, COLD_BOX)
+            if self.kept and self.kept["session"] == reading.session
+            else None
+        )
         self.program.resume(
             reading.session, reading.tick, reading.u, updates=kept.updates if kept else 0,
             operator=kept.operator if kept else self.program.operator, playing=kept.sequence if kept else None,
@@ -264,7 +268,9 @@ class RackLink(RuleBasedStateMachine):
             self.keep()
 
     def keep(self) -> None:
-        content = ControlStateStore(None, HEADER.short_digest, COLD_BOX).content(self.program, TimeBase(self.realtime, 1.0))
+        content = ControlStateStore(None, HEADER.short_digest, COLD_BOX).content(
+            self.program, TimeBase(self.realtime, 1.0)
+        )
         content["holder"] = self.holder
         self.kept = json.loads(json.dumps(content)) if self.remembers else None
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.process.cold_box import L1, T5
+from coldloop.process.cold_box import COLD_BOX, L1, T5
 from coldloop.process.limits import InputLimits
 from coldloop.registers.control_plc import LinkCause, Mode, Operator, OperatorMode, Verdict
 from coldloop.registers.safety import AlarmKind

@@ -1,12 +1,17 @@
 """What the sensors' checks make of a plant that stands still, as a simulated one with exact sensors does."""
 
+from dataclasses import replace
+
 import pytest
 
-from control_plc import sensors
-from control_plc.sensors import BEFORE, BEHIND, MOVES, TURBINE_SPEED, SensorCheckSettings, SensorMonitor
+from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES
+from coldloop.process.settings import settings_of
+from control_plc.sensors import MOVES, SensorCheckSettings, SensorMonitor
 
 REST = tuple(10.0 + place for place in range(22))
 INPUTS = (43.0, 75.0, 36.0)
+assert COLD_BOX.bath is not None
+TURBINE_SPEED, BEFORE, BEHIND = map(OUTPUT_NAMES.index, (COLD_BOX.bath.turbine_speed, *COLD_BOX.bath.turbine_pressures))
 
 
 def others_moved(tick: int) -> tuple[float, ...]:
@@ -15,10 +20,10 @@ def others_moved(tick: int) -> tuple[float, ...]:
 
 
 @pytest.fixture
-def monitor(monkeypatch: pytest.MonkeyPatch) -> SensorMonitor:
+def monitor() -> SensorMonitor:
     """The checks of another process than the cold box."""
-    monkeypatch.setattr(sensors, "MOVES_AS_ONE", False)
-    return SensorMonitor(SensorCheckSettings(), REST, moves=(0.1, 0.1, 0.1))
+    with settings_of(replace(COLD_BOX, moves_as_one=False)):
+        return SensorMonitor(SensorCheckSettings(), REST, moves=(0.1, 0.1, 0.1))
 
 
 def test_an_output_that_never_moved_is_not_frozen_while_the_inputs_rest(monitor: SensorMonitor) -> None:

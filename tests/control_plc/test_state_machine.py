@@ -8,10 +8,10 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from coldloop.process.cold_box import L1, T5
+from coldloop.process.cold_box import COLD_BOX, L1, T5
 from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.model_file import read_header
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import (
     Cause,

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import OUTPUT_NAMES
+from coldloop.process.cold_box import OUTPUT_NAMES
 from plant.components.passes import MASS
 from plant.components.phase_separator import start_account
 from plant.helium.properties import Helium, helium_of, supply_cell

@@ -12,7 +12,7 @@ import pytest
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
 from coldloop.process.limits import InputLimits
 from coldloop.process.model_file import read_header
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import ControlSession, Grant, LinkCause, PlantLinkState

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.process.model_file import read_header
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, CoolDownStep, LadderStatus, LinkCause, Mode, PlantLinkState
 from coldloop.registers.maps import PLANT_MAP

@@ -32,7 +32,9 @@ UPDATING_PERIOD = BLOCK.end - 1
 
 def shown(power: float = 1.0, tau_1_s: float = 0.25) -> OptimizerPublication:
     budget = PlcBudget(BudgetSettings(power=power), tau_1_s)
-    return OptimizerPublication(WordOrder.HIGH_FIRST, budget, blank(OperatingLimits, OPTIMIZER_MAP), 1, 1)
+    return OptimizerPublication(
+        OPTIMIZER_MAP, WordOrder.HIGH_FIRST, budget, blank(OperatingLimits, OPTIMIZER_MAP), 1, 1
+    )
 
 
 @asynccontextmanager

@@ -12,7 +12,7 @@ import optimizer_plc.program
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_file import read_header
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.plant import Measurement
 from coldloop.safety.sequence import InputSequence

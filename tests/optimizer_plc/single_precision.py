@@ -17,7 +17,7 @@ from numba.core.dispatcher import Dispatcher
 import optimizer_plc
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel, load
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.control_plc import Update, Verdict
 from optimizer_plc.computing_settings import Arithmetic, EstimatorKind, EstimatorSettings
 from optimizer_plc.program import OptimizerProgram

@@ -141,7 +141,7 @@ def test_the_inverse_covariance_is_that_of_the_riccati_equation(
 
 def after(c: Estimator, y: Array, real: Real = DOUBLE) -> Belief:
     """Return the belief after a measurement (a deviation) that follows a prediction over ten ticks from the origin."""
-    belief = no_belief(c.steps.A.shape[1], real)
+    belief = no_belief(c.steps.A.shape[1], 22, real)
     belief.numbers[0]["since"] = TICKS
     correct(c, belief, c.u0, real(c.w0), y.astype(real) + c.y0, np.zeros(28, real))
     return belief
@@ -198,6 +198,6 @@ def test_single_precision_loses_little_of_it(prediction: PredictionModel, chosen
 def test_state_feedback_does_not_look_at_outputs(model: LtiModel, prediction: PredictionModel) -> None:
     c = estimator_of(prediction, EstimatorSettings(kind=EstimatorKind.STATE_FEEDBACK))
     x = np.random.default_rng(6).normal(size=28)
-    belief = no_belief(28)
+    belief = no_belief(28, 22)
     correct(c, belief, model.u0, model.w0, without(model.y0, EVERY), x + model.x0)
     assert np.allclose(belief.x, x)

@@ -11,10 +11,10 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
-from coldloop.process.cold_box import OUTPUT_NAMES, T5
+from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, T5
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
-from optimizer_plc.computing_settings import SIGNALS, EstimatorKind, EstimatorSettings
+from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, signals_of
 from optimizer_plc.estimator import (
     begin_prediction,
     check_detectability,
@@ -71,7 +71,7 @@ def test_what_no_sensor_tells_apart_is_refused(prediction: PredictionModel, name
         estimator_of(prediction.with_disturbances(chosen.disturbed), chosen)
 
 
-@given(names=st.sets(st.sampled_from(SIGNALS), min_size=1))
+@given(names=st.sets(st.sampled_from(signals_of(COLD_BOX)), min_size=1))
 @example(names={"CV155", "CV156"})
 @example(names=set(OUTPUT_NAMES[1:]))
 @example(names=set(OUTPUT_NAMES[1:]) | {"CV155"})
@@ -112,7 +112,7 @@ def test_constant_errors_are_found_and_leave_no_offset(
 ) -> None:
     """On a plant as its model but for these errors, and a load that no sensor sees."""
     p, plant = np.concatenate([[0.0], errors * SENSORS[1:]]), model.discretised(ticks * 0.25)
-    estimator, belief = estimator_of(disturbed, ALL), no_belief(disturbed.n_states)
+    estimator, belief = estimator_of(disturbed, ALL), no_belief(disturbed.n_states, 22)
     x, u = np.zeros(28), np.array([0.5, -3.0, 0.2])
     for _ in range(6000 // ticks):
         y = model.C @ x + model.D @ u + model.G * unseen + p
@@ -135,7 +135,7 @@ def test_a_plant_with_other_valves_comes_to_rest_at_the_operating_point(
     chosen = EstimatorSettings(disturbances=("inputs",), input_walk=(0.5, 5.0, 0.5))
     valves = prediction.with_disturbances(chosen.disturbed)
     problem = PredictiveProblem(valves, ControlDesign(), InputLimits())
-    estimator, belief, plant = estimator_of(valves, chosen), no_belief(30), model.discretised(5.0)
+    estimator, belief, plant = estimator_of(valves, chosen), no_belief(30, 22), model.discretised(5.0)
     off = np.array([errors[0], 0.0, errors[1]])
     x, u = np.zeros(28), np.zeros(3)
     for _ in range(400):

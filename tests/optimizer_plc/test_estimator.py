@@ -38,7 +38,7 @@ class Estimating:
 
     def __init__(self, prediction: PredictionModel, settings: EstimatorSettings) -> None:
         self._constants = estimator_of(prediction, settings)
-        self._belief = no_belief(prediction.n_states)
+        self._belief = no_belief(prediction.n_states, 22)
 
     def correct(self, update: Update) -> Estimate:
         u_before, y, x = (np.array(values) for values in (update.u_before, update.y, update.x))
@@ -245,7 +245,7 @@ def test_a_filter_without_a_past_begins_where_the_plant_rests_with_its_inputs_an
     prediction: PredictionModel, u: tuple[float, ...], load: float | None, level: float
 ) -> None:
     """What load that takes is the mismatch where none is measured; one that is measured may have stepped just now."""
-    belief = no_belief(prediction.n_states)
+    belief = no_belief(prediction.n_states, 22)
     begin_at_rest(rest_map(prediction), belief, np.array(u), load or 0.0, load is not None, level)
     x, (_, mismatch, _) = belief.predicted, belief.numbers[0].tolist()
     step, applied = prediction.sample, np.array(u)
@@ -261,7 +261,7 @@ def test_an_optimiser_that_begins_within_a_session_believes_that_the_plant_rests
     model: LtiModel, prediction: PredictionModel
 ) -> None:
     """Its first update has what sensors say at rest with inputs that others have set: nothing is to be corrected."""
-    moved, rest = np.array([2.0, -3.0, 40.0]), no_belief(prediction.n_states)
+    moved, rest = np.array([2.0, -3.0, 40.0]), no_belief(prediction.n_states, 22)
     begin_at_rest(rest_map(prediction), rest, moved, 0.0, load_known=True, level=1.0)
     y = respond(*prediction.outputs.transposed(), rest.predicted, moved, 0.0)
     program = OptimizerProgram(model, ProgramSettings(), InputLimits())

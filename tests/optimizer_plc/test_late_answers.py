@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coldloop.process.cold_box import TICK_S
+from coldloop.process.cold_box import TICK_S, TICKS_PER_SAMPLE
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Update, Verdict
-from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
+from optimizer_plc.budget import PlcBudget
 from optimizer_plc.decisions import PROVEN
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.scheme import shortest_sequence
@@ -58,9 +58,9 @@ def test_no_period_is_longer_than_the_longest(program: OptimizerProgram, model: 
     for _ in range(20):
         period(program, model)
         program.answered(late=True)
-    assert period(program, model) == MAX_PERIOD_TICKS
+    assert period(program, model) == TICKS_PER_SAMPLE
     program.restart(0.0)
-    assert period(program, model) < MAX_PERIOD_TICKS, "a session begins without"
+    assert period(program, model) < TICKS_PER_SAMPLE, "a session begins without"
 
 
 @pytest.mark.parametrize("fixed_s", [0.0, 5.0])

@@ -32,7 +32,7 @@ class Bath:
     def __init__(self, prediction: PredictionModel, real: Real = DOUBLE) -> None:
         model = prediction.with_disturbances(SETTINGS.estimator.disturbed)
         self.c = estimator_of(model, SETTINGS.estimator, real, LIMITS)
-        self.belief, self.plant = (no_belief(model.n_states, real) for _ in range(2))
+        self.belief, self.plant = (no_belief(model.n_states, 22, real) for _ in range(2))
         self.real, self.rng, self.u = real, np.random.default_rng(3), np.zeros(3, real)
         self.load, self.done = STEP_W, 0
         self.held = self.shown = float("nan")

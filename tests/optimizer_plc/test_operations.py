@@ -10,7 +10,7 @@ from scipy.linalg import solve_triangular
 
 from optimizer_plc.computing_settings import OdeSettings
 from optimizer_plc.qp import costs, linear_algebra
-from optimizer_plc.qp.penalties import DEFAULT_PENALTIES
+from optimizer_plc.qp.penalties import PenaltySettings
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.settings import SolverName
 from optimizer_plc.solvers import fast_gradient, interior_point, ode
@@ -170,7 +170,7 @@ def ode_step(Phi: NDArray[np.float64], Gamma: NDArray[np.float64], gamma: NDArra
         counted(Phi), counted(rng.normal(size=n)), counted(Gamma), counted(gamma), np.full(n, -1e9), np.full(n, 1e9),
         0.0,
     )  # fmt: skip
-    constants = flow_in(OdeSettings(), DEFAULT_PENALTIES, np.float64)
+    constants = flow_in(OdeSettings(), PenaltySettings(), np.float64)
     flow = ode.Flow(*(value if isinstance(value, bool) else Counted(value) for value in constants))  # type: ignore[arg-type]
     z = counted(rng.normal(size=n) * 1e-2)
     before = [float(value) for value in z]

@@ -285,7 +285,7 @@ def test_an_estimate_that_is_none_leaves_the_prediction_and_what_raises_is_said_
     constants: Estimator = OptimizerProgram(model, settings, InputLimits()).constants.estimator
 
     def corrected(name: str, first: float) -> tuple[Array, float, float]:
-        belief = no_belief(prediction.n_states)
+        belief = no_belief(prediction.n_states, 22)
         belief.predicted[:] = 3.0
         estimator = OutsideEstimator(name, prediction, settings.estimator)
         y = model.y0.copy()
@@ -317,7 +317,7 @@ def test_an_estimator_that_answers_anything_leaves_the_prediction_or_is_refused(
 ) -> None:
     prediction, settings = PredictionModel(model), ProgramSettings()
     constants: Estimator = OptimizerProgram(model, settings, InputLimits()).constants.estimator
-    inputs, outputs, belief = model.u0.copy(), model.y0.copy(), no_belief(prediction.n_states)
+    inputs, outputs, belief = model.u0.copy(), model.y0.copy(), no_belief(prediction.n_states, 22)
     belief.predicted[:] = 3.0
 
     def correct(_: object, predicted: Array, __: float, measured: Measured) -> object:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.limits import InputLimits
 from optimizer_plc.computing_settings import (
     PENALTY_WEIGHT,
@@ -16,7 +17,7 @@ from optimizer_plc.computing_settings import (
 )
 from optimizer_plc.qp.costs import augmented_cost, indicators
 from optimizer_plc.qp.design import ControlDesign
-from optimizer_plc.qp.penalties import PRESETS, PenaltySettings, Preset
+from optimizer_plc.qp.penalties import PenaltySettings, Preset, presets_of
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 from optimizer_plc.settings import ProgramSettings
@@ -80,7 +81,7 @@ def test_what_is_set_to_the_default_of_its_key_is_set_too() -> None:
 @pytest.mark.parametrize("preset", Preset)
 def test_a_preset_names_keys_that_there_are(preset: Preset) -> None:
     chosen = ProgramSettings(preset=preset)
-    for section, values in PRESETS[preset].items():
+    for section, values in presets_of(COLD_BOX)[preset].items():
         assert {key: getattr(getattr(chosen, section), key) for key in values} == dict(values)
 
 

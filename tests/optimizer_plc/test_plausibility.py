@@ -35,7 +35,7 @@ class World:
     def __init__(self, prediction: PredictionModel, real: Real = DOUBLE, limits: PlausibilitySettings = LIMITS) -> None:
         model = prediction.with_disturbances(SETTINGS.estimator.disturbed)
         self.c: Estimator = estimator_of(model, SETTINGS.estimator, real, limits)
-        self.belief: Belief = no_belief(model.n_states, real)
+        self.belief: Belief = no_belief(model.n_states, 22, real)
         self.real = real
         self.rng = np.random.default_rng(1)
         self.error = np.zeros(N_Y)
@@ -156,7 +156,7 @@ def test_one_that_does_not_agree_is_believed_after_half_an_hour(world: World, ou
 def test_a_suspect_wanders_off_as_far_again_as_it_had_jumped_and_by_itself(
     jump: float, jumped_to: float, difference: float, shown: float, *, wanders: bool
 ) -> None:
-    reading = new_readings(DOUBLE)[0]
+    reading = new_readings(22, DOUBLE)[0]
     reading["jump"], reading["jumped_to"], reading["difference"] = jump, jumped_to, difference
     assert wanders_off(reading, shown, 0.1) == wanders
 

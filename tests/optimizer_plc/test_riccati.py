@@ -43,7 +43,8 @@ class Plant(NamedTuple):
         n = len(self.A)
         step = (np.ascontiguousarray(self.A[:-1, :-1]), self.A[:-1, -1])
         found = gains_after(
-            {TICKS_PER_SAMPLE: step}, self.C, self.drift, self.sensors, of_time=False, periods=LONGEST
+            {TICKS_PER_SAMPLE: step}, self.C, self.drift, self.sensors, of_time=False, periods=LONGEST,
+            tick_s=TICK_S, sampling_period_s=SAMPLING_PERIOD_S,
         )[0]  # fmt: skip
         return (found[:, :n] / self.drift).T * self.sensors, found[:, n:] * np.outer(self.sensors, self.sensors)
 
@@ -123,7 +124,7 @@ def test_every_period_of_an_unstable_plant_has_its_own_solution() -> None:
     of_ticks = {ticks: scipy.linalg.expm(GROWING * ticks * TICK_S) for ticks in range(1, TICKS_PER_SAMPLE + 1)}
     steps = {ticks: (A, A[:, 0] - np.eye(3)[:, 0]) for ticks, A in of_ticks.items()}
     C, drift, sensors = np.array([[1.0, 0.0, 0.0, 0.0]]), np.array([0.1, 0.2, 0.1, 0.05]), np.array([0.1])
-    found = gains_after(steps, C, drift, sensors, of_time=False, periods=LONGEST)
+    found = gains_after(steps, C, drift, sensors, of_time=False, periods=LONGEST, tick_s=TICK_S, sampling_period_s=5.0)
     for ticks, (step, load) in steps.items():
         A = np.eye(4)
         A[:3, :3], A[:3, 3] = step, load

@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from coldloop.process.cold_box import L1, OUTPUT_NAMES, T5
+from coldloop.process.cold_box import COLD_BOX, L1, OUTPUT_NAMES, T5
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
 from optimizer_plc.computing_settings import Arithmetic, EstimatorSettings
@@ -33,6 +33,8 @@ SINGLE: Final = real_of(Arithmetic.FLOAT32)
 DESIGN: Final = ControlDesign(target=Target.LOAD, band_margin=(0.1, 0.1))
 ALL: Final = EstimatorSettings(disturbances=("outputs",), load_walk_w=1.0)
 INPUTS: Final = EstimatorSettings(disturbances=("inputs", "T5"))
+assert COLD_BOX.bath is not None
+BATH = COLD_BOX.bath
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +62,7 @@ class Reference:
     """The same target by a linear and a quadratic program, one after the other."""
 
     def __init__(self, model: PredictionModel) -> None:
-        rest, n, scale = rest_of(model, DESIGN), len(model.model.x0), np.array(DESIGN.input_scale)
+        rest, n, scale = rest_of(model, DESIGN, BATH), len(model.model.x0), np.array(DESIGN.input_scale)
         self.states, self.held = rest.states[:, :n], rest.states[:, -1]
         self.temperature = rest.temperature
         Q = np.diag(state_weights(model.model, DESIGN))
@@ -168,7 +170,7 @@ def test_the_cost_is_of_deviations_from_the_target(
         x[0], x[1] = 2000.0 * x[0], 1e-3 * x[1]
         target, w, z = rng.normal(size=3), rng.uniform(-100.0, 100.0), rng.normal(size=problem.size)
         z[problem.n_inputs :] = 0.0
-        rest = rest_of(outputs_off, DESIGN).states[:, :28].T @ target
+        rest = rest_of(outputs_off, DESIGN, BATH).states[:, :28].T @ target
         parameters = QpParameters(x.astype(real), real(w), np.zeros(3, real), target=target.astype(real))
         qp = problem.at(parameters)
         inputs = (problem.knots_to_samples @ z[: problem.n_inputs].reshape(-1, 3)) * problem.input_scale
@@ -197,7 +199,7 @@ def test_l1_rests_at_its_operating_point_whatever_is_constant(
     """Constant errors of the readings, valves and heater with other gains, a plant that is faster or slower."""
     problem = PredictiveProblem(outputs_off, DESIGN, LIMITS)
     search, estimator = target_search(outputs_off, DESIGN, LIMITS), estimator_of(outputs_off, ALL)
-    belief, plant = no_belief(49), model.discretised(5.0 * lag)
+    belief, plant = no_belief(49, 22), model.discretised(5.0 * lag)
     p = np.concatenate([[0.0], errors * np.array([1.0, *[0.02] * 10, *[1e-3] * 10])])
     x, u, off = np.zeros(28), np.zeros(3), np.array([4.3, 7.5, 3.6])
     for _ in range(500):

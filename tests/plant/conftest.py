@@ -11,7 +11,7 @@ from coldloop.modbus.identification import DeviceIdentity
 from coldloop.modbus.requests import RequestHandler, Written
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_file import read_header
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.audit import EVENT_ROWS, Event, EventKind
 from coldloop.registers.bank import ALL_ROLES, Caller, RefusedAccessError
 from coldloop.registers.codec import codec_of

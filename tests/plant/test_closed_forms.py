@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.process.model_file import read_header
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from plant.cold_box.physics import REFERENCE, evaluate
 from plant.components.gas_valve import CHOKED, cold_valve_flow, gas_valve_flow
 from plant.components.gas_volume import SECOND_VIRIAL, GasVolume, gas_mass, gas_pressure

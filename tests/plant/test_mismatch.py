@@ -7,7 +7,7 @@ from coldloop.errors import ConfigurationError
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
+from coldloop.process.settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
 from plant.kinds import plant_maker
 from plant.program import MeasurementNoise, PlantProgram
 from plant.settings import MismatchSettings, PlantKind, PlantSection, SensorSettings

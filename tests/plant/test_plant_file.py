@@ -15,7 +15,7 @@ from coldloop.process.cold_box import T5
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load
 from coldloop.process.model_file import read_document, read_header, write_document
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
+from coldloop.process.settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
 from plant.cold_box.diagnosis import operating_point
 from plant.cold_box.model import build_model, model_at, parameters_digest
 from plant.cold_box.physics import REFERENCE

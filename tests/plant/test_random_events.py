@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from coldloop.kernels.compiled import kernel
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.model_range import model_range
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from plant.cold_box.physics import REFERENCE, cold_box_of, derivative
 from plant.components.phase_separator import content
 from plant.helium.properties import helium_of, load_helium, supply_enthalpy_and_density

@@ -6,7 +6,7 @@ import pytest
 from coldloop.process.cold_box import OUTPUT_NAMES, STATE_NAMES
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load
-from coldloop.process.model_settings import SHIPPED_MODELS, ModelSettings
+from coldloop.process.settings import SHIPPED_MODELS, ModelSettings
 from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.prediction import state_weights
 from plant.refrigerator.events import EventSchedule

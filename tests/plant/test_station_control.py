@@ -8,7 +8,7 @@ import pytest
 from coldloop.errors import ConfigurationError, ModelFileError
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
+from coldloop.process.settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.plant import StationAlarm, StationMode, Surroundings
 from plant.kinds import plant_maker

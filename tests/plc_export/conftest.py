@@ -2,11 +2,12 @@
 
 import pytest
 
-from rig.plc_export.kernels.recorded_problems import GoldenVectors, record
+from coldloop.process.settings import DEFAULT_MODEL_FILE
+from rig.plc_export.kernels.recorded_problems import GoldenVectors, paper_settings, record
 
 
 @pytest.fixture(scope="package")
 def recorded() -> GoldenVectors:
     """The most telling problems of a short run."""
-    found = record()
+    found = record(paper_settings(DEFAULT_MODEL_FILE))
     return found._replace(vectors=found.telling())

@@ -1,9 +1,8 @@
-"""Writes the C99 for the process that is loaded, and problems: `COLDLOOP_PROCESS=MODEL ... OUT TICKS LOAD...`.
+"""Writes the C99 for a process, and problems of it.
 
 `problems` has vectors and guess of each, `answers` what the kernels make of them, in words of 4 bytes, lowest first.
 """
 
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from rig.plc_export.c.solver_files import OdeExport
 from rig.plc_export.kernels.ode_program import PER_PROBLEM
-from rig.plc_export.kernels.recorded_problems import ITERATIONS, GoldenVector, record
+from rig.plc_export.kernels.recorded_problems import ITERATIONS, GoldenVector, paper_settings, record
 
 GIVEN = (*PER_PROBLEM, "guess")
 
@@ -29,16 +28,12 @@ def found(vector: GoldenVector) -> bytes:
     return words(map(np.asarray, vector.answer[:4]))
 
 
-def write(folder: Path, ticks: int, loads: Iterable[str]) -> int:
+def write(model: Path, folder: Path, ticks: int, loads: Iterable[str]) -> int:
     """Write sources and files of the problems of a run of each load; return how many there are."""
-    runs = [record(ticks, load) for load in loads]
+    runs = [record(paper_settings(model), ticks, load) for load in loads]
     first = runs[0].vectors[0]
     OdeExport(runs[0].method, first.problem, np.arange(1, ITERATIONS + 1)).write(folder, [first])
     vectors = [each for run in runs for each in run.vectors]
     (folder / "problems").write_bytes(b"".join(map(given, vectors)))
     (folder / "answers").write_bytes(b"".join(map(found, vectors)))
     return len(vectors)
-
-
-if __name__ == "__main__":
-    sys.stdout.write(f"{write(Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3:])}\n")

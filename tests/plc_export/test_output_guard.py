@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from coldloop.process.cold_box import TICK_S
 from coldloop.process.limits import InputLimits, RateReference
 from coldloop.registers.control_plc import Verdict
 from control_plc.guard import OutputGuard
@@ -44,7 +45,7 @@ each_limits = pytest.mark.parametrize("limits", LIMITS.values(), ids=LIMITS)
 
 
 def in_c(limits: InputLimits) -> dict[str, str]:
-    return GuardExport(GuardKernels(limits), golden_calls(limits)).files()
+    return GuardExport(GuardKernels(limits), golden_calls(limits), TICK_S).files()
 
 
 def in_text(limits: InputLimits) -> dict[str, str]:
@@ -274,7 +275,7 @@ def test_a_changed_bit_in_structured_text_is_found(place: int) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "what"),
     [
-        ("((tick - cl_guard_start) >= 20)", "((tick - cl_guard_start) >= 19)", 8),
+        ("((tick - cl_guard_start) >= cg", "((tick - cl_guard_start) + 1 >= cg", 8),
         ("judgement := 2;", "judgement := 1;", 7),
         ("accepted := (cl_guard_begun AND (tick >= 0)", "accepted := (cl_guard_begun AND (tick >= 300)", 6),
     ],

@@ -4,11 +4,12 @@ import re
 
 import numpy as np
 
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from rig.plc_export.kernels.recorded_problems import paper_settings
 from rig.plc_export.problem_layout import problem_layout
 from rig.plc_sizing.budget_tables import problem_of
 
-PROBLEM, PREDICTION = problem_of(paper_settings())
+PROBLEM, PREDICTION = problem_of(paper_settings(DEFAULT_MODEL_FILE))
 TEXT = problem_layout(PROBLEM, PREDICTION)
 K, INSTANT = 2, 20
 """A decision instant, and when it is, s."""

@@ -1,18 +1,20 @@
 """The exported C99 by other compilers, on other processors, for each process: the bits of the kernels."""
 
-import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
+from coldloop.process.cold_box import TICK_S
 from coldloop.process.limits import InputLimits
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from rig.plc_export.c.guard_files import GuardExport
 from rig.plc_export.kernels.golden_calls import golden_calls
 from rig.plc_export.kernels.guard_program import GuardKernels
+from rig.process_file.making import made_from
+from tests.plc_export import problems_file
 from tests.plc_export.c_programs import STRICT, write
 
 ROOT = Path(__file__).parents[2]
@@ -44,17 +46,11 @@ PROCESSES = {"cold box": None, "tank": EXAMPLES / "quadruple_tank.toml", "column
 def problems(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with an export, problems of six loads and their answers."""
     folder: Path = tmp_path_factory.mktemp("problems")
-    environment = {name: value for name, value in os.environ.items() if name != "COLDLOOP_PROCESS"}
-    file = PROCESSES[request.param]
+    file, model = PROCESSES[request.param], DEFAULT_MODEL_FILE
     if file:
         model = folder / "model.json"
-        made = [sys.executable, "-m", "rig", "process", str(file), "--out", str(model)]
-        subprocess.run(made, cwd=ROOT, env=environment, capture_output=True, check=True)
-        environment["COLDLOOP_PROCESS"] = str(model)
-    command = [sys.executable, "-m", "tests.plc_export.problems_file", str(folder), "3600", *"abcdef"]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert int(done.stdout) >= 2000
+        made_from(file).model.save(model)
+    assert problems_file.write(model, folder, 3600, "abcdef") >= 2000
     return folder
 
 
@@ -73,7 +69,7 @@ def built(target: Target, folder: Path, *sources: str) -> list[str]:
 @pytest.mark.parametrize("name", TARGETS)
 def test_the_output_guard_passes_its_self_test(tmp_path: Path, name: str) -> None:
     limits = InputLimits(rate=(0.1, 7.7, 1 / 3))
-    write(tmp_path, GuardExport(GuardKernels(limits), golden_calls(limits)).files())
+    write(tmp_path, GuardExport(GuardKernels(limits), golden_calls(limits), TICK_S).files())
     program = built(TARGETS[name], tmp_path, *map(str, tmp_path.glob("*.c")))
     done = subprocess.run(program, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout[-13:]) == (0, ", 0 failures\n")

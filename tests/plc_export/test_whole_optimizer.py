@@ -11,7 +11,7 @@ import pytest
 
 from coldloop.config import load_configuration
 from coldloop.errors import UsageError
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, Update
 from optimizer_plc.program import OptimizerProgram
 from rig.plc_export.c.optimizer_files import OptimizerExport

@@ -1,18 +1,13 @@
-"""Runs a session of the process that is loaded by the programs alone and with compiled loops, and says what differs.
+"""A session of a process by the programs alone and with compiled loops, and what differs."""
 
-python -m tests.process.both_ways TICKS LOAD [ASSIGNMENT]...    LOAD: tick:share,... of the way to the end of its span
-"""
-
-import json
-import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
 
 from coldloop.config import load_configuration
-from coldloop.process.load_profile import LOAD_SPAN, LoadProfile
-from coldloop.process.loaded import FILE
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
 from coldloop.registers.audit import EventKind
 from rig.cosim import one_process
@@ -65,23 +60,38 @@ def left_by(settings: Settings, load: LoadProfile, ticks: int, *, compiled: bool
     return Left(recording.trace_sha256, recording.updates, events, history, compiled_kernels() - recorder.before)
 
 
-def main(ticks: str, steps: str, assignments: Sequence[str]) -> None:
-    """Print it."""
-    own = (f'model.file="{FILE}"', 'plant.kind="of-process"')
+class Compared(NamedTuple):
+    """What two runs of a session leave behind."""
+
+    same: list[bool]
+    """Trace, updates, events, sensors."""
+    late: int
+    """Kernels that were compiled in the session of the programs."""
+    ticks: int
+    updates: int
+    """Of the loops."""
+    all_updates: int
+    events: set[str]
+    """Their kinds."""
+
+
+def both_ways(model: Path, ticks: int, steps: str, assignments: Sequence[str]) -> Compared:
+    """Run a session of a process by the programs alone, and with compiled loops.
+
+    Args:
+        model: Model file.
+        ticks: Of the session.
+        steps: Load, as tick:share,... of the way to the end of its span.
+        assignments: Of the configuration.
+    """
+    own = (f'model.file="{model}"', 'plant.kind="of-process"')
     settings = load_configuration(Settings, environment={}, assignments=(*own, *assignments)).settings
-    w0, end = read_header(settings.model.file).w0, LOAD_SPAN[1]
-    load = load_of_shares(steps, w0, end)
+    load = load_of_shares(steps, read_header(model).w0, settings.process.load.stored_span[1])
+    Counted.ticks = Counted.updates = 0
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stretches, "CompiledStretches", Counted)
-        programs, loops = (left_by(settings, load, int(ticks), compiled=compiled) for compiled in (False, True))
-    raised = {(EventKind(kind).name, subject, cause) for _, _, kind, subject, cause in programs.events}
-    report = {
-        "same": [one == other for one, other in zip(loops[:-1], programs[:-1], strict=True)], "late": programs.late,
-        "ticks": Counted.ticks, "updates": Counted.updates, "all_updates": len(programs.updates),
-        "events": sorted(raised),
-    }  # fmt: skip
-    sys.stdout.write(json.dumps(report))
-
-
-if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2], sys.argv[3:])
+        programs, loops = (left_by(settings, load, ticks, compiled=compiled) for compiled in (False, True))
+    return Compared(
+        [one == other for one, other in zip(loops[:-1], programs[:-1], strict=True)], programs.late,
+        Counted.ticks, Counted.updates, len(programs.updates), {EventKind(kind).name for _, _, kind, *_ in programs.events},
+    )  # fmt: skip

@@ -1,17 +1,17 @@
-"""Compares the condensed problem of the process that is loaded with a direct build of it: `COLDLOOP_PROCESS=MODEL ...`.
+"""Compares the condensed problem of a process with a direct build of it.
 
 The direct one knows the paper's equations, the process and its linear model only: profiles are interpolated, states
-simulated sample by sample, and what is summed is written out. Prints, for random situations, by how much the cost of
-the one's optimum differs from that of the other's, and by how much it leaves the other's constraints.
+simulated sample by sample, and what is summed is written out.
 """
+
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.process.limits import InputLimits
-from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import load
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import settings_of
 from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
@@ -20,91 +20,98 @@ from tests.harness.reference_qp import solved_by_daqp
 Array = NDArray[np.float64]
 
 SITUATIONS = 20
-MODEL = load(DEFAULT_MODEL_FILE)
-KNOTS = np.array(PROCESS.decision_instants)
-INSTANTS = np.array(PROCESS.constraint_instants)
-SAMPLES = int(KNOTS[-1])
-M, BANDS = len(PROCESS.inputs), len(PROCESS.bands)
-SCALE = np.array([one.scale for one in PROCESS.inputs])
-BANDED = [PROCESS.outputs.index(one) for one in PROCESS.banded]
-SAMPLED = MODEL.discretised(PROCESS.tick_s * PROCESS.ticks_per_sample)
 
 
-def profiles(z: Array) -> tuple[Array, Array]:
-    """Return inputs (SAMPLES, M) and slacks (SAMPLES, BANDS, 2) of decisions."""
-    at_knots = z[: M * len(KNOTS)].reshape(-1, M) * SCALE, z[M * len(KNOTS) :].reshape(len(KNOTS), -1)
-    times = np.arange(1, SAMPLES + 1)
-    u, v = (np.array([np.interp(times, KNOTS, column) for column in each.T]).T for each in at_knots)
-    return u, v.reshape(SAMPLES, BANDS, 2)
+class DirectProblem:
+    """The problem of a process, written out; z and situations are those of `PredictiveProblem`."""
+
+    def __init__(self, file: Path) -> None:
+        self.model = load(file)
+        self.process = process = self.model.declared
+        self.knots, self.instants = np.array(process.decision_instants), np.array(process.constraint_instants)
+        self.samples = int(self.knots[-1])
+        self.inputs, self.bands = len(process.inputs), len(process.bands)
+        self.scale = np.array([one.scale for one in process.inputs])
+        self.banded = list(process.controlled)
+        self.sampled = self.model.discretised(process.sampling_period_s)
+
+    def profiles(self, z: Array) -> tuple[Array, Array]:
+        """Return inputs (samples, inputs) and slacks (samples, bands, 2) of decisions."""
+        at_knots = (
+            z[: self.inputs * len(self.knots)].reshape(-1, self.inputs) * self.scale,
+            z[self.inputs * len(self.knots) :].reshape(len(self.knots), -1),
+        )
+        times = np.arange(1, self.samples + 1)
+        u, v = (np.array([np.interp(times, self.knots, column) for column in each.T]).T for each in at_knots)
+        return u, v.reshape(self.samples, self.bands, 2)
+
+    def outputs(self, u: Array, at: QpParameters) -> Array:
+        """Return the deviations of all outputs from the operating point, shape (samples, p)."""
+        x, y = at.x, []
+        for inputs in u:
+            x = self.sampled.A @ x + self.sampled.B @ inputs + self.sampled.F * at.w
+            y.append(self.model.C @ x + self.model.D @ inputs + self.model.G * at.w)
+        return np.array(y)
+
+    def residuals(self, z: Array, at: QpParameters) -> Array:
+        """Return what is squared and summed: weighted inputs, slacks, outputs."""
+        u, v = self.profiles(z)
+        weigh = np.sqrt([one.weight for one in self.process.outputs])
+        inputs, slacks = (
+            np.sqrt([one.weight for one in self.process.inputs]),
+            np.sqrt([band.weight for band in self.process.bands]),
+        )
+        states = (
+            self.outputs(u, at) - self.model.G * at.w - u @ self.model.D.T
+        ) * weigh  # C x, without what acts at once
+        return np.concatenate([(u * inputs).ravel(), (v * slacks[:, None]).ravel(), states.ravel()])
+
+    def rows(self, z: Array, at: QpParameters) -> Array:
+        """Return what must not be above 0."""
+        u, v = self.profiles(z)
+        y = (self.model.y0 + self.outputs(u, at))[np.ix_(self.instants - 1, self.banded)]
+        v = v[self.instants - 1]
+        low, high = (np.array([getattr(band, end) for band in self.process.bands]) for end in ("low", "high"))
+        margin = np.array([band.margin for band in self.process.bands])
+        knots = np.vstack([at.u_before, z[: self.inputs * len(self.knots)].reshape(-1, self.inputs) * self.scale])
+        longest = np.diff(self.knots, prepend=0)[:, None] * [one.rate for one in self.process.inputs]
+        bounds = [(one.low, one.high) for one in self.process.inputs]
+        u_low, u_high = np.array(bounds).T - self.model.u0
+        parts = [
+            y - (high - margin) - v[:, :, 1], low + margin - y - v[:, :, 0],
+            np.diff(knots, axis=0) - longest, -np.diff(knots, axis=0) - longest,
+            knots[1:] - u_high, u_low - knots[1:], -z[self.inputs * len(self.knots) :],
+        ]  # fmt: skip
+        return np.concatenate([part.ravel() for part in parts])
+
+    def direct_optimum(self, at: QpParameters) -> Array:
+        """Return the decisions of least cost: residuals and rows are affine in them, columns follow from unit vectors."""
+        unit = np.eye((self.inputs + 2 * self.bands) * len(self.knots))
+        nothing = np.zeros(len(unit))
+        r0, g0 = self.residuals(nothing, at), self.rows(nothing, at)
+        R = np.array([self.residuals(column, at) - r0 for column in unit]).T
+        G = np.array([self.rows(column, at) - g0 for column in unit]).T
+        return solved_by_daqp(2.0 * R.T @ R, 2.0 * R.T @ r0, G, np.full(len(g0), -np.inf), -g0)
 
 
-def outputs(u: Array, at: QpParameters) -> Array:
-    """Return the deviations of all outputs from the operating point, shape (SAMPLES, p)."""
-    x, y = at.x, []
-    for inputs in u:
-        x = SAMPLED.A @ x + SAMPLED.B @ inputs + SAMPLED.F * at.w
-        y.append(MODEL.C @ x + MODEL.D @ inputs + MODEL.G * at.w)
-    return np.array(y)
-
-
-def residuals(z: Array, at: QpParameters) -> Array:
-    """Return what is squared and summed: weighted inputs, slacks, outputs."""
-    u, v = profiles(z)
-    weigh = np.sqrt([one.weight for one in PROCESS.outputs])
-    inputs, slacks = np.sqrt([one.weight for one in PROCESS.inputs]), np.sqrt([band.weight for band in PROCESS.bands])
-    states = (outputs(u, at) - MODEL.G * at.w - u @ MODEL.D.T) * weigh  # C x, without what acts at once
-    return np.concatenate([(u * inputs).ravel(), (v * slacks[:, None]).ravel(), states.ravel()])
-
-
-def rows(z: Array, at: QpParameters) -> Array:
-    """Return what must not be above 0."""
-    u, v = profiles(z)
-    y = (MODEL.y0 + outputs(u, at))[np.ix_(INSTANTS - 1, BANDED)]
-    v = v[INSTANTS - 1]
-    low, high = (np.array([getattr(band, end) for band in PROCESS.bands]) for end in ("low", "high"))
-    margin = np.array([band.margin for band in PROCESS.bands])
-    knots = np.vstack([at.u_before, z[: M * len(KNOTS)].reshape(-1, M) * SCALE])
-    longest = np.diff(KNOTS, prepend=0)[:, None] * [one.rate for one in PROCESS.inputs]
-    bounds = [(one.low, one.high) for one in PROCESS.inputs]
-    u_low, u_high = np.array(bounds).T - MODEL.u0
-    parts = [
-        y - (high - margin) - v[:, :, 1], low + margin - y - v[:, :, 0],
-        np.diff(knots, axis=0) - longest, -np.diff(knots, axis=0) - longest,
-        knots[1:] - u_high, u_low - knots[1:], -z[M * len(KNOTS) :],
-    ]  # fmt: skip
-    return np.concatenate([part.ravel() for part in parts])
-
-
-def direct_optimum(at: QpParameters) -> Array:
-    """Return the decisions of least cost: residuals and rows are affine in them, columns follow from unit vectors."""
-    unit = np.eye((M + 2 * BANDS) * len(KNOTS))
-    nothing = np.zeros(len(unit))
-    r0, g0 = residuals(nothing, at), rows(nothing, at)
-    R = np.array([residuals(column, at) - r0 for column in unit]).T
-    G = np.array([rows(column, at) - g0 for column in unit]).T
-    return solved_by_daqp(2.0 * R.T @ R, 2.0 * R.T @ r0, G, np.full(len(g0), -np.inf), -g0)
-
-
-def main() -> None:
-    """Print the worst of all situations."""
-    problem = PredictiveProblem(PredictionModel(MODEL), ControlDesign(), InputLimits())
+def worst(file: Path) -> tuple[float, float]:
+    """Return, of random situations, by how much costs of both optima differ, and constraints are left."""
+    direct = DirectProblem(file)
+    process, model = direct.process, direct.model
+    with settings_of(process):
+        problem = PredictiveProblem(PredictionModel(model), ControlDesign(), InputLimits())
     random = np.random.default_rng(2026)
-    reach = np.abs(SAMPLED.B) @ SCALE
+    reach = np.abs(direct.sampled.B) @ direct.scale
     cost_error = violation = 0.0
     for _ in range(SITUATIONS):
-        inputs = [random.uniform(one.low, one.high) for one in PROCESS.inputs]
-        span = PROCESS.load.span[1] - PROCESS.load.span[0]
-        w = 0.1 * span * random.uniform(-1.0, 1.0) if PROCESS.has_load else 0.0
-        at = QpParameters(3.0 * reach * random.normal(size=len(reach)), w, np.array(inputs) - MODEL.u0)
+        inputs = [random.uniform(one.low, one.high) for one in process.inputs]
+        span = process.load.span[1] - process.load.span[0]
+        w = 0.1 * span * random.uniform(-1.0, 1.0) if process.has_load else 0.0
+        at = QpParameters(3.0 * reach * random.normal(size=len(reach)), w, np.array(inputs) - model.u0)
         qp = problem.at(at)
         low, high = np.append(qp.low, np.full(len(qp.gamma), -np.inf)), np.append(qp.high, qp.gamma)
         condensed = solved_by_daqp(2.0 * qp.Phi, qp.phi, qp.Gamma, low, high)
-        direct = direct_optimum(at)
-        ours, theirs = (float(np.sum(residuals(z, at) ** 2)) for z in (condensed, direct))
+        ours, theirs = (float(np.sum(direct.residuals(z, at) ** 2)) for z in (condensed, direct.direct_optimum(at)))
         cost_error = max(cost_error, abs(ours - theirs) / theirs)
-        violation = max(violation, float(rows(condensed, at).max()))
-    print(f"{cost_error} {violation}")  # noqa: T201 what the test reads
-
-
-if __name__ == "__main__":
-    main()
+        violation = max(violation, float(direct.rows(condensed, at).max()))
+    return cost_error, violation

@@ -1,9 +1,6 @@
 """A plant with a bath by other names, in another order, is the cold box: same laws; and one line for what is wrong."""
 
 import json
-import os
-import subprocess
-import sys
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -18,11 +15,12 @@ from numpy.typing import NDArray
 from coldloop.errors import ColdloopError
 from coldloop.process.cold_box import COLD_BOX, L1, T5
 from coldloop.process.lti_model import load
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from rig.process_file.judgement import described
 from rig.process_file.making import made_from
 from tests.harness.process_files import TANK
 from tests.harness.processes import Processes
+from tests.process.bath_laws import answers
 from tests.process.runs import run, started
 from tests.process.test_processes import ROOT
 
@@ -176,13 +174,7 @@ def laws(order: Order, model: Path | None) -> dict[str, Any]:
         "courses": [{names[name]: value for name, value in y.items() if name in names} for y in courses()],
         "by loops": [(50.0, 20.0, 30.0)[place] for place in order.inputs],
     }
-    environment = {name: value for name, value in os.environ.items() if name != "COLDLOOP_PROCESS"}
-    environment |= {"COLDLOOP_PROCESS": str(model)} if model else {}
-    command = [sys.executable, "-m", "tests.process.bath_laws", json.dumps(given)]
-    done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+    return answers(model or DEFAULT_MODEL_FILE, given)
 
 
 def test_names_and_order_of_its_signals_do_not_matter_to_the_laws_of_a_bath(

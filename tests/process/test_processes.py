@@ -1,13 +1,7 @@
-"""Other processes through the whole rig: over the link as in one process, adaptive and fixed, under faults.
-
-An interpreter is loaded with one process, so each of these runs is a process of its own.
-"""
+"""Other processes through the whole rig: over the link as in one process, adaptive and fixed, under faults."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Final
 
@@ -15,9 +9,11 @@ import pytest
 
 from coldloop.process.model_file import read_document, write_document
 from coldloop.registers.control_plc import Mode
+from rig.process_file.making import made_from
 from tests.harness.process_files import COLUMN, TANK, made
 from tests.harness.processes import Processes
 from tests.harness.unstable_plants import pendulum
+from tests.process.direct_problem import worst
 from tests.process.runs import run, started
 
 ROOT: Final = Path(__file__).parents[2]
@@ -65,26 +61,12 @@ def test_any_number_of_signals_and_any_tick(
     assert all(here[f"y{i}_outside_band_pct"] <= 5.0 for i in range(0, outputs, 2))
 
 
-def test_the_condensed_problem_is_the_one_that_is_written_down(processes: Processes, tmp_path: Path) -> None:
+def test_the_condensed_problem_is_the_one_that_is_written_down(tmp_path: Path) -> None:
     """That of the cold box, whose states weigh, too: tests/optimizer_plc/test_problem.py."""
-    model = tmp_path / "model.json"
-    assert started(processes, "process", COLUMN, "--out", model).code == 0
-    environment = {**os.environ, "COLDLOOP_PROCESS": str(model)}
-    command = [sys.executable, "-m", "tests.process.direct_problem"]
-    done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    cost_error, violation = map(float, done.stdout.split())
+    made_from(COLUMN).model.save(tmp_path / "model.json")
+    cost_error, violation = worst(tmp_path / "model.json")
     assert cost_error <= 1e-9
     assert violation <= 1e-6
-
-
-def test_a_model_of_another_process_is_refused_in_one_line(processes: Processes, tmp_path: Path) -> None:
-    code, _, complaints = started(
-        processes, "--process", TANK, "run", "--in-process", "--set", "model.file=cold-box", "--out", tmp_path / "run"
-    )
-    assert code != 0
-    assert "a model of another" in complaints
-    assert len(complaints.splitlines()) == 1
 
 
 def test_a_run_is_repeated_with_its_process_as_it_was_then(processes: Processes, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from coldloop.process.declaration import LAST_NUMBER, LAST_TICK
 from coldloop.process.model_file import read_header
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.codec import check_record, codec_of
 from coldloop.registers.control_plc import LatchedUpdate, Status, Update
 from coldloop.registers.domain import DomainError

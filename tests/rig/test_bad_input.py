@@ -14,7 +14,7 @@ import pytest
 
 import rig.cosim.networked_run
 from coldloop.process.model_file import read_document, write_document
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from rig.__main__ import _open_closed_streams
 from tests.harness.processes import Processes
 

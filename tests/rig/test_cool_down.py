@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coldloop.process.cold_box import L1, STATE_NAMES, T5
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from plant.helium.properties import load_helium
 from plant.integrator import plain_tuples

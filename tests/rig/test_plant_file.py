@@ -10,7 +10,7 @@ import pytest
 from coldloop.errors import ModelFileError
 from coldloop.process.cold_box import L1, T5, T5_BAND
 from coldloop.process.lti_model import LtiModel, load
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE, ModelSettings
+from coldloop.process.settings import DEFAULT_MODEL_FILE, ModelSettings
 from optimizer_plc.qp.design import ControlDesign
 from plant.cold_box.plant_file import PlantFile
 from plant.load import find_load

@@ -8,7 +8,7 @@ import pytest
 
 from coldloop.process.cold_box import T5_BAND
 from coldloop.process.lti_model import load
-from coldloop.process.model_settings import ModelSettings
+from coldloop.process.settings import ModelSettings
 from plant.load import find_load
 from plant.own_model import own_header
 from plant.settings import PlantSection

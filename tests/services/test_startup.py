@@ -10,7 +10,7 @@ import pytest
 
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.model_file import read_document, write_document
-from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus
 from coldloop.registers.maps import CONTROL_MAP
 from coldloop.registers.safety import Alarm, AlarmKind

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TextIO
 
 from coldloop.errors import ResultsError, UsageError
-from coldloop.process.signals import TICK_S
+from coldloop.process.declaration import Process
 from coldloop.registers.audit import Event, EventKind
 from coldloop.service.event_text import describe, utc_text
 from rig.cli.commands.choices import SERVICES
@@ -82,12 +82,13 @@ def execute(options: argparse.Namespace) -> int:
 
 async def _show(options: argparse.Namespace) -> None:
     from coldloop.modbus.client import RegisterClient
-    from coldloop.registers.maps import MAPS
+    from coldloop.registers.maps import maps_of
     from rig.cosim.journal_reader import JournalReader
 
-    client = RegisterClient.at(MAPS[options.service], _place(options))
+    process, place = _place(options)
+    client = RegisterClient.at(maps_of(process).by_service[options.service], place)
     reader = JournalReader(client, options.since.number, options.kind)
-    output = _CsvFile(options.csv) if options.csv else _Lines()
+    output = _CsvFile(options.csv, process) if options.csv else _Lines(process)
     try:
         await client.connect(0)
         await _copy(reader, options, output, client.peer)
@@ -96,15 +97,15 @@ async def _show(options: argparse.Namespace) -> None:
         output.close()
 
 
-def _place(options: argparse.Namespace) -> "Endpoint":
-    """Return the endpoint of the service whose journal is read."""
+def _place(options: argparse.Namespace) -> "tuple[Process, Endpoint]":
+    """Return the process, and the endpoint of the service whose journal is read."""
     settings = operator_settings(options)
     if options.endpoint is not None and (options.rig or options.port_base):
         raise UsageError("HOST:PORT, --rig and --port-base: give one of them")
     if options.endpoint is not None:
         options.rig = [options.endpoint] * len(SERVICES)
     place: Endpoint = getattr(rig_endpoints(options, settings), options.service)
-    return place
+    return settings.process, place
 
 
 async def _copy(reader: "JournalReader", options: argparse.Namespace, output: "_Lines | _CsvFile", peer: str) -> None:
@@ -134,11 +135,14 @@ def _warnings(reader: "JournalReader", peer: str) -> Iterator[str]:
 class _Lines:
     """Writes one line an event to standard output."""
 
+    def __init__(self, process: Process) -> None:
+        self._process = process
+
     def write(self, events: Sequence[Event]) -> None:
         for event in events:
             sys.stdout.write(
                 f"{event.number:>7}  {utc_text(event)}  boot {event.boot}  tick {event.tick} "
-                f"({event.tick * TICK_S:.2f} s)  {describe(event).sentence}\n"
+                f"({event.tick * self._process.tick_s:.2f} s)  {describe(event, self._process).sentence}\n"
             )
         sys.stdout.flush()
 
@@ -149,8 +153,8 @@ class _Lines:
 class _CsvFile:
     """Writes a CSV file, which appears with the first events."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, process: Process) -> None:
+        self._path, self._process = path, process
         self._file: TextIO | None = None
         self._events = 0
 
@@ -161,7 +165,7 @@ class _CsvFile:
             if self._file is None:
                 self._file = self._path.open("w", encoding="utf-8", newline="")
                 csv.writer(self._file, lineterminator="\n").writerow(COLUMNS)
-            csv.writer(self._file, lineterminator="\n").writerows(_cells(event) for event in events)
+            csv.writer(self._file, lineterminator="\n").writerows(_cells(event, self._process) for event in events)
             self._file.flush()
         except OSError as error:
             self._give_up(remove=not present)
@@ -184,9 +188,9 @@ class _CsvFile:
             sys.stdout.write(f"{self._events} events in {self._path}\n")
 
 
-def _cells(event: Event) -> list[str]:
-    text = describe(event)
-    time = f"{event.tick * TICK_S:.2f}"
+def _cells(event: Event, process: Process) -> list[str]:
+    text = describe(event, process)
+    time = f"{event.tick * process.tick_s:.2f}"
     return [
         str(event.number), str(event.boot), utc_text(event), str(event.tick), time, text.kind, text.subject, text.cause,
         text.value, text.who,

@@ -8,8 +8,7 @@ import sys
 from typing import Final
 
 from coldloop.errors import UsageError
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import OUTPUT_NAMES
+from coldloop.process.settings import settings_process
 from rig.cli.commands.options import (
     add_rig_options,
     add_to_subcommands,
@@ -41,7 +40,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     cut.add_argument("seconds", type=_seconds, help="duration in real time")
     cut.set_defaults(fault=_cut)
     sensor = what.add_parser("sensor", help="make a sensor fail: not a number, frozen, or a given value")
-    sensor.add_argument("output", metavar="OUTPUT", help=f"such as {PROCESS.banded[-1].name}")
+    sensor.add_argument("output", metavar="OUTPUT", help=f"such as {settings_process().banded[-1].name}")
     sensor.add_argument("shows", metavar="dead|stuck|VALUE|none", help="none ends the fault")
     sensor.set_defaults(fault=_sensor)
     add_to_subcommands(what)
@@ -94,12 +93,13 @@ async def _sensor(options: argparse.Namespace) -> None:
     from coldloop.operating.execution import WORK
     from rig.live.operator_request import ask
 
-    if options.output not in OUTPUT_NAMES:
-        raise UsageError(f"unknown output '{options.output}'; choose from {', '.join(OUTPUT_NAMES)}")
-    command = read_command({"kind": "sensor_fault", "output": options.output, **_shown(options.shows)})
+    settings = operator_settings(options)
+    process, rig = settings.process, rig_endpoints(options, settings)
+    if options.output not in process.output_names:
+        raise UsageError(f"unknown output '{options.output}'; choose from {', '.join(process.output_names)}")
+    command = read_command({"kind": "sensor_fault", "output": options.output, **_shown(options.shows)}, process)
     services, work = WORK[type(command)]
-    rig = rig_endpoints(options, operator_settings(options))
-    text = await ask(rig, services, lambda clients: work(clients, command))
+    text = await ask(rig, process, services, lambda clients: work(clients, command))
     sys.stdout.write(f"{text}\n")
 
 

@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from coldloop.errors import UsageError
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.settings import settings_process, whole_ticks
 from coldloop.process.updating_periods import SHORTEST_TICKS
-from coldloop.process.whole_ticks import whole_ticks
 from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.choices import FIGURE_FORMATS, LOADS, PRESETS, SOLVERS
 
@@ -45,10 +43,6 @@ class HostPort(NamedTuple):
     port: int
 
 
-SHORTEST_S: Final = SHORTEST_TICKS * TICK_S
-LONGEST_S: Final = TICKS_PER_SAMPLE * TICK_S
-
-
 def updating_period(text: str) -> float:
     """Return an updating period in seconds, 0 for `adaptive`."""
     return 0.0 if text == "adaptive" else _period(text, "neither 'adaptive' nor a")
@@ -60,14 +54,14 @@ def fixed_updating_period(text: str) -> float:
 
 
 def _period(text: str, what: str) -> float:
+    process = settings_process()
     try:
-        ticks = whole_ticks(float(text))
+        ticks = whole_ticks(float(text), process.tick_s)
     except ValueError:
         ticks = None
-    if ticks is None or not SHORTEST_TICKS <= ticks <= TICKS_PER_SAMPLE:
-        raise argparse.ArgumentTypeError(
-            f"'{text}' is {what} multiple of {TICK_S:g} s, a tick, from {SHORTEST_S:g} to {LONGEST_S:g} s"
-        )
+    if ticks is None or not SHORTEST_TICKS <= ticks <= process.ticks_per_sample:
+        span = f"{SHORTEST_TICKS * process.tick_s:g} to {process.sampling_period_s:g} s"
+        raise argparse.ArgumentTypeError(f"'{text}' is {what} multiple of {process.tick_s:g} s, a tick, from {span}")
     return float(text)
 
 
@@ -84,8 +78,9 @@ def check_load(name: str | None) -> None:
     Raises:
         UsageError: There is no such load, or the process has none.
     """
-    if name is not None and not PROCESS.has_load:
-        raise UsageError(f"load '{name}': {PROCESS.name} has no load; leave it out")
+    process = settings_process()
+    if name is not None and not process.has_load:
+        raise UsageError(f"load '{name}': {process.name} has no load; leave it out")
     if name is not None and name.partition("@")[0] not in LOADS and not (name and Path(name).exists()):
         raise UsageError(f"load '{name}': neither a file nor one of {', '.join(LOADS)}")
 
@@ -125,6 +120,7 @@ def add_to_subcommands(what: "argparse._SubParsersAction[argparse.ArgumentParser
 
 def add_loop_options(parser: argparse.ArgumentParser, loads: str) -> None:
     """Declare what the loop does; `loads` says which loads there are besides those with a name."""
+    loads = f"{loads}a CSV file time_s,{settings_process().load.column}"
     load = parser.add_argument("--load", type="name", help=f"{', '.join(LOADS)}, {loads} (default: 2h)")
     load.completer = lambda **_: LOADS  # type: ignore[attr-defined]  # argcomplete looks for it
     parser.add_argument("--solver", choices=SOLVERS, help="default: ode")
@@ -298,7 +294,7 @@ def refuse_ineffective(effective: "Configuration[Settings]", keys: Mapping[str, 
     """
     from coldloop.config import DEFAULT, flattened
 
-    usual = flattened(type(effective.settings)().model_dump(mode="json"))
+    usual = flattened(effective.usual().model_dump(mode="json"))
     for key, value, source in effective.effective():
         if key in keys and (source.startswith("--") or (source != DEFAULT and value != usual.get(key))):
             where = source if key in source.lower().replace("__", ".") else f"{source}: {key}"

@@ -18,10 +18,12 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Print the list."""
-    from coldloop.registers.maps import MAPS
+    from coldloop.process.settings import settings_process
+    from coldloop.registers.maps import maps_of
     from rig.cli.register_listing import FORMATS
 
-    maps = [MAPS[options.service]] if options.service else list(MAPS.values())
+    every = maps_of(settings_process()).by_service
+    maps = [every[options.service]] if options.service else list(every.values())
     if options.format in FORMATS:
         sys.stdout.write(FORMATS[options.format](maps))
         return 0

@@ -4,7 +4,6 @@ import argparse
 from typing import TYPE_CHECKING
 
 from coldloop.errors import UsageError
-from coldloop.process.load_profile import LOAD_COLUMN
 from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.choices import MODES
 from rig.cli.commands.options import (
@@ -36,7 +35,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     way.add_argument("--optimizer", type="export", metavar="export:FOLDER",
                      help="the exported optimiser in the place of ours (`coldloop docs plc-export`)")  # fmt: skip
     parser.add_argument("--duration", type=duration, help="plant time, such as 2h or 90s (default: that of the load)")
-    add_loop_options(parser, f"another draw such as a@2, or a CSV file time_s,{LOAD_COLUMN}")
+    add_loop_options(parser, "another draw such as a@2, or ")
     add_result_options(parser, "<load>")
 
 

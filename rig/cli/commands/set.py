@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import UsageError
-from coldloop.process.load_profile import LOAD_COLUMN, LOAD_UNIT
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import TICK_S
-from coldloop.process.whole_ticks import whole_ticks
+from coldloop.process.declaration import Process
+from coldloop.process.settings import settings_process, whole_ticks
 from rig.cli.commands.options import (
     add_rig_options,
     add_to_subcommands,
@@ -28,28 +26,27 @@ if TYPE_CHECKING:
     from rig.live.operator_request import Work
 
 MODES: Final = ("auto", "classical", "manual")
-INPUTS: Final = {one.register: one.name for one in PROCESS.inputs}
-UNIT: Final = {"W": "watts"}.get(LOAD_UNIT, LOAD_UNIT)
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_rig_options(parser)
+    process = settings_process()
+    number = f"{_unit(process)}, or a CSV file time_s,{process.load.column}"
     what = parser.add_subparsers(title="what", metavar="WHAT", required=True)
-    load = what.add_parser("load", help=f"{UNIT}, or a CSV file time_s,{LOAD_COLUMN}")
-    load.add_argument(
-        "new_load", type="name", metavar="LOAD|FILE", help=f"{UNIT}, or a CSV file time_s,{LOAD_COLUMN} that begins now"
-    )
+    load = what.add_parser("load", help=number)
+    load.add_argument("new_load", type="name", metavar="LOAD|FILE", help=f"{number} that begins now")
     load.add_argument("--at", type=_seconds, metavar="SECONDS", help="plant time at which it begins (default: now)")
     load.set_defaults(document=_load)
     mode = what.add_parser("mode", help="who drives")
     mode.add_argument("mode", choices=MODES, metavar="auto|classical|manual")
     mode.set_defaults(document=lambda options: {"kind": "mode", "mode": options.mode})
     setpoint = what.add_parser("setpoint", help="an input in manual mode")
-    setpoint.add_argument("input", choices=INPUTS, metavar="|".join(INPUTS))
+    inputs = {one.register: one.name for one in process.inputs}
+    setpoint.add_argument("input", choices=inputs, metavar="|".join(inputs))
     setpoint.add_argument("value", type=float)
     setpoint.set_defaults(
-        document=lambda options: {"kind": "setpoint", "input": INPUTS[options.input], "value": options.value}
+        document=lambda options: {"kind": "setpoint", "input": inputs[options.input], "value": options.value}
     )
     factor = what.add_parser("factor", help="seconds of plant time per second; also switches to real time")
     factor.add_argument("factor", type=float)
@@ -64,14 +61,19 @@ def declare(parser: argparse.ArgumentParser) -> None:
     add_to_subcommands(what)
 
 
+def _unit(process: Process) -> str:
+    return {"W": "watts"}.get(process.load.unit, process.load.unit)
+
+
 def _seconds(text: str) -> float:
+    tick_s = settings_process().tick_s
     try:
-        ticks = whole_ticks(float(text))
+        ticks = whole_ticks(float(text), tick_s)
     except ValueError:
         ticks = None
     if ticks is None or not 0 <= ticks < LONGEST_TICKS:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number of seconds in multiples of {TICK_S:g}")
-    return ticks * TICK_S
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number of seconds in multiples of {tick_s:g}")
+    return ticks * tick_s
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -85,10 +87,12 @@ async def _do(options: argparse.Namespace) -> None:
     from rig.live.operator_request import ask
 
     settings = operator_settings(options)
-    services, work = _stream(options) if _is_stream(options) else _command(options, settings.limits)
+    services, work = _stream(options, settings.process) if _is_stream(options) else _command(options, settings.limits)
     there = rig_services(options)
     concerned = [service for service in services if service in there]
-    text = await ask(rig_endpoints(options, settings), concerned, work, limited=not _is_stream(options))
+    text = await ask(
+        rig_endpoints(options, settings), settings.process, concerned, work, limited=not _is_stream(options)
+    )
     sys.stdout.write(f"{text}\n")
 
 
@@ -101,21 +105,20 @@ def _command(options: argparse.Namespace, limits: "InputLimits") -> tuple[tuple[
     from coldloop.operating.commands import SetSetpoint, read_command
     from coldloop.operating.execution import WORK, check_bounds
 
-    command = read_command(options.document(options))
+    command = read_command(options.document(options), limits.process)
     if isinstance(command, SetSetpoint):
-        place = list(INPUTS.values()).index(command.input)
-        check_bounds(command, limits.low[place], limits.high[place])
+        check_bounds(command, limits.low[command.place], limits.high[command.place])
     services, work = WORK[type(command)]
     return services, lambda clients: work(clients, command)
 
 
-def _stream(options: argparse.Namespace) -> tuple[tuple[str, ...], "Work"]:
+def _stream(options: argparse.Namespace, process: Process) -> tuple[tuple[str, ...], "Work"]:
     from coldloop.operating.execution import stream_load
     from coldloop.process.load_profile import read_load_file
 
     if not Path(options.new_load).is_file():
-        raise UsageError(f"load '{options.new_load}': neither {UNIT} nor a file")
-    load = read_load_file(Path(options.new_load))
+        raise UsageError(f"load '{options.new_load}': neither {_unit(process)} nor a file")
+    load = read_load_file(Path(options.new_load), process)
     return ("plant",), lambda clients: stream_load(clients, load, _tick(options), tell)
 
 
@@ -135,14 +138,14 @@ def _load(options: argparse.Namespace) -> dict[str, object]:
 
 
 def _tick(options: argparse.Namespace) -> int:
-    return 0 if options.at is None else round(options.at / TICK_S)
+    return 0 if options.at is None else round(options.at / settings_process().tick_s)
 
 
 def _acknowledgement(options: argparse.Namespace) -> dict[str, object]:
     from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmKind
     from coldloop.service.event_text import alarm_word
 
-    kinds = {alarm_word(kind).replace(" ", "-"): int(kind) for kind in AlarmKind}
+    kinds = {alarm_word(kind, settings_process()).replace(" ", "-"): int(kind) for kind in AlarmKind}
     if options.alarm is not None and options.alarm not in kinds:
         raise UsageError(f"unknown alarm '{options.alarm}'; choose from {', '.join(kinds)}")
     alarm = ALL_ALARMS if options.alarm is None else kinds[options.alarm]

@@ -29,8 +29,9 @@ async def _show(options: argparse.Namespace) -> None:
     from coldloop.operating.execution import clients_of
     from rig.live.status import colour, line, page, read_status
 
-    endpoints = rig_endpoints(options, operator_settings(options))
-    clients = clients_of({service: getattr(endpoints, service) for service in rig_services(options)})
+    settings = operator_settings(options)
+    endpoints = rig_endpoints(options, settings)
+    clients = clients_of({each: getattr(endpoints, each) for each in rig_services(options)}, settings.process)
     try:
         status = await read_status(clients)
         if not options.follow:

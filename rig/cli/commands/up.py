@@ -2,7 +2,6 @@
 
 import argparse
 
-from coldloop.process.load_profile import LOAD_COLUMN
 from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.choices import WITHOUT
 from rig.cli.commands.options import PLACES, add_loop_options, check_load, port_base, refuse_ineffective
@@ -12,7 +11,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
     parser.add_argument("--factor", type=float, help="seconds of plant time per second (default: 1)")
-    add_loop_options(parser, f"or a CSV file time_s,{LOAD_COLUMN}; its end is held")
+    add_loop_options(parser, "or, its end held, ")
     parser.add_argument("--tls", type="folder", metavar="FOLDER",
                         help="Modbus/TCP Security with what `coldloop certificates --out FOLDER` made")  # fmt: skip
     parser.add_argument("--port-base", type=port_base, metavar="PORT",

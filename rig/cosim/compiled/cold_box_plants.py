@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import TICK_S
+from coldloop.process.cold_box import TICK_S
 from plant.cold_box.physics import ColdBox, evaluate
 from plant.cold_box.program import ColdBoxProgram
 from plant.helium.properties import Helium, load_helium

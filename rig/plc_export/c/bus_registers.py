@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICK_S
+from coldloop.process.declaration import Process
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import MAGIC, Identity, ServiceState, SessionPace
@@ -21,7 +21,7 @@ from coldloop.registers.control_plc import (
     Update,
 )
 from coldloop.registers.declaration import RegisterMap
-from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP
+from coldloop.registers.maps import maps_of
 from coldloop.registers.optimizer_plc import (
     HISTORY_ROWS,
     ControlLinkStatus,
@@ -37,27 +37,33 @@ from rig.plc_export.templates import filled, template
 from rig.plc_export.tree.subset import UnfitKernelError
 
 FILES: Final = ("main.c", "control_plc.c", "control_plc.h", "diagnostics.c", "diagnostics.h", "words.c", "words.h")
-VALUES: Final = len(INPUT_NAMES) * 2 + len(OUTPUT_NAMES) + len(STATE_NAMES)
-BLOCKS: Final[Mapping[str, tuple[RegisterMap, type[tuple[Any, ...]], str]]] = {
-    "IDENTITY": (CONTROL_MAP, Identity, "fIHHIIIH"),
-    "UPDATE": (CONTROL_MAP, Update, "IIIIf" + "f" * VALUES + "I"),
-    "AWAIT_UPDATE": (CONTROL_MAP, AwaitUpdate, "III"),
-    "PLAN": (CONTROL_MAP, Plan, "IIffII"),
-    "ACKNOWLEDGEMENT": (CONTROL_MAP, Acknowledgement, "IHI"),
-    "HEARTBEAT": (CONTROL_MAP, Heartbeat, "HIII"),
-    "LATCHED_UPDATE": (CONTROL_MAP, LatchedUpdate, "IIII"),
-    "SEQUENCE_HEADER": (CONTROL_MAP, SequenceHeader, "IIIHHII"),
-    "SEQUENCE": (CONTROL_MAP, SequenceRow, "f" * len(INPUT_NAMES)),
-    "OPTIMIZER_IDENTITY": (OPTIMIZER_MAP, Identity, "fIHHIIIH"),
-    "SESSION": (OPTIMIZER_MAP, OptimizerSession, "IHfH"),
-    "CONTROL_LINK": (OPTIMIZER_MAP, ControlLinkStatus, "HIIIII"),
-    "PACE": (OPTIMIZER_MAP, SessionPace, "IHfH"),
-    "UPDATING_RULE": (OPTIMIZER_MAP, UpdatingRuleStatus, "HHHHHfff"),
-    "HISTORY": (OPTIMIZER_MAP, Optimization, "IIHHHH" + "f" * 11),
-}
+Blocks = Mapping[str, tuple[RegisterMap, type[tuple[Any, ...]], str]]
 """Blocks by their names in C, with the types of their values as the C sources put them together."""
 RULE_NUMBERS: Final = 5
 """Of the rule of the updating period: those before the times."""
+
+
+def blocks_of(process: Process) -> Blocks:
+    """Return the blocks that the C sources know."""
+    _, control, optimizer = maps_of(process)
+    values = 2 * len(process.inputs) + len(process.outputs) + len(process.states)
+    return {
+        "IDENTITY": (control, Identity, "fIHHIIIH"),
+        "UPDATE": (control, Update, "IIIIf" + "f" * values + "I"),
+        "AWAIT_UPDATE": (control, AwaitUpdate, "III"),
+        "PLAN": (control, Plan, "IIffII"),
+        "ACKNOWLEDGEMENT": (control, Acknowledgement, "IHI"),
+        "HEARTBEAT": (control, Heartbeat, "HIII"),
+        "LATCHED_UPDATE": (control, LatchedUpdate, "IIII"),
+        "SEQUENCE_HEADER": (control, SequenceHeader, "IIIHHII"),
+        "SEQUENCE": (control, SequenceRow, "f" * len(process.inputs)),
+        "OPTIMIZER_IDENTITY": (optimizer, Identity, "fIHHIIIH"),
+        "SESSION": (optimizer, OptimizerSession, "IHfH"),
+        "CONTROL_LINK": (optimizer, ControlLinkStatus, "HIIIII"),
+        "PACE": (optimizer, SessionPace, "IHfH"),
+        "UPDATING_RULE": (optimizer, UpdatingRuleStatus, "HHHHHfff"),
+        "HISTORY": (optimizer, Optimization, "IIHHHH" + "f" * 11),
+    }
 
 
 def bus_files(
@@ -79,6 +85,7 @@ def bus_files(
 def _header(
     optimizer: OptimizerProgram, kernels: OptimizerKernels, order: WordOrder, configuration: Mapping[str, Any]
 ) -> str:  # fmt: skip
+    process, blocks = optimizer.process, blocks_of(optimizer.process)
     times = {name: getattr(optimizer.budget.times, name) for name in ("slots", "preparation", "iteration")}
     statuses = [rule.status._replace(**times) for rule in kernels.rules]
     image = _image(optimizer, statuses[0], order, configuration)
@@ -87,13 +94,13 @@ def _header(
     rules = "".join(f"    {{{', '.join(str(int(each)) for each in status[:RULE_NUMBERS])}}},\n" for status in statuses)
     names = {
         "CONTROL_PORT": CONTROL_PORT, "OPTIMIZER_PORT": OPTIMIZER_PORT, "HISTORY_ROWS": HISTORY_ROWS,
-        "IDENTITY_MODEL": 6, "SEQUENCE_ROW_WORDS": 2 * len(INPUT_NAMES), "RULE_NUMBERS": RULE_NUMBERS,
+        "IDENTITY_MODEL": 6, "SEQUENCE_ROW_WORDS": 2 * len(process.inputs), "RULE_NUMBERS": RULE_NUMBERS,
         "MODEL_DIGEST": f"UINT32_C({optimizer.model_digest})", "MAGIC": f"{MAGIC!r}F",
-        "SEQUENCE_ROW_LETTERS": f'"{BLOCKS["SEQUENCE"][2]}"',
-        "USUAL_PERIOD": round(optimizer.settings.updating_period_s / TICK_S),
+        "SEQUENCE_ROW_LETTERS": f'"{blocks["SEQUENCE"][2]}"',
+        "USUAL_PERIOD": round(optimizer.settings.updating_period_s / process.tick_s),
         "OPTIMIZER_LOW_FIRST": str(order is WordOrder.LOW_FIRST).lower(),
         "PREPARATION_S": repr(float(times["preparation"])), "ITERATION_S": repr(float(times["iteration"])),
-        "LOOK_OUT_S": repr(LOOK_OUT_TICKS * TICK_S), "HEARTBEAT_S": repr(HEARTBEAT_TICKS * TICK_S),
+        "LOOK_OUT_S": repr(LOOK_OUT_TICKS * process.tick_s), "HEARTBEAT_S": repr(HEARTBEAT_TICKS * process.tick_s),
     }  # fmt: skip
     defined = "".join(f"#define {name} {value}\n" for name, value in names.items())
     return f"""{GENERATED}#ifndef REGISTERS_H
@@ -103,7 +110,7 @@ def _header(
 #include <stdint.h>
 
 {defined}
-{_addresses()}
+{_addresses(blocks)}
 /* The rule that each fixed updating period in ticks has, 0 is adaptive: its kind and its numbers. */
 static const uint16_t rule_status[{len(statuses)}][RULE_NUMBERS] = {{
 {rules}}};
@@ -116,9 +123,9 @@ static const uint16_t image[][2] = {{
 """
 
 
-def _addresses() -> str:
+def _addresses(blocks: Blocks) -> str:
     lines = []
-    for name, (of, record, letters) in BLOCKS.items():
+    for name, (of, record, letters) in blocks.items():
         block = of.block_of(record)
         if block.letters != letters:
             raise UnfitKernelError(f"block {block.name} has the values {block.letters}, its C source {letters}")
@@ -131,10 +138,11 @@ def _image(
     optimizer: OptimizerProgram, rule: UpdatingRuleStatus, order: WordOrder, configuration: Mapping[str, Any]
 ) -> bytes:  # fmt: skip
     """Return all registers of an optimiser that has just been started."""
-    bank = RegisterBank(OPTIMIZER_MAP, order)
-    bank.put(Identity(map_digest=OPTIMIZER_MAP.digest, map_version=OPTIMIZER_MAP.version, state=ServiceState.READY,
+    registers = maps_of(optimizer.process).optimizer_plc
+    bank = RegisterBank(registers, order)
+    bank.put(Identity(map_digest=registers.digest, map_version=registers.version, state=ServiceState.READY,
                       model_digest=optimizer.model_digest))  # fmt: skip
     bank.put(optimizer.operating_limits)
     bank.put(rule)
     publish_configuration(bank, configuration)
-    return bank.read(0, OPTIMIZER_MAP.end)
+    return bank.read(0, registers.end)

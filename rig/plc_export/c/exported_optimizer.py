@@ -17,7 +17,7 @@ from coldloop.errors import UsageError
 from coldloop.kernels.cache_folder import find_cache_folder
 from coldloop.parsing import parsed_json
 from coldloop.process.lti_model import load as load_model
-from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP
+from coldloop.registers.maps import maps_of
 from coldloop.text_file import held_file, read_bytes
 from optimizer_plc.settings import SHOWN
 from rig.settings import Settings
@@ -63,7 +63,7 @@ def _identity(settings: Settings) -> dict[str, Any]:
     shown = selected(settings, SHOWN)
     return {
         "model_digest": load_model(settings.model.file).digest,
-        "register_maps": [CONTROL_MAP.digest, OPTIMIZER_MAP.digest],
+        "register_maps": [each.digest for each in maps_of(settings.process)[1:]],
         "settings": parsed_json(json.dumps({key: value for key, value in shown.items() if key not in OF_SESSION})),
     }
 

@@ -5,7 +5,6 @@ from typing import Final
 
 import numpy as np
 
-from coldloop.process.signals import INPUT_NAMES, TICK_S
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from rig.plc_export.c.constants import ConstantRecords
 from rig.plc_export.c.optimizer_files import size_of
@@ -25,12 +24,14 @@ class GuardExport:
     Args:
         kernels: Its functions.
         golden: Calls with their answers.
+        tick_s: Length of a tick, s.
 
     Raises:
         UnfitKernelError: A kernel uses what is not in the subset.
     """
 
-    def __init__(self, kernels: GuardKernels, golden: Sequence[GoldenCall]) -> None:
+    def __init__(self, kernels: GuardKernels, golden: Sequence[GoldenCall], tick_s: float) -> None:
+        self._inputs, self._tick_s = len(kernels.limits.low), tick_s
         self._printer, self._tables = Printer(np.float64), tables_of(golden)
         self._kernels = KernelFiles(self._printer, kernels.functions, kernels.entries, "guard", ["limits"])
         self.constants = ConstantRecords(self._printer)
@@ -38,7 +39,7 @@ class GuardExport:
 
     def files(self) -> dict[str, str]:
         """Return the texts of the files by their names."""
-        sizes = {"INPUTS": len(INPUT_NAMES), "ROWS": SEQUENCE_ROWS, "TICK_S": TICK_S}
+        sizes = {"INPUTS": self._inputs, "ROWS": SEQUENCE_ROWS, "TICK_S": self._tick_s}
         parts = {"GENERATED": GENERATED.rstrip(), **{name: str(size) for name, size in sizes.items()}}
         texts = {name: filled(template(f"c/output_guard/{name}"), parts) for name in TEMPLATES}
         return {**self._kernels.texts(), **self._limit_files(), **self._golden_files(), **texts}
@@ -46,7 +47,7 @@ class GuardExport:
     def sizes(self) -> dict[str, int]:
         """Return the bytes of what a PLC needs."""
         state = next(each for each in self._kernels.records if each.name == "GuardState")
-        rows = 2 * 8 * len(INPUT_NAMES) * SEQUENCE_ROWS
+        rows = 2 * 8 * self._inputs * SEQUENCE_ROWS
         golden = sum(values.nbytes for values in self._tables.values())
         judged = 2 * size_of(state, 8) + rows
         return {"constants": self.constants.bytes(), "state and rows that are judged, about": judged,

@@ -6,7 +6,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.program import OptimizerProgram
@@ -47,7 +46,7 @@ class OptimizerExport:
 
     def __init__(self, optimizer: OptimizerProgram, golden: Sequence[GoldenUpdate]) -> None:
         self.kernels, self._golden, self._state = OptimizerKernels(optimizer), golden, optimizer.state
-        self.printer = Printer(np.float32)
+        self._process, self.printer = optimizer.process, Printer(np.float32)
         functions = self.kernels.functions
         made = (kind for each in functions for kind in self.printer.made_in(each))
         self._kernels = KernelFiles(self.printer, functions, self.kernels.entries, "optimizer", TABLES, made)
@@ -65,9 +64,10 @@ class OptimizerExport:
 
     def files(self) -> dict[str, str]:
         """Return the texts of the files by their names."""
-        sizes = {"INPUTS": len(INPUT_NAMES), "OUTPUTS": len(OUTPUT_NAMES), "STATES": len(STATE_NAMES),
-                 "ROWS": SEQUENCE_ROWS, "LONGEST": TICKS_PER_SAMPLE, "SHORTEST": SHORTEST_TICKS,
-                 "TICK_S": TICK_S}  # fmt: skip
+        process = self._process
+        sizes = {"INPUTS": len(process.inputs), "OUTPUTS": len(process.outputs), "STATES": len(process.states),
+                 "ROWS": SEQUENCE_ROWS, "LONGEST": process.ticks_per_sample, "SHORTEST": SHORTEST_TICKS,
+                 "TICK_S": process.tick_s}  # fmt: skip
         parts = {"GENERATED": GENERATED.rstrip(), **{name: str(size) for name, size in sizes.items()}}
         texts = {name: filled(template(f"c/optimizer/{name}"), parts)
                  for name in ("optimizer.h", "optimizer.c", "self_test.c")}  # fmt: skip

@@ -10,12 +10,10 @@ import numpy as np
 
 from coldloop.kernels.single_precision import single
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import INPUT_NAMES
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from control_plc.output_limits import Limits, admit, begin, beginning, copy_state, in_range, judge, plain, resume
 from rig.plc_export.kernels.ode_program import Array
 
-N: Final = len(INPUT_NAMES)
 Row = tuple[float, ...]
 
 
@@ -56,10 +54,8 @@ class GoldenCall(NamedTuple):
 CALLS: Final = 800
 MOST_NUMBERS: Final = 8_000
 """Of the rows of all golden calls, and of what is given and applied: each table is in one list of constants."""
-LONGEST: Final = min(SEQUENCE_ROWS, MOST_NUMBERS // (10 * N))
-"""Rows of a sequence that is judged."""
-FARTHEST: Final = min(30, LONGEST)
-"""Ticks until it begins."""
+FARTHEST: Final = 30
+"""Ticks until a sequence that is judged begins."""
 LATEST: Final = 2_000_000_000
 SEED: Final = 0
 NOT_FINITE: Final = (math.nan, math.inf, -math.inf)
@@ -68,9 +64,10 @@ NOT_FINITE: Final = (math.nan, math.inf, -math.inf)
 def golden_calls(limits: InputLimits) -> list[GoldenCall]:
     """Return calls that want what is and what is not allowed, with the answers of the control PLC's own guard."""
     drawing, calls, rows = _Drawing(plain(limits), random.Random(SEED)), list[GoldenCall](), 0  # noqa: S311 no secret
+    inputs = len(limits.low)
     for call in drawing.calls():
         rows += len(call.meanwhile) + len(call.rows)
-        if len(calls) == CALLS or N * max(rows, 2 * len(calls)) > MOST_NUMBERS:
+        if len(calls) == CALLS or inputs * max(rows, 2 * len(calls)) > MOST_NUMBERS:
             break
         calls.append(call)
     return calls
@@ -80,14 +77,16 @@ class _Drawing:
     """Calls one after the other of one guard."""
 
     def __init__(self, limits: Limits, source: random.Random) -> None:
-        self.limits, self.random = limits, source
+        self.limits, self.random, self._n = limits, source, len(limits.low)
+        self._longest = min(SEQUENCE_ROWS, MOST_NUMBERS // (10 * self._n))
+        """Rows of a sequence that is judged."""
         self.state = beginning(limits, self._row(0.2, 0.8))
         self.twin = beginning(limits, self.state.applied)
         self.tick = source.randrange(LATEST)
 
     def _row(self, low: float, high: float) -> Row:
         """Return outputs between shares of their ranges, as they cross the link."""
-        drawn = (self.random.uniform(low, high) for _ in range(N))
+        drawn = (self.random.uniform(low, high) for _ in range(self._n))
         bounds = zip(drawn, self.limits.low, self.limits.high, strict=True)
         return tuple(single(bottom + share * (top - bottom)) for share, bottom, top in bounds)
 
@@ -96,7 +95,7 @@ class _Drawing:
 
     def _changed(self, row: Row, values: Sequence[float]) -> Row:
         """Return a row with one of these values in the place of one output."""
-        place = self.random.randrange(N)
+        place = self.random.randrange(self._n)
         return (*row[:place], self.random.choice(values), *row[place + 1 :])
 
     def _applied(self) -> Row:
@@ -151,7 +150,8 @@ class _Drawing:
         """Yield the judgement of a sequence that may be played, or that is changed in one place."""
         copy_state(self.state, self.twin, self.limits)
         long = self._chance(0.08)
-        ahead, length = (FARTHEST, LONGEST) if long else (min(4, FARTHEST), min(8, LONGEST))
+        farthest = min(FARTHEST, self._longest)
+        ahead, length = (farthest, self._longest) if long else (min(4, farthest), min(8, self._longest))
         coming = self.random.randrange(ahead + 1)
         first_tick = self.tick + self.random.randrange(coming, ahead + 1)
         meanwhile = tuple(self._played(self.tick + k, moves=0.5, as_wanted=self._chance(0.5)) for k in range(coming))
@@ -170,7 +170,7 @@ class _Drawing:
 
     def _moved(self, row: Row) -> Row:
         """Return a row with one output moved by about its rate."""
-        place = self.random.randrange(N)
+        place = self.random.randrange(self._n)
         by = self.limits.rate[place] * self.random.uniform(-1.2, 1.2)
         low, high = self.limits.low[place], self.limits.high[place]
         return (*row[:place], single(min(max(row[place] + by, low), high)), *row[place + 1 :])

@@ -1,7 +1,6 @@
 """The control PLC's output guard as functions of the typed tree, in double precision."""
 
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import INPUT_NAMES
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from control_plc import output_limits
 from control_plc.output_limits import beginning, plain
@@ -21,7 +20,7 @@ class GuardKernels:
     def __init__(self, limits: InputLimits) -> None:
         self.limits = plain(limits)
         state = type_of(beginning(self.limits, self.limits.low))
-        n, tick, of = len(INPUT_NAMES), Kind.INT, type_of(self.limits)
+        n, tick, of = len(self.limits.low), Kind.INT, type_of(self.limits)
         row, rows = ArrayType(Kind.REAL, (n,)), ArrayType(Kind.REAL, (SEQUENCE_ROWS, n))
         program = Program(portable=frozenset(PORTABLE), double=True)
         self.begin, self.resume, self.admit, self.judge, self.in_range = self.entries = tuple(

@@ -6,7 +6,6 @@ from typing import Any, Final, cast
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICKS_PER_SAMPLE
 from optimizer_plc import decisions, scheme
 from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.decisions import Latched, Starts
@@ -40,13 +39,14 @@ class OptimizerKernels:
     def __init__(self, optimizer: OptimizerProgram) -> None:
         real = real_of(Arithmetic.FLOAT32)
         self.rules = [make_rule(optimizer.settings, optimizer.budget, ticks, real)
-                      for ticks in range(TICKS_PER_SAMPLE + 1)]  # fmt: skip
+                      for ticks in range(optimizer.budget.longest_ticks + 1)]  # fmt: skip
         """The rule for each fixed updating period in ticks; that for 0 adapts it."""
         self.starts = [Starts(rule.first, rule.after_interruption()) for rule in self.rules]
         self.constants: Mapping[str, Any] = {
             "constants": optimizer.constants._replace(fixed_ticks=0), "method": optimizer.method,
         }  # fmt: skip
-        sizes = (len(INPUT_NAMES), len(INPUT_NAMES), len(OUTPUT_NAMES), len(STATE_NAMES), 0)
+        process = optimizer.process
+        sizes = (len(process.inputs), len(process.inputs), len(process.outputs), len(process.states), 0)
         latched = Latched(0, 0, 0, real(0.0), *(np.zeros(size, real) for size in sizes))
         c, method, m = self.constants["constants"], self.constants["method"], optimizer.state
         program = Program(PLATFORM, GENERIC)

@@ -1,5 +1,6 @@
 """Problems of a run in single precision, and what the ODE-based solver's kernels make of each: golden vectors."""
 
+from pathlib import Path
 from typing import Final, NamedTuple, cast
 
 import numpy as np
@@ -78,20 +79,17 @@ class _ListeningOptimizer(OptimizerProgram):
         return super().solve()
 
 
-def paper_settings() -> Settings:
-    """Return the settings of the paper's PLC."""
-    return load_configuration(Settings, environment={}, assignments=SINGLE).settings
+def paper_settings(model: Path) -> Settings:
+    """Return the settings of the paper's PLC with a model file."""
+    options = {"model.file": (str(model), "model")}
+    return load_configuration(Settings, environment={}, assignments=SINGLE, options=options).settings
 
 
-def record(ticks: int = TICKS, load: str = LOAD, settings: Settings | None = None) -> GoldenVectors:
-    """Return the problems of a run of so many ticks under a named load, adaptive updating period, with the answers.
-
-    Settings are by default those of the paper's PLC.
-    """
-    settings = settings or paper_settings()
+def record(settings: Settings, ticks: int = TICKS, load: str = LOAD) -> GoldenVectors:
+    """Return the problems of a run of so many ticks under a named load, adaptive updating period, with the answers."""
     model, rig = load_model(settings.model.file), OneProcessRig(settings, compiled=False)
     optimizer = rig.optimizer = _ListeningOptimizer(model, settings.optimizer_plc.program, settings.limits)
-    rig.run(Scenario(ticks, find_load(load, model.w0), 0.0, seed=1), Recorder(ticks, []))
+    rig.run(Scenario(ticks, find_load(load, model.w0, settings.process), 0.0, seed=1), Recorder(ticks, []))
     method = cast("OdeMethod", optimizer.method)
     return GoldenVectors(method, [answered(method, qp, guess) for qp, guess in optimizer.heard])
 

@@ -4,10 +4,8 @@ from typing import NamedTuple
 
 from coldloop.errors import UsageError
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.signals import TICK_S
 from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import Plan, Update
-from coldloop.registers.maps import CONTROL_MAP
+from coldloop.registers.control_plc import Plan, Update, control_map
 from coldloop.safety.sequence import InputSequence
 from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.program import OptimizerProgram
@@ -62,13 +60,13 @@ class _ListeningOptimizer(OptimizerProgram):
     def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
         """Reset."""
         self.heard: list[GoldenUpdate] = []
-        self._begun = round(updating_period_s / TICK_S)
+        self._begun = round(updating_period_s / self.process.tick_s)
         super().restart(updating_period_s, rule)
 
     def plan(self, update: Update) -> Plan:
         """Keep the update and its plan."""
         plan = super().plan(update)
-        self.heard.append(GoldenUpdate(self._begun, update, as_transmitted(plan, CONTROL_MAP), None))
+        self.heard.append(GoldenUpdate(self._begun, update, as_transmitted(plan, control_map(self.process)), None))
         self._begun = -1
         return plan
 
@@ -98,6 +96,6 @@ class UpdateRecorder:
 
     def record(self, ticks: int, load: str, updating_period_s: float) -> list[GoldenUpdate]:
         """Return the updates of a run of so many ticks under a named load."""
-        scenario = Scenario(ticks, find_load(load, self.model.w0), updating_period_s, seed=1)
+        scenario = Scenario(ticks, find_load(load, self.model.w0, self.optimizer.process), updating_period_s, seed=1)
         self._rig.run(scenario, Recorder(ticks, []))
         return self.optimizer.heard

@@ -6,7 +6,6 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from coldloop.process.signals import INPUT_NAMES
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from control_plc.output_limits import beginning
 from rig.plc_export.kernels.golden_calls import GoldenCall, tables_of
@@ -75,7 +74,7 @@ class GuardText:
         ]
         self._kernels = "\n".join(map(self.printer.block, lowering.blocks))
         self.constants = Constants(constants, self.printer)
-        n = len(INPUT_NAMES)
+        n = len(kernels.limits.low)
         self._counts = {"INPUTS": n, "LAST": n - 1, "NUMBERS": n * SEQUENCE_ROWS,
                         "ROWS": SEQUENCE_ROWS}  # fmt: skip
 

@@ -8,8 +8,7 @@ from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
-from coldloop.process.load_profile import LOAD_UNIT
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.declaration import Process
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.program import OptimizerProgram
@@ -81,7 +80,7 @@ class OptimizerText:
     """Of the self-test, beside those of each."""
 
     def __init__(self, optimizer: OptimizerProgram, golden: Sequence[GoldenUpdate]) -> None:
-        kernels, self.golden = OptimizerKernels(optimizer), golden
+        kernels, self.golden, self._process = OptimizerKernels(optimizer), golden, optimizer.process
         begin, take, solve, note = kernels.entries
         constants, split = in_pieces(constants_of(kernels))
         self.state = {**dict(state_types(STATE, type_of(optimizer.state))), FIXED_TICKS: Kind.INT, BEGUN: Kind.BOOL,
@@ -138,8 +137,8 @@ class OptimizerText:
         begun = ", ".join(f"{name} := {'TRUE' if each == ANEW else name}"
                           for each, name in interface_names(begin, self.printer.type).items())  # fmt: skip
         return filled(template("structured_text/optimizer/optimizer.st"), {
-            **signal_counts(), "LONGEST": str(TICKS_PER_SAMPLE), "SHORTEST": str(SHORTEST_TICKS), "LATCHED": passed,
-            "TICK_S": str(TICK_S), "UNIT": LOAD_UNIT, "BEGIN": begun, "PIECE": str(PIECE),
+            **signal_counts(self._process), "LONGEST": str(self._process.ticks_per_sample), "SHORTEST": str(SHORTEST_TICKS), "LATCHED": passed,
+            "TICK_S": str(self._process.tick_s), "UNIT": self._process.load.unit, "BEGIN": begun, "PIECE": str(PIECE),
             "LOAD_STEP": interface_names(take, self.printer.type)[take.outputs[0]],
         })  # fmt: skip
 
@@ -151,12 +150,12 @@ class OptimizerText:
 
     def _golden_arrays(self) -> dict[str, Array]:
         """Return integers, numbers and rows of the golden updates, and the sum over each of them, a row each."""
-        samples = SEQUENCE_ROWS // TICKS_PER_SAMPLE
-        rows = np.zeros((len(self.golden), samples, len(INPUT_NAMES)), np.float32)
+        held, inputs = self._process.ticks_per_sample, len(self._process.inputs)
+        rows = np.zeros((len(self.golden), SEQUENCE_ROWS // held, inputs), np.float32)
         for place, each in enumerate(self.golden):
-            sent = np.array(each.sequence.rows if each.sequence else [], np.float32).reshape(-1, len(INPUT_NAMES))
-            sampled = sent[::TICKS_PER_SAMPLE]
-            assert (np.repeat(sampled, TICKS_PER_SAMPLE, axis=0)[: len(sent)] == sent).all()  # noqa: S101 as it is sent
+            sent = np.array(each.sequence.rows if each.sequence else [], np.float32).reshape(-1, inputs)
+            sampled = sent[::held]
+            assert (np.repeat(sampled, held, axis=0)[: len(sent)] == sent).all()  # noqa: S101 as it is sent
             rows[place, : len(sampled)] = sampled
         arrays = {
             "integers": np.array([integers_of(each) for each in self.golden], np.int32),
@@ -196,7 +195,8 @@ class OptimizerText:
     def _self_test(self, pages: int) -> str:
         arrays, page = self._golden_arrays(), self._page_length()
         lengths = {name: values.shape[1] for name, values in arrays.items() if name != "sums"}
-        places = np.cumsum([1, *(len(each) for each in (INPUT_NAMES, INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES))])
+        process, inputs = self._process, len(self._process.inputs)
+        places = np.cumsum([1, inputs, inputs, len(process.outputs), len(process.states)])
         cases = "".join(
             f"                {each}:\n"
             f"                    golden_{each}(row := (now_vector MOD {page}), integers := integers, reals := reals,"
@@ -204,8 +204,8 @@ class OptimizerText:
             for each in range(pages)
         )
         parts = {
-            **signal_counts(), **self.constants.summed(), "AT_ONCE": str(AT_ONCE), "WORK": str(WORK),
-            "ROWS": str(SEQUENCE_ROWS * len(INPUT_NAMES)), "SAMPLE": str(TICKS_PER_SAMPLE * len(INPUT_NAMES)),
+            **signal_counts(process), **self.constants.summed(), "AT_ONCE": str(AT_ONCE), "WORK": str(WORK),
+            "ROWS": str(SEQUENCE_ROWS * inputs), "SAMPLE": str(process.ticks_per_sample * inputs),
             **{f"N_{name.upper()}": str(length) for name, length in lengths.items()},
             **{f"AT_{name}": str(place) for name, place in zip(("U", "Y", "X", "PLAN"), places[1:], strict=True)},
             "INSTANCES": "\n".join(f"    golden_{each} : cl_golden_{each};" for each in range(pages)),
@@ -246,8 +246,8 @@ def state_types(path: Path, kind: Type) -> Iterator[tuple[Path, Kind | ArrayType
             yield path, kind
 
 
-def signal_counts() -> Mapping[str, str]:
+def signal_counts(process: Process) -> Mapping[str, str]:
     """Return how many signals there are, and the last index of each, for a template."""
-    counts = {"INPUT": len(INPUT_NAMES), "OUTPUT": len(OUTPUT_NAMES), "STATE": len(STATE_NAMES)}
+    counts = {"INPUT": len(process.inputs), "OUTPUT": len(process.outputs), "STATE": len(process.states)}
     return {**{f"{name}S": str(count) for name, count in counts.items()},
             **{f"LAST_{name}": str(count - 1) for name, count in counts.items()}}  # fmt: skip

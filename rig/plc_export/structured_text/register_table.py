@@ -5,8 +5,7 @@ from itertools import groupby
 from typing import Final
 
 from coldloop.registers.control_plc import Acknowledgement, Plan, SequenceHeader, SequenceRow, Update
-from coldloop.registers.declaration import Block, Register
-from coldloop.registers.maps import CONTROL_MAP
+from coldloop.registers.declaration import Block, Register, RegisterMap
 from rig.text_tables import markdown_table
 
 HEADER: Final = ("block", "register", "type", "unit", "field", "variable")
@@ -21,9 +20,9 @@ OTHERS: Final = {
 """Of the client: what is no variable of the same name."""
 
 
-def register_table() -> str:
-    """Return a row for each number, for arrays one row, in the order of the addresses."""
-    blocks = sorted(map(CONTROL_MAP.block_of, (*INSTANCES, SequenceRow)), key=lambda block: block.address)
+def register_table(control: RegisterMap) -> str:
+    """Return a row for each number of the control PLC's map, for arrays one row, in the order of the addresses."""
+    blocks = sorted(map(control.block_of, (*INSTANCES, SequenceRow)), key=lambda block: block.address)
     return markdown_table(HEADER, (row for block in blocks for row in rows(block)))
 
 

@@ -8,7 +8,6 @@ from typing import Final
 
 from coldloop.errors import ModelFileError
 from coldloop.kernels.first_use import kernels_of
-from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import ModelHeader
 from plant.own.disturbances import Disturbances
@@ -27,18 +26,12 @@ TRANSFER_FUNCTIONS: Final = "transfer-functions"
 FMU: Final = "fmu"
 
 
-def check_signals(header: ModelHeader) -> None:
-    """Check that a model file is of the process that this program is loaded with.
+def check_files(header: ModelHeader) -> None:
+    """Check that the files that a model was made from are there.
 
     Raises:
-        ModelFileError: It is not, or its FMU is another file than it was made from.
+        ModelFileError: Its FMU is another file than it was made from.
     """
-    if (header.state_names, header.input_names, header.output_names) != (
-        PROCESS.state_names, PROCESS.input_names, PROCESS.output_names
-    ):  # fmt: skip
-        raise ModelFileError(
-            f"{header.file}: a model of another process than COLDLOOP_PROCESS names; name the same for both"
-        )
     if header.plant == FMU:
         _fmu_of(header)
 

@@ -108,7 +108,7 @@ class RackRegisters:
         """Return the rack at the beginning of the configured session, or, and True, where it was when it ended."""
         section, configured = settings.plant, settings.session
         pace = TimeBase(configured.mode is TimeMode.REALTIME, configured.factor)
-        load = find_load(section.load, header.w0)
+        load = find_load(section.load, header.w0, header.declared)
         session = Session(1 if configured.autostart else 0, pace, load, section.seed)
         state = self._store.recall()
         journal = (

@@ -35,6 +35,7 @@ def main(name: str, settings: type[S], serve: Callable[[S], Awaitable[None]], ar
     """Run a service until it is stopped; return its exit code."""
     parser = argparse.ArgumentParser(f"python -m {name}", description=f"Coldloop: {name}.", allow_abbrev=False)
     add_configuration_options(parser)
+    parser.add_argument("--process", metavar="MODEL", help="model file of the process; the key model.file")
     parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
     parser.add_argument(
         "--with-parent", action="store_true", help="end when standard input is closed: for programs that start services"
@@ -46,8 +47,9 @@ def main(name: str, settings: type[S], serve: Callable[[S], Awaitable[None]], ar
     code, last_line = 1, None
     try:
         configuration = load_configuration(
-            settings, file=options.config, assignments=options.assignments, others=SECTIONS
-        )
+            settings, file=options.config, assignments=options.assignments, others=SECTIONS,
+            options={"model.file": (options.process, "--process")} if options.process else {},
+        )  # fmt: skip
         code = run_event_loop(lambda: _until_stopped(serve(configuration.settings), with_parent=options.with_parent))
     except ColdloopError as error:
         code, last_line = error.exit_code, f"{name}: {error}"

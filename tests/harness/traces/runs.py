@@ -1,13 +1,13 @@
-"""Runs configurations of one process in this interpreter, and prints what each leaves behind, as JSON.
+"""Runs configurations in this interpreter, of any processes, and prints what each leaves behind, as JSON.
 
-python -m tests.harness.traces.runs NAME...    COLDLOOP_PROCESS: model file of their process, none for the cold box
-python -m tests.harness.traces.runs --models FOLDER PROCESS...    only makes model files of processes
+python -m tests.harness.traces.runs NAME...
 """
 
 import ctypes
 import json
 import platform
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,11 +16,10 @@ import numpy as np
 import scipy
 
 from coldloop.config import load_configuration
-from coldloop.process.load_profile import LOAD_SPAN, LoadProfile
-from coldloop.process.loaded import FILE, PROCESS
+from coldloop.process.declaration import Process
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import read_header
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.optimizer_plc import Optimization
 from plant.load import find_load
@@ -56,14 +55,16 @@ class ObservedRig(OneProcessRig):
         return self.plant
 
 
-def left_by(configuration: Configuration) -> Left:
-    """Run a configuration."""
-    own = (f'model.file="{FILE}"', 'plant.kind="of-process"') if FILE else ()
+def left_by(configuration: Configuration, models: Path) -> tuple[Process, Left]:
+    """Run a configuration of a process, whose model file is made in the folder of models where it is not there."""
+    own: tuple[str, ...] = ()
+    if configuration.process != COLD_BOX:
+        own = (f'model.file="{model_of(configuration.process, models)}"', 'plant.kind="of-process"')
     settings = load_configuration(Settings, environment={}, assignments=(*own, *configuration.assignments)).settings
     program, model = settings.optimizer_plc.program, load_model(settings.model.file)
     evaluation, memory = RunEvaluation(model, program.design), MemorySink()
     recorder = Recorder(configuration.ticks, [evaluation, memory])
-    load = load_of(configuration, read_header(settings.model.file).w0)
+    load = load_of(configuration, read_header(settings.model.file).w0, settings.process)
     rig = ObservedRig(settings)
     rig.run(Scenario(configuration.ticks, load, program.updating_period_s, SEED), recorder)
     recorder.close()
@@ -84,14 +85,23 @@ def left_by(configuration: Configuration) -> Left:
     )
     if configuration.process != COLD_BOX:  # whose model is a file; those of others were just computed, by LAPACK
         left["processor"] = processor()
-    return left
+    return settings.process, left
 
 
-def load_of(configuration: Configuration, mean: float) -> LoadProfile:
+def model_of(name: str, models: Path) -> Path:
+    """Return the model file of a process of the tests."""
+    file = models / name / "model.json"
+    if not file.exists():
+        file.parent.mkdir()
+        made_from(PROCESSES[name](file.parent)).model.save(file)
+    return file
+
+
+def load_of(configuration: Configuration, mean: float, process: Process) -> LoadProfile:
     """Return the load of a configuration."""
     if ":" in configuration.load:
-        return load_of_shares(configuration.load, mean, LOAD_SPAN[1])
-    return lively(mean) if configuration.load == LIVELY else find_load(configuration.load, mean)
+        return load_of_shares(configuration.load, mean, process.load.stored_span[1])
+    return lively(mean) if configuration.load == LIVELY else find_load(configuration.load, mean, process)
 
 
 def of_updates(updates: list[Optimization]) -> Table:
@@ -113,34 +123,28 @@ def processor() -> str:
     return "unknown"
 
 
-def names() -> Names:
+def names(process: Process) -> Names:
     """Return what columns are called, by place."""
-    station = (*STATION_SIGNAL_NAMES, "mode", "alarms")
+    station = (*STATION_SIGNAL_NAMES, "mode", "alarms") if process.has_station else ()
     return Names(
-        trace=["load", *INPUT_NAMES, *OUTPUT_NAMES, *STATE_NAMES, *(station if FILE is None else ())],
+        trace=["load", *process.input_names, *process.output_names, *process.state_names, *station],
         updates=[*Optimization._fields],
-        indicators=[*Indicators._fields[:-1], *(f"{one.name}_outside_band_pct" for one in PROCESS.banded)],
+        indicators=[*Indicators._fields[:-1], *(f"{one.name}_outside_band_pct" for one in process.banded)],
     )
 
 
 def main(words: list[str]) -> None:
     """Print what was found."""
-    if words[0] == "--models":
-        for process in words[2:]:
-            folder = Path(words[1]) / process
-            folder.mkdir()
-            made_from(PROCESSES[process](folder)).model.save(folder / "model.json")
-        return
     made_with = Platform(
         python=platform.python_version(), numpy=np.__version__, scipy=scipy.__version__, numba=numba.__version__,
         processor=processor(),
     )  # fmt: skip
-    found = Found(
-        made_with=made_with,
-        services=[*SERVICES],
-        names={CONFIGURATIONS[words[0]].process: names()},
-        configurations={name: left_by(CONFIGURATIONS[name]) for name in words},
-    )
+    found = Found(made_with=made_with, services=[*SERVICES], names={}, configurations={})
+    with tempfile.TemporaryDirectory() as folder:
+        for name in words:
+            process, left = left_by(CONFIGURATIONS[name], Path(folder))
+            found["names"].setdefault(CONFIGURATIONS[name].process, names(process))
+            found["configurations"][name] = left
     sys.stdout.write(json.dumps(found))
 
 

@@ -1,0 +1,186 @@
+"""Settings that follow from the process, and the model file that says which process it is.
+
+A section that has defaults or bounds of its process is a `ProcessSettings`. The whole of a configuration is a
+`RootSettings`: its `model.file` decides the process, and all its sections are read for that one. A section that is made
+by itself is for the cold box, or for what `settings_of` says.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any, Final, Self
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    ModelWrapValidatorHandler,
+    PositiveFloat,
+    PrivateAttr,
+    ValidationError,
+    model_validator,
+)
+
+from coldloop.process.cold_box import COLD_BOX
+from coldloop.process.declaration import Process
+from coldloop.process.loaded import FILE, PROCESS
+from coldloop.process.model_file import declared_process, read_document
+
+_DATA: Final = Path(__file__).parent / "data"
+SHIPPED_MODELS: Final = {"cold-box": _DATA / "cold_box_model.json", "refrigerator": _DATA / "refrigerator_model.json"}
+"""Models that have a name: of the cold box alone, and of the refrigerator with its pressure loop closed."""
+DEFAULT_MODEL_FILE: Final = FILE or SHIPPED_MODELS["cold-box"]
+_PROCESS: Final[ContextVar[Process]] = ContextVar("process of settings", default=PROCESS)
+
+
+@contextmanager
+def settings_of(process: Process) -> Iterator[None]:
+    """Make settings for a process within the context."""
+    token = _PROCESS.set(process)
+    try:
+        yield
+    finally:
+        _PROCESS.reset(token)
+
+
+def settings_process() -> Process:
+    """Return the process that settings are made for here."""
+    return _PROCESS.get()
+
+
+def declared(of: Callable[[Process], Any]) -> Any:  # noqa: ANN401 the default of any field
+    """Return a field whose default is what `of` finds in the process."""
+    return Field(default_factory=lambda: of(_PROCESS.get()))
+
+
+def stretched(seconds: float, least: float = 0.0) -> Any:  # noqa: ANN401 as above
+    """Return a field whose default is a time of the cold box, longer where the ticks of the process are."""
+    return declared(lambda process: seconds * max(process.stretch, least))
+
+
+def within(bounds: Callable[[Process], tuple[float, float]]) -> AfterValidator:
+    """Return a check that a number is within bounds that the process has."""
+
+    def check(value: float) -> float:
+        low, high = bounds(_PROCESS.get())
+        if not value >= low:
+            raise ValueError(f"input should be greater than or equal to {low:g}")
+        if not value <= high:
+            raise ValueError(f"input should be less than or equal to {high:g}")
+        return value
+
+    return AfterValidator(check)
+
+
+def one_of(what: str, names: Callable[[Process], tuple[str, ...]]) -> AfterValidator:
+    """Return a check that a name is one of those that the process has."""
+
+    def check(name: str) -> str:
+        if name not in names(_PROCESS.get()):
+            raise ValueError(f"unknown {what} {name}")
+        return name
+
+    return AfterValidator(check)
+
+
+def _as_many(what: str, names: Callable[[Process], tuple[str, ...]]) -> AfterValidator:
+    def check(values: tuple[float, ...]) -> tuple[float, ...]:
+        expected = names(_PROCESS.get())
+        if len(values) != len(expected):
+            raise ValueError(f"give {len(expected)} numbers, one for each {what}: {', '.join(expected)}")
+        return values
+
+    return AfterValidator(check)
+
+
+_EACH_INPUT: Final = _as_many("input", lambda process: process.input_names)
+_EACH_BAND: Final = _as_many("output with a band", lambda process: tuple(one.name for one in process.banded))
+PerInput = Annotated[tuple[FiniteFloat, ...], _EACH_INPUT]
+PositivePerInput = Annotated[tuple[PositiveFloat, ...], _EACH_INPUT]
+PerBand = Annotated[tuple[FiniteFloat, ...], _EACH_BAND]
+PositivePerBand = Annotated[tuple[PositiveFloat, ...], _EACH_BAND]
+
+
+class ProcessSettings(BaseModel):
+    """A section, of which some follows from the process."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    _process: Process = PrivateAttr(default_factory=settings_process)
+
+    @property
+    def process(self) -> Process:
+        """The process that it is made for."""
+        return self._process
+
+
+def _named(value: object) -> object:
+    return SHIPPED_MODELS.get(value, value) if isinstance(value, str) else value
+
+
+class ModelSettings(BaseModel):
+    """The LTI model file, downloaded into both PLCs."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    file: Annotated[Path, BeforeValidator(_named)] = DEFAULT_MODEL_FILE
+    """A file, or `cold-box` or `refrigerator` for one that is shipped. It says which process it is."""
+
+
+class RootSettings(ProcessSettings):
+    """What a program reads of a configuration, all for the process of its model file.
+
+    Raises:
+        ModelFileError: The model file cannot be read, or its process is none.
+    """
+
+    model: ModelSettings = ModelSettings()
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _for_its_process(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:  # noqa: ANN401 as given
+        if not isinstance(values, Mapping):
+            return handler(values)
+        try:
+            model = ModelSettings.model_validate(values.get("model", {}))
+        except ValidationError:
+            return handler(values)  # which says so
+        if model.file == Path() or "\0" in str(model.file):
+            return handler(values)  # no file: that is said of any key
+        with settings_of(process_of(model.file)):
+            return handler(values)
+
+
+def process_of(path: Path) -> Process:
+    """Return the process of a model file.
+
+    Raises:
+        ModelFileError: The file cannot be read, or its process is none.
+    """
+    if path in SHIPPED_MODELS.values():
+        return COLD_BOX
+    found = path.stat() if path.exists() else None
+    return _process_of(path, (found.st_mtime_ns, found.st_size, found.st_ino) if found else None)
+
+
+@lru_cache(maxsize=8)
+def _process_of(path: Path, _version: object) -> Process:
+    return declared_process(read_document(path), path)
+
+
+TOLERANCE: Final = 1e-9
+"""Share of a tick: 0.3 s are three ticks of 0.1 s, although floats do not think so."""
+
+
+def whole_ticks(seconds: float, tick_s: float) -> int | None:
+    """Return how many ticks a time is; None if it is no multiple of a tick, or not finite."""
+    ticks = seconds / tick_s
+    if not math.isfinite(ticks) or abs(ticks - round(ticks)) > TOLERANCE * max(1.0, abs(ticks)):
+        return None
+    return round(ticks)
