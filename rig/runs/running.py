@@ -31,7 +31,7 @@ class _FirstTick(Sink):
 def make_scenario(settings: Settings, ticks: int | None = None) -> Scenario:
     """Return the scenario of a configuration; without a length it is that of the load."""
     name = settings.plant.load
-    load = find_load(name, load_model(settings.model.file).w0)
+    load = find_load(name, load_model(settings.model.file).w0, settings.process)
     return Scenario(
         ticks=ticks or natural_ticks(name, load),
         load=load,

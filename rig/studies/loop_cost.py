@@ -21,7 +21,7 @@ ADAPTIVE: Final = 0.0
 def loop_cost(settings: Settings, name: str, period_s: float, run: Callable[[Scenario, Recorder], None]) -> float:
     """Return J_BF under a load, a named one or a file, with what runs a scenario."""
     model = load(settings.model.file)
-    profile = find_load(name, model.w0)
+    profile = find_load(name, model.w0, settings.process)
     scenario = Scenario(natural_ticks(name, profile), profile, period_s, settings.plant.seed)
     recorder = Recorder(scenario.ticks)
     run(scenario, recorder)

@@ -8,7 +8,9 @@ import contextlib
 import os
 import sys
 from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from dataclasses import dataclass
+from typing import Final
 
 
 @dataclass
@@ -36,8 +38,8 @@ def write_line(*kernels: Kernels) -> None:
         sys.stderr.flush()
 
 
-_needed: list[Kernels] = []
-"""The kernels that are needed at present; the first are what the user has asked for, the others are parts of it."""
+_needed: Final[ContextVar[Kernels | None]] = ContextVar("kernels that are needed", default=None)
+"""What the user has asked for at present, in this thread; what is needed within it is a part of it."""
 _announced: set[str] = set()
 _announce: Announce = write_line
 
@@ -56,15 +58,16 @@ def announce_with(announce: Announce) -> None:
 @contextlib.contextmanager
 def kernels_of(owner: str, about_s: int) -> Iterator[None]:
     """Announce what is compiled in this context as the kernels of `owner`."""
-    _needed.append(Kernels(owner, about_s))
+    token = _needed.set(_needed.get() or Kernels(owner, about_s))
     try:
         yield
     finally:
-        _needed.pop()
+        _needed.reset(token)
 
 
 def needs_compiling() -> None:
     """Announce the kernels that are needed at present, unless they have been announced."""
-    if _needed and _needed[0].owner not in _announced:
-        _announced.add(_needed[0].owner)
-        _announce(_needed[0])
+    needed = _needed.get()
+    if needed is not None and needed.owner not in _announced:
+        _announced.add(needed.owner)
+        _announce(needed)
