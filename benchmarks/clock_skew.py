@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 from coldloop.config import load_configuration
 from coldloop.modbus.client import RegisterClient
-from coldloop.process.cold_box import TICK_S
+from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus, Status
-from coldloop.registers.maps import CONTROL_MAP
+from coldloop.registers.maps import maps_of
 from coldloop.service.start import run_event_loop
 from plant.load import find_load
 from plant.own_model import own_header
@@ -20,6 +20,8 @@ from rig.cosim.scenario import Scenario
 from rig.cosim.session_client import SessionClient
 from rig.cosim.wiring import START_PATIENCE_S
 from rig.settings import Settings
+
+CONTROL_MAP = maps_of(COLD_BOX).control_plc
 
 
 class Followed(NamedTuple):
@@ -35,7 +37,7 @@ async def follow(ppm: float, factor: float, hours: float, folder: Path) -> Follo
     """Run a session with a rack whose clock is off."""
     settings = load_configuration(Settings, environment={}, assignments=[f"plant.clock_error_ppm={ppm}"]).settings
     ticks = round(hours * 3600 / TICK_S)
-    load = find_load("8h", own_header(settings.model.file).w0)
+    load = find_load("8h", own_header(settings.model.file).w0, COLD_BOX)
     async with LocalServices(settings, folder) as services:
         rig = SessionClient(services.endpoints, settings)
         client = RegisterClient.at(CONTROL_MAP, services.endpoints.control_plc)

@@ -19,11 +19,11 @@ from pathlib import Path
 
 from coldloop.config import load_configuration
 from coldloop.modbus.client import RegisterClient
+from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.cold_box import TICK_S
 from coldloop.registers.common import ServerStatistics
 from coldloop.registers.control_plc import ProcessNow
-from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
+from coldloop.registers.maps import maps_of
 from coldloop.registers.safety import WatchdogStatus
 from plant.load import find_load
 from rig.cosim.local_services import LocalServices
@@ -31,6 +31,8 @@ from rig.cosim.scenario import Scenario
 from rig.cosim.session_client import SessionClient
 from rig.results.recording import LinkStatistics, Recorder
 from rig.settings import Settings
+
+PLANT_MAP, CONTROL_MAP, _ = maps_of(COLD_BOX)
 
 OURS = 4
 """Connections of the optimiser and of the rig, and one to spare for the look at the statistics."""
@@ -98,7 +100,7 @@ async def measure(options: argparse.Namespace, clients: int, logs: Path) -> tupl
     limit = f"control_plc.server.connection_limit={clients + OURS + options.flood}"
     settings = load_configuration(Settings, environment={}, assignments=[limit, *roles]).settings
     ticks = round(options.seconds / TICK_S)
-    scenario = Scenario(ticks, find_load("a", load_model(settings.model.file).w0), 0.0, 1, realtime=True)
+    scenario = Scenario(ticks, find_load("a", load_model(settings.model.file).w0, COLD_BOX), 0.0, 1, realtime=True)
     recorder = Recorder(ticks)
     async with LocalServices(settings, logs) as services:
         rig = SessionClient(services.endpoints, settings)

@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coldloop.process.cold_box import OUTPUT_NAMES, TICK_S
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop.process.cold_box import OUTPUT_NAMES, TICK_S
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from plant.kinds import plant_maker
 from plant.own_model import own_header

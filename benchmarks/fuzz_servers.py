@@ -27,15 +27,18 @@ from pathlib import Path
 from coldloop.config import load_configuration
 from coldloop.modbus.settings import TlsSettings
 from coldloop.modbus.tls import client_context
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers.common import STATISTICS_BLOCK
 from coldloop.registers.declaration import RegisterMap
-from coldloop.registers.maps import MAPS
+from coldloop.registers.maps import maps_of
 from rig import cli
 from rig.chaos.resources import resident_mb
 from rig.cli.certificate_files import CLIENTS
 from rig.cosim.local_services import LocalServices
 from rig.cosim.wiring import SERVICES
 from rig.settings import Settings
+
+MAPS = maps_of(COLD_BOX).by_service
 
 BATCH = 64
 WARM_UP_FRAMES = 2000

@@ -91,7 +91,7 @@ def main() -> int:
         folder = options.out or Path(scratch)
         claim_folder(folder, force=False)
         plan = make_plan(options)
-        with ChaosProgress(plan.ticks) as progress:
+        with ChaosProgress(plan) as progress:
             experiment = perform(plan, patient(options.patience), folder, progress, arguments={}, formats=["png"])
         write_report(folder, plan, experiment.trace, experiment.evaluation, {}, experiment.failure)
     tell(experiment.evaluation)

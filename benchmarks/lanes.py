@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
+from coldloop.process.cold_box import TICK_S
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop.process.cold_box import TICK_S
 from plant.cold_box.physics import REFERENCE, ColdBox
 from plant.helium.properties import Helium, load_helium, saturation
 from plant.integrator import advance

@@ -12,8 +12,8 @@ import numba
 import numpy as np
 from qp_solvers import RecordedProblem, record
 
+from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.process.lti_model import load
-from coldloop.process.cold_box import TICK_S
 from optimizer_plc.computing_settings import OdeSettings
 from optimizer_plc.qp.costs import matrices_of
 from optimizer_plc.qp.penalties import DEFAULT_PENALTIES
@@ -91,7 +91,7 @@ def run(period_s: float, ticks: int, hours: str) -> tuple[float, int, int]:
     """Do a run; return its time (s), its updates and its iterations."""
     settings = Settings()
     rig, recorder = OneProcessRig(settings), Recorder(ticks)
-    rig.run(Scenario(ticks, find_load(hours, load(settings.model.file).w0), period_s, seed=1), recorder)
+    rig.run(Scenario(ticks, find_load(hours, load(settings.model.file).w0, COLD_BOX), period_s, seed=1), recorder)
     updates = recorder.recording().updates
     return recorder.wall_seconds, len(updates), sum(update.iterations for update in updates)
 

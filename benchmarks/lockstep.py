@@ -7,8 +7,9 @@ import time
 from pathlib import Path
 
 from coldloop.modbus.client import RegisterClient
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.lti_model import load
-from coldloop.registers.maps import PLANT_MAP
+from coldloop.registers.maps import maps_of
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.service.start import run_event_loop
 from plant.load import find_load
@@ -17,6 +18,8 @@ from rig.cosim.scenario import Scenario
 from rig.cosim.session_client import SessionClient
 from rig.results.recording import Recorder
 from rig.settings import Settings
+
+PLANT_MAP = maps_of(COLD_BOX).plant
 
 
 async def bare_exchanges(port: int, count: int) -> float:
@@ -42,7 +45,7 @@ async def measure(ticks: int, period_s: float) -> int:
     """Measure both on one rig, and print."""
     settings = Settings()
     mean = load(settings.model.file).w0
-    scenario = Scenario(ticks, find_load("2h", mean), period_s, seed=1)
+    scenario = Scenario(ticks, find_load("2h", mean, COLD_BOX), period_s, seed=1)
     with tempfile.TemporaryDirectory() as folder:
         async with LocalServices(settings, Path(folder)) as services:
             rig = SessionClient(services.endpoints, settings)

@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 
 from coldloop.config import load_configuration
-from coldloop.process.lti_model import load as load_model
 from coldloop.process.cold_box import TICK_S
+from coldloop.process.lti_model import load as load_model
 from plant.load import HOUR_TICKS, HOURS, concatenated, telegraph
 from rig.cosim.job import Job
 from rig.figures.worker import FigureProcess

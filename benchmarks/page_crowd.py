@@ -17,8 +17,9 @@ from pathlib import Path
 import aiohttp
 
 from coldloop.config import load_configuration
+from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.cold_box import TICK_S
+from hmi.settings import HmiSettings
 from plant.load import find_load
 from rig.cosim.local_services import LocalServices
 from rig.cosim.ports import ReservedPorts
@@ -70,7 +71,7 @@ async def measure(options: argparse.Namespace, browsers: int | None, folder: Pat
     """Run the loop under so many browsers, or without the page; return its timing and what they received."""
     settings = load_configuration(Settings, environment={}).settings
     ticks = round(options.seconds / TICK_S)
-    scenario = Scenario(ticks, find_load("a", load_model(settings.model.file).w0), 0.0, 1, realtime=True)
+    scenario = Scenario(ticks, find_load("a", load_model(settings.model.file).w0, COLD_BOX), 0.0, 1, realtime=True)
     recorder = Recorder(ticks)
     async with LocalServices(settings, folder) as services:
         rig = SessionClient(services.endpoints, settings)
@@ -80,10 +81,10 @@ async def measure(options: argparse.Namespace, browsers: int | None, folder: Pat
             rig.close()
             return recorder.link, ""
         with ReservedPorts(1) as reserved:
-            section = settings.hmi.model_copy(update={"port": reserved.numbers[0]})
-        async with PageProcess(section, services.endpoints, folder) as page:
+            page_settings = HmiSettings(hmi=settings.hmi.model_copy(update={"port": reserved.numbers[0]}))
+        async with PageProcess(page_settings, services.endpoints, folder) as page:
             await page.is_served()
-            others = await start_crowd(options, browsers, section.port) if browsers else None
+            others = await start_crowd(options, browsers, page_settings.hmi.port) if browsers else None
             await rig.run(scenario, recorder)
             rig.close()
             met = (await others.communicate())[0].decode().strip() if others else ""

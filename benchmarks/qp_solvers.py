@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from qp_peers import TO_THE_END, installed_peers, peer_answer
 
 from coldloop.errors import ConfigurationError
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.lti_model import load
 from optimizer_plc.qp.costs import augmented_cost
 from optimizer_plc.qp.problem import QuadraticProblem
@@ -72,7 +73,9 @@ def record(hours: str, minutes: float, period_s: float) -> list[RecordedProblem]
         listener = RecordingSolver(make_solver(settings.optimizer_plc.program))
         rig.optimizer.solver = listener
         ticks = round(240 * minutes)
-        rig.run(Scenario(ticks, find_load(hour, load(settings.model.file).w0), period_s, seed=1), Recorder(ticks))
+        rig.run(
+            Scenario(ticks, find_load(hour, load(settings.model.file).w0, COLD_BOX), period_s, seed=1), Recorder(ticks)
+        )
         heard += listener.heard
     matrices = {"Phi": heard[0].problem.Phi, "Gamma": heard[0].problem.Gamma}
     floor = settings.optimizer_plc.program.adaptive.cost_floor

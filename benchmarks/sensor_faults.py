@@ -12,9 +12,8 @@ import random
 from collections.abc import Sequence
 from typing import NamedTuple, cast
 
-from coldloop.process.cold_box import L1, T5
+from coldloop.process.cold_box import COLD_BOX, L1, OUTPUT_NAMES, OUTPUT_UNITS, T5, TICK_S
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.cold_box import OUTPUT_NAMES, OUTPUT_UNITS, TICK_S
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Mode
 from optimizer_plc.qp.design import ControlDesign
@@ -104,7 +103,7 @@ def of_sensors(rig: OneProcessRig) -> list[Event]:
 def run(settings: Settings, load_name: str, seed: int, output: int, fault: str, ticks: int) -> Outcome:
     """Run a load with a fault."""
     header = own_header(settings.model.file)
-    load = load_table(find_load(load_name, header.w0))
+    load = load_table(find_load(load_name, header.w0), COLD_BOX)
     exact = settings.plant.model_copy(update={"sensors": type(settings.plant.sensors)()})
     made = plant_maker(header, exact)(load, seed)
     plant = FaultySensors(made, settings.plant.sensors.deviations, seed, output, fault)
@@ -184,7 +183,7 @@ def main() -> None:
         draws = range(options.first, options.first + options.sound)
         for load in (f"{name}@{draw}" for name in options.loads for draw in draws):
             rig, seed = OneProcessRig(settings), int(load.partition("@")[2])
-            profile = find_load(load, own_header(settings.model.file).w0)
+            profile = find_load(load, own_header(settings.model.file).w0, COLD_BOX)
             if options.watts is not None:
                 profile = LoadProfile((0,), (options.watts,))
             rig.run(Scenario(HOUR_TICKS, profile, 0.0, seed), Recorder(HOUR_TICKS))

@@ -1,5 +1,6 @@
 """The configuration that Python arguments describe, for `simulate` and for rigs of tests."""
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -29,8 +30,11 @@ def configured(
     Raises:
         UsageError: An argument cannot be used; one line that says why.
     """
+    model, told = (None, []) if process is None else model_file_of(Path(process))
+    for line in told:
+        warnings.warn(f"{process}: {line}", stacklevel=3)
     arguments: dict[str, tuple[object, str]] = {
-        "model.file": (None if process is None else str(model_file_of(Path(process))), "process"),
+        "model.file": (model and str(model), "process"),
         "plant.load": (None if load is None else str(load), "load"),
         "plant.seed": (seed, "seed"),
         "optimizer_plc.program.solver": (solver, "solver"),

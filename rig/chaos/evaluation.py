@@ -6,10 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Mode
-from coldloop.registers.safety import AlarmKind
+from coldloop.registers.safety import alarm_key
 from optimizer_plc.qp.design import ControlDesign
 from rig.chaos.trace import ChaosTrace
 from rig.results.indicators import excess_of
@@ -73,12 +72,12 @@ def evaluate(trace: ChaosTrace, undisturbed: Recording, rate: PerInput, design: 
         rate: Largest change of each input, as the limits have it.
         design: Has the bands.
     """
-    recording = trace.recording()
+    recording, tick_s = trace.recording(), trace.process.tick_s
     outside, outside_undisturbed = _outside(recording, design), _outside(undisturbed, design)
     steps = _steps(recording, rate)
     rows = [_row(trace, number, steps, (outside, outside_undisturbed)) for number in range(len(trace.marks))]
     return Evaluation(
-        rows, _largest(steps), _seconds(outside), _seconds(outside_undisturbed), missing_ticks=trace.missing
+        rows, _largest(steps), _seconds(outside, tick_s), _seconds(outside_undisturbed, tick_s), trace.missing
     )
 
 
@@ -86,29 +85,29 @@ def _row(
     trace: ChaosTrace, number: int, steps: NDArray[np.float64], outside: tuple[NDArray[np.bool_], NDArray[np.bool_]]
 ) -> Row:
     mark, following = trace.marks[number], trace.marks[number + 1 : number + 2]
-    end, last_event = trace.ticks, len(trace.events)
+    end, last_event, tick_s = trace.ticks, len(trace.events), trace.process.tick_s
     for later in following:
         end, last_event = later.begin, later.first_event
     before = [Mode(event.subject) for event in trace.modes(0, mark.first_event)[-1:]]
     changes = trace.modes(mark.first_event, last_event)
     return Row(
         fault=mark.fault.label,
-        at_s=mark.begin * TICK_S,
-        lasted_s=None if mark.end is None else (mark.end - mark.begin) * TICK_S,
+        at_s=mark.begin * tick_s,
+        lasted_s=None if mark.end is None else (mark.end - mark.begin) * tick_s,
         modes=tuple(mode.name for mode in _different([*before, *(Mode(event.subject) for event in changes)])),
         alarms=tuple(
             RaisedAlarm(
-                AlarmKind(event.subject).name,
-                max(0, event.tick - mark.begin) * TICK_S,
-                max(0, event.tick - (mark.begin if mark.done is None else mark.done)) * TICK_S,
+                alarm_key(event.subject, trace.process).upper(),
+                max(0, event.tick - mark.begin) * tick_s,
+                max(0, event.tick - (mark.begin if mark.done is None else mark.done)) * tick_s,
             )
             for event in trace.events[mark.first_event : last_event]
             if event.kind == EventKind.ALARM_RAISED
         ),
         largest_steps=_largest(steps[mark.begin : end]),
-        outside_s=_seconds(outside[0][mark.begin : end]),
-        undisturbed_s=_seconds(outside[1][mark.begin : end]),
-        back_s=_back_s(mark.end, before, changes),
+        outside_s=_seconds(outside[0][mark.begin : end], tick_s),
+        undisturbed_s=_seconds(outside[1][mark.begin : end], tick_s),
+        back_s=_back_s(mark.end, before, changes, tick_s),
     )
 
 
@@ -117,7 +116,7 @@ def _different(modes: Sequence[Mode]) -> list[Mode]:
     return [mode for mode, previous in zip(modes, [None, *modes], strict=False) if mode is not previous]
 
 
-def _back_s(end: int | None, before: Sequence[Mode], changes: Sequence[Event]) -> float | None:
+def _back_s(end: int | None, before: Sequence[Mode], changes: Sequence[Event], tick_s: float) -> float | None:
     """Return the time from the end of a fault until MPC drives; None when it does not."""
     if end is None:
         return None
@@ -125,7 +124,7 @@ def _back_s(end: int | None, before: Sequence[Mode], changes: Sequence[Event]) -
     if at_end and at_end[-1] is Mode.MPC:
         return 0.0
     back = [event.tick for event in changes if event.tick > end and event.subject == Mode.MPC]
-    return (back[0] - end) * TICK_S if back else None
+    return (back[0] - end) * tick_s if back else None
 
 
 def _steps(recording: Recording, rate: PerInput) -> NDArray[np.float64]:
@@ -145,5 +144,5 @@ def _outside(recording: Recording, design: ControlDesign) -> NDArray[np.bool_]:
     return outside
 
 
-def _seconds(outside: NDArray[np.bool_]) -> PerBand:
-    return tuple((outside.sum(axis=0) * TICK_S).tolist())
+def _seconds(outside: NDArray[np.bool_], tick_s: float) -> PerBand:
+    return tuple((outside.sum(axis=0) * tick_s).tolist())

@@ -60,7 +60,7 @@ def perform(
     """
     settings = plan.with_plant(effective.settings)
     scenario = plan.scenario(load_model(settings.model.file).w0)
-    trace = ChaosTrace(scenario.ticks)
+    trace = ChaosTrace(scenario.ticks, settings.process)
     failure = None
 
     async def conducted(recorder: Recorder, results: Path) -> None:

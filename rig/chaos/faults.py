@@ -3,9 +3,9 @@
 from enum import StrEnum
 from typing import Annotated, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
 
-from coldloop.process.signals import OUTPUT_NAMES, TICK_S
+from coldloop.process.settings import declared, settings_process
 from plant.refrigerator.events import EventTarget, RefrigeratorEvent
 
 Share = Annotated[float, Field(gt=0, le=1)]
@@ -39,6 +39,7 @@ class Fault(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    _tick_s: float = PrivateAttr(default_factory=lambda: settings_process().tick_s)
     at_s: Annotated[float, Field(ge=0)] | None = None
     """Left out where the instant is drawn."""
     duration_s: Duration
@@ -47,12 +48,12 @@ class Fault(BaseModel):
     @property
     def tick(self) -> int:
         """The tick before which it begins."""
-        return round((self.at_s or 0.0) / TICK_S)
+        return round((self.at_s or 0.0) / self._tick_s)
 
     @property
     def end_tick(self) -> int:
         """The tick before which it is to end."""
-        return self.tick + round(self.duration_s / TICK_S)
+        return self.tick + round(self.duration_s / self._tick_s)
 
     @property
     def label(self) -> str:
@@ -217,7 +218,7 @@ class Restart(ProcessFault):
     """SIGTERM, and a new start at the end."""
 
     kind: Literal["restart"]
-    duration_s: Duration = TICK_S
+    duration_s: Duration = declared(lambda process: process.tick_s)
 
 
 class Clock(Fault):
@@ -246,8 +247,9 @@ class Sensor(Fault):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if self.output not in OUTPUT_NAMES:
-            raise ValueError(f"unknown output '{self.output}'; choose one of {', '.join(OUTPUT_NAMES)}")
+        names = settings_process().output_names
+        if self.output not in names:
+            raise ValueError(f"unknown output '{self.output}'; choose one of {', '.join(names)}")
         if (self.shows == "value") != (self.value is not None):
             raise ValueError('give `value` with shows = "value", and only then')
         return self

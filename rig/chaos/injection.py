@@ -9,7 +9,6 @@ from typing import Final, TypeVar
 from coldloop.config import PREFIX
 from coldloop.errors import LinkError, PeerUnreachableError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
-from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.plant import SensorFault, SensorFaultKind, Surroundings
 from rig.chaos.faults import (
     SERVICE_OF,
@@ -109,9 +108,8 @@ class Injector:
         return await _insisted(write, f"{target} = {value:g}")
 
     async def _set_sensor(self, output: str, fault: SensorFault) -> None:
-        await _insisted(
-            lambda: self._plant.write_rows([fault], OUTPUT_NAMES.index(output)), f"sensor fault for {output}"
-        )
+        row = self._plant.process.output_names.index(output)
+        await _insisted(lambda: self._plant.write_rows([fault], row), f"sensor fault for {output}")
 
 
 async def _insisted(request: Callable[[], Awaitable[T]], what: str) -> T:

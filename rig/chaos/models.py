@@ -6,9 +6,8 @@ from typing import Final
 
 import numpy as np
 
-from coldloop.process.cold_box import L1
+from coldloop.process.cold_box import L1, TICK_S
 from coldloop.process.lti_model import discretise, load
-from coldloop.process.signals import TICK_S
 from plant.cold_box.equilibrium import find_equilibrium
 from plant.cold_box.linearisation import linearise
 from plant.helium.properties import load_helium

@@ -5,14 +5,13 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Final, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 
 from coldloop.config import Configuration
 from coldloop.errors import LoadFileError, UsageError
 from coldloop.parsing import parsed_toml
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import SAMPLING_PERIOD_S, TICK_S
+from coldloop.process.settings import ProcessSettings, settings_process, whole_ticks, within
 from coldloop.session.settings import TimeMode
 from coldloop.text_file import read_text
 from plant.load import concatenated, find_load, named_families, telegraph
@@ -36,23 +35,28 @@ SPREAD_S: Final = 20.0
 """Drawn faults begin up to so much after their multiple of `every_s`: anywhere in an updating period."""
 
 
-class ChaosPlan(BaseModel):
-    """A run and its faults."""
+def _of_ticks(seconds: float) -> float:
+    tick_s = settings_process().tick_s
+    if whole_ticks(seconds, tick_s) is None:
+        raise ValueError(f"input should be a multiple of {tick_s:g}")
+    return seconds
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+
+class ChaosPlan(ProcessSettings):
+    """A run and its faults."""
 
     name: str
     description: str
     load: str | tuple[str, ...] = "a"
     """Named load or CSV file; or named loads, one after the other."""
-    duration_s: Annotated[float, Field(gt=0, le=7 * 86_400, multiple_of=TICK_S)]
+    duration_s: Annotated[float, Field(gt=0, le=7 * 86_400), AfterValidator(_of_ticks)]
     plant: PlantKind | None = None
     """Which plant; that of the configuration if the plan does not say."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
     """Of all that is drawn: instants, the fate of frames, the sensors' noise."""
     mode: TimeMode = TimeMode.LOCKSTEP
     factor: Annotated[float, Field(ge=0.01, le=10_000)] = 1.0
-    updating_period_s: Annotated[float, Field(ge=0, le=SAMPLING_PERIOD_S)] = 0.0
+    updating_period_s: Annotated[float, within(lambda process: (0, process.sampling_period_s))] = 0.0
     """0 is adaptive."""
     standstill_s: Annotated[float, Field(gt=0, le=600)] = 8.0
     """In lock-step a fault that stops plant time ends after this real time. The control PLC drops an
@@ -87,15 +91,15 @@ class ChaosPlan(BaseModel):
     @property
     def ticks(self) -> int:
         """Length of the run."""
-        return round(self.duration_s / TICK_S)
+        return round(self.duration_s / self.process.tick_s)
 
     def schedule(self) -> list[AnyFault]:
         """Return all faults, those drawn too, in the order in which they begin."""
-        drawn = []
+        drawn, tick_s = [], self.process.tick_s
         if self.every_s is not None:
             draw = random.Random(self.seed)  # noqa: S311 not for secrets
             for number in range(1, int(self.duration_s / self.every_s) + 1):
-                at = number * self.every_s + TICK_S * draw.randrange(round(SPREAD_S / TICK_S))
+                at = number * self.every_s + tick_s * draw.randrange(round(SPREAD_S / tick_s))
                 fault = self.draw[draw.randrange(len(self.draw))]
                 if at + fault.duration_s < self.duration_s:
                     drawn.append(fault.model_copy(update={"at_s": at}))
@@ -124,12 +128,23 @@ class ChaosPlan(BaseModel):
         """Return the run without its faults; `mean_w` is the load of the operating point."""
         return Scenario(
             ticks=self.ticks,
-            load=_load(self.load, mean_w),
+            load=self._profile(mean_w),
             updating_period_s=self.updating_period_s,
             seed=self.seed,
             realtime=self.realtime,
             factor=self.factor,
         )
+
+    def _profile(self, mean_w: float) -> LoadProfile:
+        if isinstance(self.load, str):
+            return find_load(self.load, mean_w, self.process)
+        families = []
+        for name in self.load:
+            here = named_families(name)
+            if here is None:
+                raise LoadFileError(f"load {name}: only named loads can follow each other; give a CSV file alone")
+            families += here
+        return concatenated([telegraph(family, mean_w) for family in families])
 
 
 def _refuse_overlaps(schedule: list[AnyFault]) -> None:
@@ -142,18 +157,6 @@ def _refuse_overlaps(schedule: list[AnyFault]) -> None:
                 raise ValueError(f"'{later.label}' at {later.at_s:g} s begins before '{fault.label}' has ended")
 
 
-def _load(load: str | tuple[str, ...], mean_w: float) -> LoadProfile:
-    if isinstance(load, str):
-        return find_load(load, mean_w)
-    families = []
-    for name in load:
-        here = named_families(name)
-        if here is None:
-            raise LoadFileError(f"load {name}: only named loads can follow each other; give a CSV file alone")
-        families += here
-    return concatenated([telegraph(family, mean_w) for family in families])
-
-
 def shipped_plans() -> list[ChaosPlan]:
     """Return the plans that come with Coldloop, by name: those that suit the process."""
     plans = []
@@ -163,7 +166,7 @@ def shipped_plans() -> list[ChaosPlan]:
                 plan = parse_plan(entry.read_text(encoding="utf-8"), entry.name, {})
             except UsageError:  # of signals that are another's
                 continue
-            if plan.plant is None or plan.plant in PROCESS.plants:
+            if plan.plant is None or plan.plant in settings_process().plants:
                 plans.append(plan)
     return sorted(plans, key=lambda plan: plan.name)
 

@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from coldloop.parsing import parsed_json
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import INPUT_NAMES
+from coldloop.process.declaration import Process
 from coldloop.registers.control_plc import Mode
-from coldloop.registers.safety import AlarmKind, AlarmState
+from coldloop.registers.safety import AlarmState, alarm_key, alarms_of
 from coldloop.service.event_text import alarm_word
 from coldloop.whole_file import whole_text
 from rig.chaos.evaluation import Evaluation, RaisedAlarm, Row
@@ -18,19 +17,18 @@ from rig.chaos.trace import ChaosTrace
 from rig.results.folders import write_json
 from rig.text_tables import aligned, markdown_table
 
-HEADINGS: Final = (
-    "fault", "at s", "lasted s", "modes", "alarms (s after)", "step/limit",
-    *(f"{one.name} out s (was)" for one in PROCESS.banded),
-    "back to MPC s",
-)  # fmt: skip
-
 MANY_MODES: Final = 8
 """More modes than this are not all named in a table."""
 
 
-def table(rows: Sequence[Row]) -> str:
+def table(rows: Sequence[Row], process: Process) -> str:
     """Return all rows for a terminal."""
-    return aligned([HEADINGS, *map(_cells, rows)])
+    return aligned([_headings(process), *(_cells(row, process) for row in rows)])
+
+
+def _headings(process: Process) -> list[str]:
+    bands = [f"{one.name} out s (was)" for one in process.banded]
+    return ["fault", "at s", "lasted s", "modes", "alarms (s after)", "step/limit", *bands, "back to MPC s"]
 
 
 def write_report(
@@ -52,13 +50,13 @@ def document(
             {**row._asdict(), "alarms": [alarm._asdict() for alarm in row.alarms], "back_s": row.back_s}
             for row in evaluation.rows
         ],
-        "largest_steps": dict(zip(INPUT_NAMES, evaluation.largest_steps, strict=True)),
+        "largest_steps": dict(zip(trace.process.input_names, evaluation.largest_steps, strict=True)),
         "outside_s": evaluation.outside_s,
         "undisturbed_outside_s": evaluation.undisturbed_s,
         "missing_ticks": evaluation.missing_ticks,
         "lost_contacts": trace.lost_contacts,
         "ladder": trace.ladder._asdict() if trace.ladder else None,
-        "alarms": {AlarmKind(i).name: alarm._asdict() for i, alarm in enumerate(trace.alarms)},
+        "alarms": {alarm_key(i, trace.process).upper(): alarm._asdict() for i, alarm in enumerate(trace.alarms)},
         "events": [event._asdict() for event in trace.events],
         "resources": [sample._asdict() for sample in trace.resources],
         "log_lines": trace.log_lines,
@@ -69,20 +67,21 @@ def document(
 
 def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
     """Return the lines below the table."""
-    steps = ", ".join(f"{name} {step:.3f}" for name, step in zip(INPUT_NAMES, evaluation.largest_steps, strict=True))
+    process, largest = trace.process, evaluation.largest_steps
+    steps = ", ".join(f"{name} {step:.3f}" for name, step in zip(process.input_names, largest, strict=True))
     outside, was = evaluation.outside_s, evaluation.undisturbed_s
     lines = [
         f"largest step/limit: {steps}",
         "outside the bands: "
         + ", ".join(
-            f"{one.name} {seconds:g} s ({'undisturbed ' if one is PROCESS.banded[0] else ''}{before:g} s)"
-            for one, seconds, before in zip(PROCESS.banded, outside, was, strict=True)
+            f"{one.name} {seconds:g} s ({'undisturbed ' if one is process.banded[0] else ''}{before:g} s)"
+            for one, seconds, before in zip(process.banded, outside, was, strict=True)
         ),
         f"ticks not seen: {evaluation.missing_ticks} of {trace.ticks}",
     ]
     if trace.ladder is not None:
         lines.append(f"mode at the end: {Mode(trace.ladder.mode).name}, {trace.ladder.events} events")
-    active = [alarm_word(i) for i, alarm in enumerate(trace.alarms) if alarm.state != AlarmState.NORMAL]
+    active = [alarm_word(i, process) for i, alarm in enumerate(trace.alarms) if alarm.state != AlarmState.NORMAL]
     if active:
         lines.append(f"alarms active or unacknowledged: {', '.join(active)}")
     return [*lines, *_resource_lines(trace)]
@@ -108,20 +107,20 @@ def _page(plan: ChaosPlan, trace: ChaosTrace, evaluation: Evaluation, failure: s
         f"{plan.description}\n",
         f"Load {plan.load}, {plan.duration_s:g} s, seed {plan.seed}, {plan.mode}.\n",
         *([f"**The run failed:** {failure}\n"] if failure else []),
-        markdown_table(HEADINGS, map(_cells, evaluation.rows)) + "\n",
+        markdown_table(_headings(trace.process), (_cells(row, trace.process) for row in evaluation.rows)) + "\n",
         *(f"- {line}" for line in summary_lines(trace, evaluation)),
         "\n![Outputs, inputs, modes, faults](chaos.png)\n",
     ]
     return "\n".join(lines)
 
 
-def _cells(row: Row) -> list[str]:
+def _cells(row: Row, process: Process) -> list[str]:
     return [
         row.fault,
         f"{row.at_s:g}",
         "-" if row.lasted_s is None else f"{row.lasted_s:g}",
         _modes(row.modes),
-        _alarms(row.alarms),
+        _alarms(row.alarms, process),
         f"{row.largest_step:.3f}",
         *(f"{outside:g} ({was:g})" for outside, was in zip(row.outside_s, row.undisturbed_s, strict=True)),
         "not" if row.back_s is None else f"{row.back_s:g}",
@@ -134,9 +133,10 @@ def _modes(modes: Sequence[str]) -> str:
     return " > ".join(modes) or "-"
 
 
-def _alarms(alarms: Sequence[RaisedAlarm]) -> str:
+def _alarms(alarms: Sequence[RaisedAlarm], process: Process) -> str:
     """Return each alarm once: when it was first raised, and how often if more than once."""
-    times = Counter(alarm_word(AlarmKind[alarm.name]) for alarm in alarms)
-    first = {alarm_word(AlarmKind[alarm.name]): alarm.after_s for alarm in reversed(alarms)}
+    words = {alarm_key(alarm, process).upper(): alarm_word(alarm, process) for alarm in alarms_of(process)}
+    named = [(words[alarm.name], alarm.after_s) for alarm in alarms]
+    times, first = Counter(name for name, _ in named), dict(reversed(named))
     cells = [f"{name} {first[name]:g}" + (f" (x{count})" if count > 1 else "") for name, count in times.items()]
     return ", ".join(cells) or "none"

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import LinkError
-from coldloop.process.signals import TICK_S
 from rig.chaos.faults import WrongModel
 from rig.chaos.injection import Injector
 from rig.chaos.models import WRONG_MODEL, save_wrong_model
@@ -57,7 +56,7 @@ async def conduct(
         except TimeoutError:
             raise LinkError(
                 f"plan {plan.name} has taken {_patience_s(plan):.0f} s of real time and is at "
-                f"{driver.tick * TICK_S:g} s: see the logs in {folder / 'logs'}"
+                f"{driver.tick * plan.process.tick_s:g} s: see the logs in {folder / 'logs'}"
             ) from None
         finally:
             driver.finish()

@@ -7,10 +7,9 @@ from collections.abc import Callable
 from typing import Final
 
 from coldloop.errors import LinkError
-from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import LadderStatus
-from coldloop.registers.safety import Alarm, AlarmKind
+from coldloop.registers.safety import Alarm, alarms_of
 from rig.chaos.faults import AnyFault, ProcessFault, WrongModel
 from rig.chaos.injection import Injector
 from rig.chaos.plan import ChaosPlan
@@ -63,7 +62,9 @@ class FaultSequencer:
             else:
                 await self._end(moment)
             self._stopped_since = time.monotonic()
-        alarms = await self._client.contact(self._client.control.read_rows(Alarm, 0, len(AlarmKind)))
+        alarms = await self._client.contact(
+            self._client.control.read_rows(Alarm, 0, len(alarms_of(self._client.control.process)))
+        )
         self._trace.alarms = alarms or []
         await self._client.conclude()
 
@@ -122,9 +123,10 @@ class FaultSequencer:
                 bearable = min(bearable, fault.duration_s)
             if not self._plan.realtime and stopped_s > bearable:
                 return self._timeline.take(end)
-        if not self._timeline.on and stopped_s > max(STANDSTILL_PATIENCE_S, 4 * TICK_S / self._plan.factor):
+        tick_s = self._plan.process.tick_s
+        if not self._timeline.on and stopped_s > max(STANDSTILL_PATIENCE_S, 4 * tick_s / self._plan.factor):
             raise LinkError(
-                f"plan {self._plan.name}: the plant has been at {self.tick * TICK_S:g} s for {stopped_s:.0f} s "
+                f"plan {self._plan.name}: the plant has been at {self.tick * tick_s:g} s for {stopped_s:.0f} s "
                 f"without a fault: see {self._services.log('control_plc')}"
             )
         return None

@@ -3,7 +3,6 @@
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from coldloop.process.signals import TICK_S
 from rig.chaos.faults import AnyFault
 
 
@@ -60,5 +59,5 @@ class Timeline:
         """A fault has begun; its end is to come."""
         fault = moment.fault
         due_s = None if self._factor is None else seconds + fault.duration_s / self._factor
-        self.on.append(Moment(moment.tick + round(fault.duration_s / TICK_S), False, fault, due_s))  # noqa: FBT003
+        self.on.append(Moment(moment.tick + fault.end_tick - fault.tick, False, fault, due_s))  # noqa: FBT003
         self.on.sort(key=lambda end: end.tick)

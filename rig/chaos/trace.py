@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from coldloop.process.declaration import Process
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import LadderStatus
 from coldloop.registers.plant import PlantSample
@@ -46,6 +46,7 @@ class ChaosTrace(Sink):
     """Collects during a run; ticks that were not recorded stay NaN."""
 
     ticks: int
+    process: Process
     events: list[Event] = field(default_factory=list)
     """Of the control PLC, as they came."""
     alarms: list[Alarm] = field(default_factory=list)
@@ -59,7 +60,7 @@ class ChaosTrace(Sink):
     """Real time of the run."""
 
     def __post_init__(self) -> None:
-        sizes = (1, len(INPUT_NAMES), len(OUTPUT_NAMES), len(STATE_NAMES))
+        sizes = (1, len(self.process.inputs), len(self.process.outputs), len(self.process.states))
         self._rows = [np.full((self.ticks, size), np.nan, dtype=np.float32) for size in sizes]
 
     def sample(self, sample: PlantSample) -> None:

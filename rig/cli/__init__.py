@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from coldloop import __version__
+from coldloop.config import MODEL_FILE
 from coldloop.errors import ColdloopError, UsageError, printable
-from coldloop.process.declaration import VARIABLE
-from rig.cli.process_option import OPTION, load_named_process
+from coldloop.process.cold_box import COLD_BOX
+from coldloop.process.settings import settings_process
+from rig.cli.process_option import OPTION, named_process
 from rig.interruption import INTERRUPTION
 
 GROUPS: Final = {
@@ -147,10 +149,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if "_ARGCOMPLETE" in os.environ:
             _complete()
         try:
-            given = load_named_process(given)
-            code = _execute(make_parser(given[0] if given else None), given)
+            with named_process(given) as left:
+                code = _execute(make_parser(left[0] if left else None), left)
             sys.stdout.flush()
-        except UsageError as error:
+        except ColdloopError as error:
             sys.stderr.write(f"coldloop: {error}\n")
             return error.exit_code
         except BrokenPipeError:
@@ -170,8 +172,8 @@ def _execute(parser: argparse.ArgumentParser, given: Sequence[str]) -> int:
         parser.prog = " ".join([parser.prog, *given[: options.execute is not None]])
         parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     named = given[1] if len(given) > 1 else None
-    if os.environ.get(VARIABLE) and given and given[0] in OF_THE_COLD_BOX and named not in OF_ANY_PROCESS:
-        sys.stderr.write(f"coldloop: {given[0]}: of the cold box alone; leave out {OPTION} and unset {VARIABLE}\n")
+    if given and given[0] in OF_THE_COLD_BOX and named not in OF_ANY_PROCESS and settings_process() != COLD_BOX:
+        sys.stderr.write(f"coldloop: {given[0]}: of the cold box alone; leave out {OPTION} and unset {MODEL_FILE}\n")
         return UsageError.exit_code
     if options.execute is None:
         parser.print_help()

@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 from coldloop.modbus.requests import MAX_READ_WORDS
 from coldloop.registers.control_plc import Operator
 from coldloop.registers.declaration import Block, Kind, Register, RegisterMap
-from coldloop.registers.safety import Alarm, AlarmKind
+from coldloop.registers.safety import Alarm, alarms_of
 from coldloop.service.event_text import alarm_word
 from rig.cli.commands.options import HostPort
 from rig.cli.grafana_board import board
@@ -50,7 +50,7 @@ def _named(register_map: RegisterMap) -> Iterator[Tag]:
         if block.writer is not None and block.record is not Operator:
             continue
         if block.record is Alarm:
-            for kind in AlarmKind:
+            for kind in alarms_of(register_map.process):
                 yield from _tags(block, int(kind), f"{block.name}_{alarm_word(kind, register_map.process)}")
         elif block.rows == 1:
             yield from _tags(block, 0, block.name)

@@ -17,6 +17,7 @@ from rig.cosim.kept_up import end_of
 from rig.cosim.local_services import last_line, start_program, terminate, wait_for_end
 from rig.interpreter import PYTHON
 from rig.live.private_folder import new_own
+from rig.settings import Settings
 
 LOOK_S: Final = 0.05
 OPERATOR: Final = "operator"
@@ -103,16 +104,17 @@ class PageProcess:
     """The page; an async context in which it lives.
 
     Args:
-        section: Its settings.
+        settings: Its own, and the process of the rig.
         endpoints: Where the services are, with the operator's certificate.
         folder: Where it logs to, and keeps the first login and the audit.
     """
 
     name: Final = "the page"
 
-    def __init__(self, section: HmiSection, endpoints: RigEndpoints, folder: Path) -> None:
+    def __init__(self, settings: HmiSettings | Settings, endpoints: RigEndpoints, folder: Path) -> None:
         self._log = folder / "logs" / "hmi.log"
-        self._section, self._login = with_own_files(pointed_at(section, endpoints), folder)
+        self._section, self._login = with_own_files(pointed_at(settings.hmi, endpoints), folder)
+        self._environment = to_environment(HmiSettings(model=settings.model, hmi=self._section))
         self._process: asyncio.subprocess.Process | None = None
 
     async def __aenter__(self) -> Self:
@@ -131,9 +133,7 @@ class PageProcess:
         """Start it, or start it again."""
         self._log.parent.mkdir(parents=True, exist_ok=True)
         with new_own(self._log) as log:
-            self._process = await start_program(
-                (*PYTHON, "-m", "hmi"), to_environment(HmiSettings(hmi=self._section)), log
-            )
+            self._process = await start_program((*PYTHON, "-m", "hmi"), self._environment, log)
 
     async def __aexit__(self, *_: object) -> None:
         """End it."""

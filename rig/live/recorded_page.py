@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.config import load_configuration
-from coldloop.process.load_profile import LOAD_COLUMN
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, TICK_S
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Mode, ProcessNow
@@ -30,7 +28,6 @@ from rig.results.columns import STATION
 from rig.results.recorded_alarms import alarms_after
 from rig.results.run_folder import MOST_IN_MEMORY, MOST_LISTED, RunFolder
 
-PROCESS: Final = (LOAD_COLUMN, *INPUT_NAMES, *OUTPUT_NAMES)
 SECTIONS: Final = ("model", "limits", "session", "optimizer_plc", "telemetry")
 _MODES: Final = {word(mode): int(mode) for mode in Mode}
 _CAUSES: Final = {word(cause): int(cause) for cause in Cause}
@@ -46,12 +43,15 @@ class RecordedPage:
     def __init__(self, folder: RunFolder) -> None:
         self._folder = folder
         self.name = folder.path.resolve().name
+        self.process = folder.process
+        names = (self.process.load.column, *self.process.input_names, *self.process.output_names)
         with folder.reading("trace.parquet", MOST_IN_MEMORY) as file:
-            table = file.read(columns=[*PROCESS, "mode", "cause", "bad_sensors"])
-            self._values = np.column_stack([table[name].to_numpy() for name in PROCESS]).astype(np.float32)
+            table = file.read(columns=[*names, "mode", "cause", "bad_sensors"])
+            self._values = np.column_stack([table[name].to_numpy() for name in names]).astype(np.float32)
             self._modes = table["mode"].to_pylist()
             self._causes = table["cause"].to_pylist()
-            self._bad_sensors = [_bits(names or "") for names in table["bad_sensors"].to_pylist()]
+            bits = cache(self._bits)
+            self._bad_sensors = [bits(bad or "") for bad in table["bad_sensors"].to_pylist()]
         self._since = _beginnings(self._modes)
         self._settings = self._read_settings()
         self._station = self._read_station()
@@ -84,7 +84,7 @@ class RecordedPage:
     def updates(self) -> list[Optimization]:
         """Updates whose sequence was played."""
         with self._folder.reading("updates.parquet", MOST_LISTED) as file:
-            return [_optimization(row) for row in file.read().to_pylist()]
+            return [_optimization(row, self.process.tick_s) for row in file.read().to_pylist()]
 
     @cached_property
     def events(self) -> list[JournalEntry]:
@@ -96,8 +96,9 @@ class RecordedPage:
         """What decided the updating period."""
         program = self._settings.optimizer_plc.program
         budget = PlcBudget(program.budget, make_solver(program).tau_1_s)
-        rule = make_rule(program, budget, round(program.updating_period_s / TICK_S))
-        return rule.status._replace(**budget.times._asdict())
+        rule = make_rule(program, budget, round(program.updating_period_s / self.process.tick_s))
+        times = budget.times
+        return rule.status._replace(slots=times.slots, preparation=times.preparation, iteration=times.iteration)
 
     @property
     def limits(self) -> OperatingLimits:
@@ -110,7 +111,8 @@ class RecordedPage:
         load, *values = self._values[tick].tolist()
         if math.isnan(load):
             return None
-        u, y = tuple(values[: len(INPUT_NAMES)]), tuple(values[len(INPUT_NAMES) :])
+        inputs = len(self.process.inputs)
+        u, y = tuple(values[:inputs]), tuple(values[inputs:])
         mode = _MODES.get(self._modes[tick], int(Mode.MPC))
         cause = _CAUSES.get(self._causes[tick], int(Cause.NONE))
         suspect, faulty = self._doubts[max(0, bisect_right(self._doubts, tick, key=lambda one: one[0]) - 1)][1:]
@@ -123,15 +125,19 @@ class RecordedPage:
         found = [(0, 0, 0)]
         for entry in self.events:
             kind, subject, cause = entry.text[:3]
-            if subject not in OUTPUT_NAMES:
+            if subject not in self.process.output_names:
                 continue
-            (_, suspect, faulty), bit = found[-1], 1 << OUTPUT_NAMES.index(subject)
+            (_, suspect, faulty), bit = found[-1], self._bits(subject)
             if kind == word(EventKind.SENSOR):
                 suspect = suspect & ~bit | bit * (cause == "suspect")
             elif kind == word(EventKind.SENSOR_FAULT):
                 faulty = faulty & ~bit | bit * (cause != word(SensorFaultKind.NONE))
             found.append((entry.tick, suspect, faulty))
         return found
+
+    def _bits(self, names: str) -> int:
+        """Return the bits of outputs that are named in a text."""
+        return sum(1 << self.process.output_names.index(name) for name in names.split())
 
     def alarms(self, events: Sequence[JournalEntry]) -> list[Alarm]:
         """Return the alarms after these events."""
@@ -154,16 +160,10 @@ def _beginnings(modes: Sequence[str]) -> list[int]:
     return found
 
 
-@cache
-def _bits(names: str) -> int:
-    """Return the bits of outputs that are named in a text."""
-    return sum(1 << OUTPUT_NAMES.index(name) for name in names.split())
-
-
-def _optimization(row: Mapping[str, Any]) -> Optimization:
+def _optimization(row: Mapping[str, Any], tick_s: float) -> Optimization:
     names = [name for name in Optimization._fields if name != "tau_u"]
     values: dict[str, Any] = {name: 0.0 if row[name] is None else row[name] for name in names}
-    return Optimization(**values, tau_u=round(row["tau_u_s"] / TICK_S))
+    return Optimization(**values, tau_u=round(row["tau_u_s"] / tick_s))
 
 
 def _entry(row: Mapping[str, Any]) -> JournalEntry:

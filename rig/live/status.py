@@ -8,14 +8,12 @@ from coldloop.errors import LinkError, PeerUnreachableError
 from coldloop.number_text import value_text
 from coldloop.operating.execution import Clients, CommandClient
 from coldloop.operating.rings import last_update
-from coldloop.process.load_profile import LOAD_UNIT
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import CONTROLLED, OUTPUT_NAMES, OUTPUT_UNITS, TICK_S
+from coldloop.process.declaration import Process
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode, ProcessNow
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import LoadStatus
-from coldloop.registers.safety import Alarm, AlarmKind, AlarmState
+from coldloop.registers.safety import Alarm, AlarmState, alarms_of
 from coldloop.service.event_text import alarm_cause, alarm_word, word_of
 from rig.cosim.answer_time import answered_in_time
 from rig.terminal import Colour, coloured
@@ -44,6 +42,7 @@ class ControlStatus(NamedTuple):
 class RigStatus(NamedTuple):
     """One look at the services of a rig."""
 
+    process: Process
     plant: PlantStatus | None
     """None where it does not answer, as below."""
     control: ControlStatus | None
@@ -69,7 +68,7 @@ async def read_status(clients: Clients) -> RigStatus:
     )  # fmt: skip
     if plant is None and control is None:
         raise absent[0]
-    return RigStatus(plant, control, update, tuple(map(str, absent)))
+    return RigStatus(clients[names[0]].process, plant, control, update, tuple(map(str, absent)))
 
 
 async def _answer(reading: Awaitable[Any]) -> Any:  # noqa: ANN401 of any service
@@ -88,8 +87,8 @@ async def _plant(client: CommandClient) -> PlantStatus:
 
 async def _control(client: CommandClient) -> ControlStatus:
     await client.connect(0.0)
-    rows = await client.read_rows(Alarm, 0, len(AlarmKind))
-    alarms = tuple(_alarm(kind, row) for kind, row in zip(AlarmKind, rows, strict=True) if row.state not in QUIET)
+    rows = await client.read_rows(Alarm, 0, len(alarms_of(client.process)))
+    alarms = tuple(_alarm(kind, row, client.process) for kind, row in enumerate(rows) if row.state not in QUIET)
     return ControlStatus(
         await client.read(LadderStatus), await client.read(Operator), (await client.read(ProcessNow)).y, alarms
     )
@@ -100,10 +99,10 @@ async def _update(client: CommandClient) -> Optimization | None:
     return await last_update(client, await client.read(Identity))
 
 
-def _alarm(kind: AlarmKind, row: Alarm) -> str:
-    cause = alarm_cause(kind, row.cause)
+def _alarm(kind: int, row: Alarm, process: Process) -> str:
+    cause = alarm_cause(kind, row.cause, process)
     state = word_of(AlarmState, row.state)
-    return f"{alarm_word(kind)}{f' ({cause})' if cause else ''}, {state}"
+    return f"{alarm_word(kind, process)}{f' ({cause})' if cause else ''}, {state}"
 
 
 def _pace(plant: PlantStatus) -> str:
@@ -116,7 +115,7 @@ def _pace(plant: PlantStatus) -> str:
 
 
 def _tau_u(status: RigStatus) -> str:
-    return "-" if status.update is None else f"{status.update.tau_u * TICK_S:g} s"
+    return "-" if status.update is None else f"{status.update.tau_u * status.process.tick_s:g} s"
 
 
 def colour(status: RigStatus) -> Colour:
@@ -137,21 +136,21 @@ def page(status: RigStatus) -> str:
 
 
 def _rows(status: RigStatus) -> Iterator[tuple[str, str]]:
-    plant, control = status.plant, status.control
+    plant, control, process, tick_s = status.plant, status.control, status.process, status.process.tick_s
     if plant is not None:
-        yield "session", f"{plant.identity.session}, {_pace(plant)}, {plant.identity.tick * TICK_S:.2f} s"
+        yield "session", f"{plant.identity.session}, {_pace(plant)}, {plant.identity.tick * tick_s:.2f} s"
     if control is not None:
         mode, cause = word_of(Mode, control.ladder.mode), word_of(Cause, control.ladder.cause)
-        yield "mode", f"{mode} ({cause}) since {control.ladder.since * TICK_S:g} s"
+        yield "mode", f"{mode} ({cause}) since {control.ladder.since * tick_s:g} s"
         yield "operator", word_of(OperatorMode, control.operator.mode)
-    if plant is not None and PROCESS.has_load:
-        load, then = plant.load, value_text(plant.load.next_watts, LOAD_UNIT)
-        following = f", {then} from {load.next_tick * TICK_S:g} s" if load.upcoming else ""
-        yield "load", f"{value_text(load.watts, LOAD_UNIT)}{following}"
+    if plant is not None and process.has_load:
+        load, unit = plant.load, process.load.unit
+        then = f", {value_text(load.next_watts, unit)} from {load.next_tick * tick_s:g} s" if load.upcoming else ""
+        yield "load", f"{value_text(load.watts, unit)}{then}"
     if control is not None:
         known = any(control.y)  # a control PLC that was started again shows nothing before its first scan
-        for i in CONTROLLED:
-            yield OUTPUT_NAMES[i], f"{control.y[i]:.3f} {OUTPUT_UNITS[i]}" if known else "-"
+        for i, one in zip(process.controlled, process.banded, strict=True):
+            yield one.name, f"{control.y[i]:.3f} {one.unit}" if known else "-"
     yield "tau_u", _tau_u(status)
     if control is not None:
         yield "alarms", "; ".join(control.alarms) or "none"
@@ -160,13 +159,14 @@ def _rows(status: RigStatus) -> Iterator[tuple[str, str]]:
 
 def line(status: RigStatus) -> str:
     """Return the state as one line."""
-    plant, control = status.plant, status.control
-    parts = ["no plant  "] if plant is None else [f"{plant.identity.tick * TICK_S:10.2f} s"]
+    plant, control, process = status.plant, status.control, status.process
+    parts = ["no plant  "] if plant is None else [f"{plant.identity.tick * process.tick_s:10.2f} s"]
     parts.append("no control PLC" if control is None else f"{word_of(Mode, control.ladder.mode):9}")
-    if plant is not None and PROCESS.has_load:
-        parts.append(f"{plant.load.watts:6.1f} {LOAD_UNIT}")
+    if plant is not None and process.has_load:
+        parts.append(f"{plant.load.watts:6.1f} {process.load.unit}")
     if control is not None:
-        parts += [f"{OUTPUT_NAMES[i]} {control.y[i]:6.2f} {OUTPUT_UNITS[i]}" for i in CONTROLLED]
+        bands = zip(process.controlled, process.banded, strict=True)
+        parts += [f"{one.name} {control.y[i]:6.2f} {one.unit}" for i, one in bands]
     parts.append(f"tau_u {_tau_u(status):>6}")
     if control is not None:
         parts.append("; ".join(control.alarms) or "no alarms")

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import LinkError, PeerUnreachableError
-from coldloop.process.loaded import FILE as PROCESS_FILE
-from coldloop.process.loaded import PROCESS
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus
-from coldloop.registers.maps import PLANT_MAP
+from coldloop.registers.maps import maps_of
 from coldloop.registers.plant import Measurement
 from rig.cosim.kept_up import keep_up, say
 from rig.cosim.local_services import KeptService, LocalServices
@@ -83,7 +82,7 @@ class UpRig:
                 links.put_before(services.endpoints)
                 await links.connect()
             rig = SessionClient(services.endpoints, self._settings, services=self._services)
-            page = PageProcess(self._settings.hmi, services.endpoints, self.folder) if self._page else None
+            page = PageProcess(self._settings, services.endpoints, self.folder) if self._page else None
             try:
                 async with page or nullcontext():
                     await services.during(self._begin(services, rig, page, announce=announce))
@@ -177,14 +176,16 @@ async def _keep_page(page: PageProcess) -> None:
 
 def addresses(settings: Settings, ports: Sequence[int], folder: Path, services: Sequence[str]) -> str:
     """Return where everything is, with a line to paste."""
-    base = "" if PROCESS_FILE is None else f" --process {PROCESS_FILE}"
+    process = settings.process
+    base = "" if process == COLD_BOX else f" --process {settings.model.file}"
     base += "" if tuple(ports) == DEFAULT_PORTS else f" --port-base {ports[0]}"
-    shown = PROCESS.banded[-1]
-    measured = PLANT_MAP.block_of(Measurement).registers()
+    shown = process.banded[-1]
+    measured = maps_of(process).plant.block_of(Measurement).registers()
     address = next(one.address for one in measured if one.name == f"y.{shown.name}")
-    load = f"load {420 if PROCESS_FILE is None else PROCESS.load.span[1]:g}" if PROCESS.has_load else "mode manual"
-    which = f"load {settings.plant.load}, " if PROCESS.has_load else ""
-    more = "load FILE.csv, mode, " if PROCESS.has_load else ""
+    raised = 420 if process.load.has_named_loads else process.load.span[1]
+    load = f"load {raised:g}" if process.has_load else "mode manual"
+    which = f"load {settings.plant.load}, " if process.has_load else ""
+    more = "load FILE.csv, mode, " if process.has_load else ""
     tls = any(getattr(settings, service).server.tls for service in services)
     places = {
         service: f"127.0.0.1:{port}" if service in services else "yours: a client of the control PLC"

@@ -7,7 +7,7 @@ from typing import Final
 from coldloop.process.declaration import Process
 from coldloop.process.settings import settings_of
 from coldloop.registers.audit import EventKind
-from coldloop.registers.safety import Alarm, AlarmKind, AlarmState
+from coldloop.registers.safety import Alarm, AlarmState, alarms_of
 from coldloop.service.event_text import alarm_cause, alarm_word, kind_word
 from control_plc.alarm_settings import AlarmSettings
 from control_plc.alarms import TRANSITIONS
@@ -17,11 +17,11 @@ _KINDS: Final = {kind_word(event): event for events in TRANSITIONS.values() for 
 
 
 @cache
-def _alarms(process: Process) -> dict[str, tuple[AlarmKind, dict[str, int]]]:
+def _alarms(process: Process) -> dict[str, tuple[int, dict[str, int]]]:
     """Return the alarms by their words, each with its causes by theirs."""
     return {
         alarm_word(kind, process): (kind, {alarm_cause(kind, cause, process): cause for cause in range(64)})
-        for kind in AlarmKind
+        for kind in alarms_of(process)
     }
 
 
@@ -29,7 +29,7 @@ def alarms_after(events: Iterable[JournalEntry], process: Process) -> list[Alarm
     """Return the alarms of a process after these events, by number."""
     with settings_of(process):
         settings = AlarmSettings()
-    rows = [Alarm(priority=settings.rule(kind).priority) for kind in AlarmKind]
+    rows = [Alarm(priority=settings.rule(kind).priority) for kind in alarms_of(process)]
     for entry in events:
         event, alarm = _KINDS.get(entry.text.kind), _alarms(process).get(entry.text.subject)
         if event is not None and alarm is not None:

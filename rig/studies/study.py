@@ -111,8 +111,8 @@ def draw_of(name: str, draw: int, options: StudyOptions) -> Load:
     """Return a draw of a load; the draws of a file differ by their noise, which there is when there are several."""
     named = named_families(name) is not None
     drawn = f"{name}@{draw}" if named and draw > 1 else name
-    mean = load_model(settings_of(options.settings).model.file).w0
-    profile = find_load(drawn, mean, options.process)
+    settings = settings_of(options.settings)
+    profile = find_load(drawn, load_model(settings.model.file).w0, settings.process)
     ticks = options.ticks or natural_ticks(drawn, profile)
     if options.quick:
         ticks = min(ticks, QUICK_TICKS)

@@ -13,6 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from coldloop.errors import LinkError, PeerUnreachableError, UsageError
 from coldloop.modbus.client import RegisterClient
+from coldloop.process.settings import settings_of
 from coldloop.registers.common import Identity
 from coldloop.registers.maps import maps_of
 from rig.chaos.faults import AnyFault, WrongModel
@@ -158,7 +159,8 @@ class LiveRig:
         Raises:
             UsageError: There is no such fault, or a parameter is missing or wrong.
         """
-        fault = _parsed(kind, parameters)
+        with settings_of(self.settings.process):
+            fault = _parsed(kind, parameters)
         if isinstance(fault, WrongModel):
             save_wrong_model(self.settings.model.file, self._folder / WRONG_MODEL)
         self._call(self._injector.begin(fault))

@@ -5,17 +5,16 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Annotated, Final, Literal, NamedTuple, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, model_validator
 
 from coldloop.process.declaration import Process, Range
-from coldloop.process.settings import ProcessSettings, declared, stretched, within
-from coldloop.registers.safety import AlarmKind, AlarmPriority
+from coldloop.process.settings import ProcessSettings, declared, settings_process, stretched, within
+from coldloop.registers.safety import AlarmKind, AlarmPriority, alarm_key, alarms_of, band_alarms
 
 PASSING: Final = (AlarmKind.SCAN_OVERRUN, AlarmKind.ACCESS_REFUSED, AlarmKind.SECOND_WRITER)
 """Alarms for something that happens at an instant: their off-delay is how long ago the last time must be."""
-BANDS: Final = (AlarmKind.LEVEL_BAND, AlarmKind.T5_BAND)
-OF_THE_PROCESS: Final = (*BANDS, AlarmKind.CAPACITY, AlarmKind.SENSOR_SUSPECT, AlarmKind.INPUT_WITHOUT_EFFECT)
-"""Alarms that say nothing against PLCs, links and what the control PLC works with."""
+OF_THE_PROCESS: Final = (AlarmKind.CAPACITY, AlarmKind.SENSOR_SUSPECT, AlarmKind.INPUT_WITHOUT_EFFECT)
+"""Alarms that, as those of bands, say nothing against PLCs, links and what the control PLC works with."""
 
 LOW, MEDIUM, HIGH, CRITICAL = AlarmPriority
 
@@ -37,8 +36,8 @@ DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
     AlarmKind.OUTPUTS_REJECTED: AlarmRule(CRITICAL),  # what is computed is not applied
     AlarmKind.SCANS_STOPPED: AlarmRule(CRITICAL),  # nothing is computed
     # The process leaves its limits, or is about to unnoticed: act within minutes.
-    AlarmKind.LEVEL_BAND: AlarmRule(HIGH),  # the bath may run dry or flood; on-delay: `band_delay_s`
-    AlarmKind.T5_BAND: AlarmRule(HIGH),  # the turbines leave their range; on-delay: `band_delay_s`
+    AlarmKind.FIRST_BAND: AlarmRule(HIGH),  # as all bands; of the cold box the bath may run dry or flood
+    AlarmKind.SECOND_BAND: AlarmRule(HIGH),  # of the cold box the turbine leaves its range
     AlarmKind.PLANT_FROZEN: AlarmRule(HIGH),  # measurements are old
     AlarmKind.CAPACITY: AlarmRule(HIGH, 20.0, 30.0),  # no control holds this load
     # Control is degraded, or a protection is lost: act within the shift.
@@ -63,9 +62,10 @@ DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
 
 
 def _known_name(name: str) -> str:
-    if name.upper() not in AlarmKind.__members__:
-        known = ", ".join(kind.name.lower() for kind in AlarmKind)
-        raise ValueError(f"unknown alarm '{name}'; choose from {known}")
+    process = settings_process()
+    known = [alarm_key(alarm, process) for alarm in alarms_of(process)]
+    if name.lower() not in known:
+        raise ValueError(f"unknown alarm '{name}'; choose from {', '.join(known)}")
     return name.lower()
 
 
@@ -92,21 +92,44 @@ class RuleSettings(BaseModel):
         )
 
 
+def _bands_of(process: Process) -> dict[str, Range]:
+    return {one.name: one.band.alarm or (one.band.low, one.band.high) for one in process.banded if one.band is not None}
+
+
+def _with_declared(given: object) -> object:
+    """Return bands by output, those of the process where none are given."""
+    if not isinstance(given, Mapping):
+        return given
+    found: dict[str, object] = {**_bands_of(settings_process())}
+    names = {name.lower(): name for name in found}  # the environment has no capitals
+    for name, band in given.items():
+        if str(name).lower() not in names:
+            raise ValueError(f"{name}: no output with a band; choose from {', '.join(found)}")
+        found[names[str(name).lower()]] = band
+    return found
+
+
 class AlarmSettings(ProcessSettings):
     """When the alarms are raised, how urgent they are, and how long they may be shelved."""
 
-    level_band: tuple[FiniteFloat, FiniteFloat] = declared(lambda process: _bands_of(process)[0])
-    """Of the first output that has a band: of the cold box L1, %."""
-    t5_band: tuple[FiniteFloat, FiniteFloat] = declared(lambda process: _bands_of(process)[:2][-1])
-    """Of the second one: of the cold box T5, K. Further ones are as the process declares them."""
+    bands: Annotated[dict[str, tuple[FiniteFloat, FiniteFloat]], BeforeValidator(_with_declared)] = declared(_bands_of)
+    """Of each output that has one, by its name; those that are not given are as the process declares them."""
     band_delay_s: Delay = stretched(5.0)
-    """On-delay of the two band alarms: how long an output must be outside, plant time."""
+    """On-delay of their alarms: how long an output must be outside, plant time."""
     rules: dict[Annotated[str, AfterValidator(_known_name)], RuleSettings] = {}
     """By name of the alarm, such as `sensor_bad`."""
     shelving_s: Annotated[FiniteFloat, Field(ge=1, le=65_535)] = 900.0
     """How long an alarm is shelved by a command that gives no time, plant time."""
     longest_shelving_s: Annotated[FiniteFloat, Field(ge=1, le=65_535)] = 28_800.0
     """Longest time of one command, plant time. A shift: the next one decides again."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, given: object) -> object:
+        for name in ("level_band", "t5_band"):
+            if isinstance(given, Mapping) and name in given:
+                raise ValueError(f"{name}: bands have the names of their outputs since 0.4: set bands.L1 or bands.T5")
+        return given
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -117,21 +140,16 @@ class AlarmSettings(ProcessSettings):
             raise ValueError(f"{delayed[0]} happens at an instant and would never be raised; leave out its on_delay_s")
         return self
 
-    @property
-    def bands(self) -> tuple[tuple[float, float], ...]:
-        """What each output with a band is to be within."""
-        found = _bands_of(self.process)
-        return (self.level_band, self.t5_band, *found[2:])[: len(found)]
-
-    def rule(self, kind: AlarmKind) -> AlarmRule:
+    def rule(self, alarm: int) -> AlarmRule:
         """Return how an alarm is treated."""
-        default = DEFAULT_RULES[kind]
-        if kind is AlarmKind.CAPACITY:
+        is_band = alarm in band_alarms(self.process)
+        default = DEFAULT_RULES[AlarmKind.FIRST_BAND if is_band else AlarmKind(alarm)]
+        if alarm == AlarmKind.CAPACITY:
             stretch = self.process.stretch
             default = AlarmRule(default.priority, default.on_delay_s * stretch, default.off_delay_s * stretch)
-        if kind in BANDS:
+        if is_band:
             default = default._replace(on_delay_s=self.band_delay_s)
-        return self.rules.get(kind.name.lower(), RuleSettings()).changed(default)
+        return self.rules.get(alarm_key(alarm, self.process), RuleSettings()).changed(default)
 
     def shelving_ticks(self, asked_s: int) -> int:
         """Return how long an alarm is shelved when so many seconds are asked for; 0 asks for the default."""
@@ -140,7 +158,3 @@ class AlarmSettings(ProcessSettings):
     def ticks(self, seconds: float) -> int:
         """Return a time in ticks, not shorter than it; what is smaller than the error of a float does not count."""
         return math.ceil(seconds / self.process.tick_s - 1e-9)
-
-
-def _bands_of(process: Process) -> tuple[Range, ...]:
-    return tuple(band.alarm or (band.low, band.high) for band in process.bands)

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 from coldloop.registers.audit import EventKind
-from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
+from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmState, alarms_of, band_alarms
 from coldloop.service.journal import Journal
 from control_plc.alarm_settings import OF_THE_PROCESS, PASSING, AlarmSettings, RuleSettings
 
@@ -88,9 +88,10 @@ class AlarmPanel:
     def __init__(self, journal: Journal, settings: AlarmSettings = WITHOUT_DELAY) -> None:
         self._journal = journal
         self._settings = settings
-        self._rules = [settings.rule(kind) for kind in AlarmKind]
-        self._pending: dict[AlarmKind, _Pending] = {}
-        self._causes: dict[AlarmKind, set[int]] = {}
+        self._of_the_process = {*OF_THE_PROCESS, *band_alarms(settings.process)}
+        self._rules = [settings.rule(alarm) for alarm in alarms_of(settings.process)]
+        self._pending: dict[int, _Pending] = {}
+        self._causes: dict[int, set[int]] = {}
         """Causes for which an active alarm has been raised since its last acknowledgement."""
         self._now = 0
         self.rows = [Alarm(priority=rule.priority) for rule in self._rules]
@@ -133,7 +134,7 @@ class AlarmPanel:
 
     # -- conditions ----------------------------------------------------------------------------------------------------
 
-    def report(self, kind: AlarmKind, *, condition: bool, cause: int = 0, value: float = 0.0) -> None:
+    def report(self, kind: int, *, condition: bool, cause: int = 0, value: float = 0.0) -> None:
         """Report the condition of an alarm and its cause; a new cause raises the alarm again, whatever the value."""
         row = self.rows[kind]
         if condition != bool(row.active):
@@ -148,12 +149,12 @@ class AlarmPanel:
             else:
                 self._raise(kind, cause, value)
 
-    def pending(self, *kinds: AlarmKind) -> list[int | None]:
+    def pending(self, *kinds: int) -> list[int | None]:
         """Return since when the condition of each alarm has differed from its shown state; None where it does not."""
         changes = map(self._pending.get, kinds)
         return [None if change is None else change.since for change in changes]
 
-    def set_pending(self, kind: AlarmKind, since: int | None) -> None:
+    def set_pending(self, kind: int, since: int | None) -> None:
         """Set since when the condition of an alarm has differed from its shown state."""
         self._pending.pop(kind, None)
         if since is not None:
@@ -162,35 +163,35 @@ class AlarmPanel:
     @property
     def are_quiet(self) -> bool:
         """No alarm but those of the process is active, or about to be."""
-        others = (row for kind, row in zip(AlarmKind, self.rows, strict=True) if kind not in OF_THE_PROCESS)
-        return not any(row.active for row in others) and all(kind in OF_THE_PROCESS for kind in self._pending)
+        others = (row for kind, row in enumerate(self.rows) if kind not in self._of_the_process)
+        return not any(row.active for row in others) and all(kind in self._of_the_process for kind in self._pending)
 
-    def reported(self, kind: AlarmKind) -> int:
+    def reported(self, kind: int) -> int:
         """Return the cause last reported of an alarm, whatever its delay; 0 where its condition does not hold."""
         pending, row = self._pending.get(kind), self.rows[kind]
         if pending is None:
             return row.cause if row.active else 0
         return 0 if row.active else pending.cause
 
-    def due(self, kind: AlarmKind) -> float:
+    def due(self, kind: int) -> float:
         """Return the tick at which an alarm follows its condition; infinite where it already does."""
         (since,) = self.pending(kind)
         return math.inf if since is None else since + self.delay(kind)
 
-    def delay(self, kind: AlarmKind) -> int:
+    def delay(self, kind: int) -> int:
         """Return the delay (ticks) after which an alarm follows its condition."""
         rule = self._rules[kind]
         return self._settings.ticks(rule.off_delay_s if self.rows[kind].active else rule.on_delay_s)
 
-    def raised(self, kind: AlarmKind, cause: int = 0) -> None:
+    def raised(self, kind: int, cause: int = 0) -> None:
         """Report that the condition of an alarm holds, and its cause."""
         self.report(kind, condition=True, cause=cause)
 
-    def returned(self, kind: AlarmKind) -> None:
+    def returned(self, kind: int) -> None:
         """Report that the condition of an alarm has ended."""
         self.report(kind, condition=False)
 
-    def pulse(self, kind: AlarmKind, cause: int = 0) -> None:
+    def pulse(self, kind: int, cause: int = 0) -> None:
         """Report an instantaneous condition: the alarm returns an off-delay after the last one.
 
         An alarm with an on-delay is not raised by it.
@@ -198,7 +199,7 @@ class AlarmPanel:
         self.raised(kind, cause)
         self.returned(kind)
 
-    def _settle(self, kind: AlarmKind) -> None:
+    def _settle(self, kind: int) -> None:
         """Let a change of a condition take effect if its delay is over."""
         pending = self._pending[kind]
         if self.now - pending.since < self.delay(kind):
@@ -209,7 +210,7 @@ class AlarmPanel:
         else:
             self._raise(kind, pending.cause, pending.value)
 
-    def _raise(self, kind: AlarmKind, cause: int, value: float = 0.0) -> None:
+    def _raise(self, kind: int, cause: int, value: float = 0.0) -> None:
         row = self.rows[kind]
         if not row.active:
             self._causes[kind] = set()
@@ -220,7 +221,7 @@ class AlarmPanel:
             times = (row.times + 1) & 0xFFFF
             self._step(kind, EventKind.ALARM_RAISED, value=value, active=1, cause=cause, times=times, raised=self.now)
 
-    def _return(self, kind: AlarmKind) -> None:
+    def _return(self, kind: int) -> None:
         if self.rows[kind].state == AlarmState.OUT_OF_SERVICE:
             self._store(kind, active=0, returned=self.now)
         else:
@@ -233,7 +234,7 @@ class AlarmPanel:
         event = COMMANDED.get(command.action)
         if event is None:
             return
-        for kind in AlarmKind:
+        for kind in range(len(self.rows)):
             if command.alarm not in (kind, ALL_ALARMS):
                 continue
             if event is EventKind.ALARM_SHELVED:
@@ -241,7 +242,7 @@ class AlarmPanel:
             else:
                 self._step(kind, event, who=who)
 
-    def _shelve(self, kind: AlarmKind, asked_s: int, who: str) -> None:
+    def _shelve(self, kind: int, asked_s: int, who: str) -> None:
         ticks = self._settings.shelving_ticks(asked_s)
         until = min(self.now + ticks, 0xFFFFFFFF)
         if until != self.rows[kind].shelved_until:
@@ -252,14 +253,14 @@ class AlarmPanel:
     def restore(self, rows: Sequence[Alarm]) -> None:
         """Take the alarms of before a restart; priorities are those of the configuration."""
         self.rows = [row._replace(priority=rule.priority) for row, rule in zip(rows, self._rules, strict=True)]
-        self._causes = {kind: {row.cause} for kind, row in zip(AlarmKind, rows, strict=True) if row.active}
+        self._causes = {kind: {row.cause} for kind, row in enumerate(rows) if row.active}
         # An instantaneous alarm has no end.
         self._pending = {kind: _Pending(self.now, 0, 0.0) for kind in PASSING if self.rows[kind].active}
         self.changes += 1
 
     # -- the state machine ---------------------------------------------------------------------------------------------
 
-    def _step(self, kind: AlarmKind, event: EventKind, *, who: str = "", value: float = 0.0, **fields: int) -> None:
+    def _step(self, kind: int, event: EventKind, *, who: str = "", value: float = 0.0, **fields: int) -> None:
         """Make the transition of an event, if there is one, and note it."""
         before = AlarmState(self.rows[kind].state)
         after = TRANSITIONS[before].get(event)
@@ -276,9 +277,9 @@ class AlarmPanel:
         if suppressed and after is AlarmState.NORMAL and row.active:
             self._raise(kind, row.cause)
 
-    def _store(self, kind: AlarmKind, **fields: int) -> None:
+    def _store(self, kind: int, **fields: int) -> None:
         self.rows[kind] = self.rows[kind]._replace(**fields)
         self.changes += 1
 
-    def _shelved(self) -> list[AlarmKind]:
-        return [AlarmKind(i) for i, row in enumerate(self.rows) if row.state == AlarmState.SHELVED]
+    def _shelved(self) -> list[int]:
+        return [i for i, row in enumerate(self.rows) if row.state == AlarmState.SHELVED]

@@ -6,9 +6,9 @@ from typing import Final
 from coldloop.process.declaration import Range
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Mode
-from coldloop.registers.safety import AlarmKind, CapacityCause
+from coldloop.registers.safety import AlarmKind, CapacityCause, band_alarms
 from coldloop.service.journal import Journal
-from control_plc.alarm_settings import BANDS, AlarmSettings
+from control_plc.alarm_settings import AlarmSettings
 from control_plc.alarms import AlarmPanel
 from control_plc.ladder import Ladder
 
@@ -20,12 +20,11 @@ OPTIMIZER_DRIVES: Final = (Mode.MPC, Mode.REST)
 
 def present_limits(settings: AlarmSettings, panel: AlarmPanel) -> list[Range]:
     """Return the limits of each output with a band: its band while its alarm is raised, wider by the dead band else."""
-    bands, dead_bands = settings.bands, settings.process.dead_bands
-    level, further = (panel.rows[kind] for kind in BANDS)
-    raised = [level.active, *(further.active and further.cause == place for place in range(len(bands) - 1))]
+    process = settings.process
+    every = zip(settings.bands.values(), process.dead_bands, band_alarms(process), strict=True)
     return [
-        (low, high) if is_raised else (low - dead_band, high + dead_band)
-        for (low, high), dead_band, is_raised in zip(bands, dead_bands, raised, strict=True)
+        (low, high) if panel.rows[alarm].active else (low - dead_band, high + dead_band)
+        for (low, high), dead_band, alarm in every
     ]
 
 
@@ -42,8 +41,8 @@ class ProcessAlarms:
         self._panel = panel
         self._journal = journal
         self._settings = settings
-        self._controlled = settings.process.controlled
-        self._raised: tuple[int, int, int] | None = None
+        self._controlled, self._alarms = settings.process.controlled, band_alarms(settings.process)
+        self._raised: list[int] = []
         self._limits: list[Range] = []
         self._before: dict[AlarmKind, frozenset[int]] = dict.fromkeys(SENSORS, frozenset())
         self._suspects = 0
@@ -75,15 +74,11 @@ class ProcessAlarms:
             suspects: Outputs that the optimiser does without: bit i is output i; then inputs that have no effect.
         """
         report = self._panel.report
-        first, others = (self._panel.rows[kind] for kind in BANDS)
-        raised = first.active, others.active, others.cause
+        raised = [self._panel.rows[alarm].active for alarm in self._alarms]
         if raised != self._raised:
             self._raised, self._limits = raised, present_limits(self._settings, self._panel)
-        limits = zip(self._controlled, self._limits, strict=True)
-        outside = [not (cooling or low <= y[output] <= high) for output, (low, high) in limits]
-        report(AlarmKind.LEVEL_BAND, condition=outside[0])
-        further = [place for place, is_outside in enumerate(outside[1:]) if is_outside]
-        report(AlarmKind.T5_BAND, condition=bool(further), cause=further[0] if further else 0)
+        for alarm, output, (low, high) in zip(self._alarms, self._controlled, self._limits, strict=True):
+            report(alarm, condition=not (cooling or low <= y[output] <= high))
         mode, cause = ladder.mode, ladder.cause
         fallen = mode is not Mode.MPC and cause not in (Cause.SESSION_STARTED, Cause.OPERATOR, Cause.COOL_DOWN)
         report(AlarmKind.MODE, condition=fallen, cause=cause)

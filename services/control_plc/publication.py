@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.control_plc import LadderStatus, PlantLinkStatus, ProcessNow, Status
-from coldloop.registers.safety import AlarmKind, AlarmState
+from coldloop.registers.safety import AlarmState
 from coldloop.safety.writer_lease import WriterLease
 from coldloop.service.event_text import alarm_word, log_event
 from coldloop.service.journal import JournalPublication
@@ -149,7 +149,7 @@ class ControlPublication:
         status, process = self._bank.get(Status), self._bank.get(ProcessNow)
         alarms = {
             alarm_word(kind, self._bank.map.process).replace(" ", "_"): AlarmState(alarm.state).name.lower()
-            for kind, alarm in zip(AlarmKind, self._program.alarms.rows, strict=True)
+            for kind, alarm in enumerate(self._program.alarms.rows)
             if alarm.state != AlarmState.NORMAL
         }
         return {

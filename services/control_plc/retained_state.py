@@ -15,7 +15,7 @@ from coldloop.process.settings import ProcessSettings, settings_of, settings_pro
 from coldloop.registers.codec import check_record
 from coldloop.registers.common import SessionPace
 from coldloop.registers.control_plc import SEQUENCE_ROWS, CoolDownStep, Operator, SequenceHeader, control_map
-from coldloop.registers.safety import Alarm, AlarmKind
+from coldloop.registers.safety import Alarm, alarms_of
 from coldloop.safety.retained import RetainedFile, RetainedStateError
 from coldloop.safety.retained_writer import RetainedStateWriter
 from coldloop.safety.sequence import InputSequence, checksum
@@ -62,10 +62,12 @@ class RetainedControlState(ProcessSettings):
     operator: Operator
     watchdog: Annotated[int, Field(ge=0, lt=2**16)]
     """Time-out of the optimiser's watchdog, in ticks."""
-    alarms: Annotated[list[Alarm], Field(min_length=len(AlarmKind), max_length=len(AlarmKind))]
+    alarms: list[Alarm]
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
+        if len(self.alarms) != len(alarms_of(self.process)):
+            raise ValueError(f"{len(self.alarms)} alarms of {len(alarms_of(self.process))}")
         registers = control_map(self.process)
         for record in (SessionPace.shown(self.session, self.pace), self.operator, *self.alarms):
             check_record(record, registers)

@@ -105,7 +105,7 @@ class Commanding:
         if isinstance(operator, web.Response) or self._desk is None:
             return operator if isinstance(operator, web.Response) else refusal(409, "a recorded run takes no commands")
         try:
-            command = read_command(await _document(request))
+            command = read_command(await _document(request), self._desk.process)
             preview = await self._desk.prepare(command, operator.user.name)
         except (UsageError, LinkError) as error:
             self._refuse(request, str(error))

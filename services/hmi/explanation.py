@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.declaration import Process
 from coldloop.process.updating_periods import ComputingTimes
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization, UpdatingRuleKind, UpdatingRuleStatus
@@ -107,6 +107,8 @@ class Explanation:
     spare_s: float
     """How much longer the period is than that of q: answers have been late."""
     period_before_s: float | None
+    elapsed_s: float | None
+    """Of the period before, until this one began."""
     period_s: float
     increments: Increments | None
     alternatives: tuple[Alternative, ...]
@@ -118,8 +120,9 @@ class Explanation:
 
 
 def explain(
-    update: Optimization, before: Optimization | None, after: Optimization | None, rule: UpdatingRuleStatus
-) -> Explanation:
+    update: Optimization, before: Optimization | None, after: Optimization | None, rule: UpdatingRuleStatus,
+    process: Process,
+) -> Explanation:  # fmt: skip
     """Explain the updating period that begins with `update`.
 
     Args:
@@ -127,11 +130,13 @@ def explain(
         before: The one recorded before it.
         after: The one recorded after it.
         rule: What decides the updating period.
+        process: Whose ticks they are.
     """
+    tick_s = process.tick_s
     if before is not None and before.update + 1 != update.update:
         before = None
     branch = _branch(update, before, rule)
-    times = ComputingTimes(rule.slots, rule.preparation, rule.iteration, TICK_S, TICKS_PER_SAMPLE)
+    times = ComputingTimes(rule.slots, rule.preparation, rule.iteration, tick_s, process.ticks_per_sample)
     n_before = times.iterations(times.period(before.q)) if before is not None else 0
     increments = increments_of(update, n_before) if branch in DECIDED and before is not None else None
     needed = update.tau_u if branch is Branch.FIXED else times.period(update.q)
@@ -141,12 +146,13 @@ def explain(
         branch=branch,
         q_before=before.q if before is not None else None,
         q=update.q,
-        spare_s=(update.tau_u - needed) * TICK_S,
-        period_before_s=before.tau_u * TICK_S if before is not None else None,
-        period_s=update.tau_u * TICK_S,
+        spare_s=(update.tau_u - needed) * tick_s,
+        period_before_s=before.tau_u * tick_s if before is not None else None,
+        elapsed_s=(update.tick - before.tick) * tick_s if before is not None else None,
+        period_s=update.tau_u * tick_s,
         increments=increments,
         alternatives=_alternatives(update, before.q, increments, rule.delta, times) if increments and before else (),
-        budget=budget_of(update, rule),
+        budget=budget_of(update, rule, tick_s),
         predicted=update.j_delivered,
         came=after.j_effective if after is not None and after.update == update.update + 1 else None,
     )
@@ -172,10 +178,10 @@ def increments_of(update: Optimization, iterations_before: int) -> Increments | 
     return Increments(dD, dE if abs(dE) * iterations_before > RESOLUTION else 0.0, dK)
 
 
-def budget_of(update: Optimization, rule: UpdatingRuleStatus) -> Budget:
+def budget_of(update: Optimization, rule: UpdatingRuleStatus, tick_s: float) -> Budget:
     """Return how the PLC spends the period."""
     answer = rule.preparation + update.iterations * rule.iteration
-    return Budget(rule.preparation, answer, update.tau_u * TICK_S, update.iterations, rule.iteration)
+    return Budget(rule.preparation, answer, update.tau_u * tick_s, update.iterations, rule.iteration)
 
 
 def _branch(update: Optimization, before: Optimization | None, rule: UpdatingRuleStatus) -> Branch:
@@ -230,5 +236,5 @@ def _alternatives(
         n = times.iterations(period)
         K = update.contraction + (n - n_before) * increments.contraction
         response = -n * times.iteration / math.log(K) if 0.0 < K < 1.0 else None
-        found.append(Alternative(q, n, period * TICK_S, K, response))
+        found.append(Alternative(q, n, period * times.tick_s, K, response))
     return tuple(found)

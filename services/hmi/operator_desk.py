@@ -27,7 +27,6 @@ from coldloop.operating.execution import (
     connected,
     reason_of,
 )
-from coldloop.process.signals import INPUT_NAMES, TICK_S
 from coldloop.registers.common import SessionPace
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import AlarmAction
@@ -92,6 +91,7 @@ class OperatorDesk:
     ) -> None:
         self._endpoints = endpoints
         self._model = model
+        self.process = model.process
         self._now = now
         self._training = training
         self._prepared: OrderedDict[str, Prepared] = OrderedDict()
@@ -123,8 +123,8 @@ class OperatorDesk:
         if isinstance(command, FaultSensor) and not self._training:
             raise UsageError("sensor faults are offered only where hmi.training is switched on")
         if isinstance(command, SetSetpoint):
-            place, limits = INPUT_NAMES.index(command.input), self._model.limits
-            low, high = limits.input_low[place], limits.input_high[place]
+            limits = self._model.limits
+            low, high = limits.input_low[command.place], limits.input_high[command.place]
             if high > low:  # they are known
                 check_bounds(command, low, high)
 
@@ -134,7 +134,7 @@ class OperatorDesk:
             return self._by_the_clock(command.time_s)
         load = self._model.record("plant", LoadStatus)
         if isinstance(command, SetLoad | PlayLoad) and load and load.upcoming:
-            until = clock_text(load.last_tick * TICK_S)
+            until = clock_text(load.last_tick * self.process.tick_s)
             steps = f"{load.upcoming} steps" if load.upcoming > 1 else "step"
             return f"; the {steps} of the load still to come, until {until}, will be dropped"
         return ""
@@ -195,6 +195,5 @@ class OperatorDesk:
             return CommandResult(asked, refused_because=reason_of(error))
 
     def _clients(self, services: Iterable[str]) -> dict[str, CommandClient]:
-        return clients_of(
-            {service: self._endpoints[service].model_copy(update={"timeout_s": TIMEOUT_S}) for service in services}
-        )
+        ends = {service: self._endpoints[service].model_copy(update={"timeout_s": TIMEOUT_S}) for service in services}
+        return clients_of(ends, self.process)

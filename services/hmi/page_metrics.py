@@ -4,8 +4,7 @@ from collections.abc import Iterator
 
 from prometheus_client.core import Metric
 
-from coldloop.process.signals import OUTPUT_NAMES
-from coldloop.registers.maps import MAPS, OPTIMIZER_MAP
+from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.service.event_text import alarm_word
 from coldloop.service.metrics import block_families, build_family, gauge
@@ -16,14 +15,14 @@ from hmi.quality import RAW, Quality, qualities
 def page_families(model: Model, browsers: int) -> Iterator[Metric]:
     """Yield everything; of a service that is silent only that it is."""
     yield build_family()
-    live = [service for service in MAPS if model.is_live(service)]
-    up = {service: service in live for service in MAPS}
+    live = [service for service in model.maps if model.is_live(service)]
+    up = {service: service in live for service in model.maps}
     yield gauge("coldloop_up", "1 while a service answers the page", up, label="service")
-    ages = {service: age for service in MAPS if (age := model.age_s(service)) is not None}
+    ages = {service: age for service in model.maps if (age := model.age_s(service)) is not None}
     yield gauge("coldloop_age_seconds", "Time since the last answer of a service", ages, label="service")
     yield gauge("coldloop_page_browsers", "Streams to browsers", browsers)
     for service in live:
-        for block in MAPS[service].blocks:
+        for block in model.maps[service].blocks:
             record = model.sources[service].records.get(block.name)
             if record is not None and block.writer is None:
                 yield from block_families(service, block, record)
@@ -31,13 +30,15 @@ def page_families(model: Model, browsers: int) -> Iterator[Metric]:
     if "control_plc" in live:
         yield from _alarms(model)
     if "optimizer_plc" in live and model.updates:
-        yield from _update(model.updates[-1])
+        yield from _update(model.updates[-1], model.maps["optimizer_plc"])
 
 
 def _qualities(model: Model, live: list[str]) -> Metric:
     """Return the quality of the outputs, wherever they are read, and of the last update, as page and API have them."""
-    found, places = qualities(model.doubts, model.stale_prefixes()), ("control_plc.process.y.", *RAW)
-    names = [f"{place}{name}" for place in places if place.partition(".")[0] in live for name in OUTPUT_NAMES]
+    found, places = qualities(model.doubts, model.stale_prefixes(), model.process), ("control_plc.process.y.", *RAW)
+    names = [
+        f"{place}{name}" for place in places if place.partition(".")[0] in live for name in model.process.output_names
+    ]
     if "optimizer_plc" in live and model.updates:
         names.append("update")
     worst = dict.fromkeys(names, 0)
@@ -54,7 +55,7 @@ def _qualities(model: Model, live: list[str]) -> Metric:
 
 
 def _alarms(model: Model) -> Iterator[Metric]:
-    rows = [(alarm_word(kind), alarm) for kind, alarm in model.alarm_rows()]
+    rows = [(alarm_word(kind, model.process), alarm) for kind, alarm in model.alarm_rows()]
     for name, description, values in (
         ("coldloop_alarm_active", "1 while the condition of an alarm holds", [row.active for _, row in rows]),
         ("coldloop_alarm_state",
@@ -65,7 +66,7 @@ def _alarms(model: Model) -> Iterator[Metric]:
         yield gauge(name, description, dict(zip([alarm for alarm, _ in rows], values, strict=True)), label="alarm")
 
 
-def _update(update: Optimization) -> Iterator[Metric]:
-    for (name, field), value in zip(OPTIMIZER_MAP.block_of(Optimization).fields.items(), update, strict=True):
+def _update(update: Optimization, of: RegisterMap) -> Iterator[Metric]:
+    for (name, field), value in zip(of.block_of(Optimization).fields.items(), update, strict=True):
         unit = f" ({field.unit})" if field.unit else ""
         yield gauge(f"coldloop_update_{name}", f"Last update: {field.description}{unit}", value)

@@ -10,15 +10,13 @@ from coldloop.errors import DamagedAnswerError, LinkError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.endpoints import Endpoint
 from coldloop.operating.rings import last_update, read_ring
-from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.audit import EVENT_ROWS, Event, JournalPage
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.configuration import ConfigurationDigest, ConfigurationLine, configuration_of, lines_of
 from coldloop.registers.control_plc import LadderStatus, Operator, PlantLinkStatus, ProcessNow, Status
-from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, ControlLinkStatus, Optimization, Prediction
 from coldloop.registers.plant import LoadStatus, SensorFault, StationStatus
-from coldloop.registers.safety import Alarm, AlarmKind
+from coldloop.registers.safety import Alarm, alarms_of
 from hmi.compression_station import KIND, REFRIGERATOR
 from hmi.process_image import JournalEntry, Model
 from hmi.signals import shown_blocks
@@ -54,8 +52,8 @@ class Poller:
         self._service = service
         self._model = model
         self._poll_s = poll_s
-        self._client = RegisterClient.at(MAPS[service], endpoint)
-        self._slow = [block.record for block in shown_blocks(MAPS[service]) if block.record not in FAST[service]]
+        self._client = RegisterClient.at(model.maps[service], endpoint)
+        self._slow = [block.record for block in shown_blocks(model.maps[service]) if block.record not in FAST[service]]
         self._slow_at = 0.0
         self._alarms_at = 0.0
         self._next_event = 0
@@ -112,7 +110,7 @@ class Poller:
         now = time.monotonic()
         if service == "control_plc" and now - self._alarms_at >= ALARMS_S:
             self._alarms_at = now
-            model.put_alarms(await self._client.read_rows(Alarm, 0, len(AlarmKind)))
+            model.put_alarms(await self._client.read_rows(Alarm, 0, len(alarms_of(self._client.process))))
         if now - self._slow_at >= SLOW_S:
             self._slow_at = now
             await self._read_slow()
@@ -129,7 +127,7 @@ class Poller:
         if self._service == "plant":
             await self._read_configuration()
             with suppress(RequestRefusedError):  # a plant without sensor faults
-                faults = await self._client.read_rows(SensorFault, 0, len(OUTPUT_NAMES))
+                faults = await self._client.read_rows(SensorFault, 0, len(self._model.process.outputs))
                 self._model.faulty_sensors = sum(bool(fault.kind) << i for i, fault in enumerate(faults))
 
     async def _read_configuration(self) -> None:
@@ -176,5 +174,5 @@ class Poller:
         rows = await read_ring(self._client, Event, EVENT_ROWS, first, page.newest)
         news = sorted(row for row in rows if first <= row.number <= page.newest)
         self._last_event = news[-1] if news else self._last_event
-        self._model.put_events(JournalEntry.of(self._service, row) for row in news)
+        self._model.put_events(JournalEntry.of(self._service, row, self._model.process) for row in news)
         self._next_event = page.newest + 1

@@ -3,8 +3,6 @@
 from coldloop.number_text import value_text
 from coldloop.operating import commands
 from coldloop.operating.execution import Clients, check_manual
-from coldloop.process.load_profile import LOAD_UNIT, LOAD_WORD
-from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Mode, Operator, OperatorMode
 from coldloop.registers.plant import LoadStatus
@@ -28,12 +26,12 @@ async def read_premises(clients: Clients, command: commands.Command) -> Premises
             found["operator's mode"] = word_of(OperatorMode, (await clients["control_plc"].read(Operator)).mode)
             found["active"] = word_of(Mode, Mode.MPC if mode == Mode.REST else mode)  # between two sequences
         case commands.SetSetpoint():
-            place, operator = INPUT_NAMES.index(command.input), await check_manual(clients["control_plc"])
-            found[f"setpoint of {command.input}"] = value_text(operator.u[place], INPUT_UNITS[place])
+            operator = await check_manual(clients["control_plc"])
+            found[f"setpoint of {command.input}"] = value_text(operator.u[command.place], command.unit)
         case commands.SetLoad() | commands.PlayLoad():
-            load = await clients["plant"].read(LoadStatus)
-            until = f"changing until {commands.clock_text(load.last_tick * TICK_S)}"  # by itself
-            found[LOAD_WORD] = until if load.upcoming else value_text(load.watts, LOAD_UNIT)
+            load, process = await clients["plant"].read(LoadStatus), command.process
+            until = f"changing until {commands.clock_text(load.last_tick * process.tick_s)}"  # by itself
+            found[process.load.title] = until if load.upcoming else value_text(load.watts, process.load.unit)
         case commands.SetFactor() | commands.SetPaused():
             pace = await clients["plant"].read(SessionPace)
             running = f"{'paused, ' if pace.paused else ''}factor {value_text(pace.factor)}"

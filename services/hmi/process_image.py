@@ -9,19 +9,19 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, TypeVar, cast
 
-from coldloop.process.signals import TICK_S
+from coldloop.process.declaration import Process
 from coldloop.registers.audit import Event
 from coldloop.registers.codec import blank
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Mode, Plan, ProcessNow
-from coldloop.registers.maps import MAPS
+from coldloop.registers.maps import maps_of
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Prediction, UpdatingRuleStatus
 from coldloop.registers.plant import StationStatus
-from coldloop.registers.safety import Alarm, AlarmKind
+from coldloop.registers.safety import Alarm
 from coldloop.service.event_text import EventText, describe, utc_text
 from hmi.quality import Doubts
 from hmi.signals import values_of
-from hmi.trends import NO_STATION, TrendStore, station_values
+from hmi.trends import TrendStore
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
@@ -43,9 +43,9 @@ class JournalEntry(NamedTuple):
     text: EventText
 
     @classmethod
-    def of(cls, service: str, event: Event) -> "JournalEntry":
+    def of(cls, service: str, event: Event, process: Process) -> "JournalEntry":
         """Return an event of a journal."""
-        return cls(service, event.number, event.boot, utc_text(event), event.tick, describe(event))
+        return cls(service, event.number, event.boot, utc_text(event), event.tick, describe(event, process))
 
 
 def _same(one: Any, other: Any) -> bool:  # noqa: ANN401 a value of any register
@@ -76,14 +76,17 @@ class Model:
     """What the page knows of one rig.
 
     Args:
+        process: Which process it has.
         now: Monotonic clock, s.
         kept_s: How much of the trends is kept, s of plant time.
     """
 
-    def __init__(self, now: Callable[[], float], kept_s: float) -> None:
+    def __init__(self, process: Process, now: Callable[[], float], kept_s: float) -> None:
+        self.process = process
+        self.maps = maps_of(process).by_service
         self.now = now
-        self.sources = {service: Source() for service in MAPS}
-        self.trends = TrendStore(kept_s)
+        self.sources = {service: Source() for service in self.maps}
+        self.trends = TrendStore(process, kept_s)
         self.updates: deque[Optimization] = deque(maxlen=UPDATES_KEPT)
         self.predictions: deque[Prediction] = deque(maxlen=PREDICTIONS_KEPT)
         self.alarms: list[Alarm] = []
@@ -110,7 +113,7 @@ class Model:
 
     def put(self, service: str, record: tuple[Any, ...]) -> None:
         """Take a record of a service."""
-        block = MAPS[service].block_of(type(record))
+        block = self.maps[service].block_of(type(record))
         source = self.sources[service]
         if source.records.get(block.name) == record:
             return
@@ -126,8 +129,8 @@ class Model:
             source.was_silent = False
             self._moved(source, record.tick)
             station = self.record("plant", StationStatus)
-            values = station_values(station.signals) if station else NO_STATION
-            self.trends.add(record, self.mode, self.doubts, values, is_after_gap=is_after_gap)
+            signals = station.signals if station else ()
+            self.trends.add(record, self.mode, self.doubts, signals, is_after_gap=is_after_gap)
         elif isinstance(record, Prediction):
             self._predicted(record)
         elif isinstance(record, SessionPace):  # from now on ticks follow another clock
@@ -199,7 +202,7 @@ class Model:
 
     def record(self, service: str, kind: type[R]) -> R | None:
         """Return the newest record of a kind; None when none has been read."""
-        return cast("R | None", self.sources[service].records.get(MAPS[service].block_of(kind).name))
+        return cast("R | None", self.sources[service].records.get(self.maps[service].block_of(kind).name))
 
     @property
     def values(self) -> Mapping[str, float | int | str]:
@@ -229,7 +232,7 @@ class Model:
     @property
     def limits(self) -> OperatingLimits:
         """Bands, bounds and rates."""
-        return self.record("optimizer_plc", OperatingLimits) or blank(OperatingLimits, MAPS["optimizer_plc"])
+        return self.record("optimizer_plc", OperatingLimits) or blank(OperatingLimits, self.maps["optimizer_plc"])
 
     @property
     def tick(self) -> int:
@@ -252,7 +255,7 @@ class Model:
         pace = self.record("plant", SessionPace)
         if pace is None or not pace.realtime or pace.paused or not pace.session or not pace.factor > 0:
             return False
-        patience = max(STALE_S, 3 * TICK_S / pace.factor)
+        patience = max(STALE_S, 3 * self.process.tick_s / pace.factor)
         return self.now() - self.sources[service].moved > patience
 
     def stale_prefixes(self) -> list[str]:
@@ -260,7 +263,7 @@ class Model:
 
         `update` is the newest updating period: it has no say while something else than MPC drives.
         """
-        stale = [f"{service}." for service in MAPS if not self.is_live(service)]
+        stale = [f"{service}." for service in self.maps if not self.is_live(service)]
         identity = self.record("control_plc", Identity)
         is_looking = identity is not None and not identity.session  # for its session: nothing is measured
         if self.is_live("control_plc") and (is_looking or self.is_stopped("control_plc")):
@@ -276,9 +279,9 @@ class Model:
         """Whether the newest prediction is played: the optimiser is heard, and its sequence drives the outputs."""
         return self.mode == Mode.MPC and self.is_live("control_plc") and self.is_live("optimizer_plc")
 
-    def alarm_rows(self) -> list[tuple[AlarmKind, Alarm]]:
+    def alarm_rows(self) -> list[tuple[int, Alarm]]:
         """Return the alarms with their kinds."""
-        return list(zip(AlarmKind, self.alarms, strict=False))
+        return list(enumerate(self.alarms))
 
 
 STEP_BACK: Final = 20

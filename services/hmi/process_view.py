@@ -1,12 +1,9 @@
-"""What the page shows of the process that it is loaded with: its signals, and from where to where their bars go."""
+"""What the page shows of its process: its signals, and from where to where their bars go."""
 
 import math
 from typing import Any, Final
 
-from coldloop.process.declaration import Input, Output, Range
-from coldloop.process.load_profile import LOAD_UNIT, LOAD_WORD
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import SAMPLING_PERIOD_S
+from coldloop.process.declaration import Input, Output, Process, Range
 
 BESIDE_BAND: Final = 1.5
 """What a bar shows beside a band, on each side, over the width of the band."""
@@ -16,23 +13,23 @@ READABLE: Final = 1e-3
 """Share of a range that is worth a digit."""
 
 
-def process_document() -> dict[str, Any]:
+def process_document(process: Process) -> dict[str, Any]:
     """Return the process as the page is told: bars of signals with their ends, words and unit of the load, if any."""
-    span = PROCESS.load.span
-    load = {"word": LOAD_WORD, "unit": LOAD_UNIT, "span": span, "bar": PROCESS.load.bar or span}
+    load = process.load
+    shown = {"word": load.title, "unit": load.unit, "span": load.span, "bar": load.bar or load.span}
     return {
-        "name": PROCESS.name,
-        "mimic": PROCESS.shipped_mimic or ("mimic.svg" if PROCESS.mimic else None),
-        "sample_s": SAMPLING_PERIOD_S,
+        "name": process.name,
+        "mimic": process.shipped_mimic or ("mimic.svg" if process.mimic else None),
+        "sample_s": process.sampling_period_s,
         "inputs": [
             {"name": one.name, "label": one.name[: len(one.register)], "register": one.register, "unit": one.unit,
              "bounds": [one.low, one.high], "bar": one.bar or _input_bar(one)}
-            for one in PROCESS.inputs
+            for one in process.inputs
         ],
-        "controlled": [_output(one) for one in PROCESS.banded],
-        "measured": [_output(one) for one in PROCESS.outputs if one.band is None and one.range[0] < one.range[1]],
-        "load": load if PROCESS.has_load else None,
-        "disturbances": [_output(one) for one in PROCESS.measured_disturbances],
+        "controlled": [_output(one) for one in process.banded],
+        "measured": [_output(one) for one in process.outputs if one.band is None and one.range[0] < one.range[1]],
+        "load": shown if process.has_load else None,
+        "disturbances": [_output(one) for one in process.measured_disturbances],
     }  # fmt: skip
 
 
@@ -60,16 +57,16 @@ def _widened(low: float, high: float, share: float) -> Range:
     return low - share * (high - low), high + share * (high - low)
 
 
-def decimals_by_unit() -> dict[str, int]:
+def decimals_by_unit(process: Process) -> dict[str, int]:
     """Return how many digits after the point values with the units of the process are shown with.
 
     The last digit is the noise of an output, and a tenth of the largest move of an input in a sampling period.
     """
-    low, high = PROCESS.load.span
-    steps = [(LOAD_UNIT, READABLE * (high - low)), *((one.unit, one.rate / 10) for one in PROCESS.inputs)]
-    steps += [(one.unit, one.noise) for one in PROCESS.outputs]
+    low, high = process.load.span
+    steps = [(process.load.unit, READABLE * (high - low)), *((one.unit, one.rate / 10) for one in process.inputs)]
+    steps += [(one.unit, one.noise) for one in process.outputs]
     found: dict[str, int] = {}
     for unit, step in steps:
-        if unit not in PROCESS.decimals:
+        if unit not in process.decimals:
             found[unit] = max(found.get(unit, 0), math.ceil(-math.log10(step)))
-    return found | dict(PROCESS.decimals)
+    return found | dict(process.decimals)

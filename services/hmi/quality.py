@@ -2,11 +2,11 @@
 
 from collections.abc import Iterable, Mapping
 from enum import StrEnum
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import NamedTuple
 
-from coldloop.process.signals import OUTPUT_NAMES
-from coldloop.registers.maps import MAPS
+from coldloop.process.declaration import Process
+from coldloop.registers.maps import maps_of
 from hmi.signals import signals_of
 
 
@@ -34,10 +34,9 @@ class Doubts(NamedTuple):
     bad: int = 0
     simulated: int = 0
 
-    @property
-    def named(self) -> dict[str, Quality]:
-        """The outputs in doubt, and the worst quality of each."""
-        return _named(self)
+    def named(self, process: Process) -> dict[str, Quality]:
+        """Return the outputs in doubt, and the worst quality of each."""
+        return _named(self, process)
 
 
 _DOUBTED = (Quality.SUSPECT, Quality.HELD, Quality.BAD, Quality.SIMULATED)
@@ -45,28 +44,31 @@ SOUND = Doubts()
 
 
 @lru_cache(256)  # those of successive samples are the same
-def _named(doubts: Doubts) -> dict[str, Quality]:
+def _named(doubts: Doubts, process: Process) -> dict[str, Quality]:
     every = zip(_DOUBTED, doubts, strict=True)
-    return {name: quality for quality, bits in every for i, name in enumerate(OUTPUT_NAMES) if bits >> i & 1}
+    return {name: quality for quality, bits in every for i, name in enumerate(process.output_names) if bits >> i & 1}
 
 
 RAW = ("plant.measurement.y.", "control_plc.update.y.")  # have a bad reading as it is; elsewhere it is replaced
 
-_SIMULATED = {
-    f"{one.name.rpartition('.')[0]}." for each in MAPS for one in signals_of(each) if "Simulated" in one.description
-}
+
+@cache
+def _simulated(process: Process) -> frozenset[str]:
+    signals = (one for each in maps_of(process) for one in signals_of(each))
+    return frozenset(f"{one.name.rpartition('.')[0]}." for one in signals if "Simulated" in one.description)
 
 
-def qualities(doubts: Doubts, stale: Iterable[str]) -> Mapping[str, Quality]:
+def qualities(doubts: Doubts, stale: Iterable[str], process: Process) -> Mapping[str, Quality]:
     """Return the quality of all signals that are not good, by name; a name that ends with a dot is a beginning.
 
     Args:
         doubts: Of the outputs.
         stale: Names of what is not current.
+        process: Of which they are.
     """
     found = [(name, Quality.STALE) for name in stale]
-    for name, quality in doubts.named.items():
+    for name, quality in doubts.named(process).items():
         found.append((f"control_plc.process.y.{name}", quality))
         found += [(f"{raw}{name}", Quality.BAD if quality is Quality.HELD else quality) for raw in RAW]
-    found += [(name, Quality.SIMULATED) for name in _SIMULATED]
+    found += [(name, Quality.SIMULATED) for name in _simulated(process)]
     return dict(sorted(found, key=lambda one: list(Quality).index(one[1])))

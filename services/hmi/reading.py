@@ -11,8 +11,6 @@ from typing import Final
 
 from aiohttp import BasicAuth, hdrs, web
 
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import INPUT_NAMES, TICK_S
 from coldloop.service.metrics import exposition
 from coldloop.service.metrics_server import CONTENT_TYPE
 from hmi.assets import JSON, StreamCompression, compressed_answer, html_file, kept_answer, static_files, takes_gzip
@@ -32,13 +30,11 @@ from hmi.long_reads import LongReads
 from hmi.page_metrics import page_families
 from hmi.process_image import JournalEntry, Model
 from hmi.settings import HmiSection
-from hmi.trends import NAMES, STATION_NAMES
 
-BANDED: Final = tuple(one.name for one in PROCESS.banded)
 POINTS: Final = 800
 MOST_POINTS: Final = 4000
-MOST_NAMES: Final = 9 + sum(map(len, (PROCESS.disturbances, INPUT_NAMES, PROCESS.banded, STATION_NAMES)))
-"""Signals of one trend: what the page draws without being asked, and eight pens."""
+PENS: Final = 8
+"""Signals of one trend beside those that the page draws without being asked."""
 ROWS_AT_ONCE: Final = 500
 """Rows of a table that are made and sent at a time."""
 WINDOW_S: Final = 300.0
@@ -65,8 +61,12 @@ class Reading:
         self._model = model
         self._broadcast = broadcast
         self._guard = guard
+        process = model.process
+        self._tick_s = process.tick_s
+        drawn = (process.disturbances, process.inputs, process.banded, model.trends.station_names)
+        self._most_names = PENS + 1 + sum(map(len, drawn))
         self._long_reads = LongReads(time.monotonic)
-        self._catalog = encoded(catalog(training=settings.training and not replay, replay=replay))
+        self._catalog = encoded(catalog(model, training=settings.training and not replay, replay=replay))
         self._trends: dict[tuple[object, ...], bytes] = {}
 
     def routes(self) -> list[web.AbstractRouteDef]:
@@ -90,7 +90,7 @@ class Reading:
 
     async def mimic(self, _request: web.Request) -> web.Response:
         """Answer with the drawing that the process brings; those of the cold box are static files."""
-        answer = web.Response(text=PROCESS.mimic, content_type="image/svg+xml")
+        answer = web.Response(text=self._model.process.mimic, content_type="image/svg+xml")
         add_headers(answer)
         return answer
 
@@ -130,17 +130,17 @@ class Reading:
             HTTPBadRequest: They are not numbers, or there is no such signal.
         """
         asked = [name for name in query.get("names", "").split(",") if name]
-        names = list(dict.fromkeys(asked or (*BANDED, "load")))
-        unknown = [name for name in names if name not in NAMES]
+        names = list(dict.fromkeys(asked or (*(one.name for one in self._model.process.banded), "load")))
+        unknown = [name for name in names if name not in self._model.trends.names]
         if unknown:
             raise web.HTTPBadRequest(reason=f"unknown trend {printable(unknown[0])}")
-        if len(names) > MOST_NAMES:
-            raise web.HTTPBadRequest(reason=f"a trend has at most {MOST_NAMES} signals, not {len(names)}")
+        if len(names) > self._most_names:
+            raise web.HTTPBadRequest(reason=f"a trend has at most {self._most_names} signals, not {len(names)}")
         try:
             seconds = min(float(query.get("seconds", WINDOW_S)), self._settings.kept_s)
-            end = round(float(query["end"]) / TICK_S) if "end" in query else self._model.tick
+            end = round(float(query["end"]) / self._tick_s) if "end" in query else self._model.tick
             points = max(10, min(int(query.get("points", POINTS)), MOST_POINTS))
-            return names, end - round(seconds / TICK_S), end, points
+            return names, end - round(seconds / self._tick_s), end, points
         except (ValueError, OverflowError):
             raise web.HTTPBadRequest(reason="seconds, end and points must be numbers") from None
 
@@ -195,16 +195,20 @@ class Reading:
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         for row, *values in zip(rows, *(trends.column(name, rows) for name in names), strict=True):
-            doubts = " ".join(f"{name}={one}" for name, one in trends.doubts_at(row).named.items() if name in names)
+            doubts = " ".join(
+                f"{name}={one}"
+                for name, one in trends.doubts_at(row).named(self._model.process).items()
+                if name in names
+            )
             numbers = ("" if math.isnan(value) else f"{value:.7g}" for value in values)
-            writer.writerow([trends.ticks[row] * TICK_S, *numbers, doubts])
+            writer.writerow([trends.ticks[row] * self._tick_s, *numbers, doubts])
         return text.getvalue().encode(), following
 
     async def explanation(self, request: web.Request) -> web.Response:
         """Answer with the explanation of an updating period."""
         number, at = request.query.get("update", ""), request.query.get("at", "")
         try:
-            at_tick = round(float(at) / TICK_S) if at else None
+            at_tick = round(float(at) / self._tick_s) if at else None
             document = explanation_document(self._model, int(number) if number else None, at_tick)
         except (ValueError, OverflowError):
             raise web.HTTPBadRequest(reason="update and at must be numbers") from None
@@ -230,7 +234,7 @@ class Reading:
             raise web.HTTPBadRequest(reason="from and to must be times in s") from None
         found = []
         for entry in reversed(self._model.events):
-            if (service and entry.service != service) or not first <= entry.tick * TICK_S <= last:
+            if (service and entry.service != service) or not first <= entry.tick * self._tick_s <= last:
                 continue
             if not wanted or wanted in f"{entry.text.sentence} {entry.utc} {entry.service}".lower():
                 found.append(entry)
@@ -244,7 +248,7 @@ class Reading:
             raise web.HTTPBadRequest(reason="page must be a whole number") from None
         async with self._turn(request):
             found = self._events(request.query)
-            shown = [*map(event_document, found[start : start + EVENTS_SHOWN])]
+            shown = [*(event_document(one, self._tick_s) for one in found[start : start + EVENTS_SHOWN])]
             pages = -(-len(found) // EVENTS_SHOWN)
             document = encoded({"found": len(found), "first": start + 1, "pages": pages, "events": shown})
             return compressed_answer(request, document)
@@ -262,7 +266,7 @@ class Reading:
         writer = csv.DictWriter(text, names, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         for entry in found:
-            row = event_document(entry)
+            row = event_document(entry, self._tick_s)
             writer.writerow({name: safe_cell(row[name]) for name in names})
         return web.Response(body=text.getvalue().encode(), headers=csv_headers("coldloop-events.csv"))
 

@@ -10,11 +10,10 @@ from typing import Any, Final, NamedTuple, Protocol
 from aiohttp import web
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from coldloop.process.signals import TICK_S
+from coldloop.process.declaration import Process
 from coldloop.process.station import STATION_VALVE_NAMES
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, ProcessNow
-from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, UpdatingRuleStatus
 from coldloop.registers.plant import LoadStatus, StationSample, StationStatus
 from coldloop.registers.safety import Alarm
@@ -23,7 +22,6 @@ from hmi.page_server import PageServer, PageSite
 from hmi.process_image import JournalEntry, Model
 from hmi.quality import SOUND, Doubts
 from hmi.settings import HmiSection
-from hmi.trends import NO_STATION, station_values
 
 STEP_S: Final = 0.1
 MOST_AT_ONCE: Final = 400
@@ -43,11 +41,6 @@ class ReplayFrame(NamedTuple):
     station: StationSample | None = None
     """Of a whole refrigerator."""
 
-    @property
-    def pressures(self) -> tuple[float, ...]:
-        """What trends have of the station."""
-        return station_values(self.station.signals) if self.station else NO_STATION
-
 
 class RecordedRun(Protocol):
     """What a replay needs of a run."""
@@ -55,6 +48,10 @@ class RecordedRun(Protocol):
     @property
     def name(self) -> str:
         """Its name."""
+
+    @property
+    def process(self) -> Process:
+        """Its process."""
 
     @property
     def ticks(self) -> int:
@@ -109,7 +106,7 @@ class Replay:
     def __init__(self, run: RecordedRun, model: Model, kept_s: float) -> None:
         self._run = run
         self._model = model
-        self._kept_ticks = round(kept_s / TICK_S)
+        self._kept_ticks = round(kept_s / run.process.tick_s)
         self._playing = False
         self._speed = 20.0
         self._tick = -1
@@ -154,7 +151,7 @@ class Replay:
             if int(position) != self._tick:  # a user has moved the position
                 position = float(self._tick)
             if self._playing:
-                position = min(self._run.ticks - 1.0, position + (now - last) * self._speed / TICK_S)
+                position = min(self._run.ticks - 1.0, position + (now - last) * self._speed / self._run.process.tick_s)
                 self._advance(int(position))
                 self._playing = self._tick < self._run.ticks - 1
             last = now
@@ -191,7 +188,8 @@ class Replay:
         for each in (*range(before + 1, tick, every), tick):
             frame = run.frame(each)
             if frame is not None:
-                model.trends.add(frame.process, frame.mode, frame.doubts, frame.pressures, is_after_gap=self._in_gap)
+                station = frame.station.signals if frame.station else ()
+                model.trends.add(frame.process, frame.mode, frame.doubts, station, is_after_gap=self._in_gap)
                 newest = frame
             self._in_gap = frame is None
         self._tick = tick
@@ -214,7 +212,7 @@ class Replay:
             model.put("plant", StationStatus(*_of_status(frame.station), (math.nan,) * len(STATION_VALVE_NAMES)))
 
     def _show(self) -> None:
-        for service in MAPS:
+        for service in self._model.maps:
             self._model.put(service, Identity(session=1, tick=self._tick))
             self._model.heard(service)
         self._model.put("plant", SessionPace(1, 1, self._speed, int(not self._playing)))
@@ -235,7 +233,7 @@ async def serve_replays(runs: Sequence[RecordedRun], settings: HmiSection, annou
         PortInUseError: Another program listens there.
         ConfigurationError: A file of the settings cannot be used.
     """
-    models = [Model(time.monotonic, settings.kept_s) for _ in runs]
+    models = [Model(run.process, time.monotonic, settings.kept_s) for run in runs]
     replays = [Replay(run, model, settings.kept_s) for run, model in zip(runs, models, strict=True)]
     server = PageServer(settings, *(PageSite(m, None, r.routes()) for m, r in zip(models, replays, strict=True)))
     await server.start()

@@ -1,11 +1,11 @@
 """One sentence that explains the length of an updating period."""
 
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Final
 
 from coldloop.number_text import number_text
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, TICK_S
+from coldloop.process.declaration import Process
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ModelDeviation, UpdatingRuleStatus
 from coldloop.service.event_text import word_of
@@ -18,49 +18,46 @@ NOTABLE_SHARE: Final = 0.01
 """A plant that differs from its model by less than this share of the range of an input is not worth a word, ..."""
 NOTABLE_NOISE: Final = 5.0
 """... nor by less than so many times the noise of an output, where the process does not declare what is notable."""
-
-
-def _notable() -> tuple[float, ...]:
-    """Return what is worth a word, by input and output."""
-    usual = [(one.unit, NOTABLE_SHARE * (one.high - one.low)) for one in PROCESS.inputs]
-    usual += [(one.unit, NOTABLE_NOISE * one.noise) for one in PROCESS.outputs]
-    return tuple(PROCESS.notable.get(unit, value) for unit, value in usual)
-
-
-NOTABLE_DEVIATIONS: Final = _notable()
 MOST_DEVIATIONS: Final = 4
 SURPRISING: Final = 3.0
 """A reading that is so many times further from its prediction than the filter expects is worth a word."""
 
 
-def deviation(found: ModelDeviation, suspects: int = 0) -> str:
+@cache
+def _notable(process: Process) -> tuple[float, ...]:
+    """Return what is worth a word, by input and output."""
+    usual = [(one.unit, NOTABLE_SHARE * (one.high - one.low)) for one in process.inputs]
+    usual += [(one.unit, NOTABLE_NOISE * one.noise) for one in process.outputs]
+    return tuple(process.notable.get(unit, value) for unit, value in usual)
+
+
+def deviation(found: ModelDeviation, process: Process, suspects: int = 0) -> str:
     """Return how the plant differs from its model, without the load, the most notable first; empty where it agrees.
 
     Last come the reading that is furthest from what is predicted, if it is surprising: the model, or its sensor, is
     not what the filter takes it for; and those that are not used for that reason (bit i is output i); and inputs
     that have no effect (the bits after those).
     """
+    names = process.output_names
     parts = [
         (value, f"needs {number_text(abs(value), 3)} {unit} {'less' if value > 0 else 'more'} of {name}")
-        for name, unit, value in zip(INPUT_NAMES, INPUT_UNITS, found.u, strict=True)
+        for name, unit, value in zip(process.input_names, process.input_units, found.u, strict=True)
     ]
     parts += [
         (value, f"{name} {'+' if value > 0 else ''}{number_text(value, 3)} {unit}")
-        for name, unit, value in zip(OUTPUT_NAMES, OUTPUT_UNITS, found.y, strict=True)
+        for name, unit, value in zip(names, process.output_units, found.y, strict=True)
     ]
     notable = [
         (abs(value) / least, text)
-        for (value, text), least in zip(parts, NOTABLE_DEVIATIONS, strict=True)
+        for (value, text), least in zip(parts, _notable(process), strict=True)
         if abs(value) >= least
     ]
     texts = [text for _, text in sorted(notable, reverse=True)[:MOST_DEVIATIONS]]
-    surprise, name = max(zip(found.surprise, OUTPUT_NAMES, strict=True))
+    surprise, name = max(zip(found.surprise, names, strict=True))
     if surprise >= SURPRISING:
         texts.append(f"{name} {number_text(surprise, 2)} times further from its prediction than expected")
-    texts += [
-        f"{name} is not used: it contradicts the others" for i, name in enumerate(OUTPUT_NAMES) if suspects >> i & 1
-    ]
-    inputs = enumerate(INPUT_NAMES, len(OUTPUT_NAMES))
+    texts += [f"{name} is not used: it contradicts the others" for i, name in enumerate(names) if suspects >> i & 1]
+    inputs = enumerate(process.input_names, len(names))
     texts += [f"{name} is left where it is: it has no effect" for i, name in inputs if suspects >> i & 1]
     return ", ".join(texts)
 
@@ -113,9 +110,8 @@ def _unknown(found: Explanation, _rule: UpdatingRuleStatus) -> str:
 
 
 def _interrupted(found: Explanation, rule: UpdatingRuleStatus) -> str:
-    elapsed = (found.update.tick - found.before.tick) * TICK_S if found.before else 0.0
     return (
-        f"{_change(found)} because a load step ended the period before after {elapsed:g} s of "
+        f"{_change(found)} because a load step ended the period before after {found.elapsed_s:g} s of "
         f"{found.period_before_s:g} s: what was learned is discarded and q starts at {rule.q_first}."
     )
 

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validato
 
 from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT, Endpoint
 from coldloop.modbus.settings import TlsSettings
+from coldloop.process.settings import RootSettings
 
 PAGE_PORT = 8020
 PortNumber = Annotated[int, Field(ge=1, le=0xFFFF)]
@@ -132,9 +133,7 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-class HmiSettings(BaseModel):
-    """What the page reads of a configuration."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
+class HmiSettings(RootSettings):
+    """What the page reads of a configuration: the model file says of which process the rig is."""
 
     hmi: HmiSection = HmiSection()

@@ -8,14 +8,13 @@ from functools import cache
 from typing import Any, Final, NamedTuple
 
 from coldloop.registers.declaration import Block, Kind, RegisterMap
-from coldloop.registers.maps import MAPS
 from coldloop.registers.text import from_words
 from hmi.process_view import decimals_by_unit
 
 DECIMALS: Final = {
     "%": 2, "K": 3, "bar": 3, "W": 1, "s": 3, "ms": 2, "ppm": 1, "Pa": 0, "m3": 5, "g/s": 2, "kg": 2, "kW": 1,
-} | decimals_by_unit()  # fmt: skip
-"""Digits after the point: of PLCs, links, states and a refrigerator's station, and of the process, which come first."""
+}  # fmt: skip
+"""Digits after the point: of PLCs, links, states and a refrigerator's station. Those of the process come first."""
 DIGITS: Final = 7
 TICKS: Final = {"Tick": "time", "Ticks": "ticks"}
 """What a register counts whose description begins with this word."""
@@ -58,10 +57,11 @@ def _texts(block: Block) -> set[str]:
 
 
 @cache
-def signals_of(service: str) -> tuple[Signal, ...]:
+def signals_of(register_map: RegisterMap) -> tuple[Signal, ...]:
     """Return the signals of a service, in the order of their registers."""
     found: list[Signal] = []
-    for block in shown_blocks(MAPS[service]):
+    digits_of = DECIMALS | decimals_by_unit(register_map.process)
+    for block in shown_blocks(register_map):
         texts, seen = _texts(block), set[str]()
         for register in block.registers():
             field = register.name.partition(".")[0]
@@ -71,11 +71,11 @@ def signals_of(service: str) -> tuple[Signal, ...]:
             seen.add(label)
             floating = register.kind is Kind.F32
             has_scale = register.unit or label.startswith(("u.", "y."))  # others may be of any size
-            decimals = DECIMALS.get(register.unit) if floating and has_scale else None
+            decimals = digits_of.get(register.unit) if floating and has_scale else None
             found.append(
                 Signal(
-                    name=f"{service}.{block.name}.{label}", block=block.name, label=label, unit=register.unit,
-                    decimals=decimals, digits=DIGITS if floating and decimals is None else None,
+                    name=f"{register_map.service}.{block.name}.{label}", block=block.name, label=label,
+                    unit=register.unit, decimals=decimals, digits=DIGITS if floating and decimals is None else None,
                     counts=TICKS.get(register.description.partition(" ")[0], ""),
                     words={} if floating else words_in(register.description), description=register.description,
                     address=register.address, writer=register.writer.value if register.writer else "",

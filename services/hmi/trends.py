@@ -7,18 +7,13 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Final, NamedTuple
 
-from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, TICK_S
+from coldloop.process.declaration import Process
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.control_plc import Mode, ProcessNow
 from hmi.quality import SOUND, Doubts, Quality
 
-STATION_NAMES: Final = ("P12", "P11") if PROCESS.has_station else ()
+STATION_NAMES: Final = ("P12", "P11")
 """Signals of a refrigerator's station that are kept: high and low pressure."""
-NAMES: Final = ("load", *INPUT_NAMES, *OUTPUT_NAMES, "mode", *STATION_NAMES)
-"""Columns of the store; `mode` is that of the fail-safe ladder."""
-NO_STATION: Final = (math.nan,) * len(STATION_NAMES)
-_PLACES: Final = tuple(STATION_SIGNAL_NAMES.index(name) for name in STATION_NAMES)
 MOST_ROWS: Final = 65_536
 SPARE_ROWS: Final = 4096
 """Rows that are removed at a time, so that removing costs little."""
@@ -54,10 +49,16 @@ Columns = dict[str, list[float | None]]
 class TrendStore:
     """Samples of the process in the order of their ticks, at most `kept_s` of plant time of them."""
 
-    def __init__(self, kept_s: float) -> None:
-        self._kept_ticks = round(kept_s / TICK_S)
+    def __init__(self, process: Process, kept_s: float) -> None:
+        self._process = process
+        self._kept_ticks = round(kept_s / process.tick_s)
+        self.station_names = STATION_NAMES if process.has_station else ()
+        self.names = ("load", *process.input_names, *process.output_names, "mode", *self.station_names)
+        """Of its columns; `mode` is that of the fail-safe ladder."""
+        self._places = tuple(map(STATION_SIGNAL_NAMES.index, self.station_names))
+        self._no_station = [math.nan] * len(self._places)
         self.ticks = array("q")
-        self._columns: dict[str, array[float]] = {name: array("f") for name in NAMES}
+        self._columns: dict[str, array[float]] = {name: array("f") for name in self.names}
         self._doubts: list[Doubts] = []
         self._gaps: list[Gap] = []
 
@@ -76,7 +77,7 @@ class TrendStore:
             del column[:]
 
     def add(
-        self, process: ProcessNow, mode: int, doubts: Doubts = SOUND, station: tuple[float, ...] = NO_STATION, *,
+        self, process: ProcessNow, mode: int, doubts: Doubts = SOUND, station: Sequence[float] = (), *,
         is_after_gap: bool = False,
     ) -> None:  # fmt: skip
         """Add a sample; one that is not newer than the last one is left out.
@@ -85,7 +86,7 @@ class TrendStore:
             process: The sample.
             mode: Of the fail-safe ladder.
             doubts: Outputs whose readings are in doubt.
-            station: Values of the signals of `STATION_NAMES`.
+            station: Signals of a refrigerator's station; empty, or all 0, of a plant without.
             is_after_gap: Between the last sample and this one nothing could be read.
         """
         if process.tick <= self.last_tick:
@@ -94,8 +95,9 @@ class TrendStore:
             self._gaps.append(Gap(self.last_tick, process.tick))
         self.ticks.append(process.tick)
         self._doubts.append(doubts)
-        values = (process.load, *process.u, *process.y, float(mode), *station)
-        for name, value in zip(NAMES, values, strict=True):
+        kept = [station[place] for place in self._places] if any(station) else self._no_station
+        values = (process.load, *process.u, *process.y, float(mode), *kept)
+        for name, value in zip(self.names, values, strict=True):
             self._columns[name].append(value)
         self._trim()
 
@@ -127,19 +129,18 @@ class TrendStore:
         A longer stretch is reduced to the least and the largest value of each of `points / 2` intervals. Where a gap
         begins all columns have None.
         """
-        rows = self.between(start, end)
-        times = [tick * TICK_S for tick in self.ticks[rows.start : rows.stop]]
+        rows, tick_s = self.between(start, end), self._process.tick_s
+        times = [tick * tick_s for tick in self.ticks[rows.start : rows.stop]]
         columns = {name: self.column(name, rows) for name in names}
-        edges = [gap.end * TICK_S for gap in self.gaps(start, end)]
-        return thin(times, columns, points, edges)
+        return thin(times, columns, points, tick_s, [gap.end * tick_s for gap in self.gaps(start, end)])
 
     def modes(self, start: int, end: int) -> list[ModeInterval]:
         """Return the modes between two ticks, stretch by stretch."""
-        rows = self.between(start, end)
-        after_gap = {gap.end * TICK_S for gap in self.gaps(start, end)}
+        rows, tick_s = self.between(start, end), self._process.tick_s
+        after_gap = {gap.end * tick_s for gap in self.gaps(start, end)}
         found: list[ModeInterval] = []
         for tick, value in zip(self.ticks[rows.start : rows.stop], self.column("mode", rows), strict=True):
-            time, mode = tick * TICK_S, int(value)
+            time, mode = tick * tick_s, int(value)
             if found and time not in after_gap:
                 found[-1] = found[-1]._replace(end=time)
             if not found or found[-1].mode != mode or time in after_gap:
@@ -151,23 +152,23 @@ class TrendStore:
 
         Each lasts until the first sample of another quality, or a gap.
         """
-        rows = self.between(start, end)
+        rows, tick_s = self.between(start, end), self._process.tick_s
         after_gap = {gap.end for gap in self.gaps(start, end)}
         found: dict[str, list[Doubtful]] = {}
         before: dict[str, Quality] = {}
         last = 0
         for tick, doubts in zip(self.ticks[rows.start : rows.stop], self._doubts[rows.start : rows.stop], strict=True):
             if doubts != SOUND or before:
-                reach, now = (last + 1 if tick in after_gap else tick) * TICK_S, doubts.named
+                reach, now = (last + 1 if tick in after_gap else tick) * tick_s, doubts.named(self._process)
                 for name in before:
                     found[name][-1] = found[name][-1]._replace(end=reach)
                 for name, quality in now.items():
                     if before.get(name) != quality or tick in after_gap:
-                        found.setdefault(name, []).append(Doubtful(tick * TICK_S, tick * TICK_S, quality))
+                        found.setdefault(name, []).append(Doubtful(tick * tick_s, tick * tick_s, quality))
                 before = now
             last = tick
         for name in before:
-            found[name][-1] = found[name][-1]._replace(end=(last + 1) * TICK_S)
+            found[name][-1] = found[name][-1]._replace(end=(last + 1) * tick_s)
         return found
 
     def doubts_at(self, row: int) -> Doubts:
@@ -175,17 +176,13 @@ class TrendStore:
         return self._doubts[row]
 
 
-def station_values(signals: Sequence[float]) -> tuple[float, ...]:
-    """Return what is kept of the station's signals; nothing of a cold box alone, whose signals are all 0."""
-    return tuple(signals[place] for place in _PLACES) if any(signals) else NO_STATION
-
-
 def thin(
-    times: Sequence[float], columns: Mapping[str, Sequence[float]], points: int, edges: Sequence[float] = ()
-) -> tuple[list[float], Columns]:
+    times: Sequence[float], columns: Mapping[str, Sequence[float]], points: int, tick_s: float,
+    edges: Sequence[float] = (),
+) -> tuple[list[float], Columns]:  # fmt: skip
     """Reduce columns to the least and the largest value of each of `points / 2` intervals, if they are longer.
 
-    No interval reaches across one of the times `edges`, in order, that end a gap; where one begins there is None.
+    No interval reaches across one of the times `edges`, in order, that end a gap; a tick after it begins there is None.
     """
     cuts = [0, *(bisect_left(times, edge) for edge in edges), len(times)]
     found: list[float] = []
@@ -194,7 +191,7 @@ def thin(
         if first == end:
             continue
         if found:
-            found.append(found[-1] + TICK_S)
+            found.append(found[-1] + tick_s)
             for values in reduced.values():
                 values.append(None)
         share = max(2, points * (end - first) // len(times))

@@ -15,7 +15,6 @@ from coldloop.errors import LoadFileError
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile, read_load_file
-from coldloop.process.loaded import PROCESS
 
 SECOND_TICKS: Final = int(1.0 / COLD_BOX.tick_s)
 """Ticks of what is a second in the families below: of the cold box it is one."""
@@ -131,7 +130,7 @@ def _stretched(family: LoadFamily, name: str, mean: float, process: Process) -> 
     return family._replace(steps=tuple(scale * step for step in family.steps))
 
 
-def find_load(name: str, mean_w: float, process: Process = PROCESS) -> LoadProfile:
+def find_load(name: str, mean_w: float, process: Process) -> LoadProfile:
     """Return the load of a name or of a CSV file for a process.
 
     Raises:

@@ -24,6 +24,10 @@ from coldloop.parsing import MOST_LEVELS, TOO_DEEP, parsed_toml
 from coldloop.text_file import read_text
 
 PREFIX = "COLDLOOP__"
+MODEL_FILE: Final = "COLDLOOP__MODEL__FILE"
+"""Names the process of all programs that are started."""
+GONE: Final = "COLDLOOP_PROCESS"
+"""Named it until version 0.3."""
 DEFAULT = "default"
 DERIVED = "follows from other settings"
 LISTING: Final = "`coldloop config` lists the keys"
@@ -215,6 +219,10 @@ def _from_file(file: Path | None, option: str) -> list[Entry]:
 
 
 def _from_environment(environment: Mapping[str, str]) -> list[Entry]:
+    if environment.get(GONE):
+        raise ConfigurationError(
+            f"{GONE}: a process is named by its model file: set {MODEL_FILE} to it, and unset this"
+        )
     return [
         (name[len(PREFIX) :].lower().replace("__", "."), _parsed(value), name)
         for name, value in sorted(environment.items())
@@ -250,6 +258,15 @@ def _read_toml(file: Path, option: str) -> dict[str, Any]:
         return parsed_toml(read_text(file, f"name a readable TOML file with {option}", ConfigurationError, MOST_BYTES))
     except ValueError as error:
         raise ConfigurationError(f"{file}: not TOML: {error}") from None
+
+
+def model_file_in(environment: Mapping[str, str]) -> object:
+    """Return the model file that the environment names, or None.
+
+    Raises:
+        ConfigurationError: It does so as until version 0.3.
+    """
+    return next((value for key, value, _ in _from_environment(environment) if key == "model.file"), None)
 
 
 def _parsed(value: str) -> object:

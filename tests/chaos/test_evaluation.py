@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from coldloop.process.cold_box import INPUT_NAMES, L1, OUTPUT_NAMES, STATE_NAMES, T5
+from coldloop.process.cold_box import COLD_BOX, INPUT_NAMES, L1, OUTPUT_NAMES, STATE_NAMES, T5
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.plant import PlantSample
@@ -29,7 +29,7 @@ def sample(
 
 
 def quiet() -> ChaosTrace:
-    trace = ChaosTrace(TICKS)
+    trace = ChaosTrace(TICKS, COLD_BOX)
     for tick in range(TICKS):
         trace.sample(sample(tick))
     return trace
@@ -109,7 +109,7 @@ def test_time_outside_the_bands_is_counted_from_the_fault_on(killed: ChaosTrace)
 
 
 def test_ticks_that_nobody_saw_are_counted_and_disturb_nothing() -> None:
-    trace = ChaosTrace(TICKS)
+    trace = ChaosTrace(TICKS, COLD_BOX)
     for tick in (*range(100), *range(120, TICKS)):
         trace.sample(sample(tick))
     trace.marks = [Mark(KILL, 90, 200)]
@@ -130,11 +130,11 @@ def test_the_bands_of_the_configuration_are_those_that_are_judged_by() -> None:
 def test_a_run_without_faults_has_a_table_of_headings() -> None:
     evaluation = evaluated(quiet())
     assert evaluation.rows == []
-    assert table(evaluation.rows).count("\n") == 1
+    assert table(evaluation.rows, COLD_BOX).count("\n") == 1
 
 
 def test_the_tables_have_a_line_a_fault(killed: ChaosTrace) -> None:
-    text = table(evaluated(killed).rows)
+    text = table(evaluated(killed).rows, COLD_BOX)
     assert "MPC > HOLD > CLASSICAL > MPC" in text
     assert "optimizer lost 0.25" in text
     assert text.count("\n") == 3
@@ -147,5 +147,5 @@ def test_a_restless_run_still_has_a_table_that_can_be_read() -> None:
     trace.marks = [Mark(KILL, 90, 95)]
     (row,) = evaluated(trace).rows
     assert len(row.modes) == 40
-    assert "REST > MPC > (32 more) > REST > MPC" in table([row])
-    assert "sequence late 2.5 (x20)" in table([row])
+    assert "REST > MPC > (32 more) > REST > MPC" in table([row], COLD_BOX)
+    assert "sequence late 2.5 (x20)" in table([row], COLD_BOX)

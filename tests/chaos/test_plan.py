@@ -3,8 +3,11 @@
 import pytest
 
 from coldloop.errors import LoadFileError, UsageError
+from coldloop.process.settings import settings_of
 from rig.chaos.faults import Drop, Kill, Reset
 from rig.chaos.plan import SHIPPED, SPREAD_S, ChaosPlan, find_plan, parse_plan, shipped_plans
+from rig.process_file.making import made_from
+from tests.harness.process_files import COLUMN
 
 KINDS = {
     "delay", "drop", "duplicate", "reorder", "reset", "freeze", "truncate", "abort", "flip",
@@ -30,7 +33,7 @@ def test_the_shipped_plans_are_sound_and_have_all_kinds() -> None:
     [
         ("name = ", "mine.toml: not TOML"),
         ('name = "mine"', "mine.toml: description: Field required"),
-        (HEAD.replace("600", "0.3"), "mine.toml: duration_s: Input should be a multiple of 0.25"),
+        (HEAD.replace("600", "0.3"), "mine.toml: duration_s: input should be a multiple of 0.25"),
         (HEAD + "sped = 3", "mine.toml: sped: no such key"),
         (with_fault('kind = "explode"', "at_s = 3"), "mine.toml: faults.0: Input tag 'explode'"),
         (with_fault('kind = "drop"', 'link = "plant"', "at_s = 3", "duration_s = 1"), "faults.0.drop.share"),
@@ -52,6 +55,22 @@ def test_what_is_wrong_is_said_in_one_line(text: str, complaint: str) -> None:
         parse_plan(text, "mine.toml", {})
     assert complaint in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_plan_is_of_the_process_that_it_is_read_for() -> None:
+    """A column has a tick of 3 s, samples of 60 s, and none of the cold box's sensors."""
+    column = made_from(COLUMN).process
+    text = with_fault('kind = "restart"', 'process = "plant"', "at_s = 60")
+    with settings_of(column):
+        plan = parse_plan(text, "mine.toml", {"updating_period_s": 60.0})
+        assert "sensor" not in [one.name for one in shipped_plans()]
+        for changes, complaint in (({"duration_s": 599.0}, "multiple of"), ({"updating_period_s": 600.0}, "less than")):
+            with pytest.raises(UsageError, match=complaint):
+                parse_plan(text, "mine.toml", changes)
+    (fault,) = plan.schedule()
+    assert (plan.ticks, fault.tick, fault.end_tick) == (600 / column.tick_s, 60 / column.tick_s, 60 / column.tick_s + 1)
+    (fault,) = parse_plan(text, "mine.toml", {}).schedule()
+    assert (fault.tick, fault.end_tick) == (240, 241)
 
 
 def test_a_shorter_run_leaves_out_the_faults_behind_its_end() -> None:

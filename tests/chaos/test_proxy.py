@@ -16,9 +16,9 @@ from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import Grant
 from coldloop.registers.declaration import Block
-from coldloop.registers.maps import CONTROL_MAP
 from rig.chaos.faults import Delay, Direction, Drop, Duplicate, Freeze, Reset, Truncate
 from rig.chaos.proxy import MOST_FROZEN, LinkProxy
+from tests.harness.records import CONTROL_MAP
 
 COMMON = {"link": "optimizer", "duration_s": 1.0}
 READ_THREE = bytes.fromhex("0001 0000 0006 ff 03 0000 0003")

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, LinkCause, Mode, OperatorMode, PlantLinkState, Verdict
 from coldloop.registers.plant import SensorFaultKind
@@ -31,7 +32,7 @@ def event(kind: int, subject: int = 0, cause: int = 0, value: float = 0.0, who: 
          "alarm returned: sequence rejected (plant lost)"),
         (event(EventKind.ALARM_RAISED, AlarmKind.PLANT_OTHER_MASTER, LinkCause.SECOND_MASTER),
          "alarm raised: plant other master (second master)"),
-        (event(EventKind.ALARM_ACKNOWLEDGED, AlarmKind.T5_BAND, who="10.0.0.5:1"),
+        (event(EventKind.ALARM_ACKNOWLEDGED, AlarmKind.SECOND_BAND, who="10.0.0.5:1"),
          "alarm acknowledged: t5 band, by 10.0.0.5:1"),
         (event(EventKind.ALARM_SHELVED, AlarmKind.SENSOR_BAD, value=900), "alarm shelved: sensor bad, 900 s"),
         (event(EventKind.BOOT, 1), "boot: with a retained state"),
@@ -50,7 +51,7 @@ def event(kind: int, subject: int = 0, cause: int = 0, value: float = 0.0, who: 
     ids=lambda noted: noted if isinstance(noted, str) else "",
 )  # fmt: skip
 def test_an_event_is_one_sentence(noted: Event, sentence: str) -> None:
-    assert describe(noted).sentence == sentence
+    assert describe(noted, COLD_BOX).sentence == sentence
 
 
 def test_a_time_is_iso_8601_with_milliseconds() -> None:
@@ -63,7 +64,7 @@ WORDS = st.integers(0, 0xFFFF)
 
 @given(kind=WORDS | st.sampled_from(EventKind), subject=WORDS, cause=WORDS, value=st.floats(width=32))
 def test_numbers_that_nobody_knows_stay_numbers(kind: int, subject: int, cause: int, value: float) -> None:
-    text = describe(Event(kind=kind, subject=subject, cause=cause, value=value))
+    text = describe(Event(kind=kind, subject=subject, cause=cause, value=value), COLD_BOX)
     assert text.sentence.isprintable()
     if kind not in set(EventKind):
         assert text.kind == str(kind)
@@ -73,9 +74,9 @@ def test_numbers_that_nobody_knows_stay_numbers(kind: int, subject: int, cause: 
 def test_the_log_has_the_words_and_what_it_counts_floods_by(caplog: pytest.LogCaptureFixture) -> None:
     log = logging.getLogger("coldloop.test")
     with caplog.at_level(logging.INFO):
-        log_event(log, event(EventKind.ALARM_RAISED, AlarmKind.SENSOR_BAD, 6))
-        log_event(log, event(EventKind.MODE, Mode.HOLD, who="10.0.0.5:1"))
-        log_event(log, event(EventKind.LEASE, 1))
+        log_event(log, event(EventKind.ALARM_RAISED, AlarmKind.SENSOR_BAD, 6), COLD_BOX)
+        log_event(log, event(EventKind.MODE, Mode.HOLD, who="10.0.0.5:1"), COLD_BOX)
+        log_event(log, event(EventKind.LEASE, 1), COLD_BOX)
     raised, mode, lease = ({**record.__dict__, "message": record.getMessage()} for record in caplog.records)
     assert raised.items() >= {"message": "alarm raised", "alarm": "sensor bad", "cause": "T5", "tick": 8}.items()
     assert mode.items() >= {"message": "mode", "mode": "hold", "who": "10.0.0.5:1", "number": 1}.items()

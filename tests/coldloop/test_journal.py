@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, EventKind, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.maps import CONTROL_MAP
 from coldloop.registers.text import from_words
 from coldloop.service.journal import ANY_SUBJECT, KEPT, LOOKED_AT, Journal, JournalPublication
+from tests.harness.records import CONTROL_MAP
 
 ALL = JournalQuery(0, 0, ANY_SUBJECT)
 KINDS = st.sampled_from([EventKind.MODE, EventKind.ALARM_RAISED, EventKind.LEASE])

@@ -10,11 +10,11 @@ import pytest
 
 from coldloop.errors import PortInUseError
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.service.metrics import bank_families, exposition, gauge
 from coldloop.service.metrics_server import MOST_OPEN, MetricsServer
 from coldloop.service.metrics_settings import MetricsSettings
+from tests.harness.records import PLANT_MAP
 
 
 def bank() -> RegisterBank:

@@ -5,10 +5,9 @@ import zlib
 import pytest
 
 from coldloop.registers.codec import WordOrder, codec_of
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.registers.seal import CRC_BYTES, Seal, seal_of, sealed_bytes
-from tests.harness.records import sealed
+from tests.harness.records import PLANT_MAP, sealed
 
 MEASUREMENT = PLANT_MAP.block_of(Measurement)
 RECORD = Measurement(7, 385.0, (1.0,) * 22, (2.0,) * 28, 1, (0.0,) * 3)

@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 
 from coldloop.registers.codec import WordOrder, codec_of
 from coldloop.registers.control_plc import SequenceHeader, SequenceRow
-from coldloop.registers.maps import CONTROL_MAP
 from coldloop.safety.sequence import InputSequence, checksum, with_checksum
-from tests.harness.records import Row, as_transmitted
+from tests.harness.records import CONTROL_MAP, Row, as_transmitted
 
 ROWS = [Row(43.0 + 0.01 * tick, 75.0 - tick, 36.0) for tick in range(20)]
 HEADER = SequenceHeader(number=7, update=6, first_tick=140, length=20, tau_u=20, model_digest=0x2B8F1A90, crc=0)

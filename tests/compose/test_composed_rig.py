@@ -12,8 +12,8 @@ import pytest
 from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.common import Identity, SessionPace
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Actuators, LoadStep
+from tests.harness.records import PLANT_MAP
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -10,9 +10,9 @@ import pytest
 
 from coldloop.modbus.settings import TlsSettings
 from coldloop.modbus.tls import client_context
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Actuators, LoadStep
 from tests.compose.browser import assert_an_operator_changes_the_load
+from tests.harness.records import PLANT_MAP
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -19,11 +19,11 @@ from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.control_plc import ControlSession
 from coldloop.registers.declaration import RegisterMap
-from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 from coldloop.registers.plant import PlantSession
 from rig.cli.certificates import Authority
 from tests.harness.process_files import made
 from tests.harness.processes import END_S, Processes
+from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 from tests.process.runs import started
 
 PROGRAM = Path(__file__).parents[2] / "docker" / "healthcheck.py"

@@ -15,8 +15,8 @@ from coldloop.service.journal import Journal
 from control_plc.alarm_settings import DEFAULT_RULES, OF_THE_PROCESS, AlarmSettings
 from control_plc.alarms import TRANSITIONS, AlarmPanel
 
-KIND = AlarmKind.LEVEL_BAND
-NAME = KIND.name.lower()
+KIND = AlarmKind.FIRST_BAND
+NAME = "l1_band"
 
 
 @pytest.fixture
@@ -260,7 +260,11 @@ def test_a_condition_that_does_not_last_as_long_as_its_delay_changes_nothing() -
 
 def test_the_alarms_of_the_process_have_delays_and_others_none() -> None:
     settings = AlarmSettings()
-    assert {kind for kind in AlarmKind if settings.rule(kind).on_delay_s} == {*OF_THE_PROCESS} - {
+    assert {kind for kind in AlarmKind if settings.rule(kind).on_delay_s} == {
+        *OF_THE_PROCESS,
+        AlarmKind.FIRST_BAND,
+        AlarmKind.SECOND_BAND,
+    } - {
         AlarmKind.SENSOR_SUSPECT,
         AlarmKind.INPUT_WITHOUT_EFFECT,
     }
@@ -356,7 +360,7 @@ def test_each_alarm_has_a_rule_and_the_configuration_changes_what_it_names() -> 
         {"rules": {"sensor_bad": {"priority": "low"}, "T5_BAND": {"on_delay_s": 1}}}
     )
     assert settings.rule(AlarmKind.SENSOR_BAD) == (AlarmPriority.LOW, 0.0, 0.0)
-    assert settings.rule(AlarmKind.T5_BAND) == (AlarmPriority.HIGH, 1.0, 0.0)
+    assert settings.rule(AlarmKind.SECOND_BAND) == (AlarmPriority.HIGH, 1.0, 0.0)
     assert settings.rule(KIND) == (AlarmPriority.HIGH, 5.0, 0.0)
     assert AlarmPanel(Journal(), settings).rows[AlarmKind.SENSOR_BAD].priority == AlarmPriority.LOW
 
@@ -364,7 +368,7 @@ def test_each_alarm_has_a_rule_and_the_configuration_changes_what_it_names() -> 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"rules": {"sensor_worse": {}}}, "unknown alarm 'sensor_worse'; choose from mode, level_band"),
+        ({"rules": {"sensor_worse": {}}}, "unknown alarm 'sensor_worse'; choose from mode, l1_band"),
         ({"rules": {"mode": {"priority": "urgent"}}}, "'low', 'medium', 'high' or 'critical'"),
         ({"rules": {"mode": {"on_delay_s": -1}}}, "greater than or equal to 0"),
         ({"rules": {"mode": {"on_delay_s": "nan"}}}, "finite number"),

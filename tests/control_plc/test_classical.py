@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.process.cold_box import L1, T5, TICK_S
+from coldloop.process.cold_box import COLD_BOX, L1, T5, TICK_S
 from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import read_header
@@ -230,7 +230,7 @@ def test_whatever_the_sensors_tell_bounds_and_rates_are_kept(
 
 
 def test_the_loops_hold_the_plant_by_themselves_on_load_a() -> None:
-    load = find_load("a", HEADER.w0)
+    load = find_load("a", HEADER.w0, COLD_BOX)
     plant = make_plant(HEADER, SensorSettings(), load, seed=1)
     program = classical_program()
     level, temperature = [], []

@@ -17,11 +17,11 @@ LEVEL, TEMPERATURE = COLD_BOX.dead_bands
 def test_a_level_within_the_dead_band_raises_nothing(excess: float, bench: "Bench") -> None:
     bench.steady, bench.level = True, LEVEL_BAND[1] - 60.0 + excess
     bench.scans(40)
-    assert not bench.program.alarms.rows[AlarmKind.LEVEL_BAND].active
+    assert not bench.program.alarms.rows[AlarmKind.FIRST_BAND].active
 
 
 def test_the_alarm_is_raised_beyond_the_dead_band_and_returns_inside_the_band(bench: "Bench") -> None:
-    bench.steady, alarm = True, AlarmKind.LEVEL_BAND
+    bench.steady, alarm = True, AlarmKind.FIRST_BAND
     for excess, is_active in ((1.1 * LEVEL, 1), (0.1 * LEVEL, 1), (-0.1 * LEVEL, 0), (0.9 * LEVEL, 0)):
         bench.level = LEVEL_BAND[1] - 60.0 + excess
         bench.scans(22)

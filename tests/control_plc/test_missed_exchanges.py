@@ -7,9 +7,8 @@ import pytest
 
 from coldloop.registers.codec import WordOrder, codec_of
 from coldloop.registers.control_plc import Cause, Mode, Status, Verdict
-from coldloop.registers.maps import CONTROL_MAP
 from coldloop.registers.safety import AlarmKind
-from tests.harness.records import Row
+from tests.harness.records import CONTROL_MAP, Row
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -21,7 +21,6 @@ from coldloop.registers.codec import codec_of
 from coldloop.registers.control_plc import Operator, OperatorMode, PlantLinkState
 from coldloop.registers.declaration import Block, Role
 from coldloop.registers.domain import DomainError
-from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 from coldloop.registers.plant import Measurement
 from coldloop.registers.seal import sealed_bytes
 from coldloop.safety.lease import SIMPLE_CLIENT
@@ -32,7 +31,7 @@ from control_plc.runtime import ControlPlc
 from control_plc.scan_cycle import ScanCycle
 from control_plc.settings import ControlSection, ControlSettings
 from plant.rack.outputs import AppliedOutputs
-from tests.harness.records import as_transmitted, sealed
+from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP, as_transmitted, sealed
 from tests.link.poison import values_of
 
 HEADER: Final = read_header(DEFAULT_MODEL_FILE)

@@ -29,7 +29,6 @@ from coldloop.registers.control_plc import (
     PlantLinkStatus,
 )
 from coldloop.registers.declaration import Block
-from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.safety.retained import RetainedFile
@@ -41,7 +40,7 @@ from control_plc.sessions import ADOPT_AFTER_S
 from control_plc.settings import ControlSettings
 from rig.cli.certificates import Authority
 from rig.cosim.ports import ReservedPorts
-from tests.harness.records import sealed
+from tests.harness.records import CONTROL_MAP, PLANT_MAP, sealed
 
 WITHIN_S = 60.0
 HEADER = read_header(DEFAULT_MODEL_FILE)
@@ -228,11 +227,11 @@ async def test_what_an_operator_says_before_the_rack_is_found_holds(tmp_path: Pa
         async with running(SmallRack(4), control_plc=settings) as plc:
             if asked is not None:
                 ask(plc, asked)
-                ask(plc, AlarmCommand(AlarmKind.T5_BAND, AlarmAction.SHELVE, 600))
+                ask(plc, AlarmCommand(AlarmKind.SECOND_BAND, AlarmAction.SHELVE, 600))
             await until(lambda: plc.sessions.running)
             assert plc.bank.get(Identity).session == 4
             assert plc.bank.get(Operator).mode == OperatorMode.MANUAL
-            assert alarm(plc, AlarmKind.T5_BAND) is AlarmState.SHELVED
+            assert alarm(plc, AlarmKind.SECOND_BAND) is AlarmState.SHELVED
             assert alarm(plc, AlarmKind.CLOCK_SKEW) is AlarmState.SHELVED
 
 

@@ -9,7 +9,6 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
-from coldloop.registers.maps import MAPS
 from rig.cli import make_parser
 from rig.cli.command_listing import command_listing
 from rig.cli.commands.docs import anchor, headings
@@ -19,6 +18,7 @@ from rig.plc_sizing.profile import PlcProfile
 from rig.process_file.declaration import ProcessFile
 from rig.settings import Settings
 from tests.harness.path_options import path_table
+from tests.harness.records import MAPS
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -18,10 +18,10 @@ import pytest
 
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.control_plc import LadderStatus, Mode
-from coldloop.registers.maps import CONTROL_MAP
 from rig import cli
 from tests.conftest import Coldloop, draw_nothing
 from tests.harness.processes import Process, Processes
+from tests.harness.records import CONTROL_MAP
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -4,12 +4,13 @@ import re
 import struct
 from pathlib import Path
 
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers.common import MAGIC
 from coldloop.registers.control_plc import Verdict
-from coldloop.registers.maps import CONTROL_MAP
 from coldloop.registers.safety import AlarmKind
-from coldloop.service.event_text import word
+from coldloop.service.event_text import alarm_word, word
 from control_plc.alarm_settings import PASSING, AlarmSettings
+from tests.harness.records import CONTROL_MAP
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -19,7 +20,7 @@ def test_alarms_are_called_what_they_are_called_with_their_priorities() -> None:
     rows = re.findall(r"^\| (\d) \w+ \|.*\| ([^|]+) \|$", page, re.MULTILINE)
     told = {(int(priority), name) for priority, names in rows for name in re.findall(r"`([^`]+)`", names)}
     settings = AlarmSettings()
-    assert told == {(int(settings.rule(kind).priority), word(kind)) for kind in AlarmKind}
+    assert told == {(int(settings.rule(kind).priority), alarm_word(kind, COLD_BOX)) for kind in AlarmKind}
     passing = re.search(r"happens at an instant \(([^)]+)\)", page)
     assert passing is not None
     assert set(re.findall(r"`([^`]+)`", passing[1])) == {word(kind) for kind in PASSING}

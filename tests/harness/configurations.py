@@ -2,6 +2,7 @@
 
 from typing import Final
 
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import LoadProfile
 from plant.load import find_load
 
@@ -70,7 +71,7 @@ LEFT_TO_PROGRAMS: Final[dict[str, tuple[str, ...]]] = {
 }
 """Whose ticks alone are compiled, where that is worth while."""
 UNUSUAL: Final[dict[str, tuple[str, ...]]] = {
-    "narrow alarm bands": ("control_plc.alarms.level_band=[59.9,60.1]", "control_plc.alarms.t5_band=[12,13]"),
+    "narrow alarm bands": ("control_plc.alarms.bands.L1=[59.9,60.1]", "control_plc.alarms.bands.T5=[12,13]"),
     "sensors out of range": ("control_plc.sensors.level=[59.9,60.1]",),
     "sensors that freeze soon": ("control_plc.sensors.frozen_s=0.5",),
     "sequences that are refused": ("limits.slew_s=4",),
@@ -86,5 +87,5 @@ UNUSUAL: Final[dict[str, tuple[str, ...]]] = {
 
 def lively(mean_load: float) -> LoadProfile:
     """Return a load that moves from the first minute on, about the load of the operating point, W."""
-    e = find_load("e", mean_load)
+    e = find_load("e", mean_load, COLD_BOX)
     return LoadProfile((0, *(time - e.times[1] + 60 for time in e.times[1:])), e.watts)

@@ -28,7 +28,7 @@ STEPS: Final = f"{PROGRAM}interrupting_load_step_w=0.01"
 LONG: Final = f"{PROGRAM}updating_period_s=60"
 CASES: Final[Mapping[str, Case]] = {
     "column": Case("column"),
-    "column, noise, alarms": Case("column", (NOISE, "control_plc.alarms.level_band=[96.24,96.26]"), events=ALARMS),
+    "column, noise, alarms": Case("column", (NOISE, "control_plc.alarms.bands.xD=[96.24,96.26]"), events=ALARMS),
     "column, load steps that interrupt": Case("column", (STEPS, LONG)),
     "column, single precision": Case("column", (f'{PROGRAM}arithmetic="float32"',)),
     "column, a borrowed solver": Case("column", (f'{PROGRAM}solver="osqp"', LONG), updates=0),

@@ -9,7 +9,9 @@ from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.maps import maps_of
 
 R = TypeVar("R", bound=tuple[Any, ...])
-MAPS: Final = maps_of(COLD_BOX)
+PLANT_MAP, CONTROL_MAP, OPTIMIZER_MAP = maps_of(COLD_BOX)
+MAPS: Final = maps_of(COLD_BOX).by_service
+"""By service."""
 
 
 class Row(NamedTuple):
@@ -22,7 +24,7 @@ class Row(NamedTuple):
 
 def map_of(record: type[tuple[Any, ...]]) -> RegisterMap:
     """Return the map that has a record."""
-    return next(one for one in MAPS if record in [block.record for block in one.blocks])
+    return next(one for one in MAPS.values() if record in [block.record for block in one.blocks])
 
 
 def as_transmitted(record: R) -> R:

@@ -19,6 +19,7 @@ from aiohttp.test_utils import make_mocked_request
 from coldloop.errors import ConfigurationError, UsageError
 from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.settings import TlsSettings
+from coldloop.process.cold_box import COLD_BOX
 from hmi.access import (
     LOGIN_BURST,
     LOGINS_A_MINUTE,
@@ -184,7 +185,7 @@ def test_who_logs_in_again_leaves_no_session_behind(site: Site) -> None:
 async def test_two_pages_on_one_host_do_not_log_each_other_out(tmp_path: Path) -> None:
     write_user(tmp_path / "users", OPERATOR[0], PageRole.OPERATE, OPERATOR[1])
     section = HmiSection(port=0, login=LoginSettings(users=tmp_path / "users"))
-    pages = [PageServer(section, PageSite(Model(Clock(), 300))) for _ in range(2)]
+    pages = [PageServer(section, PageSite(Model(COLD_BOX, Clock(), 300))) for _ in range(2)]
     async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as browser:  # keeps cookies of an IP
         for page in pages:
             await page.start()

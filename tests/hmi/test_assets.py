@@ -10,6 +10,7 @@ from contextlib import asynccontextmanager
 
 import aiohttp
 
+from coldloop.process.cold_box import COLD_BOX
 from hmi.page_server import PageServer, PageSite
 from hmi.process_image import Model
 from hmi.settings import HmiSection
@@ -21,7 +22,7 @@ PLAIN, GZIP = {"Accept-Encoding": "identity"}, {"Accept-Encoding": "gzip, br"}
 @asynccontextmanager
 async def served() -> AsyncIterator[aiohttp.ClientSession]:
     """Yield a client of a page of its own that decompresses nothing."""
-    page = PageServer(HmiSection(port=0), PageSite(Model(Clock(), 7200)))
+    page = PageServer(HmiSection(port=0), PageSite(Model(COLD_BOX, Clock(), 7200)))
     await page.start()
     async with aiohttp.ClientSession(page.address, auto_decompress=False) as client:
         yield client

@@ -11,13 +11,13 @@ from pathlib import Path
 import aiohttp
 import pytest
 
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers.control_plc import ProcessNow
 from hmi.audit import KEPT, LARGEST_FILE, MOST_KINDS, OLDER_FILES, REPEATS_S, Audit
 from hmi.page_server import PageServer, PageSite
 from hmi.process_image import Model
-from hmi.reading import MOST_NAMES, ROWS_AT_ONCE
+from hmi.reading import PENS, ROWS_AT_ONCE
 from hmi.settings import HmiSection
-from hmi.trends import NAMES
 from tests.harness.waiting import eventually
 from tests.hmi.conftest import OPERATOR, Clock, Site
 
@@ -176,7 +176,7 @@ def test_a_full_audit_is_set_aside_and_a_few_are_kept(tmp_path: Path) -> None:
 
 
 async def test_a_table_has_each_signal_once_and_all_its_rows() -> None:
-    model = Model(Clock(), 7200)
+    model = Model(COLD_BOX, Clock(), 7200)
     rows = 3 * ROWS_AT_ONCE + 1
     for tick in range(rows):
         model.trends.add(ProcessNow(tick, 400.0, (43.0, 75.0, 36.0), (1.5,) * 22), 1)
@@ -187,7 +187,7 @@ async def test_a_table_has_each_signal_once_and_all_its_rows() -> None:
         names = ",".join(["L1", "T5"] * 800)
         async with browser.get(f"{page.address}api/trend.csv?seconds=7200&names={names}") as answer:
             lines = (await answer.text()).splitlines()
-        too_many = ",".join(NAMES[: MOST_NAMES + 1])
+        too_many = ",".join(model.trends.names[: PENS + 9])
         async with browser.get(f"{page.address}api/trend?names={too_many}") as answer:
             assert answer.status == HTTPStatus.BAD_REQUEST
         for name in ("a" * 300, "%00", "..%2Fpage_server.py", "vendor"):

@@ -19,15 +19,17 @@ from coldloop.operating.commands import (
     duration_text,
 )
 from coldloop.operating.execution import lead_ticks
-from coldloop.process.cold_box import TICK_S
+from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
+from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.plant import LoadAhead, LoadStatus
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
 from hmi.operator_desk import CONFIRM_WITHIN_S, CommandResult, OperatorDesk, PremisesChangedError
 from hmi.process_image import Model
+from tests.harness.records import MAPS
 from tests.hmi.conftest import Clock
 
 R = TypeVar("R", bound=tuple[Any, ...])
@@ -36,7 +38,8 @@ R = TypeVar("R", bound=tuple[Any, ...])
 class Peer:
     """A service by direct calls: what is written counts at once, unless a test says what happens instead."""
 
-    def __init__(self, *records: tuple[Any, ...]) -> None:
+    def __init__(self, register_map: RegisterMap, *records: tuple[Any, ...]) -> None:
+        self.map, self.process = register_map, register_map.process
         self.records: dict[type, tuple[Any, ...]] = {type(record): record for record in records}
         self.panel = AlarmPanel(Journal())
         self.written: list[tuple[Any, ...]] = []
@@ -78,13 +81,14 @@ class Desk:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.clock = Clock(100.0)
-        self.model = Model(self.clock, 300)
+        self.model = Model(COLD_BOX, self.clock, 300)
         pace = SessionPace(1, 1, 1.0, 0)
         self.model.put("plant", pace)
-        self.plant = Peer(Identity(session=1, tick=1000), pace, LoadStatus(watts=400.0, free=4096))
+        self.plant = Peer(MAPS["plant"], Identity(session=1, tick=1000), pace, LoadStatus(watts=400.0, free=4096))
         auto = Operator(OperatorMode.AUTO, (43.0, 75.0, 36.0))
-        self.control = Peer(Identity(session=1, tick=1000), auto, LadderStatus(Mode.MPC, Cause.NONE, 0, 1, 0, 0))
-        self.optimizer = Peer(Identity(session=1))
+        ladder = LadderStatus(Mode.MPC, Cause.NONE, 0, 1, 0, 0)
+        self.control = Peer(MAPS["control_plc"], Identity(session=1, tick=1000), auto, ladder)
+        self.optimizer = Peer(MAPS["optimizer_plc"], Identity(session=1))
         self.desk = OperatorDesk({}, self.model, self.clock, training=False)
         peers = {"plant": self.plant, "control_plc": self.control, "optimizer_plc": self.optimizer}
         monkeypatch.setattr(self.desk, "_clients", lambda services: {service: peers[service] for service in services})
@@ -107,7 +111,7 @@ def desk(monkeypatch: pytest.MonkeyPatch) -> Desk:
 
 
 def alarm(
-    action: AlarmAction, kind: int = AlarmKind.T5_BAND, *, time_s: int = 0, seen: dict[str, int] | None = None
+    action: AlarmAction, kind: int = AlarmKind.SECOND_BAND, *, time_s: int = 0, seen: dict[str, int] | None = None
 ) -> TreatAlarm:
     return TreatAlarm(kind="alarm", alarm=int(kind), action=int(action), time_s=time_s, seen=seen)
 
@@ -181,7 +185,7 @@ async def test_a_step_that_is_longer_than_one_request_can_say_begins_another_one
     ids=["factor 1", "factor 200", "lock-step"],
 )
 def test_a_load_begins_late_enough_to_be_there_in_time(pace: SessionPace, ticks: int) -> None:
-    assert lead_ticks(pace) == ticks
+    assert lead_ticks(pace, TICK_S) == ticks
 
 
 # -- alarms ------------------------------------------------------------------------------------------------------------
@@ -208,7 +212,7 @@ async def test_what_the_control_plc_ignores_is_not_told_as_applied(desk: Desk) -
 
 
 async def test_an_alarm_that_was_raised_again_is_not_acknowledged_unseen(desk: Desk) -> None:
-    desk.control.panel.raised(AlarmKind.T5_BAND)
+    desk.control.panel.raised(AlarmKind.SECOND_BAND)
     desk.control.panel.raised(AlarmKind.MODE, 1)
     seen = {"t5 band": 1, "mode": 1}
     desk.control.panel.raised(AlarmKind.MODE, 2)

@@ -8,22 +8,25 @@ import math
 import random
 from collections.abc import Sequence
 from decimal import Decimal, getcontext
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from coldloop.process.cold_box import OUTPUT_NAMES, T5
+from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, T5
 from coldloop.registers.codec import blank
 from coldloop.registers.control_plc import Verdict
-from coldloop.registers.maps import OPTIMIZER_MAP
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, UpdatingRuleKind, UpdatingRuleStatus
-from hmi.explanation import Branch, Explanation, explain, increments_of
-from hmi.sentences import deviation, sentence
+from hmi import explanation, sentences
+from hmi.explanation import Branch, Explanation, increments_of
+from hmi.sentences import sentence
 from optimizer_plc.rules import Algorithm1, Observation, algorithm_1, assess
-from tests.harness.records import as_transmitted
+from tests.harness.records import MAPS, as_transmitted
 
 getcontext().prec = 40
+explain = partial(explanation.explain, process=COLD_BOX)
+deviation = partial(sentences.deviation, process=COLD_BOX)
 
 RULE = UpdatingRuleStatus(UpdatingRuleKind.ALGORITHM_1, 9, 2, 19, 2, slots=0.25, preparation=0.13, iteration=0.25)
 FIXED = UpdatingRuleStatus(UpdatingRuleKind.FIXED, 9, 9, 9, 0, slots=0.25, preparation=0.13, iteration=0.25)
@@ -276,7 +279,7 @@ def test_a_slope_where_k_rounds_to_one_is_not_told_as_the_slope_of_k() -> None:
     assert "dK/dn" not in text
 
 
-NO_DEVIATION = blank(ModelDeviation, OPTIMIZER_MAP)
+NO_DEVIATION = blank(ModelDeviation, MAPS["optimizer_plc"])
 
 
 def test_a_plant_that_differs_from_its_model_is_described_the_most_notable_first() -> None:

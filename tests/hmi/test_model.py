@@ -10,23 +10,25 @@ import pytest
 
 from coldloop.errors import LinkError
 from coldloop.modbus.endpoints import Endpoint
-from coldloop.process.cold_box import OUTPUT_NAMES
+from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, TICK_S
 from coldloop.registers.audit import Event, EventKind, JournalPage
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Mode, Plan, ProcessNow
-from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmPriority, AlarmState
 from coldloop.service.metrics import exposition
 from hmi.access import Party
 from hmi.broadcast import WAITING, Broadcast
-from hmi.documents import MOST_MARKS, alarms_document, encoded, state_document, trend_document
+from hmi.documents import MOST_MARKS, alarms_document, catalog, encoded, state_document, trend_document
 from hmi.page_metrics import page_families
 from hmi.polling import Poller
 from hmi.process_image import STALE_S, JournalEntry, Model
 from hmi.reading import safe_cell
 from hmi.signals import signals_of, words_in
 from hmi.trends import MOST_ROWS, TrendStore, thin
+from rig.process_file.making import made_from
+from tests.harness.process_files import COLUMN
+from tests.harness.records import MAPS
 from tests.hmi.conftest import Clock
 
 
@@ -37,8 +39,8 @@ def clock() -> Clock:
 
 @pytest.fixture
 def model(clock: Clock) -> Model:
-    one = Model(clock, 3600)
-    for service in MAPS:
+    one = Model(COLD_BOX, clock, 3600)
+    for service in one.maps:
         one.put(service, Identity(session=1, tick=1))
         one.heard(service)
     one.put("plant", SessionPace(1, 1, 1.0, 0))
@@ -58,12 +60,27 @@ def test_descriptions_that_number_their_meanings_become_words_and_others_do_not(
 
 
 def test_every_register_of_a_block_with_one_row_is_a_signal() -> None:
-    for service, register_map in MAPS.items():
-        names = {signal.name for signal in signals_of(service)}
-        assert len(names) == len(signals_of(service))
+    for register_map in MAPS.values():
+        names = {signal.name for signal in signals_of(register_map)}
+        assert len(names) == len(signals_of(register_map))
         for block in register_map.blocks:
             if block.rows == 1:
-                assert any(name.startswith(f"{service}.{block.name}.") for name in names)
+                assert any(name.startswith(f"{register_map.service}.{block.name}.") for name in names)
+
+
+def test_processes_side_by_side_have_signals_and_times_of_their_own() -> None:
+    for process in (COLD_BOX, made_from(COLUMN).process, COLD_BOX):
+        model = Model(process, Clock(), 3600)
+        u, y = (0.0,) * len(process.inputs), tuple(map(float, range(len(process.outputs))))
+        model.put("control_plc", ProcessNow(8, 1.0, u, y))
+        told, state = catalog(model, training=False, replay=True), state_document(model)
+        assert (told["outputs"], told["process"]["name"]) == (list(process.output_names), process.name)
+        assert state["time_s"] == 8 * process.tick_s
+        trend = trend_document(model, told["outputs"], 0, 8, 100)
+        assert trend["time"] == [8 * process.tick_s]
+        for name, value in zip(process.output_names, y, strict=True):
+            assert state["values"][f"control_plc.process.y.{name}"] == value
+            assert trend["series"][name] == [value]
 
 
 def test_a_service_that_is_silent_is_not_live_and_its_values_are_stale(model: Model, clock: Clock) -> None:
@@ -91,7 +108,7 @@ def test_a_tick_that_stands_still_is_stale_only_where_it_should_move(
     model.put("plant", pace)
     model.put("control_plc", process(5))
     clock.time += STALE_S + 1.0
-    for service in MAPS:
+    for service in model.maps:
         model.heard(service)
     assert ("control_plc.process." in model.stale_prefixes()) is stands
 
@@ -114,7 +131,7 @@ def test_a_control_plc_that_was_started_again_and_looks_for_its_session_empties_
 
 def test_marks_are_of_the_session_that_is_shown(model: Model) -> None:
     def entry(utc: str, service: str, kind: EventKind) -> JournalEntry:
-        return JournalEntry.of(service, Event(tick=400, kind=kind))._replace(utc=utc)
+        return JournalEntry.of(service, Event(tick=400, kind=kind), COLD_BOX)._replace(utc=utc)
 
     raised = EventKind.ALARM_RAISED
     model.put_events([entry("10:00", "control_plc", raised), entry("10:05", "plant", EventKind.SESSION)])
@@ -130,7 +147,7 @@ def test_time_that_goes_on_after_a_pause_is_neither_old_nor_a_gap(model: Model, 
     model.put("plant", pace._replace(paused=1))
     for _ in range(40):
         clock.time += 1.0
-        for service in MAPS:
+        for service in model.maps:
             model.heard(service)
     model.put("plant", pace)
     assert "control_plc.process." not in model.stale_prefixes()
@@ -188,28 +205,28 @@ def test_a_service_that_counts_its_events_anew_loses_none(model: Model, monkeypa
 def test_thinning_keeps_every_excursion_and_says_nothing_that_was_not_there() -> None:
     values = [0.0] * 10_000
     values[4321], values[7777] = 9.0, -5.0
-    times, columns = thin([float(i) for i in range(10_000)], {"a": values}, 200)
+    times, columns = thin([float(i) for i in range(10_000)], {"a": values}, 200, TICK_S)
     assert len(times) == len(columns["a"]) <= 210
     assert (max(columns["a"]), min(columns["a"])) == (9.0, -5.0)
     assert set(columns["a"]) == {0.0, 9.0, -5.0}
     assert times == sorted(times)
-    assert thin([1.0, 2.0], {"a": [3.0, 4.0]}, 200) == ([1.0, 2.0], {"a": [3.0, 4.0]})
+    assert thin([1.0, 2.0], {"a": [3.0, 4.0]}, 200, TICK_S) == ([1.0, 2.0], {"a": [3.0, 4.0]})
 
 
 def test_the_store_forgets_what_is_too_old_and_never_grows_beyond_its_end() -> None:
-    store = TrendStore(kept_s=300)
+    store = TrendStore(COLD_BOX, kept_s=300)
     for tick in range(0, 400_000, 4):
         store.add(process(tick), 1)
     assert len(store) <= 300 + 4096 + 1
     assert store.ticks[-1] - store.ticks[0] >= 1200
-    long = TrendStore(kept_s=1e9)
+    long = TrendStore(COLD_BOX, kept_s=1e9)
     for tick in range(MOST_ROWS + 10_000):
         long.add(process(tick), 1)
     assert len(long) <= MOST_ROWS + 4096
 
 
 def test_modes_are_told_stretch_by_stretch() -> None:
-    store = TrendStore(3600)
+    store = TrendStore(COLD_BOX, 3600)
     for tick, mode in enumerate([1, 1, 1, 3, 3, 1]):
         store.add(process(tick), mode)
     assert [(one.start, one.end, one.mode) for one in store.modes(0, 10)] == [
@@ -303,7 +320,7 @@ def test_updates_are_drawn_only_while_they_are_in_force(model: Model) -> None:
 @pytest.mark.parametrize("count", [MOST_MARKS, MOST_MARKS + 7])
 def test_marks_are_all_of_the_window_or_since_when_is_said(model: Model, count: int) -> None:
     model.put("control_plc", process(2 * MOST_MARKS))
-    event = JournalEntry.of("control_plc", Event(kind=EventKind.ALARM_RAISED))
+    event = JournalEntry.of("control_plc", Event(kind=EventKind.ALARM_RAISED), COLD_BOX)
     model.put_events(event._replace(tick=tick) for tick in range(count))
     document = trend_document(model, ["L1"], 0, 2 * MOST_MARKS, 20)
     assert len(document["marks"]) == MOST_MARKS
@@ -313,7 +330,7 @@ def test_marks_are_all_of_the_window_or_since_when_is_said(model: Model, count: 
 def test_active_alarms_come_first_and_returned_ones_hide_none(model: Model) -> None:
     rows = [Alarm(priority=AlarmPriority.LOW) for _ in AlarmKind]
     rows[AlarmKind.MODE] = Alarm(AlarmState.ACKNOWLEDGED, 1, priority=AlarmPriority.CRITICAL)
-    rows[AlarmKind.T5_BAND] = Alarm(AlarmState.RETURNED, 0, priority=AlarmPriority.HIGH)
+    rows[AlarmKind.SECOND_BAND] = Alarm(AlarmState.RETURNED, 0, priority=AlarmPriority.HIGH)
     rows[AlarmKind.SCAN_OVERRUN] = Alarm(AlarmState.UNACKNOWLEDGED, 1, priority=AlarmPriority.LOW)
     model.put_alarms(rows)
     assert [one["name"] for one in alarms_document(model)][:3] == ["scan overrun", "mode", "t5 band"]
@@ -345,7 +362,7 @@ def test_what_is_sent_is_json_even_when_numbers_or_words_are_none(model: Model) 
 def test_loads_and_alarms_are_marked_on_the_trends(model: Model) -> None:
     model.put("control_plc", process(100))
     kinds = (EventKind.LIVE_LOAD, EventKind.BOOT, EventKind.ALARM_RAISED)
-    model.put_events(JournalEntry.of("plant", Event(i, 1, 50 + i, kind=kind)) for i, kind in enumerate(kinds))
+    model.put_events(JournalEntry.of("plant", Event(i, 1, 50 + i, kind=kind), COLD_BOX) for i, kind in enumerate(kinds))
     marks = trend_document(model, ["L1"], 0, 100, 100)["marks"]
     assert [(mark["kind"], mark["time"]) for mark in marks] == [("load", 12.5), ("alarm", 13.0)]
 
@@ -416,6 +433,6 @@ def test_metrics_have_the_qualities_of_the_page(model: Model, clock: Clock) -> N
     assert told("update") == [0]
     model.put("control_plc", LadderStatus(Mode.MANUAL, 0, 0, 1, 1, 0))
     clock.time += 10
-    for service in MAPS:
+    for service in model.maps:
         model.heard(service)
     assert told(*signals, "update") == [4, 4, 4, 4], "the tick does not move; no update is in force"

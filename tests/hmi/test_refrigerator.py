@@ -9,14 +9,14 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from coldloop.process.cold_box import OUTPUT_NAMES
+from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES
 from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
-from coldloop.registers.maps import MAPS
 from coldloop.registers.plant import StationAlarm, StationStatus
 from hmi.assets import STATIC
 from hmi.compression_station import plant_document
 from hmi.process_image import Model
 from hmi.signals import signals_of
+from tests.harness.records import MAPS
 from tests.harness.waiting import eventually
 from tests.hmi.conftest import Served, Site, opened, record, write_registers
 
@@ -106,7 +106,7 @@ def drawn(name: str) -> list[str]:
 
 
 def test_every_tag_of_a_drawing_is_a_signal_and_drawn_once() -> None:
-    signals = {signal.name for service in MAPS for signal in signals_of(service)}
+    signals = {signal.name for one in MAPS.values() for signal in signals_of(one)}
     for name in ("mimic.svg", "mimic-refrigerator.svg"):
         tags = drawn(name)
         assert set(tags) <= signals
@@ -120,7 +120,7 @@ def test_the_refrigerator_shows_all_that_the_station_measures() -> None:
 
 
 def test_limits_and_words_are_those_of_the_plants_registers() -> None:
-    model = Model(lambda: 0.0, 300)
+    model = Model(COLD_BOX, lambda: 0.0, 300)
     assert plant_document(model) == {"kind": ""}
     model.configuration = {
         "plant.kind": "refrigerator", "plant.station.alarms.hp_low_bar": 14.0, "plant.station.alarms.hp_high_bar": 17

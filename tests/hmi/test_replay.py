@@ -12,13 +12,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from coldloop.process.cold_box import OUTPUT_NAMES
+from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind
 from hmi.explanation import Branch
 from hmi.process_image import JournalEntry, Model
 from hmi.quality import SOUND
 from hmi.replay import Replay
-from rig.live.recorded_page import RecordedPage, _bits
+from rig.live.recorded_page import RecordedPage
 from rig.results.run_folder import RunFolder
 from tests.conftest import Coldloop
 from tests.harness.processes import END_S, Processes
@@ -54,7 +54,7 @@ def test_ticks_that_are_missing_in_a_recording_are_a_gap_and_end_nothing(recorde
     rows = table.to_pandas()
     rows.loc[100:160, [name for name in rows.select_dtypes("float") if name != "time_s"]] = float("nan")
     pq.write_table(pa.Table.from_pandas(rows, preserve_index=False).cast(table.schema), folder / "trace.parquet")
-    model, run = Model(time.monotonic, 3600.0), RecordedPage(RunFolder(folder))
+    model, run = Model(COLD_BOX, time.monotonic, 3600.0), RecordedPage(RunFolder(folder))
     assert run.frame(120) is None
     replay = Replay(run, model, 3600.0)
     for tick, gaps in ((120, []), (161, [(99, 161)]), (239, [(99, 161)])):
@@ -120,9 +120,12 @@ def test_a_recorded_run_has_the_quality_of_its_sensors(recorded_run: Path, monke
     recorded = RecordedPage(RunFolder(recorded_run))
     t5, kinds = OUTPUT_NAMES.index("T5"), EventKind
     noted = ((5, kinds.SENSOR, 2), (9, kinds.SENSOR_FAULT, 3), (12, kinds.SENSOR, 0), (15, kinds.SENSOR_FAULT, 0))
-    events = [JournalEntry.of("plant", Event(tick=at, kind=kind, subject=t5, cause=cause)) for at, kind, cause in noted]
+    events = [
+        JournalEntry.of("plant", Event(tick=at, kind=kind, subject=t5, cause=cause), COLD_BOX)
+        for at, kind, cause in noted
+    ]
     monkeypatch.setattr(recorded, "events", events)
-    told = [recorded.frame(tick).doubts.named.get("T5") for tick in (4, 5, 8, 9, 13, 15)]
+    told = [recorded.frame(tick).doubts.named(COLD_BOX).get("T5") for tick in (4, 5, 8, 9, 13, 15)]
     assert told == [None, "suspect", "suspect", "simulated", "simulated", None]
     assert recorded.frame(recorded.ticks - 1).doubts == SOUND
-    assert _bits("L1 T5") == 1 << OUTPUT_NAMES.index("L1") | 1 << OUTPUT_NAMES.index("T5")
+    assert recorded._bits("L1 T5") == 1 << OUTPUT_NAMES.index("L1") | 1 << t5  # noqa: SLF001

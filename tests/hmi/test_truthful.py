@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from hmi.trends import NAMES
+from coldloop.process.cold_box import COLD_BOX
+from hmi.trends import TrendStore
 from tests.harness.processes import Processes
 from tests.harness.waiting import eventually
 from tests.hmi.conftest import RECORDED_S, Served, Site, log_in_by_clicks, opened
@@ -129,7 +130,7 @@ def test_every_signal_of_the_trends_can_be_a_pen(page: "Page") -> None:
     view(page, "trends")
     page.wait_for_selector("#chart-L1")
     offered = set(page.eval_on_selector_all("#pen-add option", "all => all.map((one) => one.value)")) - {""}
-    assert offered | {"L1", "T5", "load", "CV155", "CV156", "NCR22_A"} == set(NAMES)
+    assert offered | {"L1", "T5", "load", "CV155", "CV156", "NCR22_A"} == set(TrendStore(COLD_BOX, 1).names)
     page.select_option("#pen-add", "T4")
     page.wait_for_selector("#chart-pen-T4")
     assert "T4 K" in page.inner_text("#chart-pen-T4 .title")

@@ -20,10 +20,10 @@ from coldloop.registers.codec import WordOrder, codec_of
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import ControlSession, Operator, OperatorMode, PlantLinkState, PlantLinkStatus
 from coldloop.registers.declaration import RegisterMap
-from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
 from coldloop.registers.plant import HISTORY_ROWS, LoadStep, Measurement, PlantSample, PlantSession
 from coldloop.registers.safety import Alarm, AlarmKind, LeaseState, LeaseStatus, WatchdogTime
 from tests.harness.processes import Process, Processes
+from tests.harness.records import CONTROL_MAP, PLANT_MAP
 from tests.harness.treated_link import TreatedLink
 
 HOST: Final = "127.0.0.1"

@@ -6,9 +6,9 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import Status
 from coldloop.registers.declaration import RegisterMap
-from coldloop.registers.maps import OPTIMIZER_MAP, PLANT_MAP
 from coldloop.registers.optimizer_plc import OptimizerSession
 from coldloop.registers.plant import LoadStep, PlantSession
+from tests.harness.records import OPTIMIZER_MAP, PLANT_MAP
 
 if TYPE_CHECKING:
     from tests.harness.processes import Processes

@@ -17,10 +17,9 @@ from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import ControlSession, Grant, LinkCause, PlantLinkState
 from coldloop.registers.declaration import Block
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import AlarmKind
-from tests.harness.records import sealed
+from tests.harness.records import PLANT_MAP, sealed
 from tests.harness.waiting import until
 
 if TYPE_CHECKING:

@@ -11,12 +11,12 @@ from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, CoolDownStep, LadderStatus, LinkCause, Mode, PlantLinkState
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Actuators
 from coldloop.registers.safety import AlarmKind, WatchdogTime
 from coldloop.safety.retained import RetainedFile
 from control_plc.retained_state import OWNER
 from rig.chaos.faults import Direction
+from tests.harness.records import PLANT_MAP
 
 if TYPE_CHECKING:
     from tests.harness.processes import Process

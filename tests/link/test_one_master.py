@@ -10,9 +10,9 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.registers.audit import EventKind
 from coldloop.registers.common import ServerStatistics
 from coldloop.registers.control_plc import LinkCause, PlantLinkState, PlantLinkStatus, Status
-from coldloop.registers.maps import OPTIMIZER_MAP
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
 from coldloop.registers.safety import AlarmKind, LeaseState, LeaseStatus
+from tests.harness.records import OPTIMIZER_MAP
 from tests.link.conftest import SAFE_STATE
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from coldloop.process.cold_box import TICK_S
 from coldloop.registers.common import Identity
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Actuators
 from coldloop.registers.safety import AlarmKind
+from tests.harness.records import PLANT_MAP
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -12,10 +12,10 @@ from typing import Any, Final
 
 import pytest
 
-from coldloop.registers.maps import MAPS
 from rig.cosim.wiring import SERVICES
 from rig.settings import Settings
 from tests.harness.processes import Ended, Process, Processes
+from tests.harness.records import MAPS
 from tests.harness.treated_link import TreatedLink
 from tests.link.poison import PoisonedReads
 

@@ -7,10 +7,10 @@ import pytest
 
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import LinkCause
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import AlarmKind
 from rig.chaos.faults import Direction
+from tests.harness.records import PLANT_MAP
 from tests.link.poison import Change, changed, poisons
 
 if TYPE_CHECKING:

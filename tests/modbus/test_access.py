@@ -12,7 +12,7 @@ from coldloop.modbus.settings import AccessSettings
 from coldloop.registers.codec import codec_of
 from coldloop.registers.control_plc import Grant, Operator, Plan, SequenceHeader, SequenceRow
 from coldloop.registers.declaration import Role
-from coldloop.registers.maps import CONTROL_MAP
+from tests.harness.records import CONTROL_MAP
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import Running, Serve, Wire

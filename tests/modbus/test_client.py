@@ -15,9 +15,8 @@ from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import Grant
 from coldloop.registers.declaration import RegisterMap
-from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
 from coldloop.registers.plant import Actuators, LoadStep, Measurement, PlantSample, PlantSession
-from tests.harness.records import as_transmitted, sealed
+from tests.harness.records import CONTROL_MAP, PLANT_MAP, as_transmitted, sealed
 
 if TYPE_CHECKING:
     from coldloop.registers.bank import Caller

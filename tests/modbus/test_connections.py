@@ -10,8 +10,8 @@ import pytest
 from coldloop.errors import PortInUseError
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import PlantSession
+from tests.harness.records import PLANT_MAP
 
 if TYPE_CHECKING:
     from coldloop.registers.bank import Caller

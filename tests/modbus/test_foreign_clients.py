@@ -11,9 +11,9 @@ import pytest
 
 from coldloop.process.cold_box import OUTPUT_NAMES, T5
 from coldloop.registers.common import Identity
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Measurement
 from tests.conftest import install
+from tests.harness.records import PLANT_MAP
 
 if TYPE_CHECKING:
     from coldloop.registers.declaration import Register

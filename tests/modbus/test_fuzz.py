@@ -14,7 +14,7 @@ from coldloop.modbus.refusals import RefusalLog
 from coldloop.modbus.requests import RequestHandler, Written
 from coldloop.registers.bank import Caller, RefusedAccessError, RegisterBank
 from coldloop.registers.declaration import Role
-from coldloop.registers.maps import MAPS
+from tests.harness.records import MAPS
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import Plug

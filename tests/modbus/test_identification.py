@@ -7,7 +7,7 @@ from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.pdu.mei_message import ReadDeviceInformationResponse
 
 from coldloop.modbus.server import DeviceIdentity
-from coldloop.registers.maps import CONTROL_MAP
+from tests.harness.records import CONTROL_MAP
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import Serve

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Actuators, PlantSession
+from tests.harness.records import PLANT_MAP
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import Serve

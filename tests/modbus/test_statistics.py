@@ -10,7 +10,7 @@ from coldloop.modbus.refusals import ErrorCounters
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import STATISTICS_BLOCK, Identity, ServerStatistics
 from coldloop.registers.declaration import RegisterMap
-from coldloop.registers.maps import MAPS
+from tests.harness.records import MAPS
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import Serve

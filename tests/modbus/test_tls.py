@@ -15,8 +15,8 @@ from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.settings import TlsSettings
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import AwaitUpdate, Grant, SequenceRow
-from coldloop.registers.maps import CONTROL_MAP
 from rig.cli.certificates import Authority
+from tests.harness.records import CONTROL_MAP
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import Pki, Running, Serve

@@ -15,7 +15,7 @@ from coldloop.modbus.refusals import RefusalLog
 from coldloop.modbus.settings import ServerSettings
 from coldloop.modbus.turns import REQUESTS_AT_ONCE, TURN_S, Turns
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.maps import PLANT_MAP
+from tests.harness.records import PLANT_MAP
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import FakeTransport, Plug, Serve

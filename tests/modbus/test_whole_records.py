@@ -20,10 +20,9 @@ from coldloop.registers.bank import BusyError, Caller, IllegalValueError, Regist
 from coldloop.registers.codec import WordOrder, codec_of
 from coldloop.registers.control_plc import Heartbeat
 from coldloop.registers.declaration import Block, Field, Kind, Register, RegisterMap
-from coldloop.registers.maps import CONTROL_MAP, MAPS, PLANT_MAP
 from coldloop.registers.plant import Actuators, Measurement, PlantSession
 from coldloop.registers.seal import Seal, seal_of
-from tests.harness.records import sealed
+from tests.harness.records import CONTROL_MAP, MAPS, PLANT_MAP, sealed
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import Plug, Serve

@@ -28,7 +28,6 @@ from coldloop.registers.control_plc import (
     Verdict,
 )
 from coldloop.registers.declaration import Block, RegisterMap
-from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
 from coldloop.safety.lease import Lease
 from coldloop.safety.sequence import InputSequence, checksum
@@ -36,7 +35,7 @@ from optimizer_plc.runtime import OptimizerPlc
 from optimizer_plc.settings import OptimizerSettings
 from rig.chaos.faults import Direction
 from rig.chaos.proxy import reset
-from tests.harness.records import sealed
+from tests.harness.records import CONTROL_MAP, PLANT_MAP, sealed
 from tests.harness.treated_link import TreatedLink
 
 WITHIN_S = 60.0

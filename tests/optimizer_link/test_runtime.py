@@ -13,9 +13,9 @@ from coldloop.registers.audit import EVENT_ROWS, Event, EventKind
 from coldloop.registers.bank import Caller
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import AwaitUpdate, Verdict
-from coldloop.registers.maps import OPTIMIZER_MAP
 from coldloop.registers.optimizer_plc import ControlLinkState, Optimization, OptimizerSession
 from optimizer_plc.runtime import SHORTEST_WAIT_S
+from tests.harness.records import OPTIMIZER_MAP
 
 if TYPE_CHECKING:
     from tests.optimizer_link.conftest import Connect, PlayedControlPlc

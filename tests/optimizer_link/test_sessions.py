@@ -16,11 +16,11 @@ from coldloop.registers.bank import Caller, IllegalValueError, RefusedAccessErro
 from coldloop.registers.codec import WordOrder, blank
 from coldloop.registers.common import SessionPace
 from coldloop.registers.declaration import Role
-from coldloop.registers.maps import OPTIMIZER_MAP
 from coldloop.registers.optimizer_plc import OperatingLimits, OptimizerSession
 from coldloop.registers.text import from_words
 from optimizer_plc.budget import BudgetSettings, PlcBudget
 from optimizer_plc.publication import OptimizerPublication
+from tests.harness.records import OPTIMIZER_MAP
 
 if TYPE_CHECKING:
     from tests.optimizer_link.conftest import Connect, Link, PlayedControlPlc, Until

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 import optimizer_plc.program
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_file import read_header
@@ -126,7 +127,7 @@ def recorded_jumps(model: LtiModel, hour: str, minutes: float) -> list[Jump]:
     control = make_program(read_header(DEFAULT_MODEL_FILE), ControlSection(), InputLimits())
     control.restart(session=1)
     plant = ColdBoxProgram(
-        box=REFERENCE, x0=model.x0.tolist(), u0=model.u0.tolist(), load=find_load(hour, model.w0), noise=None
+        box=REFERENCE, x0=model.x0.tolist(), u0=model.u0.tolist(), load=find_load(hour, model.w0, COLD_BOX), noise=None
     )
     jumps: list[Jump] = []
     jumped, load_before = False, model.w0

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Verdict
 from optimizer_plc.computing_settings import FastGradientSettings, InteriorPointSettings, QpoasesSettings
@@ -381,7 +382,7 @@ def test_every_solver_closes_the_loop(name: str, updating_period_s: float, model
     section = OptimizerSection(program=ProgramSettings(solver=SolverName(name)))
     rig = OneProcessRig(Settings(optimizer_plc=section))
     recorder = Recorder(480)
-    rig.run(Scenario(480, find_load("e", model.w0), updating_period_s, seed=1), recorder)
+    rig.run(Scenario(480, find_load("e", model.w0, COLD_BOX), updating_period_s, seed=1), recorder)
     recording = recorder.recording()
     assert len(recording.updates) >= 20
     assert {row.verdict for row in recording.updates} == {Verdict.ACCEPTED}

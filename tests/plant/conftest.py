@@ -16,7 +16,6 @@ from coldloop.registers.audit import EVENT_ROWS, Event, EventKind
 from coldloop.registers.bank import ALL_ROLES, Caller, RefusedAccessError
 from coldloop.registers.codec import codec_of
 from coldloop.registers.declaration import Role
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.registers.seal import Seal, seal_of
 from plant.cold_box.physics import REFERENCE, ColdBox, derivative, outputs
@@ -26,7 +25,7 @@ from plant.kinds import plant_maker
 from plant.numeric import RealArray
 from plant.rack.registers import RackRegisters
 from plant.settings import PlantSettings
-from tests.harness.records import sealed
+from tests.harness.records import PLANT_MAP, sealed
 
 R = TypeVar("R", bound=tuple[Any, ...])
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.load_profile import LOAD_SPAN, LoadProfile
+from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.plant import LoadStep
 from plant.rack.load_schedule import MOST_UPCOMING, LoadSchedule
 
@@ -41,7 +41,7 @@ def test_what_was_known_of_later_ticks_is_dropped() -> None:
         ([(5, 1.0)], "tick 5 is past"),
         ([(6, 1.0), (6, 2.0)], "does not come after"),
         ([(6, -1.0)], "outside"),
-        ([(6, LOAD_SPAN[1] + 1)], "outside"),
+        ([(6, COLD_BOX.load.stored_span[1] + 1)], "outside"),
         ([(6 + step, 1.0) for step in range(MOST_UPCOMING + 1)], "write these later"),
     ],
 )

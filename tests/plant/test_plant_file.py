@@ -11,7 +11,7 @@ import pytest
 
 from coldloop.config import flattened
 from coldloop.errors import ConfigurationError, LoadFileError, ModelFileError
-from coldloop.process.cold_box import T5
+from coldloop.process.cold_box import COLD_BOX, T5
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load
 from coldloop.process.model_file import read_document, read_header, write_document
@@ -112,7 +112,9 @@ def test_a_model_file_carries_its_plant(tmp_path: Path) -> None:
     assert load(file).digest == header.digest
 
     section = PlantSection(mismatch=MismatchSettings(turbine_efficiency=1.1, jt_valve=0.9))
-    made, off = (plant_maker(header, each)(find_load("a", header.w0), 1) for each in (PlantSection(), section))
+    made, off = (
+        plant_maker(header, each)(find_load("a", header.w0, COLD_BOX), 1) for each in (PlantSection(), section)
+    )
     assert made.box == plant.box
     assert off.box.turbine.efficiency == 1.1 * 0.74
     assert off.box.jt_valve.flow_area == 0.9 * plant.box.jt_valve.flow_area
@@ -183,6 +185,6 @@ def test_another_supply_pressure_counts_its_tables() -> None:
 
 
 def test_a_named_load_that_would_go_below_nothing_is_refused() -> None:
-    assert min(find_load("a", 60.0).watts) == 0.0
+    assert min(find_load("a", 60.0, COLD_BOX).watts) == 0.0
     with pytest.raises(LoadFileError, match=r"load 2h: would go down to -40 W about 60 W.*CSV file"):
-        find_load("2h", 60.0)
+        find_load("2h", 60.0, COLD_BOX)

@@ -7,12 +7,12 @@ import pytest
 
 from coldloop.errors import ColdloopError
 from coldloop.registers.bank import ANYBODY
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Actuators, PlantSession
 from coldloop.session.clock import Pacer
 from plant.rack.registers import RackRegisters
 from plant.runtime import PlantRuntime
 from plant.settings import PlantSettings
+from tests.harness.records import PLANT_MAP
 
 OUTPUTS = Actuators(0, (43.0, 75.0, 36.0), session=1)
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.process.load_profile import LOAD_SPAN
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers.audit import EventKind, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.plant import (
     LOAD_ROWS,
@@ -103,7 +103,7 @@ def test_a_load_that_does_not_begin_at_tick_0_and_go_on_is_refused(
     assert rack.shown().session == 1
 
 
-@pytest.mark.parametrize("watts", [math.nan, math.inf, -math.inf, -1.0, 1e30, LOAD_SPAN[1] * 1.001])
+@pytest.mark.parametrize("watts", [math.nan, math.inf, -math.inf, -1.0, 1e30, COLD_BOX.load.stored_span[1] * 1.001])
 def test_a_load_that_is_none_is_refused(under_way: "RackOnTheBus", watts: float) -> None:
     assert under_way.operator.write(LoadStep(40, watts), 1) == (3,)
     assert under_way.operator.request(float_write(LOAD_ADDRESS + 6, watts)) == (3,)

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers.audit import EventKind
 from coldloop.registers.plant import (
     STATION_ROWS,
@@ -48,7 +49,7 @@ def test_a_compressor_that_an_operator_trips_is_told_in_alarms_mode_and_journal(
     now = rack.operator.read(StationStatus)
     assert now.mode == StationMode.ONE_COMPRESSOR
     assert now.alarms & StationAlarm.NC2_TRIPPED
-    told = [describe(event).sentence for kind in STATION_EVENTS for event in rack.events(kind)]
+    told = [describe(event, COLD_BOX).sentence for kind in STATION_EVENTS for event in rack.events(kind)]
     assert any("nc2" in sentence and "operator" in sentence for sentence in told), told
     assert any("nc2 tripped (raised)" in sentence for sentence in told), told
     assert any("one compressor" in sentence for sentence in told), told

@@ -10,8 +10,8 @@ from coldloop.registers.codec import WordOrder, codec_of
 from coldloop.registers.common import IDENTITY_BLOCK
 from coldloop.registers.control_plc import SequenceRow
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32
-from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 from coldloop.registers.plant import Actuators, LoadStep, PlantSession
+from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 
 if TYPE_CHECKING:
     from tests.registers.conftest import Records

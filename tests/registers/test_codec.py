@@ -9,9 +9,8 @@ from coldloop.registers.codec import WordOrder, codec_of
 from coldloop.registers.common import IDENTITY_BLOCK, MAGIC, Identity
 from coldloop.registers.control_plc import Grant
 from coldloop.registers.declaration import Block
-from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 from coldloop.registers.plant import LoadStep, Measurement
-from tests.harness.records import as_transmitted
+from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP, as_transmitted
 
 if TYPE_CHECKING:
     from tests.registers.conftest import Records

@@ -16,8 +16,8 @@ from coldloop.registers.configuration import (
     lines_of,
     publish_configuration,
 )
-from coldloop.registers.maps import PLANT_MAP
 from plant.settings import SHOWN, PlantSection, PlantSettings, SensorSettings
+from tests.harness.records import PLANT_MAP
 
 
 def read(values: dict[str, Any]) -> dict[str, Any]:

@@ -5,8 +5,8 @@ import pytest
 from coldloop.modbus.requests import MAX_READ_WORDS, MAX_READ_WRITE_WORDS
 from coldloop.registers.common import IDENTITY_BLOCK, Identity
 from coldloop.registers.declaration import Block, Kind, RegisterMap, Role, f32, f32_array, fields_of, u16, u32
-from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 from coldloop.registers.plant import Measurement
+from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 
 MAPS = (PLANT_MAP, CONTROL_MAP, OPTIMIZER_MAP)
 each_map = pytest.mark.parametrize("register_map", MAPS, ids=lambda register_map: register_map.service)

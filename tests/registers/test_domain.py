@@ -10,10 +10,9 @@ from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.codec import check_record, codec_of
 from coldloop.registers.control_plc import LatchedUpdate, Status, Update
 from coldloop.registers.domain import DomainError
-from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
 from coldloop.registers.plant import MAX_AGE, Measurement
 from coldloop.registers.safety import Alarm
-from tests.harness.records import map_of
+from tests.harness.records import CONTROL_MAP, PLANT_MAP, map_of
 
 HEADER = read_header(DEFAULT_MODEL_FILE)
 MEASURED = Measurement(7, HEADER.w0, HEADER.y0, HEADER.x0, 3, HEADER.u0, 5, 1, 1, 0, 0.5)

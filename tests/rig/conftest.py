@@ -14,6 +14,7 @@ import control_plc.runtime
 import optimizer_plc.runtime
 import plant.runtime
 from coldloop.modbus.client import RegisterClient
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
 from coldloop.registers.codec import WordOrder
@@ -56,12 +57,12 @@ def lively(mean_load: float) -> LoadProfile:
 
 @pytest.fixture(scope="session")
 def load_a(mean_load: float) -> LoadProfile:
-    return find_load("a", mean_load)
+    return find_load("a", mean_load, COLD_BOX)
 
 
 @pytest.fixture(scope="session")
 def load_e(mean_load: float) -> LoadProfile:
-    return find_load("e", mean_load)
+    return find_load("e", mean_load, COLD_BOX)
 
 
 Simulate = Callable[..., Recording]

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import NO_LOAD
-from coldloop.process.loaded import PROCESS
-from coldloop.registers.maps import MAPS
+from coldloop.process.settings import settings_of
 from coldloop.session.settings import TimeMode
 from optimizer_plc.qp.penalties import Preset
 from optimizer_plc.settings import SolverName
@@ -25,6 +25,7 @@ from rig.cli.register_listing import FORMATS
 from rig.cli.tag_exports import EXPORTS
 from rig.studies import APART, STUDIES
 from tests.harness.processes import Ended, Processes
+from tests.harness.records import MAPS
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
@@ -170,9 +171,9 @@ def test_an_abbreviation_of_an_option_is_none(words: tuple[str, ...], cut: str, 
     assert cut in outcome.complaints[-1]
 
 
-def test_a_load_of_a_process_that_has_none_is_refused(monkeypatch: pytest.MonkeyPatch, coldloop: "Coldloop") -> None:
-    monkeypatch.setattr("rig.cli.commands.options.PROCESS", replace(PROCESS, load=NO_LOAD, bath=None))
-    outcome = coldloop("run", "--load", "a")
+def test_a_load_of_a_process_that_has_none_is_refused(coldloop: "Coldloop") -> None:
+    with settings_of(replace(COLD_BOX, load=NO_LOAD, bath=None)):
+        outcome = coldloop("run", "--load", "a")
     assert (outcome.code, outcome.complaints) == (2, ["coldloop: load 'a': cold-box has no load; leave it out"])
 
 

@@ -11,8 +11,8 @@ import pytest
 
 from coldloop.process.lti_model import load
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop.registers.maps import MAPS
 from rig.cli.register_listing import COLUMNS
+from tests.harness.records import MAPS
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop

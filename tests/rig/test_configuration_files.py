@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from coldloop.config import DERIVED, as_toml, load_configuration
-from optimizer_plc.qp.penalties import OF_PRESETS, PRESETS, Preset
+from coldloop.process.cold_box import COLD_BOX
+from optimizer_plc.qp.penalties import OF_PRESETS, Preset, presets_of
 from rig import simulate
 from rig.settings import Settings
 
@@ -137,7 +138,9 @@ def test_the_option_reaches_the_run(coldloop: "Coldloop", tmp_path: Path) -> Non
 
 
 def test_all_that_a_preset_decides_is_declared() -> None:
-    decided = {f"{name}.{key}" for preset in PRESETS.values() for name, values in preset.items() for key in values}
+    decided = {
+        f"{name}.{key}" for preset in presets_of(COLD_BOX).values() for name, values in preset.items() for key in values
+    }
     assert decided == set(OF_PRESETS)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coldloop.process.cold_box import L1, STATE_NAMES, T5
+from coldloop.process.cold_box import COLD_BOX, L1, STATE_NAMES, T5
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from plant.helium.properties import load_helium
@@ -39,7 +39,7 @@ def assert_balanced(run: Simulation) -> None:
     """The plant with the inputs of a run: its helium is constant, and it has gained what crossed its boundary."""
     section = {"kind": "refrigerator", "refrigerator": {"start": "warm"}}
     maker = plant_maker(HEADER, PlantSettings.model_validate({"plant": section}).plant)
-    plant = maker(load_table(find_load(str(LOAD), HEADER.w0)), 1)
+    plant = maker(load_table(find_load(str(LOAD), HEADER.w0), COLD_BOX), 1)
     assert isinstance(plant, RefrigeratorProgram)
     parameters, tables, sums = plain_tuples(plant.plant), plain_tuples(HELIUM), np.zeros(4)
     before, block = plant.memory, run.recording.block

@@ -21,12 +21,12 @@ from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.declaration import Block, RegisterMap
-from coldloop.registers.maps import CONTROL_MAP, PLANT_MAP
 from coldloop.registers.safety import AlarmKind
 from coldloop.service.journal import KEPT, Journal, JournalPublication
 from rig.cli.commands.events import COLUMNS
 from rig.cosim.journal_reader import JournalReader
 from tests.harness.processes import Processes
+from tests.harness.records import CONTROL_MAP, PLANT_MAP
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
@@ -194,7 +194,7 @@ def test_follow_goes_on_with_new_events_until_it_is_interrupted(serve: Serve, pr
 def test_the_csv_file_has_a_header_and_a_row_for_each_event(coldloop: "Coldloop", serve: Serve, tmp_path: Path) -> None:
     file = tmp_path / "events.csv"
     with serve(3) as service:
-        service.journal.note(20, EventKind.ALARM_SHELVED, AlarmKind.T5_BAND, 1, value=900.0)
+        service.journal.note(20, EventKind.ALARM_SHELVED, AlarmKind.SECOND_BAND, 1, value=900.0)
         outcome = coldloop("events", at(service), "--csv", file)
     assert (outcome.code, outcome.out) == (0, f"4 events in {file}\n")
     with file.open(newline="", encoding="utf-8") as text:

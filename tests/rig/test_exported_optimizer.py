@@ -17,7 +17,6 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity
-from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP
 from coldloop.registers.safety import LeaseState, LeaseStatus
 from rig import cli
 from rig.cli.plc_folder import export_plc
@@ -29,6 +28,7 @@ from rig.plc_export.kernels.recorded_problems import SINGLE
 from rig.settings import Settings
 from tests.conftest import Coldloop, install_libmodbus
 from tests.harness.processes import Processes
+from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP
 from tests.rig.conftest import until_accepted
 
 if TYPE_CHECKING:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from coldloop.process.cold_box import L1, OUTPUT_UNITS
+from coldloop.process.cold_box import COLD_BOX, L1, OUTPUT_UNITS
 from coldloop.registers.audit import EventKind
 from optimizer_plc.qp.design import ControlDesign
 from plant.load import find_load
@@ -46,7 +46,7 @@ def test_a_level_sensor_fails(monkeypatch: pytest.MonkeyPatch, fault: str, notic
     monkeypatch.setattr(PlantProgram, "measure", measured)
     settings = Settings()
     rig = OneProcessRig(settings, compiled=False)
-    rig.run(Scenario(TICKS, find_load("e@100", 385.0), 0.0, seed=1), Recorder(TICKS))
+    rig.run(Scenario(TICKS, find_load("e@100", 385.0, COLD_BOX), 0.0, seed=1), Recorder(TICKS))
     events = [event for event in rig.control.journal.since(0) if event.kind == EventKind.SENSOR]
     assert [(event.subject, event.cause) for event in events[:1]] == ([] if noticed is None else [(L1, noticed)])
     assert all(event.tick <= BEGIN + TEN_MINUTES for event in events[:1])

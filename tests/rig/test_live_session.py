@@ -14,14 +14,13 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import ControlSession, LadderStatus, Mode, PlantLinkState, PlantLinkStatus
-from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 from coldloop.registers.optimizer_plc import OptimizerSession
 from coldloop.registers.plant import LiveLoad, LoadAhead, LoadStatus, LoadStep, PlantSession
 from coldloop.registers.safety import AlarmKind, WatchdogStatus
 from rig.cosim.journal_reader import JournalReader
 from rig.cosim.local_services import LocalServices
 from rig.settings import Settings
-from tests.harness.records import sealed
+from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP, sealed
 
 pytestmark = pytest.mark.usefixtures("processes", "realtime")
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from coldloop.errors import LoadFileError
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import LoadProfile
 from plant.load import HOUR_TICKS, NAMED, find_load
 
@@ -29,8 +30,8 @@ def by_the_tick(load: LoadProfile, hours: int) -> list[float]:
 
 @pytest.mark.parametrize("name", NAMED)
 def test_a_named_load_is_always_the_same_and_lasts_as_long_as_it_says(name: str) -> None:
-    load = find_load(name, 385.0)
-    assert load == find_load(name, 385.0)
+    load = find_load(name, 385.0, COLD_BOX)
+    assert load == find_load(name, 385.0, COLD_BOX)
     hours = len(NAMED[name])
     assert (hours - 1) * HOUR_TICKS < load.times[-1] < hours * HOUR_TICKS
     assert min(load.watts) >= 0
@@ -39,23 +40,23 @@ def test_a_named_load_is_always_the_same_and_lasts_as_long_as_it_says(name: str)
 
 @pytest.mark.parametrize("name", NAMED)
 def test_a_named_load_moves_about_the_mean_that_it_is_given(name: str) -> None:
-    low, high = find_load(name, 385.0), find_load(name, 400.0)
+    low, high = find_load(name, 385.0, COLD_BOX), find_load(name, 400.0, COLD_BOX)
     assert low.times == high.times
     assert [after - before for before, after in zip(low.watts, high.watts, strict=True)] == [15.0] * len(low.watts)
 
 
 def test_the_hours_a_to_f_differ() -> None:
-    assert len({find_load(name, 385.0) for name in "abcdef"}) == 6
+    assert len({find_load(name, 385.0, COLD_BOX) for name in "abcdef"}) == 6
 
 
 @pytest.mark.parametrize(("whole", "parts"), [("2h", "ab"), ("6h", "abcdef")])
 def test_a_long_load_is_its_hours_one_after_the_other(whole: str, parts: str) -> None:
-    joined = [watts for part in parts for watts in by_the_tick(find_load(part, 385.0), 1)]
-    assert by_the_tick(find_load(whole, 385.0), len(parts)) == joined
+    joined = [watts for part in parts for watts in by_the_tick(find_load(part, 385.0, COLD_BOX), 1)]
+    assert by_the_tick(find_load(whole, 385.0, COLD_BOX), len(parts)) == joined
 
 
 def test_a_csv_file_holds_each_step_until_the_next(write: Write) -> None:
-    load = find_load(str(write("time_s,load_w\n0,385\n10.25,400.5\n60,385\n")), 0.0)
+    load = find_load(str(write("time_s,load_w\n0,385\n10.25,400.5\n60,385\n")), 0.0, COLD_BOX)
     assert load == LoadProfile((0, 41, 240), (385.0, 400.5, 385.0))
 
 
@@ -85,7 +86,7 @@ def test_a_csv_file_holds_each_step_until_the_next(write: Write) -> None:
     ],
 )
 def test_a_csv_file_as_spreadsheets_save_it_is_read(content: str | bytes, write: Write) -> None:
-    assert find_load(str(write(content)), 0.0) == LoadProfile((0, 20), (385.0, 400.0))
+    assert find_load(str(write(content)), 0.0, COLD_BOX) == LoadProfile((0, 20), (385.0, 400.0))
 
 
 @pytest.mark.parametrize(
@@ -119,7 +120,7 @@ def test_a_bad_csv_file_is_told_in_one_line_with_place_and_remedy(
 
 def assert_told(load: Path, *parts: str) -> None:
     with pytest.raises(LoadFileError) as caught:
-        find_load(str(load), 385.0)
+        find_load(str(load), 385.0, COLD_BOX)
     message = str(caught.value)
     assert "\n" not in message
     for expected in parts:
@@ -157,7 +158,7 @@ def test_a_file_that_may_not_be_read_is_told(write: Write) -> None:
 
 
 def test_another_draw_is_of_the_same_family_at_other_instants(mean_load: float) -> None:
-    first, again, second = (find_load(name, mean_load) for name in ("c", "c@1", "c@2"))
+    first, again, second = (find_load(name, mean_load, COLD_BOX) for name in ("c", "c@1", "c@2"))
     assert first == again
     assert second.times != first.times
     assert set(second.watts) == set(first.watts)
@@ -166,4 +167,4 @@ def test_another_draw_is_of_the_same_family_at_other_instants(mean_load: float) 
 @pytest.mark.parametrize("name", ["c@", "c@0", "c@-1", "c@two"])
 def test_a_draw_is_a_number_from_1_on(name: str, mean_load: float) -> None:
     with pytest.raises(LoadFileError, match="write c@2"):
-        find_load(name, mean_load)
+        find_load(name, mean_load, COLD_BOX)

@@ -28,13 +28,13 @@ from coldloop.registers.configuration import (
     publish_configuration,
 )
 from coldloop.registers.control_plc import LadderStatus, Operator
-from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.text import to_words
 from plant.own_model import own_header
 from rig.cosim.wiring import SERVICES
 from rig.settings import Settings
 from rig.testing.event_loop import BackgroundLoop
+from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop, Outcome

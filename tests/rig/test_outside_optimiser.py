@@ -23,7 +23,6 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import MAGIC, Identity
 from coldloop.registers.control_plc import LadderStatus, Mode, Status, Verdict
-from coldloop.registers.maps import CONTROL_MAP
 from coldloop.registers.safety import LeaseState, LeaseStatus
 from rig import cli
 from rig.cosim.endpoints import REQUIRED
@@ -32,6 +31,7 @@ from rig.cosim.session_client import SessionClient
 from rig.settings import Settings
 from tests.conftest import Coldloop
 from tests.harness.processes import Process, Processes
+from tests.harness.records import CONTROL_MAP
 from tests.rig.conftest import until_accepted
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coldloop.errors import ModelFileError
-from coldloop.process.cold_box import L1, T5, T5_BAND
+from coldloop.process.cold_box import COLD_BOX, L1, T5, T5_BAND
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.settings import DEFAULT_MODEL_FILE, ModelSettings
 from optimizer_plc.qp.design import ControlDesign
@@ -86,7 +86,7 @@ def predicted(model: LtiModel, at: LtiModel, u: RealArray, w: RealArray) -> Real
 @pytest.mark.usefixtures("compiles")
 async def test_over_the_bus_it_is_the_same_plant(made: Made, on_the_bus: "OnTheBus", simulate: "Simulate") -> None:
     model = ModelSettings(file=made.file)
-    scenario = Scenario(ticks=80, load=find_load("a", made.model.w0), updating_period_s=0.0, seed=1)
+    scenario = Scenario(ticks=80, load=find_load("a", made.model.w0, COLD_BOX), updating_period_s=0.0, seed=1)
     async with on_the_bus(Settings(model=model)) as bus:
         networked = await bus.record(scenario)
     assert networked.trace_sha256 == simulate(scenario, model=model).trace_sha256

@@ -15,7 +15,6 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import ControlSession, Mode, Plan, ProcessNow, Status, Verdict
 from coldloop.registers.declaration import RegisterMap
-from coldloop.registers.maps import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 from coldloop.registers.optimizer_plc import OptimizerSession
 from coldloop.registers.plant import LoadStep, PlantSession
 from control_plc.settings import ControlSection, LadderSettings
@@ -24,6 +23,7 @@ from rig.cosim.scenario import Scenario
 from rig.cosim.session_reader import SampleReader
 from rig.settings import Settings
 from tests.harness import processes as harness
+from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 from tests.harness.waiting import until
 
 if TYPE_CHECKING:

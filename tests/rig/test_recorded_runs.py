@@ -362,7 +362,9 @@ def test_the_copy_of_a_load_is_what_was_read(what: str, coldloop: "Coldloop", tm
     (tmp_path / "load.csv").write_text(WRITTEN[what], encoding="utf-16" if what == "UTF-16" else "utf-8")
     words = ("run", "--in-process", "--load", tmp_path / "load.csv", "--duration", "15s", "--out", tmp_path / "run")
     assert coldloop(*words).code == 0
-    assert read_load_file(tmp_path / "run" / "inputs" / "load.csv") == read_load_file(tmp_path / "load.csv")
+    assert read_load_file(tmp_path / "run" / "inputs" / "load.csv", COLD_BOX) == read_load_file(
+        tmp_path / "load.csv", COLD_BOX
+    )
     (tmp_path / "load.csv").unlink()
     assert coldloop("rerun", tmp_path / "run").code == 0
 

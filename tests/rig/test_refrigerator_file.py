@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.process.cold_box import T5_BAND
+from coldloop.process.cold_box import COLD_BOX, T5_BAND
 from coldloop.process.lti_model import load
 from coldloop.process.settings import ModelSettings
 from plant.load import find_load
@@ -53,7 +53,7 @@ async def test_over_the_bus_it_is_the_same_refrigerator(
     made: Path, on_the_bus: "OnTheBus", simulate: "Simulate"
 ) -> None:
     model, plant = ModelSettings(file=made), PlantSection.model_validate({"kind": "refrigerator"})
-    scenario = Scenario(ticks=80, load=find_load("a", load(made).w0), updating_period_s=0.0, seed=1)
+    scenario = Scenario(ticks=80, load=find_load("a", load(made).w0, COLD_BOX), updating_period_s=0.0, seed=1)
     async with on_the_bus(Settings(model=model, plant=plant)) as bus:
         networked = await bus.record(scenario)
     assert networked.trace_sha256 == simulate(scenario, model=model, plant=plant).trace_sha256

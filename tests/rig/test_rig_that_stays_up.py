@@ -14,12 +14,12 @@ import pytest
 from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.control_plc import Operator, OperatorMode
-from coldloop.registers.maps import CONTROL_MAP
 from rig import cli
 from rig.live.link_cuts import CUT_FILES, CuttableLinks
 from rig.live.started_rigs import running_rig, state_folder
 from tests.conftest import Coldloop
 from tests.harness.processes import Processes
+from tests.harness.records import CONTROL_MAP
 from tests.harness.waiting import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.usefixtures("realtime", "undrawn")

@@ -43,7 +43,7 @@ def test_an_alarm_is_as_it_was_when_the_recording_begins() -> None:
         noted(1, EventKind.ALARM_SHELVED, 5), noted(2, raised, 5), noted(3, returned, 5), noted(4, raised, 5),
         noted(5, acknowledged, 5), noted(6, raised, 7), noted(7, returned, 7), noted(8, EventKind.ALARM_UNSHELVED, 5),
     ]  # fmt: skip
-    entry = [JournalEntry.of("control_plc", event) for event in state_of(events, NOW)]
+    entry = [JournalEntry.of("control_plc", event, COLD_BOX) for event in state_of(events, NOW)]
     rows = alarms_after(entry, COLD_BOX)
     assert (rows[5].state, rows[5].active, rows[5].raised) == (AlarmState.ACKNOWLEDGED, 1, 40)
     assert (rows[7].state, rows[7].active) == (AlarmState.RETURNED, 0)

@@ -11,16 +11,18 @@ from typing import Annotated, Any, NamedTuple
 
 import pytest
 
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import IDENTITY_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, f32
-from coldloop.registers.maps import CONTROL_MAP, MAPS, PLANT_MAP
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import AlarmKind
+from coldloop.service.event_text import alarm_word
 from coldloop.service.metrics import metric_name
 from rig.cli.tag_exports import exported, runs
 from tests.conftest import Coldloop
+from tests.harness.records import CONTROL_MAP, MAPS, PLANT_MAP
 
 T5_ADDRESS = 216
 GRAFANA = Path(__file__).parents[2] / "docs" / "grafana.json"
@@ -106,7 +108,7 @@ def test_each_request_reads_neighbours_of_one_block_that_fit(service: str) -> No
 
 def test_a_new_alarm_is_exported_by_itself() -> None:
     names = {tag.name for tag in exported(CONTROL_MAP)}
-    assert {f"alarms_{kind.name.lower()}_state" for kind in AlarmKind} <= names
+    assert {f"alarms_{alarm_word(kind, COLD_BOX)}_state".replace(" ", "_") for kind in AlarmKind} <= names
 
 
 def test_the_dashboard_of_the_docs_is_the_one_that_is_made_and_its_metrics_are_there(coldloop: Coldloop) -> None:

@@ -11,9 +11,9 @@ from coldloop.errors import LinkError
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.common import Identity
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import PlantSession
 from rig.cosim.scenario import Scenario
+from tests.harness.records import PLANT_MAP
 
 if TYPE_CHECKING:
     from tests.rig.conftest import Bus, OnTheBus, Simulate

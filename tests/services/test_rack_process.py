@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.common import Identity
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import Actuators, LoadStep, Measurement, OutputVerdict, PlantSession
+from tests.harness.records import PLANT_MAP
 
 if TYPE_CHECKING:
     from tests.harness.processes import Process

@@ -12,8 +12,8 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.process.model_file import read_document, write_document
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus
-from coldloop.registers.maps import CONTROL_MAP
 from coldloop.registers.safety import Alarm, AlarmKind
+from tests.harness.records import CONTROL_MAP
 from tests.harness.waiting import until
 
 if TYPE_CHECKING:

@@ -3,7 +3,7 @@
 import asyncio
 
 from coldloop.modbus.client import RegisterClient
-from coldloop.registers.maps import PLANT_MAP
+from tests.harness.records import PLANT_MAP
 
 PATIENCE_S = 60.0
 

@@ -10,8 +10,8 @@ import pytest
 from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.common import Identity
-from coldloop.registers.maps import PLANT_MAP
 from coldloop.registers.plant import LoadStep, PlantSession
+from tests.harness.records import PLANT_MAP
 
 if TYPE_CHECKING:
     from tests.services.conftest import Start

@@ -195,9 +195,9 @@ def test_what_happens_to_a_refrigerator_is_told_by_its_ranges_modes_and_alarms(
     happened = [
         ("control_plc", 0, EventKind.MODE, Mode.HOLD), ("control_plc", 8, EventKind.MODE, Mode.MPC),
         ("control_plc", 2400, EventKind.ALARM_RAISED, AlarmKind.CAPACITY),
-        ("control_plc", 2500, EventKind.ALARM_RAISED, AlarmKind.LEVEL_BAND),
+        ("control_plc", 2500, EventKind.ALARM_RAISED, AlarmKind.FIRST_BAND),
         ("control_plc", 2600, EventKind.ALARM_RAISED, AlarmKind.CAPACITY),
-        ("plant", 2600, EventKind.ALARM_RAISED, AlarmKind.T5_BAND),
+        ("plant", 2600, EventKind.ALARM_RAISED, AlarmKind.SECOND_BAND),
     ]  # fmt: skip
     run = replace(run, events=[Happening(*event) for event in happened])
     asked = STUDIES["disturbances"].requests(under)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from coldloop.errors import StudyError
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.settings import SHIPPED_MODELS
@@ -66,7 +67,7 @@ def situation(rng: np.random.Generator) -> QpParameters:
 @pytest.fixture(scope="module")
 def sequence() -> ProblemSequence:
     """The problems of five minutes of load e, the first load steps among them."""
-    load = find_load("e", load_model(SHIPPED_MODELS["cold-box"]).w0)
+    load = find_load("e", load_model(SHIPPED_MODELS["cold-box"]).w0, COLD_BOX)
     return problem_sequence(Scenario(1200, load, 5.0, seed=1), ())
 
 

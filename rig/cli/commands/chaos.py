@@ -62,7 +62,7 @@ def execute(options: argparse.Namespace) -> int:
     _refuse_what_has_no_effect(effective)
     out = options.out or claim_folder_of_now(Path("chaos"), plan.name)
     claim_folder(out, force=options.force)
-    with ChaosProgress(plan.ticks) as progress:
+    with ChaosProgress(plan) as progress:
         experiment = perform(
             plan, effective, out, progress, arguments=plain_arguments(options), formats=options.figures
         )
@@ -101,7 +101,7 @@ def _report(out: Path, plan: "ChaosPlan", experiment: "Experiment") -> None:
 
     with writing(out, "no report was written, choose another --out"):
         _write(out, plan, experiment)
-    sys.stdout.write(table(experiment.evaluation.rows))
+    sys.stdout.write(table(experiment.evaluation.rows, plan.process))
     for line in [*summary_lines(experiment.trace, experiment.evaluation), f"results in {out}"]:
         sys.stdout.write(f"{line}\n")
 

@@ -94,12 +94,12 @@ async def _sensor(options: argparse.Namespace) -> None:
     from rig.live.operator_request import ask
 
     settings = operator_settings(options)
-    process, rig = settings.process, rig_endpoints(options, settings)
+    process = settings.process
     if options.output not in process.output_names:
         raise UsageError(f"unknown output '{options.output}'; choose from {', '.join(process.output_names)}")
     command = read_command({"kind": "sensor_fault", "output": options.output, **_shown(options.shows)}, process)
     services, work = WORK[type(command)]
-    text = await ask(rig, process, services, lambda clients: work(clients, command))
+    text = await ask(rig_endpoints(options, settings), process, services, lambda clients: work(clients, command))
     sys.stdout.write(f"{text}\n")
 
 

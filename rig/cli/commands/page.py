@@ -56,7 +56,7 @@ async def _watch(options: argparse.Namespace, settings: "Settings") -> None:
     _say(f"http{'s' if section.https else ''}://{section.host}:{section.port}/")
     if login is not None:
         _say(login.line.strip())
-    await serve(HmiSettings(hmi=section))
+    await serve(HmiSettings(model=settings.model, hmi=section))
 
 
 def _say(address: str) -> None:

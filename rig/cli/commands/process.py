@@ -14,7 +14,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     what.add_argument("file", type="read", nargs="?", metavar="FILE", help="process file (TOML)")
     what.add_argument("--keys", action="store_true", help="list the keys of process files, as Markdown")
     parser.add_argument("--out", type="write", metavar="MODEL",
-                        help="write the model file; then --process MODEL, or COLDLOOP_PROCESS=MODEL")  # fmt: skip
+                        help="write the model file; then --process MODEL, or the key model.file")  # fmt: skip
     parser.add_argument("--limit", type=positive_count, default=300, metavar="SECONDS",
                         help="how long its plant may take, in a process of its own (default: 300)")  # fmt: skip
 

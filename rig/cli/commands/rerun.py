@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import UsageError
-from rig.cli.process_option import TRUST
 
+TRUST: Final = "--trust"
 MANIFEST: Final = "manifest.json"
 
 
@@ -22,13 +22,13 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run again; 0 for the same trace, 1 for another one."""
-    from coldloop.process.settings import DEFAULT_MODEL_FILE
+    from coldloop.process.settings import ModelSettings
     from rig.runs.rerun import repeat
 
     path: Path = options.manifest
     if path.is_file() and path.name != MANIFEST:
         raise UsageError(f"{path}: not the {MANIFEST} of a run; name that, or its folder")
-    folder, trusted = path.parent if path.name == MANIFEST else path, None if options.trust else DEFAULT_MODEL_FILE
+    folder, trusted = path.parent if path.name == MANIFEST else path, None if options.trust else ModelSettings().file
     same, text = repeat(folder, options.out, force=options.force, trusted=trusted)
     sys.stdout.write(text)
     return 0 if same else 1

@@ -142,10 +142,11 @@ def _tick(options: argparse.Namespace) -> int:
 
 
 def _acknowledgement(options: argparse.Namespace) -> dict[str, object]:
-    from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmKind
+    from coldloop.registers.safety import ALL_ALARMS, AlarmAction, alarms_of
     from coldloop.service.event_text import alarm_word
 
-    kinds = {alarm_word(kind, settings_process()).replace(" ", "-"): int(kind) for kind in AlarmKind}
+    process = settings_process()
+    kinds = {alarm_word(alarm, process).replace(" ", "-"): alarm for alarm in alarms_of(process)}
     if options.alarm is not None and options.alarm not in kinds:
         raise UsageError(f"unknown alarm '{options.alarm}'; choose from {', '.join(kinds)}")
     alarm = ALL_ALARMS if options.alarm is None else kinds[options.alarm]

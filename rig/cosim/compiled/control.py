@@ -5,9 +5,8 @@ from typing import Any
 import numpy as np
 
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Mode, OperatorMode, ProcessNow, SequenceHeader, Update
-from coldloop.registers.safety import AlarmKind, CapacityCause
+from coldloop.registers.safety import AlarmKind, CapacityCause, band_alarms
 from coldloop.safety.sequence import InputSequence, with_checksum
-from control_plc.alarm_settings import BANDS
 from control_plc.output_limits import GuardState, Limits
 from control_plc.process_alarms import present_limits
 from control_plc.program import ControlProgram
@@ -45,14 +44,16 @@ def due(program: ControlProgram) -> float:
 def alarms_of(program: ControlProgram) -> Alarms:
     """Return the band alarms as they are, with their present limits."""
     low, high = np.array(present_limits(program.alarm_settings, program.alarms), dtype=np.float64).T
-    rows, delays = (program.alarms.rows[kind] for kind in BANDS), map(program.alarms.delay, BANDS)
-    causes = [row.cause if row.active else NOT for row in rows]
+    bands, process = band_alarms(program.alarm_settings.process), program.alarm_settings.process
+    active, delays = zip(
+        *((bool(program.alarms.rows[each].active), program.alarms.delay(each)) for each in bands), strict=True
+    )
     return Alarms(
         low.copy(),
         high.copy(),
-        np.array(program.alarm_settings.process.controlled),
-        np.array(causes),
-        np.array(list(delays)),
+        np.array(process.controlled),
+        np.array(active),
+        np.array(delays),
     )
 
 
@@ -70,7 +71,10 @@ def scan_record(program: ControlProgram) -> Any:  # noqa: ANN401 a record
         header.number, header.first_tick, header.length, header.tau_u
     )  # fmt: skip
     s["triggered"], s["lowest"] = program.watchdog.triggered, program.watchdog.lowest
-    s["since"] = [NOT if since is None else since for since in program.alarms.pending(*BANDS)]
+    s["since"] = [
+        NOT if since is None else since
+        for since in program.alarms.pending(*band_alarms(program.alarm_settings.process))
+    ]
     s["unchanged"], s["rests"], s["seen"] = sensors.unchanged, sensors.rests, sensors.before
     s["inputs"], s["inputs_moved"] = sensors.inputs, sensors.inputs_moved
     _, s["seen_x"], (s["seen_load"],) = sensors.image.last
@@ -115,7 +119,7 @@ def restore_scan(program: ControlProgram, s: Any, trace: Trace) -> None:  # noqa
     sensors.image.has_moved = bool(s["image_moved"])
     sensors.seen(last, y, x, (load,))
     program.watchdog.triggered, program.watchdog.lowest = int(s["triggered"]), int(s["lowest"])
-    for kind, since in zip(BANDS, s["since"].tolist(), strict=True):
+    for kind, since in zip(band_alarms(program.alarm_settings.process), s["since"].tolist(), strict=True):
         program.alarms.set_pending(kind, None if since == NOT else since)
 
 

@@ -50,34 +50,23 @@ def look(w: World, alarms: Alarms, s: Any, plant: PlantState, trace: Trace) -> b
         for i in range(x.shape[0]):
             same = same and x[i] == (trace.x[row - 1, i] if row > 0 else s.seen_x[i])
     s.same = same
-    changes = is_due(alarms, 0, s.since[0], s.tick, y) or is_due(alarms, 1, s.since[1], s.tick, y)
+    changes = False
+    for band in range(alarms.places.shape[0]):
+        changes = changes or is_due(alarms, band, s.since[band], s.tick, y)
     return known and not (interrupted or frozen or changes) and are_inside(y, w.low, w.high)
 
 
 @kernel
-def cause_of(alarms: Alarms, kind: int, y: Array) -> int:
-    """Return the cause of a band alarm, or NOT where all its outputs are within their bands."""
-    for place in range(kind, alarms.places.shape[0] if kind else 1):
-        if not alarms.low[place] <= y[alarms.places[place]] <= alarms.high[place]:
-            return place - kind
-    return NOT
+def differs(alarms: Alarms, band: int, y: Array) -> bool:
+    """Return whether the condition of a band alarm is another than the alarm shows."""
+    inside = alarms.low[band] <= y[alarms.places[band]] <= alarms.high[band]
+    return bool(inside == alarms.active[band])
 
 
 @kernel
-def is_due(alarms: Alarms, kind: int, since: int, tick: int, y: Array) -> bool:
-    """Return whether a band alarm follows its condition at this tick, after its delay, or another cause at once."""
-    cause, shown = cause_of(alarms, kind, y), alarms.causes[kind]
-    if (cause == NOT) == (shown == NOT):
-        return bool(cause != shown)
-    return bool(tick - (tick if since == NOT else since) >= alarms.delays[kind])
-
-
-@kernel
-def pending(alarms: Alarms, kind: int, since: int, tick: int, y: Array) -> int:
-    """Return since when the condition of a band alarm has been another than the alarm shows, or NOT."""
-    if (cause_of(alarms, kind, y) == NOT) == (alarms.causes[kind] == NOT):
-        return NOT
-    return tick if since == NOT else since
+def is_due(alarms: Alarms, band: int, since: int, tick: int, y: Array) -> bool:
+    """Return whether a band alarm follows its condition at this tick, after its delay."""
+    return differs(alarms, band, y) and bool(tick - (tick if since == NOT else since) >= alarms.delays[band])
 
 
 @kernel
@@ -123,8 +112,11 @@ def scan(
     if w.each_may_rest:
         note_moves(s.unchanged, s.inputs, s.inputs_moved, u, w.moves, tick)
     note_image(w, s, u)
-    for kind in range(2):
-        s.since[kind] = pending(alarms, kind, s.since[kind], tick, y)
+    for band in range(alarms.places.shape[0]):
+        if not differs(alarms, band, y):
+            s.since[band] = NOT
+        elif s.since[band] == NOT:
+            s.since[band] = tick
     s.tick = tick + 1
 
 

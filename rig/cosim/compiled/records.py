@@ -47,7 +47,7 @@ def scan_type(process: Process) -> np.dtype[Any]:
         ("first", "i8"), ("tick", "i8"), ("next_update", "i8"), ("updates", "i8"), ("update_tick", "i8"),
         ("update_load", "f8"), ("load_step", "f8"), ("u_before", "f8", (inputs,)), ("number", "i8"),
         ("first_tick", "i8"), ("length", "i8"), ("tau_u", "i8"), ("accepted", "i8"), ("triggered", "i8"),
-        ("lowest", "i8"), ("since", "i8", 2), ("unchanged", "i8", (outputs,)), ("rests", "i8", (outputs,)),
+        ("lowest", "i8"), ("since", "i8", (len(process.bands),)), ("unchanged", "i8", (outputs,)), ("rests", "i8", (outputs,)),
         ("seen", "f8", (outputs,)), ("seen_x", "f8", (states,)), ("seen_load", "f8"), ("same", "?"),
         ("image_count", "i8"), ("image_moved", "?"), ("image_inputs", "f8", (inputs,)),
         ("inputs", "f8", (outputs, inputs)), ("inputs_moved", "i8", (outputs,)), ("load_index", "i8"),
@@ -112,17 +112,15 @@ class Optimizer(NamedTuple):
 
 
 class Alarms(NamedTuple):
-    """The band alarms as they are until one of them changes: that of the first band, and that of all others."""
+    """The band alarms as they are until one of them changes; arrays are of shape (bands,)."""
 
     low: Array
-    """Of each band, shape (bands,)."""
     high: Array
     places: NDArray[np.int64]
-    """The output of each, shape (bands,)."""
-    causes: NDArray[np.int64]
-    """Of each alarm, NOT where it is not active, shape (2,)."""
+    """The output of each."""
+    active: NDArray[np.bool_]
     delays: NDArray[np.int64]
-    """Ticks until each alarm follows its condition, shape (2,)."""
+    """Ticks until each alarm follows its condition."""
 
 
 class Trace(NamedTuple):

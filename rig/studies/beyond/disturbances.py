@@ -3,12 +3,11 @@
 from dataclasses import replace
 from typing import Final, NamedTuple
 
-from coldloop.process.cold_box import TICK_S
+from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.plant import StationAlarm, StationMode
-from coldloop.registers.safety import AlarmKind
-from coldloop.service.event_text import word_of
+from coldloop.service.event_text import alarm_word, word_of
 from rig.results.driving import CONTROL
 from rig.studies.beyond.coupling import REFRIGERATOR, TRACE_TICKS
 from rig.studies.drawing import over_time
@@ -128,7 +127,7 @@ def _ladder(run: Outcome) -> str:
 
 def _alarms(run: Outcome) -> list[str]:
     """Return the control PLC's alarms in the order in which they were first raised."""
-    raised = [word_of(AlarmKind, one.subject) for one in _of_control_plc(run, EventKind.ALARM_RAISED)]
+    raised = [alarm_word(one.subject, COLD_BOX) for one in _of_control_plc(run, EventKind.ALARM_RAISED)]
     return list(dict.fromkeys(raised))
 
 

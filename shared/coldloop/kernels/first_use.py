@@ -10,7 +10,6 @@ import sys
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Final
 
 
 @dataclass
@@ -38,8 +37,8 @@ def write_line(*kernels: Kernels) -> None:
         sys.stderr.flush()
 
 
-_needed: Final[ContextVar[Kernels | None]] = ContextVar("kernels that are needed", default=None)
-"""What the user has asked for at present, in this thread; what is needed within it is a part of it."""
+_needed: ContextVar[Kernels | None] = ContextVar("kernels that are needed", default=None)
+"""What the user has asked for at present, in this thread; what it needs itself is a part of it."""
 _announced: set[str] = set()
 _announce: Announce = write_line
 

@@ -8,10 +8,9 @@ from coldloop.errors import LoadFileError, UsageError
 from coldloop.number_text import value_text
 from coldloop.process.declaration import LAST_TICK, Process
 from coldloop.process.load_profile import LoadProfile, load_profile_of
-from coldloop.process.loaded import PROCESS
 from coldloop.process.settings import ProcessSettings, one_of, settings_of, settings_process, within
 from coldloop.registers.plant import SensorFaultKind
-from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmKind
+from coldloop.registers.safety import ALL_ALARMS, AlarmAction, alarms_of
 from coldloop.service.event_text import alarm_word, word
 
 LONGEST_FILE: Final = 1_000_000
@@ -164,7 +163,7 @@ class TreatAlarm(_Command):
     @field_validator("alarm")
     @classmethod
     def _known(cls, alarm: int) -> int:
-        if alarm != ALL_ALARMS and alarm not in AlarmKind.__members__.values():
+        if alarm != ALL_ALARMS and alarm not in alarms_of(settings_process()):
             raise ValueError(f"unknown alarm {alarm}")
         return alarm
 
@@ -195,7 +194,7 @@ Command = SetMode | SetSetpoint | SetLoad | PlayLoad | SetFactor | SetPaused | T
 _COMMAND: Final[TypeAdapter[Command]] = TypeAdapter(Annotated[Command, Field(discriminator="kind")])
 
 
-def read_command(document: object, process: Process = PROCESS) -> Command:
+def read_command(document: object, process: Process) -> Command:
     """Return a command for a process as it was sent.
 
     Raises:

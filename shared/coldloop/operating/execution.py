@@ -25,12 +25,11 @@ from coldloop.operating.commands import (
 from coldloop.operating.load_stream import LoadStream
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.loaded import PROCESS
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
 from coldloop.registers.maps import Maps, maps_of
 from coldloop.registers.plant import LiveLoad, LoadStatus, SensorFault, SensorFaultKind
-from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
+from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmState, alarms_of
 from coldloop.registers.seal import sealed
 from coldloop.service.event_text import alarm_word, word
 
@@ -74,7 +73,7 @@ Clients = Mapping[str, CommandClient]
 """One for each service that a command concerns; connected."""
 
 
-def clients_of(endpoints: Mapping[str, Endpoint], process: Process = PROCESS) -> dict[str, CommandClient]:
+def clients_of(endpoints: Mapping[str, Endpoint], process: Process) -> dict[str, CommandClient]:
     """Return clients of services of a process, not connected yet."""
     maps = maps_of(process).by_service
     return {service: CommandClient.at(maps[service], endpoint) for service, endpoint in endpoints.items()}
@@ -253,9 +252,10 @@ def lead_ticks(pace: SessionPace, tick_s: float) -> int:
 async def treat_alarm(clients: Clients, command: TreatAlarm) -> str:
     """Write what is done with alarms; wait until their states say that it was."""
     client, action = clients["control_plc"], AlarmAction(command.action)
-    kinds = list(AlarmKind) if command.alarm == ALL_ALARMS else [AlarmKind(command.alarm)]
-    raised_again: list[AlarmKind] = []
-    before = await client.read_rows(Alarm, 0, len(AlarmKind))
+    every = alarms_of(command.process)
+    kinds = list(every) if command.alarm == ALL_ALARMS else [command.alarm]
+    raised_again: list[int] = []
+    before = await client.read_rows(Alarm, 0, len(every))
     if command.seen is None:
         await client.write(AlarmCommand(command.alarm, action, command.time_s))
         if action is AlarmAction.ACKNOWLEDGE:
@@ -266,18 +266,16 @@ async def treat_alarm(clients: Clients, command: TreatAlarm) -> str:
         kinds, raised_again = _seen(before, kinds, command)
         for kind in kinds:
             await client.write(AlarmCommand(kind, action, command.time_s))
-    rows = await client.read_rows(Alarm, 0, len(AlarmKind))
+    rows = await client.read_rows(Alarm, 0, len(every))
     for _ in range(round(EFFECT_S / LOOK_S)):
         if all(_is_done(action, rows[kind].state) for kind in kinds):
             break
         await asyncio.sleep(LOOK_S)
-        rows = await client.read_rows(Alarm, 0, len(AlarmKind))
+        rows = await client.read_rows(Alarm, 0, len(every))
     return _treated(command, rows, kinds, raised_again)
 
 
-def _seen(
-    rows: Sequence[Alarm], kinds: Sequence[AlarmKind], command: TreatAlarm
-) -> tuple[list[AlarmKind], list[AlarmKind]]:
+def _seen(rows: Sequence[Alarm], kinds: Sequence[int], command: TreatAlarm) -> tuple[list[int], list[int]]:
     """Return the alarms that are as the operator has seen them, and those that were raised again since.
 
     Raises:
@@ -302,9 +300,7 @@ def _is_done(action: AlarmAction, state: int) -> bool:
     return state != {AlarmAction.UNSHELVE: AlarmState.SHELVED}.get(action, AlarmState.OUT_OF_SERVICE)
 
 
-def _treated(
-    command: TreatAlarm, rows: Sequence[Alarm], kinds: Sequence[AlarmKind], raised_again: Sequence[AlarmKind]
-) -> str:
+def _treated(command: TreatAlarm, rows: Sequence[Alarm], kinds: Sequence[int], raised_again: Sequence[int]) -> str:
     """Return what has become of alarms.
 
     Raises:
@@ -335,13 +331,13 @@ def _treated(
     return text
 
 
-def _by_state(rows: Sequence[Alarm], kinds: Sequence[AlarmKind]) -> list[tuple[AlarmState, list[AlarmKind]]]:
+def _by_state(rows: Sequence[Alarm], kinds: Sequence[int]) -> list[tuple[AlarmState, list[int]]]:
     """Return the states in which alarms are, and which ones are in each."""
     sorted_out = [(state, [kind for kind in kinds if rows[kind].state == state]) for state in AlarmState]
     return [(state, each) for state, each in sorted_out if each]
 
 
-def _names(kinds: Sequence[AlarmKind], process: Process) -> str:
+def _names(kinds: Sequence[int], process: Process) -> str:
     return ", ".join(alarm_word(kind, process) for kind in kinds)
 
 

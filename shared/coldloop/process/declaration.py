@@ -1,6 +1,6 @@
 """What a process is to the PLCs: its signals, its time, what it may and what it should do.
 
-A Coldloop program is loaded with one process, as a PLC is with one project (`coldloop.process.loaded`). The cold box is
+A program is given its process with its model file (`coldloop.process.settings`). The cold box is
 declared in `coldloop.process.cold_box`; others come with their model file, from a process file (`docs/your-plant.md`).
 Needs the standard library only.
 """
@@ -12,9 +12,6 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Self, get_args, get_type_hints
-
-VARIABLE: Final = "COLDLOOP_PROCESS"
-"""Of the environment: the model file that a program is loaded with."""
 
 LAST_TICK: Final = 2**32 - 2**16 - 1
 """Last tick of a session, after 34 years: what is planned from there still fits a register."""

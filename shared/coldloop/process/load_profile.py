@@ -4,20 +4,10 @@ import math
 from bisect import bisect_right
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 from coldloop.errors import LoadFileError
 from coldloop.process.declaration import LAST_TICK, LOAD_IN_WATTS, Process
-from coldloop.process.loaded import PROCESS
 from coldloop.table import TIME, Table, read_table, table_of
-
-LOAD_SPAN: Final = PROCESS.load.stored_span
-"""Lowest and highest load, as registers have them."""
-LOAD_UNIT: Final = PROCESS.load.unit
-LOAD_WORD: Final = PROCESS.load.word or PROCESS.load.name
-"""What operators call the load."""
-LOAD_COLUMN: Final = PROCESS.load.column
-"""Of files and traces. In a file the name that a load in watts has is understood for any."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +39,7 @@ class LoadProfile:
         return self.watts[bisect_right(self.times, tick) - 1]
 
 
-def read_load_file(path: Path, process: Process = PROCESS) -> LoadProfile:
+def read_load_file(path: Path, process: Process) -> LoadProfile:
     """Return the load of a CSV file with the columns time_s and load_w, or load in another unit, steps held.
 
     Raises:
@@ -59,7 +49,7 @@ def read_load_file(path: Path, process: Process = PROCESS) -> LoadProfile:
     return _profile(read_table(path, columns, "name a readable CSV file", LoadFileError), process)
 
 
-def load_profile_of(text: str, where: str, process: Process = PROCESS) -> LoadProfile:
+def load_profile_of(text: str, where: str, process: Process) -> LoadProfile:
     """Return the load in a CSV text; `where` names it in messages.
 
     Raises:

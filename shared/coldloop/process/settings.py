@@ -2,7 +2,7 @@
 
 A section that has defaults or bounds of its process is a `ProcessSettings`. The whole of a configuration is a
 `RootSettings`: its `model.file` decides the process, and all its sections are read for that one. A section that is made
-by itself is for the cold box, or for what `settings_of` says.
+by itself is for the cold box, or for what `settings_of` says; `model_named` says it for a command.
 """
 
 import math
@@ -29,14 +29,14 @@ from pydantic import (
 
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
-from coldloop.process.loaded import FILE, PROCESS
 from coldloop.process.model_file import declared_process, read_document
 
 _DATA: Final = Path(__file__).parent / "data"
 SHIPPED_MODELS: Final = {"cold-box": _DATA / "cold_box_model.json", "refrigerator": _DATA / "refrigerator_model.json"}
 """Models that have a name: of the cold box alone, and of the refrigerator with its pressure loop closed."""
-DEFAULT_MODEL_FILE: Final = FILE or SHIPPED_MODELS["cold-box"]
-_PROCESS: Final[ContextVar[Process]] = ContextVar("process of settings", default=PROCESS)
+DEFAULT_MODEL_FILE: Final = SHIPPED_MODELS["cold-box"]
+_MODEL: Final[ContextVar[Path]] = ContextVar("model file of settings", default=DEFAULT_MODEL_FILE)
+_PROCESS: Final[ContextVar[Process]] = ContextVar("process of settings", default=COLD_BOX)
 
 
 @contextmanager
@@ -47,6 +47,21 @@ def settings_of(process: Process) -> Iterator[None]:
         yield
     finally:
         _PROCESS.reset(token)
+
+
+@contextmanager
+def model_named(file: Path) -> Iterator[None]:
+    """Let settings that name no model file have this one within the context.
+
+    Raises:
+        ModelFileError: It cannot be read, or its process is none.
+    """
+    token = _MODEL.set(file)
+    try:
+        with settings_of(process_of(file)):
+            yield
+    finally:
+        _MODEL.reset(token)
 
 
 def settings_process() -> Process:
@@ -129,7 +144,7 @@ class ModelSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    file: Annotated[Path, BeforeValidator(_named)] = DEFAULT_MODEL_FILE
+    file: Annotated[Path, BeforeValidator(_named)] = Field(default_factory=lambda: _MODEL.get())
     """A file, or `cold-box` or `refrigerator` for one that is shipped. It says which process it is."""
 
 
@@ -140,7 +155,7 @@ class RootSettings(ProcessSettings):
         ModelFileError: The model file cannot be read, or its process is none.
     """
 
-    model: ModelSettings = ModelSettings()
+    model: ModelSettings = Field(default_factory=ModelSettings)
 
     @model_validator(mode="wrap")
     @classmethod

@@ -23,7 +23,7 @@ from coldloop.registers.declaration import (
     u32,
 )
 from coldloop.registers.plant import MAX_STATE
-from coldloop.registers.safety import Alarm, AlarmCommand, AlarmKind, LeaseStatus, WatchdogStatus, WatchdogTime
+from coldloop.registers.safety import Alarm, AlarmCommand, LeaseStatus, WatchdogStatus, WatchdogTime, alarms_of
 
 SEQUENCE_ROWS: Final = 240
 
@@ -385,7 +385,7 @@ def control_map(process: Process) -> RegisterMap:
         Block("sequence header", 488, SequenceHeader, "Commits the sequence in the buffer", Role.OPTIMIZER),
         Block("sequence", 500, SequenceRow, "Spare buffer for a sequence", Role.OPTIMIZER, SEQUENCE_ROWS),
         Block("pace", 1950, SessionPace, "Time base of the present session", Role.OPERATOR),
-        Block("alarms", 2000, Alarm, "One row for each alarm", rows=len(AlarmKind)),
+        Block("alarms", 2000, Alarm, "One row for each alarm", rows=len(alarms_of(process))),
         *LAST_BLOCKS,
     )
     return RegisterMap(service="control_plc", version=4, blocks=placed(process, blocks))

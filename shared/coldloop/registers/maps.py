@@ -2,10 +2,9 @@
 
 from collections.abc import Mapping
 from functools import cache
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from coldloop.process.declaration import Process
-from coldloop.process.loaded import PROCESS
 from coldloop.registers.control_plc import control_map
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.optimizer_plc import optimizer_map
@@ -29,8 +28,3 @@ class Maps(NamedTuple):
 def maps_of(process: Process) -> Maps:
     """Return the register maps of a process."""
     return Maps(plant_map(process), control_map(process), optimizer_map(process))
-
-
-MAPS: Final[Mapping[str, RegisterMap]] = maps_of(PROCESS).by_service
-"""Of the process that the programs are loaded with, by service."""
-PLANT_MAP, CONTROL_MAP, OPTIMIZER_MAP = maps_of(PROCESS)

@@ -3,6 +3,7 @@
 from enum import IntEnum
 from typing import Annotated, Final, NamedTuple, Self
 
+from coldloop.process.declaration import Process
 from coldloop.registers.audit import NOBODY, WHO_WORDS
 from coldloop.registers.declaration import in_ticks, text, u16, u32
 
@@ -52,11 +53,13 @@ class LeaseStatus(NamedTuple):
 
 
 class AlarmKind(IntEnum):
-    """The alarms of the control PLC; the number is the row in their block."""
+    """The alarms of the control PLC; the number is the row in their block. Further bands have rows behind these."""
 
     MODE = 0
-    LEVEL_BAND = 1
-    T5_BAND = 2
+    FIRST_BAND = 1
+    """The first output that has a band is outside it: of the cold box L1."""
+    SECOND_BAND = 2
+    """So is the second one: of the cold box T5."""
     SEQUENCE_REJECTED = 3
     SEQUENCE_LATE = 4
     SEQUENCE_EXHAUSTED = 5
@@ -86,6 +89,25 @@ class AlarmKind(IntEnum):
     """A reading contradicts the prediction and the other readings."""
     INPUT_WITHOUT_EFFECT = 22
     """The optimiser leaves an input where it is: that of a turbine which stands moves nothing."""
+
+
+def band_alarms(process: Process) -> tuple[int, ...]:
+    """Return the alarm of each output with a band, by its number."""
+    further = range(len(AlarmKind), len(AlarmKind) + len(process.bands))
+    return (AlarmKind.FIRST_BAND, AlarmKind.SECOND_BAND, *further)[: len(process.bands)]
+
+
+def alarms_of(process: Process) -> range:
+    """Return the numbers of all alarms of a process."""
+    return range(len(AlarmKind) + max(0, len(process.bands) - 2))
+
+
+def alarm_key(alarm: int, process: Process) -> str:
+    """Return what the configuration calls an alarm."""
+    bands = band_alarms(process)
+    return (
+        f"{process.banded[bands.index(alarm)].name.lower()}_band" if alarm in bands else AlarmKind(alarm).name.lower()
+    )
 
 
 class CapacityCause(IntEnum):

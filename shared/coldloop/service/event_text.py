@@ -11,8 +11,7 @@ from enum import Enum, IntEnum
 from functools import cache
 from typing import Final, NamedTuple
 
-from coldloop.process.declaration import Output, Process
-from coldloop.process.loaded import PROCESS
+from coldloop.process.declaration import Process
 from coldloop.process.range_bits import ModelRange
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import (
@@ -25,7 +24,7 @@ from coldloop.registers.control_plc import (
     Verdict,
 )
 from coldloop.registers.plant import SensorFaultKind, StationAlarm, StationMode, Surroundings
-from coldloop.registers.safety import AlarmKind
+from coldloop.registers.safety import AlarmKind, band_alarms
 from coldloop.registers.text import from_words
 
 Words = Callable[[int], str]
@@ -99,11 +98,8 @@ class _Words:
     def __init__(self, process: Process) -> None:
         self.process = process
         self.alarms = {kind.value: word(kind) for kind in AlarmKind} | {
-            kind: _band_word(outputs)
-            for kind, outputs in {
-                AlarmKind.LEVEL_BAND: process.banded[:1],
-                AlarmKind.T5_BAND: process.banded[1:],
-            }.items()
+            number: (one.band and one.band.alarm_word) or f"{one.name} outside its band"
+            for number, one in zip(band_alarms(process), process.banded, strict=True)
         }
         self.alarm_causes = self._alarm_causes()
         alarm = _Wording(self.alarm_word)
@@ -158,10 +154,8 @@ class _Words:
         }
 
     def _alarm_causes(self) -> dict[int, Words]:
-        further = [output.name for output in self.process.banded[1:]]
         inputs, outputs = _listed(self.process.input_names), _listed(self.process.output_names)
         return {
-            AlarmKind.T5_BAND: _listed(further if len(further) > 1 else ("",)),
             AlarmKind.STATE_NOT_RETAINED: _listed(("", "the previous one was set aside")),
             AlarmKind.MODE: _causes(Cause),
             AlarmKind.SENSOR_BAD: outputs,
@@ -179,12 +173,6 @@ class _Words:
 
 
 _words_of: Final = cache(_Words)
-
-
-def _band_word(outputs: Sequence[Output]) -> str:
-    declared = [output.band.alarm_word for output in outputs if output.band and output.band.alarm_word]
-    names = " or ".join(output.name for output in outputs) or "further output"
-    return declared[0] if declared else f"{names} outside its band"
 
 
 kind_word: Final = _members(EventKind)
@@ -211,17 +199,17 @@ class EventText(NamedTuple):
         return f"{self.kind}{': ' if self.subject else ''}{self.subject}{details}{value}{who}"
 
 
-def alarm_word(number: int, process: Process = PROCESS) -> str:
-    """Return the word for an alarm of a process: of bands those of the first output that has one, and of the others."""
+def alarm_word(number: int, process: Process) -> str:
+    """Return the word for an alarm of a process."""
     return _words_of(process).alarm_word(number)
 
 
-def alarm_cause(alarm: int, cause: int, process: Process = PROCESS) -> str:
+def alarm_cause(alarm: int, cause: int, process: Process) -> str:
     """Return the cause of an alarm in words; empty when there is none."""
     return _words_of(process).alarm_causes.get(alarm, _nothing)(cause)
 
 
-def describe(event: Event, process: Process = PROCESS) -> EventText:
+def describe(event: Event, process: Process) -> EventText:
     """Return an event of a process in words."""
     wording = _words_of(process).wordings.get(event.kind, _Wording())
     unit = wording.unit
@@ -241,7 +229,7 @@ def describe(event: Event, process: Process = PROCESS) -> EventText:
     )
 
 
-def log_event(log: logging.Logger, event: Event, process: Process = PROCESS) -> None:
+def log_event(log: logging.Logger, event: Event, process: Process) -> None:
     """Write an event of a process to a log."""
     text = describe(event, process)
     if event.kind == EventKind.MODE:
