@@ -116,7 +116,7 @@ class AlarmSettings(ProcessSettings):
     """Of each output that has one, by its name; those that are not given are as the process declares them."""
     band_delay_s: Delay = stretched(5.0)
     """On-delay of their alarms: how long an output must be outside, plant time."""
-    rules: dict[Annotated[str, AfterValidator(_known_name)], RuleSettings] = {}
+    rules: dict[Annotated[str, AfterValidator(_known_name)], RuleSettings] = Field(default_factory=dict)
     """By name of the alarm, such as `sensor_bad`."""
     shelving_s: Annotated[FiniteFloat, Field(ge=1, le=65_535)] = 900.0
     """How long an alarm is shelved by a command that gives no time, plant time."""

@@ -1,4 +1,4 @@
-"""Several processes in one interpreter: one after the other, interleaved, in threads; each leaves what it leaves alone."""
+"""Several processes in one interpreter, interleaved and in threads: each leaves what it leaves alone."""
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -8,6 +8,7 @@ import pytest
 
 import coldloop
 from coldloop.process.cold_box import COLD_BOX
+from coldloop.process.settings import DEFAULT_MODEL_FILE
 from rig import simulate
 from tests.harness.process_files import COLUMN, TANK
 
@@ -40,9 +41,9 @@ def test_processes_run_in_threads_beside_each_other(alone: dict[str, str]) -> No
         assert list(pool.map(trace, names)) == [alone[name] for name in names]
 
 
-def test_a_process_is_read_from_either_file_and_the_cold_box_from_its_model(tmp_path: Path) -> None:
+def test_a_process_is_read_from_either_file_and_the_cold_box_from_its_model() -> None:
     tank = coldloop.Process.read(TANK)
     assert tank.input_names == ("v1", "v2")
     assert tank == coldloop.Process.read(TANK)
-    assert coldloop.Process.read(Path(coldloop.__file__).parent / "process" / "data" / "cold_box_model.json") == COLD_BOX
+    assert coldloop.Process.read(DEFAULT_MODEL_FILE) == COLD_BOX
     assert coldloop.simulate is simulate

@@ -73,6 +73,10 @@ def settings_process() -> Process:
     return _PROCESS.get()
 
 
+def _named_model() -> Path:
+    return _MODEL.get()
+
+
 def made_by(make: Callable[[], Any]) -> Any:  # noqa: ANN401 the default of any field
     """Return a field with a default that is made each time; its JSON schema shows what it is here."""
 
@@ -176,7 +180,7 @@ class ModelSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    file: Annotated[Path, BeforeValidator(_named)] = made_by(lambda: _MODEL.get())
+    file: Annotated[Path, BeforeValidator(_named)] = made_by(_named_model)
     """A file, or `cold-box` or `refrigerator` for one that is shipped. It says which process it is."""
 
 
