@@ -7,7 +7,8 @@ from typing import Annotated, Final, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, model_validator
 
-from coldloop.process.declaration import Process, Range
+from coldloop.process.declaration import Process
+from coldloop.process.sections import Range
 from coldloop.process.settings import ProcessSettings, declared, settings_process, stretched, within
 from coldloop.registers.safety import AlarmKind, AlarmPriority, alarm_key, alarms_of, band_alarms
 
@@ -93,7 +94,7 @@ class RuleSettings(BaseModel):
 
 
 def _bands_of(process: Process) -> dict[str, Range]:
-    return {one.name: one.band.alarm or (one.band.low, one.band.high) for one in process.banded if one.band is not None}
+    return {one.name: one.alarm or one.edges for one in process.banded if one.edges is not None}
 
 
 def _with_declared(given: object) -> object:
