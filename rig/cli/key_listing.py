@@ -123,7 +123,8 @@ def _value(said: Schema, declared: Schema) -> str:
         limits = (f"{word} {one[limit]:g}" for limit, word in LIMITS.items() if limit in one)
         return ", ".join([FORMATS.get(one.get("format", ""), WORDS[one["type"]]), *limits])
     if "prefixItems" in one:
-        return f"{COUNTS[len(one['prefixItems'])]}, [low, high]"
+        count = len(one["prefixItems"])
+        return f"{COUNTS[count]}{', [low, high]' * (count == 2)}"
     if "each" in one:
         return f"{COUNTS[one['maxItems']]}, one for each {one['each']}"
     return f"list: {_value(one['items'], declared)}"

@@ -82,7 +82,8 @@ def made_from(path: Path) -> Made:
         output_names=tuple(one.name for one in process.outputs),
         output_units=tuple(one.unit for one in process.outputs),
         load_name=process.load.name, load_unit=process.load.unit, parameters_digest=linear.digest, plant=linear.kind,
-        note=f"made from {path.name}", plant_parameters=linear.parameters | played, process=process.model_dump(mode="json"),
+        note=f"made from {path.name}", plant_parameters=linear.parameters | played,
+        process=process.model_dump(mode="json"),
         declaration_digest=declaration_digest(said, path.parent),
     )  # fmt: skip
     if process.bath is not None:

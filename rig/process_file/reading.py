@@ -16,6 +16,10 @@ RESERVED: Final = frozenset((
 """Fields of registers and columns of a trace, in small letters."""
 
 
+OWN: Final = ("plants", "shipped_mimic", "iterations", "forecasts", "drawing")
+"""Keys of the cold box, and what is found with a model: no file of a user gives them."""
+
+
 def read_process_file(path: Path) -> Process:
     """Return what a process file says.
 
@@ -28,8 +32,12 @@ def read_process_file(path: Path) -> Process:
     return file
 
 
-def _wrong(file: Process) -> str:
+def _wrong(file: Process) -> str:  # noqa: PLR0911 a return for each
     """Return what is wrong with a process that is still without its model; empty where nothing is."""
+    if own := [str(key) for key in OWN if key in file.model_fields_set]:
+        return f"{own[0]}: is found with the model, or the cold box's own; leave it out"
+    if own := [one.name for one in file.outputs if one.quantity]:
+        return f"{own[0]}: a quantity is the cold box's own; leave it out"
     plant, signals = file.plant, (*file.inputs, *file.outputs, *file.outside)
     names = [each.name for each in signals]
     lower = [name.lower() for name in names]

@@ -1,7 +1,5 @@
 """What the sensors' checks make of a plant that stands still, as a simulated one with exact sensors does."""
 
-from dataclasses import replace
-
 import pytest
 
 from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES
@@ -22,7 +20,7 @@ def others_moved(tick: int) -> tuple[float, ...]:
 @pytest.fixture
 def monitor() -> SensorMonitor:
     """The checks of another process than the cold box."""
-    with settings_of(replace(COLD_BOX, moves_as_one=False)):
+    with settings_of(COLD_BOX.model_copy(update={"moves_as_one": False})):
         return SensorMonitor(SensorCheckSettings(), REST, moves=(0.1, 0.1, 0.1))
 
 

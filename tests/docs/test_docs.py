@@ -9,13 +9,13 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
+from coldloop.process.declaration import Process
 from rig.cli import make_parser
 from rig.cli.command_listing import command_listing
 from rig.cli.commands.docs import anchor, headings
 from rig.cli.key_listing import key_listing
 from rig.cli.register_listing import FORMATS
 from rig.plc_sizing.profile import PlcProfile
-from rig.process_file.declaration import ProcessFile
 from rig.settings import Settings
 from tests.harness.path_options import path_table
 from tests.harness.records import MAPS
@@ -30,7 +30,7 @@ def test_the_register_page_is_what_the_command_prints() -> None:
 
 
 @pytest.mark.parametrize(
-    ("model", "page"), [(ProcessFile, "keys.md"), (PlcProfile, "keys.md"), (Settings, "configuration.md")]
+    ("model", "page"), [(Process, "keys.md"), (PlcProfile, "keys.md"), (Settings, "configuration.md")]
 )
 def test_the_pages_of_keys_are_what_the_commands_print(model: type[BaseModel], page: str) -> None:
     tables = key_listing(model)

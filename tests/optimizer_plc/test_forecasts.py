@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, T5, TICKS_PER_SAMPLE
-from coldloop.process.declaration import Forecast
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
+from coldloop.process.sections import Forecast
 from coldloop.process.settings import settings_of
 from optimizer_plc.computing_settings import EstimatorSettings
 from optimizer_plc.estimator import estimator_of
@@ -29,7 +29,7 @@ PARTS = (1, 3)
 def test_a_step_counts_by_how_much_of_a_part_it_has() -> None:
     """By hand: 400 from tick 0, 460 from tick 30; samples of 20 ticks."""
     forecasts = Forecasts(
-        replace(COLD_BOX, forecasts=(Forecast(name="load", ticks=(0, 30), values=(400.0, 460.0)),)), PARTS
+        COLD_BOX.model_copy(update={"forecasts": (Forecast(name="load", ticks=(0, 30), values=(400.0, 460.0)),)}), PARTS
     )
     assert len(forecasts) == 2
     assert forecasts.changes(0).tolist() == [0.0, 45.0], "of ticks 20 to 60 three quarters"
@@ -86,10 +86,10 @@ def test_what_is_forecast_is_not_said_to_be_an_error_of_a_sensor(
 ) -> None:
     """The registers of the model's deviation: T5 reads 0.4 K too much, and the load will rise."""
     rise = Forecast(name=COLD_BOX.load.name, ticks=(0, 30), values=(400.0, 460.0))
-    process = replace(COLD_BOX, forecasts=(rise,))
+    process = COLD_BOX.model_copy(update={"forecasts": (rise,)})
     with settings_of(process):
         settings = ProgramSettings(estimator=EstimatorSettings(disturbances=("T5",)))
-        program = OptimizerProgram(replace(model, process=process.document()), settings, InputLimits())
+        program = OptimizerProgram(replace(model, process=process.model_dump(mode="json")), settings, InputLimits())
     program.state.belief.x[:] = 60.0
     program.state.belief.x[len(model.x0)] = 0.4
     expected = [float(np.float32(0.4)) * (place == T5) for place in range(len(OUTPUT_NAMES))]

@@ -82,7 +82,9 @@ def test_what_is_set_to_the_default_of_its_key_is_set_too() -> None:
 def test_a_preset_names_keys_that_there_are(preset: Preset) -> None:
     chosen = ProgramSettings(preset=preset)
     for section, values in presets_of(COLD_BOX)[preset].items():
-        assert {key: getattr(getattr(chosen, section), key) for key in values} == dict(values)
+        assert {key: getattr(getattr(chosen, section), key) for key in values} == {
+            key: tuple(value) if isinstance(value, list) else value for key, value in values.items()
+        }
 
 
 def test_alpha_follows_from_the_weight_of_a_violation_for_all_solvers_alike() -> None:

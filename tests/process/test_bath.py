@@ -3,7 +3,6 @@
 import json
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -69,7 +68,7 @@ def toml(keys: Mapping[str, Any]) -> list[str]:
 def bath_section() -> dict[str, Any]:
     """Return the cold box's bath by the names and in the unit of load of `OTHER`."""
     assert COLD_BOX.bath is not None
-    section = asdict(COLD_BOX.bath)
+    section = COLD_BOX.bath.model_dump()
     for key, value in section.items():
         if isinstance(value, str):
             section[key] = OTHER.names[value]
@@ -92,9 +91,9 @@ def signals() -> Iterable[str]:
         yield "[[outputs]]"
         yield from toml({"name": OTHER.names[output.name], "unit": output.unit, "at": MODEL.y0[place]})
         yield from toml({"range": [-1e3, 1e4], "noise": 0.01})
-        if output.band is not None and output.band.loop is not None:
-            loop = asdict(output.band.loop) | {"input": OTHER.names[output.band.loop.input]}
-            yield from toml({"band": [output.band.low, output.band.high], "penalty": output.band.weight})
+        if output.loop is not None:
+            loop = output.loop.model_dump() | {"input": OTHER.names[output.loop.input]}
+            yield from toml({"band": output.band, "penalty": output.penalty})
             yield f"loop = {{ {', '.join(toml({key: loop[key] for key in ('input', 'gain', 'integral_time_s')}))} }}"
 
 
@@ -221,7 +220,7 @@ def test_the_section_that_the_documentation_shows_is_the_cold_boxs() -> None:
     page = (ROOT / "docs" / "your-plant.md").read_text(encoding="utf-8")
     shown = tomllib.loads(page[page.index("[bath]") :].partition("```")[0])["bath"]
     assert COLD_BOX.bath is not None
-    known = asdict(COLD_BOX.bath)
+    known = COLD_BOX.bath.model_dump()
     assert {
         key: list(value) if isinstance(value, tuple) else value for key, value in known.items() if key in shown
     } == shown

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from coldloop.errors import ColdloopError
+from coldloop.errors import ColdloopError, ModelFileError
 from coldloop.process.settings import process_of
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.rest import rest_map
@@ -120,8 +120,8 @@ def test_disturbances_are_states_that_hold_and_outputs_where_they_are_measured(t
     assert "warning" not in text
 
 
-def test_only_disturbances_are_drawn_as_such_and_old_model_files_tell_which(tmp_path: Path) -> None:
-    """Of two measured states one has the name of its output: it is no disturbance, and no state of version 0.3 was."""
+def test_only_disturbances_are_drawn_as_such_and_model_files_of_another_form_are_refused(tmp_path: Path) -> None:
+    """Of two measured states one has the name of its output: it is no disturbance."""
     (tmp_path / "new").mkdir()
     text = FILE.replace('name = "upper"', 'name = "upper_level"')
     found = made(tmp_path / "new", text)
@@ -129,8 +129,10 @@ def test_only_disturbances_are_drawn_as_such_and_old_model_files_tell_which(tmp_
     assert {"upper_level", "rain", "ambient"} < {one.name for one in process.outputs}
     assert [one.name for one in process.measured_disturbances] == ["rain", "ambient"]
     model.save(tmp_path / "new.json")
-    replace(model, process={k: v for k, v in model.process.items() if k != "disturbances"}).save(tmp_path / "old.json")
-    assert process_of(tmp_path / "new.json") == process_of(tmp_path / "old.json") == process
+    assert process_of(tmp_path / "new.json") == process
+    replace(model, process=model.process | {"decision_instants": [1]}).save(tmp_path / "old.json")
+    with pytest.raises(ModelFileError, match=r"of version 0\.3 or earlier, .* make one with `coldloop process FILE"):
+        process_of(tmp_path / "old.json")
 
 
 IN_M3: Final = POND.replace("= w\n", "= w[0], 1e3 * w[1], 1e3 * w[2], w[3]\n")
@@ -152,8 +154,7 @@ def test_a_setpoint_is_the_middle_of_its_tolerance_and_what_the_fallback_goes_to
     (band,) = made(tmp_path).process.bands
     assert (band.low, band.high, band.margin) == pytest.approx((10.4, 10.6, 0.1))
     assert band.alarm == (9.0, 12.0)
-    assert band.loop is not None
-    assert band.loop.setpoint_offset == pytest.approx(0.5)
+    assert band.setpoint_offset == pytest.approx(0.5)
 
 
 def test_a_course_is_held_from_step_to_step() -> None:

@@ -20,9 +20,9 @@ from plant.own.maker import _fmu_of, file_digest
 from rig.chaos.plan import find_plan
 from rig.cli.commands.options import _tls_site
 from rig.plc_sizing.profile import find_profile
-from rig.process_file.declaration import read_process_file
 from rig.process_file.judgement import described
 from rig.process_file.making import made_from
+from rig.process_file.reading import read_process_file
 from rig.process_file.step_test import from_step_test
 from tests.process.test_process_file import HEATER, ONE_BY_ONE, made
 

@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from coldloop.errors import ColdloopError
-from rig.process_file.declaration import read_process_file
 from rig.process_file.historian import Request, record_of
+from rig.process_file.reading import read_process_file
 from rig.process_file.step_test import from_step_test
 from tests.process.test_step_test import FILE, answered, steps
 

@@ -15,7 +15,7 @@ from coldloop.errors import ColdloopError
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
 from coldloop.process.model_file import read_header
-from rig.process_file.declaration import LagSection
+from coldloop.process.sections import Lag
 from rig.process_file.judgement import described
 from rig.process_file.linearised import lag_model
 from rig.process_file.making import Made, made_from
@@ -64,7 +64,7 @@ def made(folder: Path, text: str = ONE_BY_ONE, plant: str = HEATER) -> Made:
 
 
 def test_the_cold_box_is_a_process_like_others_and_survives_a_journey_as_data() -> None:
-    assert Process.of(COLD_BOX.document()) == COLD_BOX
+    assert Process.model_validate(COLD_BOX.model_dump(mode="json")) == COLD_BOX
 
 
 def test_a_heater_by_hand(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_the_quadruple_tank_has_the_time_constants_that_its_author_gives() -> No
 
 
 def test_a_dead_time_has_the_phase_of_a_dead_time_well_below_its_reciprocal() -> None:
-    lag = LagSection(output="y", source="u", gain=2.0, time_constant_s=100.0, delay_s=30.0)
+    lag = Lag(output="y", source="u", gain=2.0, time_constant_s=100.0, delay_s=30.0)
     a, b, c = lag_model(lag)
     for w in (1e-4, 1e-3, 1e-2, 1 / 30.0):
         found = c @ np.linalg.solve(1j * w * np.eye(len(a)) - a, b)
@@ -352,7 +352,7 @@ def test_the_command_prints_it_and_writes_nothing_that_is_half_made(tmp_path: Pa
     done = coldloop("process", tmp_path / "process.toml", "--out", tmp_path / "model.json")
     assert done.code == 0, done.complaints
     assert "heater: 1 input, 1 output, 1 state; " in done.out
-    assert Process.of(made(tmp_path).model.process).inputs[0].name == "power"
+    assert Process.model_validate(made(tmp_path).model.process).inputs[0].name == "power"
     (tmp_path / "process.toml").write_text("name = 3", encoding="utf-8")
     failed = coldloop("process", tmp_path / "process.toml", "--out", tmp_path / "other.json")
     assert failed.code != 0

@@ -5,14 +5,13 @@ import json
 import subprocess
 import tomllib
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.declaration import NO_LOAD
+from coldloop.process.sections import NO_LOAD
 from coldloop.process.settings import settings_of
 from coldloop.session.settings import TimeMode
 from optimizer_plc.qp.penalties import Preset
@@ -172,7 +171,7 @@ def test_an_abbreviation_of_an_option_is_none(words: tuple[str, ...], cut: str, 
 
 
 def test_a_load_of_a_process_that_has_none_is_refused(coldloop: "Coldloop") -> None:
-    with settings_of(replace(COLD_BOX, load=NO_LOAD, bath=None)):
+    with settings_of(COLD_BOX.model_copy(update={"load": NO_LOAD, "bath": None})):
         outcome = coldloop("run", "--load", "a")
     assert (outcome.code, outcome.complaints) == (2, ["coldloop: load 'a': cold-box has no load; leave it out"])
 

@@ -99,5 +99,5 @@ def test_what_is_said_of_a_key_is_found_below_it_among_arguments_or_at_what_it_h
         '| `kind` | `water`, `helium` | `"helium"` | What it is. |',
         "| `open` | true or false | `false` |  |",
         "| `map` | file | `map.json`, shipped |  |",
-        "| `spans` | three numbers, one for each input | `[1.0, 2.0, 3.0]` | Its sides. |",
+        "| `spans` | three numbers | `[1.0, 2.0, 3.0]` | Its sides. |",
     ]

@@ -63,8 +63,8 @@ class CompiledStretches:
             compiled.constants, plant.biases, plant.deviations, np.array(load.times), np.array(load.watts),
             control_plc.guard.limits, np.array(sensors.low), np.array(sensors.high), np.array(sensors.least),
             np.array(sensors.is_controlled), sensors.kinds, np.array(sensors.moves),
-            sensors.may_rest, sensors.each_may_rest, sensors.frozen_ticks, *process.load.stored_span, control_plc.watchdog.time,
-            optimizer_plc.settings.interrupting_load_step_w,
+            sensors.may_rest, sensors.each_may_rest, sensors.frozen_ticks, *process.load.stored_span,
+            control_plc.watchdog.time, optimizer_plc.settings.interrupting_load_step_w,
         )  # fmt: skip
 
     def ahead(self, until: int) -> Stretch | None:

@@ -138,8 +138,8 @@ class OptimizerText:
                           for each, name in interface_names(begin, self.printer.type).items())  # fmt: skip
         return filled(template("structured_text/optimizer/optimizer.st"), {
             **signal_counts(process), "LONGEST": str(process.ticks_per_sample), "SHORTEST": str(SHORTEST_TICKS),
-            "LATCHED": passed, "TICK_S": str(process.tick_s), "UNIT": process.load.unit, "BEGIN": begun, "PIECE": str(PIECE),
-            "LOAD_STEP": interface_names(take, self.printer.type)[take.outputs[0]],
+            "LATCHED": passed, "TICK_S": str(process.tick_s), "UNIT": process.load.unit, "BEGIN": begun,
+            "PIECE": str(PIECE), "LOAD_STEP": interface_names(take, self.printer.type)[take.outputs[0]],
         })  # fmt: skip
 
     def _configuration(self) -> str:

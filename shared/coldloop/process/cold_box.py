@@ -1,13 +1,13 @@
 """The cold box of the paper: the process of programs where nothing else is named. It is declared in a process file."""
 
-import tomllib
 from importlib.resources import files
 from typing import Final
 
+from coldloop.parsing import parsed_toml
 from coldloop.process.declaration import Process
 
 COLD_BOX: Final = Process.model_validate(
-    tomllib.loads((files("coldloop.process") / "data" / "cold_box.toml").read_text(encoding="utf-8"))
+    parsed_toml((files("coldloop.process") / "data" / "cold_box.toml").read_text(encoding="utf-8"))
 )
 
 L1, V1, T1, T2, T5, P1 = map(COLD_BOX.output_names.index, ("L1", "V1", "T1", "T2", "T5", "P1"))

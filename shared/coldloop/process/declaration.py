@@ -71,19 +71,19 @@ class Process(Section):
     """Outputs whose constant error is estimated by default; those that the model tells apart if not given."""
     moves_as_one: bool = False
     """Whether all outputs move when any do: one that rests meanwhile is frozen, whatever the inputs do."""
-    tuned: dict[str, dict[str, Any]] = {}
+    tuned: dict[str, dict[str, Any]] = Field(default_factory=dict)
     """Settings of the preset `tuned`, by section; an estimate of the constants of all outputs if not given. In
     `unmeasured` is what `estimator` has instead where the load is not measured."""
-    decimals: dict[str, int] = {}
+    decimals: dict[str, int] = Field(default_factory=dict)
     """Digits after the point on the page, by unit; from noise and rates if not given."""
-    notable: dict[str, float] = {}
+    notable: dict[str, float] = Field(default_factory=dict)
     """How much plant and model differ at least for a word on the page, by unit; likewise."""
     plants: tuple[str, ...] = ("of-process",)
     """Kinds of plant that simulate it, by their names in the configuration; the first by default."""
     shipped_mimic: str = ""
     """Path of a drawing that comes with the page, whose values name their registers."""
-    iterations: dict[str, float] = {}
-    """Found with the model: time of a solver's iteration, or of a preparation, over that with the cold box's problem."""
+    iterations: dict[str, float] = Field(default_factory=dict)
+    """Found with the model: times of iterations and of a preparation, over those with the cold box's problem."""
     forecasts: tuple[Forecast, ...] = ()
     """Found with the model: what the files say that load and disturbances name in `forecast`."""
     drawing: str = ""

@@ -4,6 +4,7 @@ What is not given follows from what is, here or when the model is made (`rig.pro
 """
 
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, Final, Self
@@ -29,14 +30,21 @@ the other terms of the cost are below the 7 digits of single precision.
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}$")]
 Range = tuple[FiniteFloat, FiniteFloat]
+Limits = tuple[int | FiniteFloat, int | FiniteFloat]
+"""Of registers, whose digest knows whole numbers."""
 
 
 class Section(BaseModel):
     """A section of a process file."""
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", use_attribute_docstrings=True, ignored_types=(cached_property,)
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", ignored_types=(cached_property,))
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Return a copy with changes, without what was computed of the original."""
+        copied = super().model_copy(update=update, deep=deep)
+        for name in copied.__dict__.keys() - type(self).model_fields.keys():
+            del copied.__dict__[name]
+        return copied
 
 
 def _near(given: float | None, usual: float, what: str) -> None:
@@ -96,7 +104,7 @@ class Input(Section):
     """Whether its constant error is told from the load."""
     tag: str = Field(default_factory=lambda given: given["name"].lower())
     """Its name in commands; its name in small letters if not given."""
-    span: Range = Field(default_factory=lambda given: (min(given["low"], 0.0), max(given["high"], 0.0)))
+    span: Limits = Field(default_factory=lambda given: (min(given["low"], 0.0), max(given["high"], 0.0)))
     """What its registers take; its range and 0 if not given."""
     bar: Range | None = None
     """Ends of its bar on the operator's page; from its range if not given."""
@@ -109,6 +117,28 @@ class Input(Section):
                 raise ValueError(f"{self.name}: {what} = {value:g} is outside low to high")
         _near(self.weight, _usual_weight(self.low, self.high), f"{self.name}: weight")
         return self
+
+
+def _edges(given: dict[str, Any]) -> Range | None:
+    setpoint, tolerance = given["setpoint"], given["tolerance"]
+    return given["band"] if setpoint is None else (setpoint - tolerance, setpoint + tolerance)
+
+
+def _usual_tolerance(given: dict[str, Any]) -> float | None:
+    low, high = given["range"]
+    return None if given["setpoint"] is None or high <= low else 0.01 * (high - low)
+
+
+def _usual_penalty(given: dict[str, Any]) -> float | None:
+    edges = _edges(given)
+    if edges is None or edges[0] >= edges[1]:
+        return None
+    return float(1.0 / ((edges[1] - edges[0]) / (20 if given["setpoint"] is None else 2)) ** 2)
+
+
+def _usual_dead_band(given: dict[str, Any]) -> float:
+    band = given["band"]
+    return max(3.0 * given["noise"], 0.01 * (band[1] - band[0])) if band else 0.0
 
 
 class Output(Section):
@@ -130,14 +160,14 @@ class Output(Section):
     """What it is to be kept within."""
     setpoint: FiniteFloat | None = None
     """What it is to be kept at, instead of a band."""
-    tolerance: PositiveFloat | None = Field(default_factory=lambda given: _usual_tolerance(given))
+    tolerance: PositiveFloat | None = Field(default_factory=_usual_tolerance)
     """Deviation from the setpoint that is none to indicators, figures and alarms; 1 % of `range` if not given."""
-    penalty: PositiveFloat | None = Field(default_factory=lambda given: _usual_penalty(given))
+    penalty: PositiveFloat | None = Field(default_factory=_usual_penalty)
     """rho, per square of what band or setpoint is missed by and sample; if not given 1 over the square of a twentieth
     of the band, or of the tolerance."""
     alarm: Range | None = None
     """Outside of it the alarm is raised; the band, or the setpoint with its tolerance, if not given."""
-    dead_band: NonNegativeFloat = Field(default_factory=lambda given: _usual_dead_band(given))
+    dead_band: NonNegativeFloat = Field(default_factory=_usual_dead_band)
     """Excess over the band up to which it does not count as outside, for alarms, indicators and the page; if not given
     3 times `noise`, and 1 % of the band at least; a setpoint's is its tolerance."""
     weight: NonNegativeFloat = 0.0
@@ -203,28 +233,6 @@ class Output(Section):
         )  # fmt: skip
 
 
-def _edges(given: dict[str, Any]) -> Range | None:
-    setpoint, tolerance = given["setpoint"], given["tolerance"]
-    return given["band"] if setpoint is None else (setpoint - tolerance, setpoint + tolerance)
-
-
-def _usual_tolerance(given: dict[str, Any]) -> float | None:
-    low, high = given["range"]
-    return None if given["setpoint"] is None or high <= low else 0.01 * (high - low)
-
-
-def _usual_penalty(given: dict[str, Any]) -> float | None:
-    edges = _edges(given)
-    if edges is None or edges[0] >= edges[1]:
-        return None
-    return float(1.0 / ((edges[1] - edges[0]) / (20 if given["setpoint"] is None else 2)) ** 2)
-
-
-def _usual_dead_band(given: dict[str, Any]) -> float:
-    band = given["band"]
-    return max(3.0 * given["noise"], 0.01 * (band[1] - band[0])) if band else 0.0
-
-
 @dataclass(frozen=True, kw_only=True)
 class Band:
     """What an output is to be kept within, as controllers take it."""
@@ -256,7 +264,7 @@ class Outside(Section):
     """Shown with every value; an FMU may have it."""
     at: FiniteFloat
     """At the operating point."""
-    span: Range
+    span: Limits
     """Within which it stays."""
     walk: PositiveFloat = Field(default_factory=lambda given: 0.01 * (given["span"][1] - given["span"][0]))
     """Random walk that the estimator expects, of the load of what is not measured of it, per square root of a sampling
@@ -374,7 +382,7 @@ class State(Section):
     unit: str = ""
     """As the plant has it."""
     walk: PositiveFloat | None = None
-    """Its process noise, per square root of a sampling period; None where settings of the estimator say it by unit."""
+    """Its process noise, per square root of a sampling period; of the cold box settings of the estimator say it."""
 
 
 class Forecast(Section):
