@@ -62,7 +62,7 @@ class Reading:
         self._broadcast = broadcast
         self._guard = guard
         process, self._tick_s = model.process, model.process.tick_s
-        drawn = (process.disturbances, process.inputs, process.banded, model.trends.station_names)
+        drawn = (process.measured_disturbances, process.inputs, process.banded, model.trends.station_names)
         self._most_names = PENS + 1 + sum(map(len, drawn))
         self._long_reads = LongReads(time.monotonic)
         self._catalog = encoded(catalog(model, training=settings.training and not replay, replay=replay))
@@ -89,7 +89,7 @@ class Reading:
 
     async def mimic(self, _request: web.Request) -> web.Response:
         """Answer with the drawing that the process brings; those of the cold box are static files."""
-        answer = web.Response(text=self._model.process.mimic, content_type="image/svg+xml")
+        answer = web.Response(text=self._model.process.drawing, content_type="image/svg+xml")
         add_headers(answer)
         return answer
 
