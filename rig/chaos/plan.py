@@ -11,7 +11,7 @@ from coldloop.config import Configuration
 from coldloop.errors import LoadFileError, UsageError
 from coldloop.parsing import parsed_toml
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.settings import ProcessSettings, settings_process, whole_ticks, within
+from coldloop.process.settings import ProcessSettings, one_of, settings_process, whole_ticks, within
 from coldloop.session.settings import TimeMode
 from coldloop.text_file import read_text
 from plant.load import concatenated, find_load, named_families, telegraph
@@ -50,7 +50,7 @@ class ChaosPlan(ProcessSettings):
     load: str | tuple[str, ...] = "a"
     """Named load or CSV file; or named loads, one after the other."""
     duration_s: Annotated[float, Field(gt=0, le=7 * 86_400), AfterValidator(_of_ticks)]
-    plant: PlantKind | None = None
+    plant: Annotated[PlantKind, one_of("plant", lambda process: process.plants)] | None = None
     """Which plant; that of the configuration if the plan does not say."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
     """Of all that is drawn: instants, the fate of frames, the sensors' noise."""
@@ -163,11 +163,9 @@ def shipped_plans() -> list[ChaosPlan]:
     for entry in SHIPPED.iterdir():
         if entry.name.endswith(".toml"):
             try:
-                plan = parse_plan(entry.read_text(encoding="utf-8"), entry.name, {})
-            except UsageError:  # of signals that are another's
+                plans.append(parse_plan(entry.read_text(encoding="utf-8"), entry.name, {}))
+            except UsageError:  # of signals or a plant that are another's
                 continue
-            if plan.plant is None or plan.plant in settings_process().plants:
-                plans.append(plan)
     return sorted(plans, key=lambda plan: plan.name)
 
 

@@ -51,14 +51,16 @@ def execute(options: argparse.Namespace) -> int:
     check_load(options.plan_load)
     if options.plan is None:
         raise UsageError("name a plan; `coldloop chaos --list` lists the shipped ones")
+    from coldloop.process.settings import settings_of
     from rig.chaos.experiment import perform
     from rig.chaos.plan import find_plan
     from rig.chaos.progress import ChaosProgress
     from rig.results.folders import claim_folder, claim_folder_of_now
     from rig.runs.manifest import plain_arguments
 
-    plan = find_plan(options.plan, _changes(options))
-    effective = configuration(options)
+    effective, changes = configuration(options), _changes(options)
+    with settings_of(effective.settings.process):
+        plan = find_plan(options.plan, changes)
     _refuse_what_has_no_effect(effective)
     out = options.out or claim_folder_of_now(Path("chaos"), plan.name)
     claim_folder(out, force=options.force)
