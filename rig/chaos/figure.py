@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from coldloop.number_text import ends_text
-from coldloop.process.declaration import Input, Process
+from coldloop.process.declaration import Process
+from coldloop.process.sections import Input
 from coldloop.registers.control_plc import Mode
 from coldloop.whole_file import whole_file
 from optimizer_plc.qp.design import ControlDesign

@@ -17,8 +17,6 @@ WRONG_MODEL: Final = "wrong_model.json"
 """Its file in the folder of a run."""
 MOVED_INPUTS: Final = (-3.0, -15.0, 2.0)
 """From those of the right model: CV155 %, NCR22_A W, CV156 %."""
-
-
 GAIN: Final = 0.9
 """Of other processes: over those of the right model."""
 

@@ -28,7 +28,7 @@ WORDS: Final = {
 ARGUMENT: Final = re.compile(r"^    (\w+): (.*(?:\n     +.*)*)", re.MULTILINE)
 """Of a docstring."""
 FORMATS: Final = {"path": "file", "ipvanynetwork": "address or network"}
-NUMBERS: Final = {2: "two numbers, [low, high]", 3: "three numbers, one for each input"}
+COUNTS: Final = {1: "one number", 2: "two numbers", 3: "three numbers"}
 LIMITS: Final = {"minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most", "exclusiveMaximum": "below"}
 
 
@@ -123,7 +123,9 @@ def _value(said: Schema, declared: Schema) -> str:
         limits = (f"{word} {one[limit]:g}" for limit, word in LIMITS.items() if limit in one)
         return ", ".join([FORMATS.get(one.get("format", ""), WORDS[one["type"]]), *limits])
     if "prefixItems" in one:
-        return NUMBERS[len(one["prefixItems"])]
+        return f"{COUNTS[len(one['prefixItems'])]}, [low, high]"
+    if "each" in one:
+        return f"{COUNTS[one['maxItems']]}, one for each {one['each']}"
     return f"list: {_value(one['items'], declared)}"
 
 

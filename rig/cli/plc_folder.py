@@ -160,7 +160,8 @@ def described(
     iterations = len(vectors) * len(vectors[0].answer.costs)
     tested = {"iterations": iterations, "operations": count.total}
     cost = ExportCost(variables=len(problem.phi), operations={ITERATION: cost_of(count)}, bytes=needed,
-                      self_test=tested, work=cut.work, piece=cut.piece, longest_period_s=settings.process.sampling_period_s)  # fmt: skip
+                      self_test=tested, work=cut.work, piece=cut.piece,
+                      longest_period_s=settings.process.sampling_period_s)  # fmt: skip
     readme = filled(template(name), {
         **parts, "COST": cost_text(cost, profile), "RECORDED": str(iterations),
         "PROBLEM": problem_layout(*problem_of(settings)),
@@ -205,7 +206,8 @@ def whole_optimizer(
               counted_updates(recorder.optimizer, golden[:COUNTED]).items()}  # fmt: skip
     cut = WHOLE if target == "c" else CUT
     cost = ExportCost(variables=len(recorded.vectors[0].guess), operations={**others, ITERATION: cost_of(count)},
-                      bytes=needed, work=cut.work, piece=cut.piece, longest_period_s=settings.process.sampling_period_s)  # fmt: skip
+                      bytes=needed, work=cut.work, piece=cut.piece,
+                      longest_period_s=settings.process.sampling_period_s)  # fmt: skip
     texts[README] = filled(template(name), {
         **parts, "COST": cost_text(cost, profile),
         "GOLDEN": str(len(golden)), "COUNTED": str(min(COUNTED, len(golden))),
@@ -268,7 +270,8 @@ def output_guard(target: str, settings: Settings) -> dict[str, str]:
             (signal, *(f"{each:g}" for each in limits))
             for signal, *limits in zip(process.input_names, *kernels.limits[:3], strict=True)
         ]),
-        "REFERENCE": REFERENCES[settings.limits.rate_reference], "SLEW_S": f"{kernels.limits.slew_ticks * process.tick_s:g}",
+        "REFERENCE": REFERENCES[settings.limits.rate_reference],
+        "SLEW_S": f"{kernels.limits.slew_ticks * process.tick_s:g}",
     })  # fmt: skip
     return texts
 

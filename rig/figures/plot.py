@@ -16,7 +16,8 @@ from matplotlib.ticker import ScalarFormatter
 from numpy.typing import NDArray
 
 from coldloop.number_text import axis_labels, ends_text
-from coldloop.process.declaration import Input, Output, Process
+from coldloop.process.declaration import Process
+from coldloop.process.sections import Input, Output
 
 Series = NDArray[np.floating]
 

@@ -28,7 +28,7 @@ from rig.results.columns import STATION
 from rig.results.recorded_alarms import alarms_after
 from rig.results.run_folder import MOST_IN_MEMORY, MOST_LISTED, RunFolder
 
-SECTIONS: Final = ("model", "limits", "session", "optimizer_plc", "telemetry")
+SECTIONS: Final = ("limits", "session", "optimizer_plc", "telemetry")
 _MODES: Final = {word(mode): int(mode) for mode in Mode}
 _CAUSES: Final = {word(cause): int(cause) for cause in Cause}
 
@@ -72,6 +72,8 @@ class RecordedPage:
     def _read_settings(self) -> OptimizerSettings:
         """Return what the optimiser was configured with."""
         values = {key: value for key, value in self._folder.configuration.items() if key.split(".")[0] in SECTIONS}
+        copy = self._folder.manifest["inputs"].get("model", {}).get("file")
+        values["model.file"] = str(self._folder.held(copy)) if copy else "cold-box"
         options: Mapping[str, tuple[object, str]] = {key: (value, "manifest") for key, value in values.items()}
         return load_configuration(OptimizerSettings, environment={}, options=options).settings
 

@@ -19,7 +19,8 @@ def problem_layout(problem: PredictiveProblem, prediction: PredictionModel) -> s
     ]
     for band, output in enumerate(prediction.constrained):
         for end, where in enumerate(("below", "above")):
-            what = f"slack: how far {process.outputs[output].name} is {where} its band there, {process.outputs[output].unit}"
+            one = process.outputs[output]
+            what = f"slack: how far {one.name} is {where} its band there, {one.unit}"
             variables.append((_element(design.n_slacks, behind + 2 * band + end), what))
     bands = " and ".join(process.output_names[output] for output in prediction.constrained)
     count = 2 * len(prediction.constrained) * len(design.constraint_instants)

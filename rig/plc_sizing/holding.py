@@ -108,7 +108,7 @@ def _is_measured(model: LtiModel, process: Process, ticks: int, reserve: float) 
     """Return whether outputs with a band stay in the range of their sensor until a step of the load is answered."""
     moved = model.C @ discretise(model.A, model.B, model.F, 2 * ticks * process.tick_s).F + model.G
     found = zip(model.y0, reserve * abs(moved) * np.ptp(process.load.span), process.outputs, strict=True)
-    return all(move < min(one.range[1] - at, at - one.range[0]) for at, move, one in found if one.band)
+    return all(move < min(one.range[1] - at, at - one.range[0]) for at, move, one in found if one.edges)
 
 
 def leaves_its_band(model: LtiModel, process: Process) -> str:
@@ -116,7 +116,7 @@ def leaves_its_band(model: LtiModel, process: Process) -> str:
     move, x = max(process.load.span, key=lambda end: abs(end - model.w0)) - model.w0, np.zeros(len(model.A))
     for ticks in range(process.decision_instants[-1] * process.ticks_per_sample + 1 if process.has_load else 0):
         for value, at, one in zip(model.y0 + model.C @ x + model.G * move, model.y0, process.outputs, strict=True):
-            if one.band and one.band.low <= at <= one.band.high and not one.band.low <= value <= one.band.high:
+            if one.edges and one.edges[0] <= at <= one.edges[1] and not one.edges[0] <= value <= one.edges[1]:
                 at_s = f"{ticks * process.tick_s:.3g} s"
                 return f"; {one.name} leaves its band {at_s} after a load step of {move:g} {process.load.unit}".rstrip()
         x = model.A_tick @ x + model.F_tick * move

@@ -78,9 +78,10 @@ def verdict(profile: PlcProfile, program: ProgramSettings, problem: PredictivePr
     memory = f"{needed.total / 1e3:,.0f} of {profile.memory_bytes / 1e3:,.0f} kB"
     longest, shortest = budget.ladder[-1], budget.ladder[0]
     first, then = sorted((("memory", limits.by_memory), ("time", limits.by_time)), key=lambda one: one[1])
+    shortest_s, longest_s = (ticks * budget.times.tick_s for ticks in (shortest, longest))
     return (
-        f"{profile.name}: {problem_text} fits, in {memory}; it updates every {shortest * budget.times.tick_s:g} s at the "
-        f"soonest ({_iterations(budget, shortest)}), {_iterations(budget, longest)} in {longest * budget.times.tick_s:g} s; "
+        f"{profile.name}: {problem_text} fits, in {memory}; it updates every {shortest_s:g} s at the "
+        f"soonest ({_iterations(budget, shortest)}), {_iterations(budget, longest)} in {longest_s:g} s; "
         f"{first[0]} gives way first, with more than {_variables(first[1])} variables ({then[0]} with "
         f"more than {_variables(then[1])}){_calls(profile, budget)}."
     )

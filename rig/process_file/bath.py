@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
-from coldloop.process.declaration import Bath
+from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel
-from rig.process_file.declaration import ProcessFile
+from coldloop.process.sections import Bath
 
 Array = NDArray[np.float64]
 
@@ -18,12 +18,17 @@ STILL: Final = 0.1
 """Part of itself that a mode may move by over the horizon and still integrate."""
 
 
-def check_bath(file: ProcessFile, model: LtiModel, bath: Bath) -> None:
+def check_bath(file: Process, model: LtiModel, bath: Bath) -> None:
     """Check that the laws of a bath have an answer.
 
     Raises:
         UsageError: They have none: one line.
     """
+    for name in bath.states:
+        if name not in model.state_names:
+            raise UsageError(f"bath: {name} is no state of the plant: {', '.join(model.state_names)}")
+        if bath.states.count(name) > 1:
+            raise UsageError(f"bath: {name} is named twice")
     level = model.C[model.output_names.index(bath.level)]
     if bath.level_state and not level[model.state_names.index(bath.level_state)]:
         raise UsageError(f"bath: {bath.level} does not show {bath.level_state}; name the state that is its level")

@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from coldloop.errors import UsageError
-from coldloop.process.declaration import Forecast
+from coldloop.process.declaration import Process
+from coldloop.process.sections import Disturbance, Forecast, Load
 from coldloop.table import TIME, read_table
-from rig.process_file.declaration import DisturbanceSection, LoadSection, ProcessFile
 
 
-def courses_of(file: ProcessFile, folder: Path) -> dict[str, Any]:
+def courses_of(file: Process, folder: Path) -> dict[str, Any]:
     """Return what a model file says of the disturbances among the plant's parameters; nothing if there are none.
 
     Raises:
@@ -21,7 +21,7 @@ def courses_of(file: ProcessFile, folder: Path) -> dict[str, Any]:
     return {"disturbances": [_course(one, folder, file.tick_s) for one in file.disturbances]}
 
 
-def forecasts_of(file: ProcessFile, folder: Path) -> tuple[Forecast, ...]:
+def forecasts_of(file: Process, folder: Path) -> tuple[Forecast, ...]:
     """Return what the optimiser expects.
 
     Raises:
@@ -35,12 +35,12 @@ def forecasts_of(file: ProcessFile, folder: Path) -> tuple[Forecast, ...]:
     )
 
 
-def _course(one: DisturbanceSection, folder: Path, tick_s: float) -> dict[str, Any]:
+def _course(one: Disturbance, folder: Path, tick_s: float) -> dict[str, Any]:
     ticks, values = ([0], [one.at]) if one.course is None else _steps(one, folder / one.course, tick_s)
     return {"ticks": ticks, "values": values, "measured": one.noise is not None}
 
 
-def _steps(one: LoadSection | DisturbanceSection, path: Path, tick_s: float) -> tuple[list[int], list[float]]:
+def _steps(one: Load | Disturbance, path: Path, tick_s: float) -> tuple[list[int], list[float]]:
     """Return ticks and values of a CSV file with time_s and the name of a signal."""
     wanted = (TIME, one.name)
     times, values = read_table(path, wanted, "name a CSV file beside the process file").columns(wanted)

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import ModelFileError, UsageError
+from coldloop.process.declaration import Process
 from plant.own.fmu import FmuSimulation, Wiring
 from plant.own.fmu_file import DOUBLE, Fmu
 from plant.own.maker import FMU, file_digest
-from rig.process_file.declaration import ProcessFile
 from rig.process_file.identified import Record, identified
 from rig.process_file.linear_model import Linearised, jacobian, operating_point
 from rig.process_file.step_test import model_identified
@@ -31,7 +31,7 @@ MOST_FINDINGS: Final = 5
 """Of a description that breaks the standard, that are told."""
 
 
-def with_units(file: ProcessFile, folder: Path) -> ProcessFile:
+def with_units(file: Process, folder: Path) -> Process:
     """Return a process file with units from its FMU's description where it gives none.
 
     Raises:
@@ -48,10 +48,10 @@ def with_units(file: ProcessFile, folder: Path) -> ProcessFile:
         return section if section.unit else section.model_copy(update={"unit": declared.unit or ""})
 
     named = {name: tuple(map(unit, getattr(file, name))) for name in ("inputs", "outputs", "disturbances")}
-    return file.model_copy(update={**named, "load": file.load and unit(file.load)})
+    return file.model_copy(update={**named, "load": unit(file.load) if file.has_load else file.load})
 
 
-def from_fmu(file: ProcessFile, folder: Path, name: str) -> Linearised:
+def from_fmu(file: Process, folder: Path, name: str) -> Linearised:
     """Return the model of an FMU.
 
     Raises:
@@ -92,14 +92,14 @@ def from_fmu(file: ProcessFile, folder: Path, name: str) -> Linearised:
     )
 
 
-def _wiring(file: ProcessFile, fmu: Fmu) -> Wiring:
+def _wiring(file: Process, fmu: Fmu) -> Wiring:
     for name in file.plant.start:
         fmu.port(name)
     for one in file.inputs:
         variable = fmu.variables.get(one.variable or one.name)
         if variable is not None and variable.causality != "input" and variable.variability != "tunable":
             raise UsageError(f"inputs: {variable.name} is no input of {fmu.path} but its {variable.causality}")
-    load = file.load
+    load = file.load if file.has_load else None
     return Wiring(
         inputs=[one.variable or one.name for one in file.inputs],
         outputs=[one.variable or one.name for one in file.outputs],
@@ -122,7 +122,7 @@ def _shown_states(fmu: Fmu) -> list[str]:
     )
 
 
-def _steps_per_tick(file: ProcessFile, fmu: Fmu) -> int:
+def _steps_per_tick(file: Process, fmu: Fmu) -> int:
     slave, experiment = fmu.description.coSimulation, fmu.description.defaultExperiment
     fixed = slave.fixedInternalStepSize
     if not fixed and not slave.canHandleVariableCommunicationStepSize and experiment is not None:
@@ -138,17 +138,17 @@ def _steps_per_tick(file: ProcessFile, fmu: Fmu) -> int:
     return steps
 
 
-def _horizon(file: ProcessFile) -> int:
+def _horizon(file: Process) -> int:
     return file.prediction.decision_instants[-1]
 
 
-def _sample(file: ProcessFile, simulation: FmuSimulation) -> Array:
+def _sample(file: Process, simulation: FmuSimulation) -> Array:
     for _ in range(file.ticks_per_sample):
         simulation.tick()
     return simulation.outputs()
 
 
-def _at_rest(file: ProcessFile, fmu: Fmu, wiring: Wiring) -> tuple[FmuSimulation, Wiring]:
+def _at_rest(file: Process, fmu: Fmu, wiring: Wiring) -> tuple[FmuSimulation, Wiring]:
     """Return the FMU at rest with the inputs of the operating point, and how it gets there.
 
     Raises:
@@ -180,7 +180,7 @@ def _at_rest(file: ProcessFile, fmu: Fmu, wiring: Wiring) -> tuple[FmuSimulation
 
 
 def _differentiated(
-    file: ProcessFile, fmu: Fmu, wiring: Wiring, simulation: FmuSimulation
+    file: Process, fmu: Fmu, wiring: Wiring, simulation: FmuSimulation
 ) -> tuple[Array, Array, str] | None:
     """Return derivatives of the states' rates and of the outputs by states, inputs and load; None if it has none.
 
@@ -225,7 +225,7 @@ def _named(fmu: Fmu, wiring: Wiring) -> dict[str, str]:
 # -- an FMU that hides its states -------------------------------------------------------------------------------------
 
 
-def _step_tested(file: ProcessFile, simulation: FmuSimulation, where: str) -> Record:
+def _step_tested(file: Process, simulation: FmuSimulation, where: str) -> Record:
     """Return what outputs do when inputs and load step at random about the operating point, for all lengths of time."""
     generator = np.random.default_rng(0)
     horizon = _horizon(file)
@@ -244,7 +244,7 @@ def _step_tested(file: ProcessFile, simulation: FmuSimulation, where: str) -> Re
     for k, row in enumerate(steps):
         outputs[k] = after
         u, w = row[: len(file.inputs)], row[len(file.inputs) :]
-        simulation.put(u, w if file.load else np.append(0.0, w))
+        simulation.put(u, w if file.has_load else np.append(0.0, w))
         after = _sample(file, simulation)
     names = tuple(name for name, _, _ in signals)
     operating = np.array([value for _, value, _ in signals])

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.number_text import ends_text, number_text
-from coldloop.process.declaration import Input, Output, Process
+from coldloop.process.declaration import Process
+from coldloop.process.sections import Input, Output
 from rig.plc_sizing.holding import NOTHING, digits_last_s, leaves_its_band, shortest_period_s, waiting
 from rig.process_file.bath import exchanged
 from rig.process_file.gain_intervals import LEVEL, half_widths
@@ -122,7 +123,7 @@ def _loops(made: Made, effect: Array) -> list[str]:
     """Return what is wrong with the loops of the fallback; `effect` is what inputs do to the outputs with a band."""
     inputs, found = [one.name for one in made.process.inputs], list[str]()
     for row, output in zip(effect, made.process.banded, strict=True):
-        loop = output.band.loop if output.band else None
+        loop = output.loop
         if loop is not None and loop.gain * row[inputs.index(loop.input)] < 0:
             found.append(f"the gain of {output.name} by {loop.input} has the wrong sign: it would drive it away")
     return found
@@ -149,7 +150,7 @@ def _too_coarse(signal: Input | Output, ends: tuple[float, float], least: float,
 
 def unheld(banded: Sequence[Output], A: Array) -> str:
     """Return that nothing but MPC holds a plant (n, n), where a mode grows and no output has a loop; else nothing."""
-    if any(one.band and one.band.loop for one in banded) or np.linalg.eigvals(A).real.max() <= NOTHING:
+    if any(one.loop for one in banded) or np.linalg.eigvals(A).real.max() <= NOTHING:
         return ""
     return "nothing holds this plant when MPC has no answer: a mode grows, and no output has a loop"
 

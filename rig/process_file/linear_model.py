@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
-from rig.process_file.declaration import ProcessFile
+from coldloop.process.declaration import Process
 from rig.process_file.identified import Identified, Record
 
 Array = NDArray[np.float64]
@@ -48,16 +48,18 @@ class Linearised(NamedTuple):
     """What it was identified from, if it was, and what was found there."""
 
 
-def operating_point(file: ProcessFile) -> tuple[Array, Array]:
+def operating_point(file: Process) -> tuple[Array, Array]:
     """Return the inputs at the operating point, and load (0 without) and other disturbances there, shape (1 + k,)."""
-    w = [file.load.at if file.load else 0.0, *(one.at for one in file.disturbances)]
+    w = [file.load.at, *(one.at for one in file.disturbances)]
     return np.array([one.at for one in file.inputs]), np.array(w)
 
 
-def with_disturbances(file: ProcessFile, found: Linearised) -> Linearised:
+def with_disturbances(file: Process, found: Linearised) -> Linearised:
     """Return the model with the disturbances other than the load as states, which hold, and outputs if measured."""
     n, k = len(found.A), len(file.disturbances)
-    F, G = (matrix if file.load else np.hstack([0.0 * matrix[:, :1], matrix[:, 1:]]) for matrix in (found.F, found.G))
+    F, G = (
+        matrix if file.has_load else np.hstack([0.0 * matrix[:, :1], matrix[:, 1:]]) for matrix in (found.F, found.G)
+    )
     shown = np.eye(k)[[one.noise is not None for one in file.disturbances]]
     zeros = np.zeros
     return found._replace(
@@ -74,7 +76,7 @@ def with_disturbances(file: ProcessFile, found: Linearised) -> Linearised:
     )
 
 
-def given_outputs(file: ProcessFile) -> Array:
+def given_outputs(file: Process) -> Array:
     """Return the outputs at the operating point, which the file gives.
 
     Raises:

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
+from coldloop.process.declaration import Process
 from coldloop.process.lti_model import discretise
+from coldloop.process.sections import Lag, PlantSource
 from plant.own.disturbances import outside
 from plant.own.maker import FMU, PYTHON, TRANSFER_FUNCTIONS
 from plant.own.python_class import Equations, equations_of, evaluated
-from rig.process_file.declaration import LagSection, PlantSection, ProcessFile
 from rig.process_file.fmu_model import from_fmu
 from rig.process_file.linear_model import Linearised, given_outputs, jacobian, operating_point, with_disturbances
 from rig.process_file.matrices import from_matrices
@@ -32,7 +33,7 @@ PADE_ORDER: Final = 2
 """Of the approximation of a dead time in the prediction model; the simulated plant has it exactly."""
 
 
-def linearised(file: ProcessFile, folder: Path) -> Linearised:
+def linearised(file: Process, folder: Path) -> Linearised:
     """Return the model of a process whose file is in a folder.
 
     Raises:
@@ -63,7 +64,7 @@ def linearised(file: ProcessFile, folder: Path) -> Linearised:
     return with_disturbances(file, found)
 
 
-def _by_record(file: ProcessFile, plant: Linearised, path: Path) -> Linearised:
+def _by_record(file: Process, plant: Linearised, path: Path) -> Linearised:
     """Return the model of a record, for a plant that hides its states."""
     model = from_step_test(file, path)
     hidden = dict(plant.parameters)
@@ -76,7 +77,7 @@ def _by_record(file: ProcessFile, plant: Linearised, path: Path) -> Linearised:
     return model._replace(kind=plant.kind, parameters=hidden, digest=plant.digest, notes=notes)
 
 
-def _gains_compared(file: ProcessFile, plant: Linearised, model: Linearised) -> list[str]:
+def _gains_compared(file: Process, plant: Linearised, model: Linearised) -> list[str]:
     """Return which gains of a record's model, after the horizon, are far from those of the plant that it is for."""
     true, found = (one.C @ discretise(one.A, one.B, one.F[:, 0], file.horizon_s).B + one.D for one in (plant, model))
     seen = np.abs(true) > SEEN * np.abs(true).max(axis=1, keepdims=True)
@@ -91,7 +92,7 @@ def _gains_compared(file: ProcessFile, plant: Linearised, model: Linearised) -> 
 # -- a class with equations ------------------------------------------------------------------------------------------
 
 
-def _from_equations(file: ProcessFile, place: str, source: str, name: str) -> Linearised:
+def _from_equations(file: Process, place: str, source: str, name: str) -> Linearised:
     equations = equations_of(source, name, place)
     u, w = operating_point(file)
     n, m = len(equations.states), len(u)
@@ -121,8 +122,8 @@ def _sizes(x: Array, equations: Equations) -> Array:
     return np.where(size > 0.0, size, 1.0)
 
 
-def _outside_sizes(file: ProcessFile) -> list[float]:
-    spans = [file.load.span if file.load else (0.0, 4.0), *(one.span for one in file.disturbances)]
+def _outside_sizes(file: Process) -> list[float]:
+    spans = [file.load.span if file.has_load else (0.0, 4.0), *(one.span for one in file.disturbances)]
     return [0.25 * (high - low) for low, high in spans]
 
 
@@ -155,10 +156,10 @@ def _rest(equations: Equations, u: Array, w: Array, place: str, sample_s: float)
 # -- transfer functions ----------------------------------------------------------------------------------------------
 
 
-def _from_lags(file: ProcessFile, plant: PlantSection) -> Linearised:
+def _from_lags(file: Process, plant: PlantSource) -> Linearised:
     """Return the lags side by side: a state each, and before it as many as its dead time is approximated with."""
     lags, m = plant.transfer_functions or (), len(file.inputs)
-    sources = {one.name: i for i, one in enumerate(file.inputs)} | ({file.load.name: m} if file.load else {})
+    sources = {one.name: i for i, one in enumerate(file.inputs)} | ({file.load.name: m} if file.has_load else {})
     sources |= {one.name: i for i, one in enumerate(file.disturbances, m + 1)}
     outputs = {one.name: i for i, one in enumerate(file.outputs)}
     for lag in lags:
@@ -184,7 +185,7 @@ def _from_lags(file: ProcessFile, plant: PlantSection) -> Linearised:
     )  # fmt: skip
 
 
-def lag_model(lag: LagSection) -> tuple[Array, Array, Array]:
+def lag_model(lag: Lag) -> tuple[Array, Array, Array]:
     """Return A (k, k), b (k,), c (k,) of one lag, its dead time by a Pade approximation, its state last."""
     rate = 1.0 / lag.time_constant_s
     if lag.delay_s == 0.0:

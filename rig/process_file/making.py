@@ -2,7 +2,8 @@
 
 import hashlib
 import json
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -10,17 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
-from coldloop.process.declaration import NO_LOAD, Band, Input, Load, Loop, Output, Process, State
+from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel, discretise
+from coldloop.process.sections import Output, State
 from plant.own.maker import file_digest
 from rig.plc_sizing.problem_sizes import ProblemSizes, iteration_shares
 from rig.process_file.bath import check_bath
 from rig.process_file.courses import courses_of, forecasts_of
-from rig.process_file.declaration import OutputSection, ProcessFile, read_process_file
 from rig.process_file.fmu_model import with_units
 from rig.process_file.linear_model import Linearised
 from rig.process_file.linearised import linearised
 from rig.process_file.mimic import drawing_of
+from rig.process_file.reading import read_process_file
 from rig.process_file.source import installed_source
 
 Array = NDArray[np.float64]
@@ -60,12 +62,12 @@ def made_from(path: Path) -> Made:
     said = read_process_file(path)
     file = with_units(said, path.parent)
     linear = linearised(file, path.parent)
-    file = _with_sensors(file)
-    try:
-        process = _process(file, linear)
-    except ValueError as error:
-        raise UsageError(f"{path}: {error}") from error
-    process = replace(process, forecasts=forecasts_of(file, path.parent), mimic=_drawing(file, path.parent))
+    file = _with_sensors(file, linear.y0.tolist())
+    process = file.model_copy(update={
+        "states": _states(file, linear), "constants": file.constants or _constants(file, linear),
+        "iterations": iteration_shares(_sizes(file, len(linear.states))),
+        "forecasts": forecasts_of(file, path.parent), "drawing": _drawing(file, path.parent),
+    })  # fmt: skip
     _check_room(process)
     _check_rest(file, linear)
     tick = discretise(linear.A, linear.B, linear.F[:, 0], file.tick_s)
@@ -80,7 +82,7 @@ def made_from(path: Path) -> Made:
         output_names=tuple(one.name for one in process.outputs),
         output_units=tuple(one.unit for one in process.outputs),
         load_name=process.load.name, load_unit=process.load.unit, parameters_digest=linear.digest, plant=linear.kind,
-        note=f"made from {path.name}", plant_parameters=linear.parameters | played, process=process.document(),
+        note=f"made from {path.name}", plant_parameters=linear.parameters | played, process=process.model_dump(mode="json"),
         declaration_digest=declaration_digest(said, path.parent),
     )  # fmt: skip
     if process.bath is not None:
@@ -88,7 +90,7 @@ def made_from(path: Path) -> Made:
     return Made(model, process, linear, len(file.disturbances))
 
 
-def declaration_digest(file: ProcessFile, folder: Path) -> str:
+def declaration_digest(file: Process, folder: Path) -> str:
     """Return the SHA-256 of what a process file says, and of all files that it names: the same on all machines.
 
     The matrices that are made from it may differ in their last bits by the versions of Python and NumPy.
@@ -108,68 +110,26 @@ def declaration_digest(file: ProcessFile, folder: Path) -> str:
     return hashlib.sha256(json.dumps([said, named], sort_keys=True).encode()).hexdigest()
 
 
-def _drawing(file: ProcessFile, folder: Path) -> str:
+def _drawing(file: Process, folder: Path) -> str:
     if file.mimic is None:
         return ""
     names = [*(one.name for one in file.inputs), *(one.name for one in file.outputs)]
-    return drawing_of(folder / file.mimic, [*names, "load"] if file.load else names)
+    return drawing_of(folder / file.mimic, [*names, "load"] if file.has_load else names)
 
 
-def _process(file: ProcessFile, linear: Linearised) -> Process:
-    load, disturbances = file.load, {one.name for one in file.disturbances}
-    return Process(
-        name=file.name, tick_s=file.tick_s, ticks_per_sample=file.ticks_per_sample,
-        inputs=tuple(
-            Input(
-                name=one.name, unit=one.unit, register=one.name.lower(), description=one.description or one.name,
-                span=(min(one.low, 0.0), max(one.high, 0.0)), low=one.low, high=one.high, rate=one.rate,
-                safe=one.at if one.safe is None else one.safe, scale=(one.high - one.low) / 4,
-                weight=one.weight or one.usual_weight, walk=one.rate / 10,
-            )
-            for one in file.inputs
-        ),
-        outputs=tuple(map(_output, file.outputs, linear.y0.tolist())),
-        states=_states(file, linear),
-        load=NO_LOAD if load is None else Load(
-            name=load.name, unit=load.unit, span=load.span, walk=load.usual_walk
-        ),
-        decision_instants=file.prediction.decision_instants,
-        constraint_instants=file.prediction.constraint_instants,
-        constants=_constants(file, linear),
-        disturbances=tuple(one.name for one in file.outputs if one.edges is None and one.name in disturbances),
-        iterations=iteration_shares(_sizes(file, len(linear.states))), bath=file.bath,
-    )  # fmt: skip
-
-
-def _with_sensors(file: ProcessFile) -> ProcessFile:
-    """Return a file with the disturbances that are measured as its last outputs."""
+def _with_sensors(file: Process, y0: Sequence[float]) -> Process:
+    """Return a file with the disturbances that are measured as its last outputs, and where outputs (n_y,) rest."""
     sensors = tuple(
-        OutputSection(name=one.name, unit=one.unit, range=one.span, noise=one.noise, at=one.at)
+        Output(name=one.name, unit=one.unit, range=one.span, noise=one.noise, at=one.at)
         for one in file.disturbances
         if one.noise is not None
     )
-    return file.model_copy(update={"outputs": file.outputs + sensors})
+    every = zip((*file.outputs, *sensors), y0, strict=True)
+    return file.model_copy(update={"outputs": tuple(one.model_copy(update={"at": at}) for one, at in every)})
 
 
-def _output(one: OutputSection, at_rest: float) -> Output:
-    """Return an output that is so at the operating point."""
-    band, loop = None, one.loop
-    if one.edges is not None:
-        low, high = one.edges
-        margin = 0.0 if one.setpoint is None else (high - low) / 2
-        band = Band(
-            low=low, high=high, weight=one.penalty or one.usual_penalty(one.edges), margin=margin, alarm=one.alarm,
-            dead_band=one.usual_dead_band if one.dead_band is None else one.dead_band,
-            loop=None if loop is None else Loop(
-                input=loop.input, gain=loop.gain, integral_time_s=loop.integral_time_s,
-                setpoint_offset=0.0 if one.setpoint is None else one.setpoint - at_rest,
-            ),
-        )  # fmt: skip
-    return Output(name=one.name, unit=one.unit, range=one.range, noise=one.noise, weight=one.weight, band=band)
-
-
-def _states(file: ProcessFile, linear: Linearised) -> tuple[State, ...]:
-    given = {one.name: one.usual_walk for one in file.disturbances}
+def _states(file: Process, linear: Linearised) -> tuple[State, ...]:
+    given: dict[str, float | None] = {one.name: one.walk for one in file.disturbances}
     given |= {state.name: state.walk for state in file.states}
     unknown = set(given) - set(linear.states)
     if unknown:
@@ -184,7 +144,7 @@ def _states(file: ProcessFile, linear: Linearised) -> tuple[State, ...]:
     )
 
 
-def _constants(file: ProcessFile, linear: Linearised) -> tuple[str, ...]:
+def _constants(file: Process, linear: Linearised) -> tuple[str, ...]:
     """Return the outputs whose constant error can be told from states, load and each other.
 
     Hautus' test at the integrator: (A, F; C, G) and a column of ones for each constant have no direction of zeros
@@ -192,7 +152,7 @@ def _constants(file: ProcessFile, linear: Linearised) -> tuple[str, ...]:
     best, as a load that moves one output by much and another by next to nothing hardly differs from an error of the
     first.
     """
-    with_load = (linear.F, linear.G) if file.load else (linear.F[:, :0], linear.G[:, :0])
+    with_load = (linear.F, linear.G) if file.has_load else (linear.F[:, :0], linear.G[:, :0])
     modes = np.vstack([np.hstack([linear.A, with_load[0]]), np.hstack([linear.C, with_load[1]])])
     found: list[int] = []
     sensors = {one.name for one in file.disturbances}  # whose errors their effects would be blamed for
@@ -216,7 +176,7 @@ def _told_apart(columns: Array) -> float:
     return float(np.linalg.svd(scaled, compute_uv=False)[-1])
 
 
-def _sizes(file: ProcessFile, states: int) -> ProblemSizes:
+def _sizes(file: Process, states: int) -> ProblemSizes:
     bands = sum(output.edges is not None for output in file.outputs)
     constants = len(file.outputs)  # as many at most have one, and the load a mismatch
     ahead = len(file.prediction.decision_instants) * sum(one.forecast is not None for one in file.outside)
@@ -245,7 +205,7 @@ def _check_room(process: Process) -> None:
         )
 
 
-def _check_rest(file: ProcessFile, linear: Linearised) -> None:
+def _check_rest(file: Process, linear: Linearised) -> None:
     """Check that outputs at rest are within the ranges of their sensors.
 
     Raises:

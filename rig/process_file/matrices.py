@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from coldloop.errors import UsageError
 from coldloop.foreign import foreign
 from coldloop.parsing import parsed_json
+from coldloop.process.declaration import Process
 from coldloop.text_file import MOST_BYTES, read_bytes
 from plant.own.maker import LINEAR
 from plant.own.python_class import made_by
-from rig.process_file.declaration import ProcessFile
 from rig.process_file.linear_model import Linearised, given_outputs, operating_point
 from rig.process_file.source import source_of
 
@@ -25,7 +25,7 @@ NAMES: Final = "ABCDFG"
 REMEDY: Final = "write it with numpy.savez(A=..., ...), or as JSON"
 
 
-def from_matrices(file: ProcessFile, folder: Path, given: str) -> Linearised:
+def from_matrices(file: Process, folder: Path, given: str) -> Linearised:
     """Return the model whose matrices are given: dx/dt = A x + B u + F w, y = C x + D u + G w.
 
     Args:
@@ -76,7 +76,7 @@ def _of_file(path: Path) -> dict[str, Array]:
         raise UsageError(f"{path}: not a readable NPZ or JSON file of matrices ({error}); {REMEDY}") from error
 
 
-def _of_state_space(file: ProcessFile, folder: Path, given: str) -> dict[str, Array]:
+def _of_state_space(file: Process, folder: Path, given: str) -> dict[str, Array]:
     """Return the matrices of an object with A, B, C, D in continuous time, as python-control and SciPy have them.
 
     Its inputs are those of the file, then the load, if there is one, and the other disturbances.
@@ -98,7 +98,7 @@ def _of_state_space(file: ProcessFile, folder: Path, given: str) -> dict[str, Ar
         raise UsageError(
             f"{given}: has {M['B'].shape[1]} inputs, not {m + outside}: {m} inputs, then load and other disturbances"
         )
-    none = 0 if file.load else 1  # the first column is the load's
+    none = 0 if file.has_load else 1  # the first column is the load's
     for whole, rest in (("B", "F"), ("D", "G")):
         M[rest] = np.pad(M[whole][:, m:], ((0, 0), (none, 0)))
         M[whole] = M[whole][:, :m]

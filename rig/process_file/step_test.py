@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
+from coldloop.process.declaration import Process
+from coldloop.process.sections import Disturbance, Load
 from coldloop.table import TIME, Table, read_table
 from plant.own.maker import LINEAR
-from rig.process_file.declaration import DisturbanceSection, LoadSection, ProcessFile
 from rig.process_file.identified import Identified, Places, Record, identified, unexplained
 from rig.process_file.linear_model import Linearised, operating_point
 
@@ -28,7 +29,7 @@ EVEN: Final = 0.01
 """Largest deviation of an interval from the others, over their length."""
 
 
-def from_step_test(file: ProcessFile, path: Path) -> Linearised:
+def from_step_test(file: Process, path: Path) -> Linearised:
     """Return the model that a step test shows.
 
     Raises:
@@ -47,7 +48,7 @@ def from_step_test(file: ProcessFile, path: Path) -> Linearised:
     return model._replace(notes=(*model.notes, *notes), record=(record, found))
 
 
-def record_compared(file: ProcessFile, path: Path, plant: Linearised, model: Linearised) -> list[str]:
+def record_compared(file: Process, path: Path, plant: Linearised, model: Linearised) -> list[str]:
     """Return which outputs of a record the plant that it is for explains by far worse than the model found in it."""
     record, moved = _recorded(file, _table(file, path))
     places = _places(file, moved)
@@ -63,18 +64,18 @@ def record_compared(file: ProcessFile, path: Path, plant: Linearised, model: Lin
     ]
 
 
-def _table(file: ProcessFile, path: Path) -> Table:
+def _table(file: Process, path: Path) -> Table:
     named = (*file.inputs, *file.outside, *file.outputs)
     return read_table(path, [TIME, *(one.name for one in named)], "name a CSV file beside the process file")
 
 
-def _unused(table: Table, record: Record, file: ProcessFile) -> list[str]:
+def _unused(table: Table, record: Record, file: Process) -> list[str]:
     used = {table.place(name) for name in (TIME, PIECE, *record.input_names, *(one.name for one in file.outputs))}
     left = [name for place, name in enumerate(table.names) if name and place not in used]
     return [f"not used: {', '.join(left)}"] if left else []
 
 
-def _recorded(file: ProcessFile, table: Table) -> tuple[Record, list[LoadSection | DisturbanceSection]]:
+def _recorded(file: Process, table: Table) -> tuple[Record, list[Load | Disturbance]]:
     """Return a record in samples of the model, and what moved in it beside the inputs."""
     moved = [one for one in file.outside if table.place(one.name) is not None]
     names = [one.name for one in (*file.inputs, *moved)]
@@ -93,14 +94,12 @@ def _recorded(file: ProcessFile, table: Table) -> tuple[Record, list[LoadSection
     return Record(period_s * every, held, outputs[::every], at, tuple(names), table.where, cut), moved
 
 
-def _places(file: ProcessFile, moved: Sequence[LoadSection | DisturbanceSection]) -> list[int]:
+def _places(file: Process, moved: Sequence[Load | Disturbance]) -> list[int]:
     """Return the columns that load and disturbances have in F and G."""
-    return [1 + file.disturbances.index(one) if isinstance(one, DisturbanceSection) else 0 for one in moved]
+    return [1 + file.disturbances.index(one) if isinstance(one, Disturbance) else 0 for one in moved]
 
 
-def model_identified(
-    file: ProcessFile, found: Identified, y0: Array, moved: Sequence[LoadSection | DisturbanceSection]
-) -> Linearised:
+def model_identified(file: Process, found: Identified, y0: Array, moved: Sequence[Load | Disturbance]) -> Linearised:
     """Return what was identified as the model of a process.
 
     Args:
@@ -125,7 +124,7 @@ def model_identified(
     )  # fmt: skip
 
 
-def _outputs(file: ProcessFile, found: Identified) -> Array:
+def _outputs(file: Process, found: Identified) -> Array:
     """Return the outputs at the operating point: as given, else where the model rests.
 
     Raises:
@@ -141,7 +140,7 @@ def _outputs(file: ProcessFile, found: Identified) -> Array:
     )
 
 
-def _check_readings(file: ProcessFile, path: str, outputs: Array) -> None:
+def _check_readings(file: Process, path: str, outputs: Array) -> None:
     """Check that readings are such as the file's sensors give.
 
     Raises:

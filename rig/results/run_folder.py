@@ -16,9 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from coldloop.errors import UsageError, printable
 from coldloop.parsing import parsed_json
-from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
-from coldloop.process.model_file import read_document
+from coldloop.process.model_file import process_in, read_document
 from coldloop.registers.control_plc import Mode
 from coldloop.service.event_text import word
 from coldloop.text_file import held_file, read_text
@@ -221,12 +220,8 @@ class RunFolder:
         Raises:
             UsageError: Its declaration is none that this version makes.
         """
-        declared = self.model.get("process")
-        try:
-            return Process.of(declared) if declared else COLD_BOX
-        except (KeyError, TypeError, ValueError) as error:
-            place = self.path / self.manifest["inputs"]["model"]["file"]
-            raise UsageError(f"{place}: process: {error}; use the version of Coldloop that made this run") from None
+        place = f"{self.path / str(self.manifest['inputs']['model']['file'])}: process"
+        return process_in(self.model.get("process", {}), place, "use the version of Coldloop that made this run")
 
     @property
     def model(self) -> dict[str, Any]:

@@ -30,7 +30,7 @@ LOST: Final = range(20, 40)
 
 
 def estimator_requirements(make: Made, settings: Settings) -> list[Requirement]:
-    """Return what the estimators that are made keep, in a session each of several plants of the process of the settings."""
+    """Return what the estimators that are made keep, in a session each of several plants."""
     program = settings.optimizer_plc.program
     prediction = prediction_of(load(settings.model.file), program.estimator.disturbed, program.design)
 

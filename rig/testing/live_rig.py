@@ -244,6 +244,7 @@ def up(
     factor: float | None = None,
     solver: str | None = None,
     updating_period: Period | None = None,
+    process: str | Path | None = None,
     seed: int | None = None,
     config: str | Path | None = None,
     folder: str | Path | None = None,
@@ -258,6 +259,7 @@ def up(
         factor: In real time: seconds of plant time in a second; by default 1.
         solver: `ode`, `qpoases`, `osqp`, `fast-gradient`, `interior-point`, `hybrid` or `daqp`; by default `ode`.
         updating_period: Seconds, from 2 ticks to a sampling period (0.5 to 5 s); `adaptive`, the default.
+        process: Process file, or a model file that was made from one; by default the cold box.
         seed: Seed of the sensors' noise, and of which frames a fault hits; by default 1.
         config: TOML file with further settings. An argument that is given comes before it.
         folder: Takes the logs; a temporary one if not given.
@@ -270,7 +272,7 @@ def up(
     """
     effective = configured(
         load=load, solver=solver, updating_period=updating_period, seed=seed, config=config, sections=settings,
-        mode=mode, factor=factor,
+        process=process, mode=mode, factor=factor,
     )  # fmt: skip
     check_certificates(effective.settings)
     with contextlib.ExitStack() as stack:

@@ -7,7 +7,8 @@ from typing import Annotated, Final, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, model_validator
 
-from coldloop.process.declaration import Process, Range
+from coldloop.process.declaration import Process
+from coldloop.process.sections import Range
 from coldloop.process.settings import ProcessSettings, declared, settings_process, stretched, within
 from coldloop.registers.safety import AlarmKind, AlarmPriority, alarm_key, alarms_of, band_alarms
 
@@ -93,7 +94,7 @@ class RuleSettings(BaseModel):
 
 
 def _bands_of(process: Process) -> dict[str, Range]:
-    return {one.name: one.band.alarm or (one.band.low, one.band.high) for one in process.banded if one.band is not None}
+    return {one.name: one.alarm or one.edges for one in process.banded if one.edges is not None}
 
 
 def _with_declared(given: object) -> object:
@@ -116,7 +117,7 @@ class AlarmSettings(ProcessSettings):
     """Of each output that has one, by its name; those that are not given are as the process declares them."""
     band_delay_s: Delay = stretched(5.0)
     """On-delay of their alarms: how long an output must be outside, plant time."""
-    rules: dict[Annotated[str, AfterValidator(_known_name)], RuleSettings] = {}
+    rules: dict[Annotated[str, AfterValidator(_known_name)], RuleSettings] = Field(default_factory=dict)
     """By name of the alarm, such as `sensor_bad`."""
     shelving_s: Annotated[FiniteFloat, Field(ge=1, le=65_535)] = 900.0
     """How long an alarm is shelved by a command that gives no time, plant time."""

@@ -13,8 +13,8 @@ from typing import Annotated, Self
 from pydantic import BaseModel, ConfigDict, FiniteFloat, PositiveFloat, model_validator
 
 from coldloop.process.cold_box import LEVEL_LOOP, T5_LOOP
-from coldloop.process.declaration import Loop
 from coldloop.process.limits import InputLimits
+from coldloop.process.sections import Band, Loop
 from coldloop.process.settings import ProcessSettings, declared, whole_ticks, within
 from coldloop.safety.sequence import Inputs
 
@@ -32,8 +32,8 @@ class PiSettings(BaseModel):
     """Setpoint less the output at the operating point of the model file, in the unit of the output."""
 
 
-def _declared(loop: Loop) -> PiSettings:
-    return PiSettings(gain=loop.gain, integral_time_s=loop.integral_time_s, setpoint_offset=loop.setpoint_offset)
+def _declared(loop: Loop, band: Band) -> PiSettings:
+    return PiSettings(gain=loop.gain, integral_time_s=loop.integral_time_s, setpoint_offset=band.setpoint_offset)
 
 
 class TemperatureLoop(PiSettings):
@@ -64,9 +64,9 @@ class ClassicalSettings(ProcessSettings):
     def pairs(self) -> "tuple[tuple[str, str, PiSettings], ...]":
         """Output, input and tuning of each loop."""
         return tuple(
-            (output.name, loop.input, getattr(self, output.quantity) if output.quantity else _declared(loop))
-            for output in self.process.banded
-            if output.band is not None and (loop := output.band.loop) is not None
+            (output.name, loop.input, getattr(self, output.quantity) if output.quantity else _declared(loop, band))
+            for output, band in zip(self.process.banded, self.process.bands, strict=True)
+            if (loop := band.loop) is not None
         )
 
     @property

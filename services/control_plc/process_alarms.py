@@ -3,7 +3,7 @@
 from collections.abc import Collection, Sequence
 from typing import Final
 
-from coldloop.process.declaration import Range
+from coldloop.process.sections import Range
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.safety import AlarmKind, CapacityCause, band_alarms

@@ -148,6 +148,7 @@ def state_document(model: Model, changed: Iterable[str] | None = None) -> Docume
     """Return the state of everything that is shown; of signals only those that have changed, if these are named."""
     process = model.process
     names = model.values if changed is None else [name for name in changed if name in model.values]
+    found = model.record("optimizer_plc", ModelDeviation) or blank(ModelDeviation, model.maps["optimizer_plc"])
     stale, replaced = model.stale_prefixes(), model.doubts.held | model.doubts.bad
     not_current = [f"control_plc.process.y.{name}" for i, name in enumerate(process.output_names) if replaced >> i & 1]
     document: Document = {
@@ -156,11 +157,7 @@ def state_document(model: Model, changed: Iterable[str] | None = None) -> Docume
         "time_s": model.tick * process.tick_s,
         "services": services_document(model),
         "plant": plant_document(model),
-        "deviation": deviation(
-            model.record("optimizer_plc", ModelDeviation) or blank(ModelDeviation, model.maps["optimizer_plc"]),
-            process,
-            model.doubts.suspect,
-        ),
+        "deviation": deviation(found, process, model.doubts.suspect),
         "commands": model.commands,
         "stale": stale + not_current,
         "quality": dict(qualities(model.doubts, stale, process)),
@@ -210,15 +207,12 @@ def explanation_document(model: Model, number: int | None, at_tick: int | None =
 def prediction_document(prediction: Prediction, process: Process) -> Document:
     """Return a prediction as curves over plant time."""
     start, sample_s = prediction.tick * process.tick_s, process.sampling_period_s
-    names = process.input_names
+    names, banded = process.input_names, zip(process.banded, outputs_of(prediction), strict=True)
     inputs = [prediction.u[i :: len(names)] for i in range(len(names))]
     return {
         "update": prediction.update,
         "time": [start + sample * sample_s for sample in PREDICTED_SAMPLES],
-        **{
-            one.name: list(map(rounded, ahead))
-            for one, ahead in zip(process.banded, outputs_of(prediction), strict=True)
-        },
+        **{one.name: list(map(rounded, ahead)) for one, ahead in banded},
         "input_time": [start + sample * sample_s for sample in INPUT_SAMPLES],
         **{name: [rounded(value) for value in one] for name, one in zip(names, inputs, strict=True)},
     }

@@ -3,7 +3,8 @@
 import math
 from typing import Any, Final
 
-from coldloop.process.declaration import Input, Output, Process, Range
+from coldloop.process.declaration import Process
+from coldloop.process.sections import Output, Range
 
 BESIDE_BAND: Final = 1.5
 """What a bar shows beside a band, on each side, over the width of the band."""
@@ -19,22 +20,22 @@ def process_document(process: Process) -> dict[str, Any]:
     shown = {"word": load.title, "unit": load.unit, "span": load.span, "bar": load.bar or load.span}
     return {
         "name": process.name,
-        "mimic": process.shipped_mimic or ("mimic.svg" if process.mimic else None),
+        "mimic": process.shipped_mimic or ("mimic.svg" if process.drawing else None),
         "sample_s": process.sampling_period_s,
         "inputs": [
-            {"name": one.name, "label": one.name[: len(one.register)], "register": one.register, "unit": one.unit,
-             "bounds": [one.low, one.high], "bar": one.bar or _input_bar(one)}
+            {"name": one.name, "label": one.name[: len(one.tag)], "register": one.tag, "unit": one.unit,
+             "bounds": [one.low, one.high], "bar": one.bar or _widened(one.low, one.high, BESIDE_BOUNDS)}
             for one in process.inputs
         ],
         "controlled": [_output(one) for one in process.banded],
-        "measured": [_output(one) for one in process.outputs if one.band is None and one.range[0] < one.range[1]],
+        "measured": [_output(one) for one in process.outputs if one.edges is None and not one.quantity],
         "load": shown if process.has_load else None,
         "disturbances": [_output(one) for one in process.measured_disturbances],
     }  # fmt: skip
 
 
 def _output(one: Output) -> dict[str, Any]:
-    band = one.band
+    band = one.kept
     loop = band.loop.input if band and band.loop else None
     dead_band = band.dead_band if band else 0.0
     bar = one.bar or _output_bar(one)
@@ -43,14 +44,10 @@ def _output(one: Output) -> dict[str, Any]:
 
 def _output_bar(one: Output) -> Range:
     """Return the ends of the bar of an output: about its band within the range of its sensor, or that range."""
-    if one.band is None:
+    if one.edges is None:
         return one.range
-    low, high = _widened(one.band.low, one.band.high, BESIDE_BAND)
-    return (low, high) if one.range[0] == one.range[1] else (max(low, one.range[0]), min(high, one.range[1]))
-
-
-def _input_bar(one: Input) -> Range:
-    return _widened(one.low, one.high, BESIDE_BOUNDS)
+    low, high = _widened(*one.edges, BESIDE_BAND)
+    return max(low, one.range[0]), min(high, one.range[1])
 
 
 def _widened(low: float, high: float, share: float) -> Range:

@@ -61,9 +61,8 @@ class Reading:
         self._model = model
         self._broadcast = broadcast
         self._guard = guard
-        process = model.process
-        self._tick_s = process.tick_s
-        drawn = (process.disturbances, process.inputs, process.banded, model.trends.station_names)
+        process, self._tick_s = model.process, model.process.tick_s
+        drawn = (process.measured_disturbances, process.inputs, process.banded, model.trends.station_names)
         self._most_names = PENS + 1 + sum(map(len, drawn))
         self._long_reads = LongReads(time.monotonic)
         self._catalog = encoded(catalog(model, training=settings.training and not replay, replay=replay))
@@ -90,7 +89,7 @@ class Reading:
 
     async def mimic(self, _request: web.Request) -> web.Response:
         """Answer with the drawing that the process brings; those of the cold box are static files."""
-        answer = web.Response(text=self._model.process.mimic, content_type="image/svg+xml")
+        answer = web.Response(text=self._model.process.drawing, content_type="image/svg+xml")
         add_headers(answer)
         return answer
 
@@ -195,11 +194,7 @@ class Reading:
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         for row, *values in zip(rows, *(trends.column(name, rows) for name in names), strict=True):
-            doubts = " ".join(
-                f"{name}={one}"
-                for name, one in trends.doubts_at(row).named(self._model.process).items()
-                if name in names
-            )
+            doubts = " ".join(f"{name}={one}" for name, one in trends.doubts_at(row).items() if name in names)
             numbers = ("" if math.isnan(value) else f"{value:.7g}" for value in values)
             writer.writerow([trends.ticks[row] * self._tick_s, *numbers, doubts])
         return text.getvalue().encode(), following

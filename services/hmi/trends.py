@@ -171,9 +171,9 @@ class TrendStore:
             found[name][-1] = found[name][-1]._replace(end=(last + 1) * tick_s)
         return found
 
-    def doubts_at(self, row: int) -> Doubts:
-        """Return the outputs whose readings are in doubt."""
-        return self._doubts[row]
+    def doubts_at(self, row: int) -> dict[str, Quality]:
+        """Return the outputs whose readings are in doubt, and how."""
+        return self._doubts[row].named(self._process)
 
 
 def thin(

@@ -82,8 +82,8 @@ class EstimatorSettings(ProcessSettings):
     """Of one measurement, whatever the updating period; or of a mean over a sampling period, so that measurements which
     follow each other sooner count for less: a model error is then not taken for more load the shorter the period is."""
     disturbances: tuple[str, ...] = ()
-    """Signals, by name or group (`outputs`, `inputs`), with an unknown constant that is estimated, so that there is no offset on a
-    plant that is not the model. That of an output is added to its reading, that of an input acts like more of it."""
+    """Signals, by name or group (`outputs`, `inputs`), with an unknown constant that is estimated, so that there is no
+    offset on a plant that is not the model. That of an output is added to its reading, that of an input acts like more of it."""
     disturbance_walk: PositiveFloat = 3.0
     """Random walk of an output's constant over its sensor's standard deviation."""
     input_walk: PositivePerInput = declared(lambda process: tuple(one.walk for one in process.inputs))

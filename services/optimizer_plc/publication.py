@@ -70,8 +70,9 @@ class OptimizerPublication:
                 f"session.updating_period = {ticks}: give {SHORTEST_TICKS} or more, or 0 (adaptive)"
             )
         if ticks and asked.realtime and not self._budget.is_enough(ticks):
+            period_s = ticks * self._budget.times.tick_s
             raise IllegalValueError(
-                f"session.updating_period = {ticks}: in real time no answer is there within {ticks * self._budget.times.tick_s:g} s, one "
+                f"session.updating_period = {ticks}: in real time no answer is there within {period_s:g} s, one "
                 f"iteration takes {self._budget.answer_after_s(1):g} s with its preparation: give more, or 0 (adaptive)"
             )
 

@@ -10,8 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationInfo, 
 from coldloop.config import as_toml, flattened
 from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, Endpoint
 from coldloop.modbus.settings import ServerSettings
-from coldloop.process.declaration import FURTHEST_WEIGHT
 from coldloop.process.limits import InputLimits
+from coldloop.process.sections import FURTHEST_WEIGHT
 from coldloop.process.settings import (
     TOLERANCE,
     ProcessSettings,

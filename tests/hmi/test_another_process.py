@@ -1,7 +1,6 @@
 """An operator of the quadruple tank: the page, commands and alarms are those of its process, not of a cold box.
 
-An interpreter is loaded with one process, so the rig and each command are processes of their own; what they did is read
-with nothing but a socket.
+The rig and each command are programs of their own; what they did is read with nothing but a socket.
 """
 
 import re
@@ -42,10 +41,10 @@ class Tank(NamedTuple):
 
     def coldloop(self, *words: object, process: bool = True) -> Ended:
         """Run a command to its end; its output is one text."""
-        more = {"COLDLOOP_PROCESS": str(self.model)} if process else None
+        which = ("--process", self.model) if process else ()
         command = words if words[0] == "registers" else (*words, "--port-base", self.base)
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        return self.processes.coldloop(*command, more=more, **pipes).ended(PROGRAM_S)
+        return self.processes.coldloop(*which, *command, **pipes).ended(PROGRAM_S)
 
     @property
     def mode(self) -> int:

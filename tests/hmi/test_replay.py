@@ -76,8 +76,13 @@ def test_a_replay_takes_no_commands(served: Served) -> None:
     assert not served.ask("/api/me")["operates"]
 
 
-def test_recorded_settings_give_rule_and_limits(recorded_run: Path) -> None:
-    recorded = RecordedPage(RunFolder(recorded_run))
+def test_recorded_settings_give_rule_and_limits(recorded_run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "of another machine"
+    shutil.copytree(recorded_run, folder)
+    manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+    manifest["configuration"]["model.file"] = "/absent/model.json"
+    (folder / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
+    recorded = RecordedPage(RunFolder(folder))
     assert (recorded.rule.q_first, recorded.rule.delta, recorded.rule.iteration) == (5, 0, 0.25)
     assert recorded.limits.output_high == (61.0, 16.0)
 

@@ -93,5 +93,6 @@ def both_ways(model: Path, ticks: int, steps: str, assignments: Sequence[str]) -
         programs, loops = (left_by(settings, load, ticks, compiled=compiled) for compiled in (False, True))
     return Compared(
         [one == other for one, other in zip(loops[:-1], programs[:-1], strict=True)], programs.late,
-        Counted.ticks, Counted.updates, len(programs.updates), {EventKind(kind).name for _, _, kind, *_ in programs.events},
+        Counted.ticks, Counted.updates, len(programs.updates),
+        {EventKind(kind).name for _, _, kind, *_ in programs.events},
     )  # fmt: skip

@@ -85,7 +85,7 @@ class DirectProblem:
         return np.concatenate([part.ravel() for part in parts])
 
     def direct_optimum(self, at: QpParameters) -> Array:
-        """Return the decisions of least cost: residuals and rows are affine in them, columns follow from unit vectors."""
+        """Return the decisions of least cost: residuals and rows are affine in them."""
         unit = np.eye((self.inputs + 2 * self.bands) * len(self.knots))
         nothing = np.zeros(len(unit))
         r0, g0 = self.residuals(nothing, at), self.rows(nothing, at)

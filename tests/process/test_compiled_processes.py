@@ -13,6 +13,7 @@ from tests.process.both_ways import both_ways
 USUALLY: Final = {"matrices", "foreseen"}
 
 
+@pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if name in USUALLY else pytest.mark.night) for name in CASES]
 )

@@ -22,9 +22,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Make, print; write the model file when there is --out."""
     from coldloop.errors import UsageError
+    from coldloop.process.declaration import Process
     from coldloop.whole_file import require_regular_file
     from rig.cli.key_listing import key_listing
-    from rig.process_file.declaration import ProcessFile
     from rig.process_file.in_child import text_of_child
     from rig.process_file.judgement import described
     from rig.process_file.making import made_from
@@ -33,7 +33,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.keys:
         if out is not None:
             raise UsageError("--out: writes the model of a process file; name that file, and leave out --keys")
-        sys.stdout.write(key_listing(ProcessFile))
+        sys.stdout.write(key_listing(Process))
         return 0
     if out is not None:
         require_regular_file(out)

@@ -42,7 +42,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     mode.add_argument("mode", choices=MODES, metavar="auto|classical|manual")
     mode.set_defaults(document=lambda options: {"kind": "mode", "mode": options.mode})
     setpoint = what.add_parser("setpoint", help="an input in manual mode")
-    inputs = {one.register: one.name for one in process.inputs}
+    inputs = {one.tag: one.name for one in process.inputs}
     setpoint.add_argument("input", choices=inputs, metavar="|".join(inputs))
     setpoint.add_argument("value", type=float)
     setpoint.set_defaults(

@@ -62,8 +62,8 @@ class CompiledStretches:
         self._world = World(
             compiled.constants, plant.biases, plant.deviations, np.array(load.times), np.array(load.watts),
             control_plc.guard.limits, np.array(sensors.low), np.array(sensors.high), np.array(sensors.least),
-            np.array(sensors.is_controlled), sensors.kinds, np.array(sensors.moves), sensors.may_rest, sensors.each_may_rest,
-            sensors.frozen_ticks, *process.load.stored_span, control_plc.watchdog.time,
+            np.array(sensors.is_controlled), sensors.kinds, np.array(sensors.moves),
+            sensors.may_rest, sensors.each_may_rest, sensors.frozen_ticks, *process.load.stored_span, control_plc.watchdog.time,
             optimizer_plc.settings.interrupting_load_step_w,
         )  # fmt: skip
 

@@ -132,13 +132,13 @@ class OptimizerText:
                      golden)  # fmt: skip
 
     def _interface(self) -> str:
-        begin, take = self.entries[:2]
+        process, (begin, take) = self._process, self.entries[:2]
         passed = passed_by_name(take, (*take.inputs, *take.shared), self.printer.type, 12)
         begun = ", ".join(f"{name} := {'TRUE' if each == ANEW else name}"
                           for each, name in interface_names(begin, self.printer.type).items())  # fmt: skip
         return filled(template("structured_text/optimizer/optimizer.st"), {
-            **signal_counts(self._process), "LONGEST": str(self._process.ticks_per_sample), "SHORTEST": str(SHORTEST_TICKS), "LATCHED": passed,
-            "TICK_S": str(self._process.tick_s), "UNIT": self._process.load.unit, "BEGIN": begun, "PIECE": str(PIECE),
+            **signal_counts(process), "LONGEST": str(process.ticks_per_sample), "SHORTEST": str(SHORTEST_TICKS),
+            "LATCHED": passed, "TICK_S": str(process.tick_s), "UNIT": process.load.unit, "BEGIN": begun, "PIECE": str(PIECE),
             "LOAD_STEP": interface_names(take, self.printer.type)[take.outputs[0]],
         })  # fmt: skip
 

@@ -17,7 +17,7 @@ from pydantic import (
     model_validator,
 )
 
-from coldloop.process.declaration import FURTHEST_WEIGHT
+from coldloop.process.sections import FURTHEST_WEIGHT
 from coldloop.process.settings import (
     PerBand,
     PerInput,

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.declaration import Bath
 from coldloop.process.limits import InputLimits
+from coldloop.process.sections import Bath
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.design import ControlDesign, Target
 from optimizer_plc.qp.prediction import PredictionModel, state_cost

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Final
 
-from coldloop.process.declaration import Load
 from coldloop.process.load_profile import LoadProfile
+from coldloop.process.sections import Load
 from coldloop.registers.plant import LOAD_ROWS, LoadStatus, LoadStep
 
 MOST_UPCOMING: Final = 2 * LOAD_ROWS

@@ -118,10 +118,8 @@ class PlayLoad(_Command):
     def text(self) -> str:
         """The command in words."""
         times = self.profile.times
-        return (
-            f"Play a load of {len(times)} steps, {duration_text(times[-1] * self.process.tick_s)} long, from now on; its last "
-            "value is held"
-        )
+        length = duration_text(times[-1] * self.process.tick_s)
+        return f"Play a load of {len(times)} steps, {length} long, from now on; its last value is held"
 
 
 class SetFactor(_Command):

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from coldloop.errors import LoadFileError
-from coldloop.process.declaration import LAST_TICK, LOAD_IN_WATTS, Process
+from coldloop.process.declaration import LAST_TICK, Process
+from coldloop.process.sections import LOAD_IN_WATTS
 from coldloop.table import TIME, Table, read_table, table_of
 
 

@@ -15,6 +15,7 @@ from coldloop.process.model_file import (
     FORMAT,
     REMEDY,
     VECTORS,
+    declared_process,
     digest_of,
     header_of,
     read_document,
@@ -144,7 +145,7 @@ class LtiModel:
         Raises:
             KeyError, TypeError, ValueError: The model says something else there.
         """
-        return Process.of(self.process) if self.process else THE_COLD_BOX
+        return Process.model_validate(self.process) if self.process else THE_COLD_BOX
 
     @property
     def short_digest(self) -> int:
@@ -209,10 +210,7 @@ def load(path: Path) -> LtiModel:
         model = LtiModel(**described, **arrays)
     except (KeyError, TypeError, ValueError) as error:
         raise ModelFileError(f"{path}: {error} in the model file; {REMEDY}") from error
-    try:
-        process = model.declared
-    except (KeyError, TypeError, ValueError) as error:
-        raise ModelFileError(f"{path}: process: {error}; {REMEDY}") from error
+    process = declared_process(document, path)
     if len(model.state_names) < len(process.states):
         raise ModelFileError(
             f"{path}: {len(model.state_names)} states in the model file, a {process.name} has {len(process.states)}; "

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from pydantic import ValidationError
+
 from coldloop.errors import ModelFileError
 from coldloop.parsing import parsed_json
 from coldloop.process.cold_box import COLD_BOX as THE_COLD_BOX
@@ -70,7 +72,7 @@ class ModelHeader:
         Raises:
             KeyError, TypeError, ValueError: The file says something else there.
         """
-        return Process.of(self.process) if self.process else THE_COLD_BOX
+        return Process.model_validate(self.process) if self.process else THE_COLD_BOX
 
     @property
     def short_digest(self) -> int:
@@ -93,19 +95,26 @@ def declared_process(document: Mapping[str, Any], path: Path) -> Process:
     Raises:
         ModelFileError: What it declares is no process.
     """
-    if not document.get("process"):
+    return process_in(document.get("process", {}), f"{path}: process", PROCESS_REMEDY)
+
+
+def process_in(declared: Mapping[str, Any], where: str, remedy: str) -> Process:
+    """Return the process that is declared, the cold box if none is; `where` and `remedy` are for the message.
+
+    Raises:
+        ModelFileError: It is none that this version makes.
+    """
+    if not declared:
         return THE_COLD_BOX
+    if "decision_instants" in declared:
+        raise ModelFileError(f"{where}: of version 0.3 or earlier, which declared it in another form; {remedy}")
     try:
-        return Process.of(document["process"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ModelFileError(f"{path}: process: {error}; {PROCESS_REMEDY}") from error
-
-
-def _disturbances(document: Mapping[str, Any]) -> list[str]:
-    """Return which outputs measure a disturbance by a model file of version 0.3: those of states that nothing moves."""
-    rows = zip(document["state_names"], document["A"], document["B"], document["F"], strict=True)
-    holding = {name for name, A, B, F in rows if not any((*A, *B, F))}
-    return [name for name in document["output_names"] if name in holding]
+        return Process.model_validate(declared)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        said = "is unknown" if first["type"] == "extra_forbidden" else first["msg"].removeprefix("Value error, ")
+        raise ModelFileError(f"{where}: {place} {said}; {remedy}") from None
 
 
 def header_of(document: dict[str, Any], path: Path) -> ModelHeader:
@@ -155,8 +164,6 @@ def read_document(path: Path, remedy: str = REMEDY) -> dict[str, Any]:
         raise ModelFileError(f"{path}: a number that is not finite; {remedy}") from error
     if document.get("digest") != found:
         raise ModelFileError(f"{path}: digest mismatch, the file was changed after it was made; {remedy}")
-    if document.get("process"):
-        document["process"] = {"disturbances": _disturbances(document)} | document["process"]
     return document
 
 

@@ -9,23 +9,27 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
 
 from pydantic import (
-    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
     Field,
     FiniteFloat,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
     ModelWrapValidatorHandler,
     PositiveFloat,
     PrivateAttr,
     ValidationError,
     model_validator,
 )
+from pydantic_core import CoreSchema, to_jsonable_python
+from pydantic_core.core_schema import no_info_after_validator_function
 
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
@@ -69,9 +73,22 @@ def settings_process() -> Process:
     return _PROCESS.get()
 
 
-def declared(of: Callable[[Process], Any]) -> Any:  # noqa: ANN401 the default of any field
+def _named_model() -> Path:
+    return _MODEL.get()
+
+
+def made_by(make: Callable[[], Any]) -> Any:  # noqa: ANN401 the default of any field
+    """Return a field with a default that is made each time; its JSON schema shows what it is here."""
+
+    def show(schema: dict[str, Any]) -> None:
+        schema["default"] = to_jsonable_python(make())
+
+    return Field(default_factory=make, json_schema_extra=show)
+
+
+def declared(of: Callable[[Process], Any]) -> Any:  # noqa: ANN401 as above
     """Return a field whose default is what `of` finds in the process."""
-    return Field(default_factory=lambda: of(_PROCESS.get()))
+    return made_by(lambda: of(_PROCESS.get()))
 
 
 def stretched(seconds: float, least: float = 0.0) -> Any:  # noqa: ANN401 as above
@@ -79,43 +96,62 @@ def stretched(seconds: float, least: float = 0.0) -> Any:  # noqa: ANN401 as abo
     return declared(lambda process: seconds * max(process.stretch, least))
 
 
-def within(bounds: Callable[[Process], tuple[float, float]]) -> AfterValidator:
+@dataclass(frozen=True)
+class Checked:
+    """What the process says of a value: a check after its type's own, and what the JSON schema shows of it."""
+
+    check: Callable[[Process, Any], None]
+    """Raises ValueError."""
+    shown: Callable[[Process], dict[str, Any]]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401
+        """Check what the type lets pass."""
+
+        def checked(value: Any) -> Any:  # noqa: ANN401 of any type
+            self.check(_PROCESS.get(), value)
+            return value
+
+        return no_info_after_validator_function(checked, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        """Show it."""
+        return {**handler(schema), **self.shown(_PROCESS.get())}
+
+
+def within(bounds: Callable[[Process], tuple[float, float]]) -> Checked:
     """Return a check that a number is within bounds that the process has."""
 
-    def check(value: float) -> float:
-        low, high = bounds(_PROCESS.get())
+    def check(process: Process, value: float) -> None:
+        low, high = bounds(process)
         if not value >= low:
             raise ValueError(f"input should be greater than or equal to {low:g}")
         if not value <= high:
             raise ValueError(f"input should be less than or equal to {high:g}")
-        return value
 
-    return AfterValidator(check)
+    return Checked(check, lambda process: dict(zip(("minimum", "maximum"), bounds(process), strict=True)))
 
 
-def one_of(what: str, names: Callable[[Process], tuple[str, ...]]) -> AfterValidator:
+def one_of(what: str, names: Callable[[Process], tuple[str, ...]]) -> Checked:
     """Return a check that a name is one of those that the process has."""
 
-    def check(name: str) -> str:
-        if name not in names(_PROCESS.get()):
+    def check(process: Process, name: str) -> None:
+        if name not in names(process):
             raise ValueError(f"unknown {what} {name}")
-        return name
 
-    return AfterValidator(check)
-
-
-def _as_many(what: str, names: Callable[[Process], tuple[str, ...]]) -> AfterValidator:
-    def check(values: tuple[float, ...]) -> tuple[float, ...]:
-        expected = names(_PROCESS.get())
-        if len(values) != len(expected):
-            raise ValueError(f"give {len(expected)} numbers, one for each {what}: {', '.join(expected)}")
-        return values
-
-    return AfterValidator(check)
+    return Checked(check, lambda process: {"enum": list(names(process))})
 
 
-_EACH_INPUT: Final = _as_many("input", lambda process: process.input_names)
-_EACH_BAND: Final = _as_many("output with a band", lambda process: tuple(one.name for one in process.banded))
+def _each(what: str, names: Callable[[Process], tuple[str, ...]]) -> Checked:
+    def check(process: Process, values: tuple[float, ...]) -> None:
+        if len(values) != len(names(process)):
+            known = ", ".join(names(process))
+            raise ValueError(f"give {len(names(process))} numbers, one for each {what}: {known}")
+
+    return Checked(check, lambda process: {"each": what, "maxItems": len(names(process))})
+
+
+_EACH_INPUT: Final = _each("input", lambda process: process.input_names)
+_EACH_BAND: Final = _each("output with a band", lambda process: tuple(one.name for one in process.banded))
 PerInput = Annotated[tuple[FiniteFloat, ...], _EACH_INPUT]
 PositivePerInput = Annotated[tuple[PositiveFloat, ...], _EACH_INPUT]
 PerBand = Annotated[tuple[FiniteFloat, ...], _EACH_BAND]
@@ -144,7 +180,7 @@ class ModelSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    file: Annotated[Path, BeforeValidator(_named)] = Field(default_factory=lambda: _MODEL.get())
+    file: Annotated[Path, BeforeValidator(_named)] = made_by(_named_model)
     """A file, or `cold-box` or `refrigerator` for one that is shipped. It says which process it is."""
 
 

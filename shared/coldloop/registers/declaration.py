@@ -166,7 +166,7 @@ def each_input(description: str, *, in_span: bool = True) -> Declared:
     def declared(process: Process) -> Field:
         inputs = process.inputs
         return Field(
-            Kind.F32, description.format("Input"), elements=tuple(one.register for one in inputs),
+            Kind.F32, description.format("Input"), elements=tuple(one.tag for one in inputs),
             units=process.input_units,
             each=tuple(
                 f32(description.format(one.description), unit=one.unit, low=one.span[0] if in_span else None,

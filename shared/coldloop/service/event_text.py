@@ -98,7 +98,7 @@ class _Words:
     def __init__(self, process: Process) -> None:
         self.process = process
         self.alarms = {kind.value: word(kind) for kind in AlarmKind} | {
-            number: (one.band and one.band.alarm_word) or f"{one.name} outside its band"
+            number: one.alarm_word or f"{one.name} outside its band"
             for number, one in zip(band_alarms(process), process.banded, strict=True)
         }
         self.alarm_causes = self._alarm_causes()

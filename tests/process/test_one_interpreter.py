@@ -1,0 +1,49 @@
+"""Several processes in one interpreter, interleaved and in threads: each leaves what it leaves alone."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+import coldloop
+from coldloop.process.cold_box import COLD_BOX
+from coldloop.process.settings import DEFAULT_MODEL_FILE
+from rig import simulate
+from tests.harness.process_files import COLUMN, TANK
+
+RUNS: Final[dict[str, tuple[Path | None, float]]] = {
+    "cold box": (None, 120.0), "tank": (TANK, 240.0), "column": (COLUMN, 3000.0),
+}  # fmt: skip
+"""Process file and length, s."""
+
+
+def trace(name: str) -> str:
+    process, duration_s = RUNS[name]
+    return str(simulate("a", process=process, duration_s=duration_s).summary["trace_sha256"])
+
+
+@pytest.fixture(scope="module")
+def alone() -> dict[str, str]:
+    """The trace of each."""
+    return {name: trace(name) for name in RUNS}
+
+
+def test_processes_follow_each_other_in_any_order(alone: dict[str, str]) -> None:
+    assert len(set(alone.values())) == len(RUNS)
+    for name in ("column", "cold box", "tank", "cold box"):
+        assert trace(name) == alone[name], name
+
+
+def test_processes_run_in_threads_beside_each_other(alone: dict[str, str]) -> None:
+    names = 3 * [*RUNS]
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(trace, names)) == [alone[name] for name in names]
+
+
+def test_a_process_is_read_from_either_file_and_the_cold_box_from_its_model() -> None:
+    tank = coldloop.Process.read(TANK)
+    assert tank.input_names == ("v1", "v2")
+    assert tank == coldloop.Process.read(TANK)
+    assert coldloop.Process.read(DEFAULT_MODEL_FILE) == COLD_BOX
+    assert coldloop.simulate is simulate
