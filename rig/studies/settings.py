@@ -6,10 +6,10 @@ from typing import Final
 from coldloop.config import load_configuration
 from rig.settings import Settings
 
-PAPER: Final = "optimizer_plc.program.preset=paper"
+PAPER: Final = ("model.file=cold-box", "optimizer_plc.program.preset=paper")
 
 
 @lru_cache(maxsize=1024)
 def settings_of(assignments: tuple[str, ...]) -> Settings:
-    """Return the settings of a request; those of the environment do not count."""
-    return load_configuration(Settings, environment={}, assignments=(PAPER, *assignments)).settings
+    """Return the settings of a request, of the cold box unless it names a model; the environment does not count."""
+    return load_configuration(Settings, environment={}, assignments=(*PAPER, *assignments)).settings

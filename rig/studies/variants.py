@@ -75,7 +75,7 @@ def _variant(file: Path, name: str, table: Any, own: tuple[str, ...]) -> Variant
                 raise UsageError(f"{place}: {key}: has no effect on this study: {instead}")
     options = {key: (value, place) for key, value in settings.items()}
     try:
-        effective = load_configuration(Settings, environment={}, assignments=(PAPER, *own, TUNED), options=options)
+        effective = load_configuration(Settings, environment={}, assignments=(*PAPER, *own, TUNED), options=options)
         outside_digests(effective.settings.optimizer_plc.program.outside)
     except ConfigurationError as error:
         said = str(error).removeprefix(f"{place}: ")

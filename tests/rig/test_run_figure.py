@@ -1,5 +1,6 @@
 """What the figure of a run shows, and that its legends name what can be seen and nothing else."""
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from coldloop.process.cold_box import COLD_BOX, INPUT_NAMES
 from rig.figures.plot import Bounds, RunCurves, draw_run, label_marks, labels_of
@@ -105,3 +107,9 @@ def test_marks_of_any_linear_axis_differ_and_parse_back(low: float, mantissa: fl
         step = float(np.diff(marks).min())
         assert [float(label) for label in labels] == pytest.approx(list(marks), abs=0.01 * step, rel=0)
         assert not axis.get_offset_text().get_text()
+
+
+def test_figures_that_threads_draw_have_one_style() -> None:
+    with ThreadPoolExecutor(4) as pool:
+        sizes = list(pool.map(lambda _: [text.get_size() for text in draw_run(curves()).findobj(Text)], range(6)))
+    assert sizes == sizes[:1] * 6

@@ -1,5 +1,6 @@
 """`simulate`: the loop from Python."""
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ from coldloop.errors import UsageError
 from coldloop.process.cold_box import COLD_BOX
 from rig import Simulation, simulate
 from rig.results.columns import TRACE, files_of
+from tests.harness.process_files import COLUMN, TANK
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +59,22 @@ def test_settings_are_sections_of_the_configuration() -> None:
     assert noisy.configuration["plant.sensors.level"] == 0.5
     assert noisy.configuration["plant.seed"] == 3
     assert noisy.recording.y[:, 0].std() > 0.1
+
+
+@pytest.mark.usefixtures("compiles")
+def test_processes_in_one_interpreter_leave_the_traces_that_each_leaves_alone() -> None:
+    """In turn, and in four threads: nothing of one is left for another."""
+
+    def left(process: Path | None) -> tuple[str, list[str]]:
+        run = simulate(process=process, duration_s="30s")
+        return run.summary["trace_sha256"], run.trace.arrow.column_names
+
+    processes = [None, TANK, COLUMN]
+    in_turn = [left(process) for process in processes]
+    own = ["CV155", "v1", "reflux"]
+    assert [[name for name in own if name in names] for _, names in in_turn] == [[name] for name in own]
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(left, processes * 3)) == in_turn * 3
 
 
 @pytest.mark.parametrize(

@@ -67,15 +67,16 @@ def workers(options: argparse.Namespace) -> "Workers":
 
 def study_options(options: argparse.Namespace) -> "StudyOptions":
     """Return the extent of the study."""
+    from coldloop.config import as_toml
+    from coldloop.process.settings import SHIPPED_MODELS, ModelSettings
     from rig.studies.study import StudyOptions
     from rig.studies.variants import read_variants
 
-    given = vars(options)
-    variants = read_variants(options.variants) if given.get("variants") else ()
-    asked, duration = (
-        StudyOptions(options.seeds, None, tuple(given.get("load", ())), options.quick, variants),
-        given.get("duration"),
-    )
+    given, model = vars(options), ModelSettings().file
+    own = () if model == SHIPPED_MODELS["cold-box"] else (f"model.file={as_toml(str(model))}",)
+    variants = read_variants(options.variants, own) if given.get("variants") else ()
+    load, duration = tuple(given.get("load", ())), given.get("duration")
+    asked = StudyOptions(options.seeds, None, load, options.quick, variants, own)
     return replace(asked, ticks=duration.ticks(asked.process.tick_s)) if duration else asked
 
 
