@@ -56,7 +56,9 @@ def files_of(process: Process) -> dict[str, RunFile]:
     maps, tick = maps_of(process), process.tick_unit
     return {
         TRACE: RunFile(f"One row a tick of {tick}", _trace(process, maps)),
-        UPDATES: RunFile("One row an update whose sequence was played", _updates(process, maps)),
+        UPDATES: RunFile(
+            "One row an update that no load step cut off; `verdict` says whether it was played", _updates(process, maps)
+        ),
         EVENTS: RunFile("One row an event of the journals: modes, alarms, commands", _events(process, maps)),
         STATION: RunFile(
             "One row a tick: compression station and nitrogen; only where the plant is a refrigerator",
