@@ -152,7 +152,7 @@ class Process(Section):
     @cached_property
     def content(self) -> str:
         """All of it, as text."""
-        return self.model_dump_json()
+        return json.dumps(self.model_dump(mode="json"), sort_keys=True)
 
     def __eq__(self, other: object) -> bool:
         return self is other or (isinstance(other, Process) and self.content == other.content)
