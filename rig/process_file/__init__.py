@@ -1,1 +1,1 @@
-"""The process file: anybody's process in one TOML, made into the model file that all programs are loaded with."""
+"""The process file: anybody's process in one TOML, made into the model file that all programs are given."""

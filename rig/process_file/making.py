@@ -1,4 +1,4 @@
-"""A process file made into a model file: the linear model, and the process as programs are loaded with it."""
+"""A process file made into a model file: the linear model, and the process that it completes."""
 
 import hashlib
 import json

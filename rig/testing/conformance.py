@@ -71,7 +71,7 @@ def quality(solver: OutsideSolver, problems: list[QuadraticProblem]) -> tuple[li
 
 
 def problems_of(settings: Settings, count: int = PROBLEMS) -> Iterator[QuadraticProblem]:
-    """Yield problems of the loaded process: states that a tenth of the inputs' ranges makes, loads, inputs."""
+    """Yield problems of the process: states that a tenth of the inputs' ranges makes, loads, inputs."""
     program, random = settings.optimizer_plc.program, np.random.default_rng(1)
     prediction = PredictionModel(load(settings.model.file))
     problem = PredictiveProblem(prediction, program.design, settings.limits)

@@ -147,7 +147,7 @@ class PlantKind(StrEnum):
     REFRIGERATOR = "refrigerator"
     """S1 to S4: with nitrogen pre-cooler and compression station."""
     OF_PROCESS = "of-process"
-    """That of the process which programs are loaded with."""
+    """That of the process in the model file."""
 
 
 class RefrigeratorStart(StrEnum):

@@ -4,6 +4,7 @@ A program is given its process with its model file (`coldloop.process.settings`)
 (`docs/your-plant.md`), completed with what its model says; that of the cold box is `data/cold_box.toml`.
 """
 
+import json
 from collections.abc import Sequence
 from functools import cached_property
 from importlib.metadata import entry_points
