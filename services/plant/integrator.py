@@ -4,11 +4,13 @@ from typing import Any
 
 import numpy as np
 
+from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
-from plant.cold_box.physics import ColdBox, cold_box_of, evaluate
+from coldloop.kernels.named import named
+from plant.cold_box.physics import ColdBox, evaluate
 from plant.cold_box.settling import settle_box
 from plant.components.phase_separator import add_to_account, content, start_account
-from plant.helium.properties import Helium, helium_of
+from plant.helium.properties import Helium
 from plant.numeric import RealArray
 
 
@@ -71,15 +73,10 @@ def advance_and_read(
     before, which saves one of five evaluations. `box` and `helium` come as `plain_tuples`: numba takes 30 us a call to
     recognise nested named tuples, 5 us for plain ones, and this kernel is called every tick.
     """
-    plant, tables = cold_box_of(box), helium_of(helium)
+    plant, tables = named(ColdBox, box), named(Helium, borrowed(helium))
     y = np.empty(22)
     if not held:
         evaluate(x, u, w, plant, tables, slope, y)
     ahead = advance_along(x, slope, u, w, dt, plant, tables)
     evaluate(ahead, u, w, plant, tables, slope, y)
     return ahead, y
-
-
-def plain_tuples(value: Any) -> Any:  # noqa: ANN401 - any nesting of tuples
-    """Return nested named tuples as nested plain ones."""
-    return tuple(plain_tuples(part) for part in value) if isinstance(value, tuple) else value

@@ -4,11 +4,13 @@ from typing import Final
 
 import numpy as np
 
+from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
+from coldloop.kernels.named import named
 from coldloop.process.cold_box import OUTPUT_NAMES
 from plant.components.passes import MASS
 from plant.components.phase_separator import start_account
-from plant.helium.properties import Helium, helium_of, supply_cell
+from plant.helium.properties import Helium, supply_cell
 from plant.numeric import RealArray
 from plant.refrigerator.equipment import EquipmentLaw, act
 from plant.refrigerator.high_pressure import FIRST
@@ -18,7 +20,6 @@ from plant.refrigerator.physics import (
     Refrigerator,
     advance_refrigerator,
     evaluate_refrigerator,
-    refrigerator_of,
 )
 from tests.harness.refrigerator_energy import refrigerator_energy_rates
 
@@ -88,4 +89,6 @@ def accounted_program_tick(
     sums: RealArray,
 ) -> RealArray:
     """Do `accounted_tick`; parameters and tables come as `plain_tuples`."""
-    return accounted_tick(x, y, signals, equipment, u, v, d, refrigerator_of(plant), helium_of(helium), law, sums)
+    return accounted_tick(
+        x, y, signals, equipment, u, v, d, named(Refrigerator, plant), named(Helium, borrowed(helium)), law, sums
+    )

@@ -5,14 +5,16 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
+from coldloop.kernels.named import named, plain_tuples
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.model_range import model_range
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from plant.cold_box.physics import REFERENCE, cold_box_of, derivative
+from plant.cold_box.physics import REFERENCE, ColdBox, derivative
 from plant.components.phase_separator import content
-from plant.helium.properties import helium_of, load_helium, supply_enthalpy_and_density
-from plant.integrator import advance, plain_tuples
+from plant.helium.properties import Helium, load_helium, supply_enthalpy_and_density
+from plant.integrator import advance
 from plant.numeric import RealArray
 from plant.own_model import own_header
 from plant.refrigerator.equipment import ACTING, DEVIATING, EquipmentLaw, resting_equipment
@@ -24,9 +26,9 @@ from plant.refrigerator.physics import (
     REFERENCE_REFRIGERATOR,
     SIGNAL_NAMES,
     STATE_NAMES,
+    Refrigerator,
     evaluate_refrigerator,
     inventory,
-    refrigerator_of,
 )
 from plant.refrigerator.station_control import station_law
 from plant.refrigerator.station_settings import StationSettings
@@ -74,7 +76,7 @@ def held(
     law: EquipmentLaw,
 ) -> tuple[RealArray, RealArray]:
     """Return the state after some ticks, and the sums of `accounted_tick`; `equipment` is overwritten."""
-    plant, helium = refrigerator_of(plain), helium_of(tables)
+    plant, helium = named(Refrigerator, plain), named(Helium, borrowed(tables))
     sums, y, signals = np.zeros(4), np.empty(22), np.empty(len(SIGNAL_NAMES))
     evaluate_refrigerator(x, u, v, d, plant, helium, np.empty(x.shape[0]), y, signals)
     for _ in range(ticks):
@@ -192,7 +194,7 @@ def box_held(
     x: RealArray, u: RealArray, w: float, ticks: int, plain: object, tables: object
 ) -> tuple[RealArray, RealArray]:
     """Return the same for a cold box: what crossed, its size (J), and the largest difference (W)."""
-    box, helium, sums = cold_box_of(plain), helium_of(tables), np.zeros(3)
+    box, helium, sums = named(ColdBox, plain), named(Helium, borrowed(tables)), np.zeros(3)
     for _ in range(ticks):
         stage = x
         for k in range(4):

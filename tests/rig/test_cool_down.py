@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from coldloop.kernels.named import plain_tuples
 from coldloop.process.cold_box import COLD_BOX, L1, STATE_NAMES, T5
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from plant.helium.properties import load_helium
-from plant.integrator import plain_tuples
 from plant.kinds import plant_maker
 from plant.load import find_load
 from plant.numeric import RealArray

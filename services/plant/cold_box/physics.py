@@ -9,7 +9,7 @@ All functions are kernels and take x (28 states, `STATE_NAMES`), u (3 inputs, `I
 real or complex.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -63,23 +63,6 @@ class ColdBox(NamedTuple):
 
 
 REFERENCE = ColdBox()
-
-
-@kernel
-def cold_box_of(fields: Any) -> ColdBox:  # noqa: ANN401 - any nesting of tuples
-    """Rebuild the parameters from nested plain tuples, see `plant.integrator.advance_and_read`."""
-    return ColdBox(
-        PhaseSeparator(*fields[0]),
-        Valve(*fields[1]),
-        Turbine(Valve(*fields[2][0]), fields[2][1], fields[2][2], fields[2][3], fields[2][4]),
-        HeatExchanger(*fields[3]),
-        HeatExchanger(*fields[4]),
-        HeatExchanger(*fields[5]),
-        ReturnLine(*fields[6]),
-        fields[7],
-        fields[8],
-        fields[9],
-    )
 
 
 class Streams(NamedTuple):

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from coldloop.kernels.named import plain_tuples
 from coldloop.process.model_range import model_range
 from plant.cold_box.physics import PA_PER_BAR, ColdBox, outputs
 from plant.helium.properties import load_helium
-from plant.integrator import advance_and_read, plain_tuples
+from plant.integrator import advance_and_read
 from plant.numeric import RealArray
 from plant.program import HeatLoad, MeasurementNoise, PlantProgram
 

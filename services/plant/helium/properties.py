@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import inlined, kernel
 from plant.helium.interpolation import (
     Curves,
@@ -103,22 +102,6 @@ def load_helium() -> Helium:
         turbine_entropy=surface("turbine_entropy"),
         departure=curves("departure"),
         vapour_density=surface("vapour_density"),
-    )
-
-
-@inlined
-def helium_of(fields: Any) -> Helium:  # noqa: ANN401 - any nesting of tuples
-    """Rebuild the tables from nested plain tuples, see `plant.integrator.advance_and_read`."""
-    lent = borrowed(fields)
-    return Helium(
-        Curves(*lent[0]),
-        Curves(*lent[1]),
-        Surface(*lent[2]),
-        Surface(*lent[3]),
-        Surface(*lent[4]),
-        Surface(*lent[5]),
-        Curves(*lent[6]),
-        Surface(*lent[7]),
     )
 
 

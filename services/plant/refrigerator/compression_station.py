@@ -6,7 +6,7 @@ compressors (share of the full one), the openings of the valves (%). The exchang
 line: its mass is theirs, too, and its pressure that of `plant.refrigerator.high_pressure`.
 """
 
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from coldloop.kernels.compiled import kernel
 from plant.components.actuator import Actuator, check_actuator
@@ -58,28 +58,6 @@ class CompressionStation(NamedTuple):
     """Time constant of a compressor that starts, s."""
     run_down: float = 1.5
     """The same for one that stops, s."""
-
-
-@kernel
-def station_of(fields: Any) -> CompressionStation:  # noqa: ANN401 - any nesting of tuples
-    """Rebuild the parameters from nested plain tuples."""
-    return CompressionStation(
-        GasVolume(*fields[0]),
-        GasVolume(*fields[1]),
-        GasVolume(*fields[2]),
-        ScrewCompressor(*fields[3]),
-        ScrewCompressor(*fields[4]),
-        Valve(*fields[5]),
-        Valve(*fields[6]),
-        Valve(*fields[7]),
-        Actuator(*fields[8]),
-        ReliefValve(fields[9][0], fields[9][1], Valve(*fields[9][2])),
-        ReliefValve(fields[10][0], fields[10][1], Valve(*fields[10][2])),
-        ReliefValve(fields[11][0], fields[11][1], Valve(*fields[11][2])),
-        fields[12],
-        fields[13],
-        fields[14],
-    )
 
 
 class Pressures(NamedTuple):

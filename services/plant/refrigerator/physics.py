@@ -18,15 +18,17 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
+from coldloop.kernels.named import named
 from coldloop.process import cold_box, station
-from plant.cold_box.physics import REFERENCE, ColdBox, Streams, cold_box_of, evaluate
+from plant.cold_box.physics import REFERENCE, ColdBox, Streams, evaluate
 from plant.components.actuator import opening_rate
 from plant.components.cell_account import WILD, widest_move
 from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow
 from plant.components.nitrogen_bath import nitrogen_level
 from plant.components.phase_separator import Content, add_to_account, content, settle_account, start_account
-from plant.helium.properties import Helium, helium_of
+from plant.helium.properties import Helium
 from plant.numeric import Array, RealArray
 from plant.refrigerator.compression_station import (
     STATION_STATE_UNITS,
@@ -34,7 +36,6 @@ from plant.refrigerator.compression_station import (
     CompressionStation,
     StationFlows,
     check_station,
-    station_of,
     station_pressures,
     station_rates,
 )
@@ -58,7 +59,6 @@ from plant.refrigerator.precooler import (
     Precooler,
     Precooling,
     check_precooler,
-    precooler_of,
 )
 
 BOX_STATES: Final = len(cold_box.STATE_NAMES)
@@ -110,12 +110,6 @@ class Crossing(NamedTuple):
     """What NEF6 and NEF5 do."""
     heater: float
     """W."""
-
-
-@kernel
-def refrigerator_of(fields: Any) -> Refrigerator:  # noqa: ANN401 - any nesting of tuples
-    """Rebuild the parameters from nested plain tuples, see `plant.integrator.advance_and_read`."""
-    return Refrigerator(cold_box_of(fields[0]), precooler_of(fields[1]), station_of(fields[2]))
 
 
 @kernel
@@ -306,7 +300,7 @@ def advance_and_read_refrigerator(
     helium: Any,  # noqa: ANN401 - any nesting of tuples
 ) -> tuple[RealArray, RealArray, RealArray]:
     """Return the state after `dt` seconds, the outputs and the signals there; parameters come as `plain_tuples`."""
-    parameters, tables = refrigerator_of(plant), helium_of(helium)
+    parameters, tables = named(Refrigerator, plant), named(Helium, borrowed(helium))
     ahead = advance_refrigerator(x, u, v, d, dt, parameters, tables)
     y, signals = read(ahead, u, v, d, parameters, tables)
     return ahead, y, signals

@@ -4,7 +4,7 @@ States, `PRECOOLER_STATES`: the cells of NEF6 from the hot end on and the coil o
 (kg), the opening of its feed valve CV167 (%).
 """
 
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from coldloop.kernels.compiled import kernel
 from plant.components.actuator import Actuator, check_actuator
@@ -29,17 +29,6 @@ class Precooler(NamedTuple):
     """The bath; 20 g/s of nitrogen through the open feed valve."""
     actuator: Actuator = Actuator(lag=2.0, fastest=10.0)
     """Of CV167."""
-
-
-@kernel
-def precooler_of(fields: Any) -> Precooler:  # noqa: ANN401 - any nesting of tuples
-    """Rebuild the parameters from nested plain tuples."""
-    bath = fields[1]
-    return Precooler(
-        HeatExchanger(*fields[0]),
-        NitrogenBath(bath[0], bath[1], bath[2], bath[3], Valve(*bath[4])),
-        Actuator(*fields[2]),
-    )
 
 
 class Precooling(NamedTuple):

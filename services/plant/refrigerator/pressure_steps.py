@@ -12,9 +12,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from coldloop.kernels.named import plain_tuples
 from coldloop.process.cold_box import INPUT_NAMES, TICK_S
 from plant.helium.properties import load_helium
-from plant.integrator import plain_tuples
 from plant.numeric import RealArray
 from plant.refrigerator.file import SHIPPED, RefrigeratorFile, read_refrigerator_file
 from plant.refrigerator.physics import (

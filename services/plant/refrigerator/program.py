@@ -5,11 +5,11 @@ from typing import Any, Final
 
 import numpy as np
 
+from coldloop.kernels.named import plain_tuples
 from coldloop.process.model_range import model_range
 from coldloop.registers.plant import StationAlarm, StationMode, StationSample, StationStatus, Surroundings
 from plant.cold_box.program import ColdBoxProgram
 from plant.helium.properties import load_helium
-from plant.integrator import plain_tuples
 from plant.numeric import RealArray
 from plant.program import HeatLoad, MeasurementNoise
 from plant.refrigerator.equipment import ACTING, DEVIATING, GIVEN_NAMES, resting_equipment, standing_equipment

@@ -7,7 +7,7 @@ a negative inventory flow into the low-pressure line would do.
 """
 
 from math import sqrt
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from coldloop.kernels.compiled import kernel
 from coldloop.process.cold_box import TICK_S
@@ -152,32 +152,6 @@ class StationLaw(NamedTuple):
     alarms: AlarmLimits
     equipment: EquipmentLaw
     overrides: Overrides
-
-
-@kernel
-def law_of(fields: Any) -> StationLaw:  # noqa: ANN401 - any nesting of tuples
-    """Rebuild the constants from nested plain tuples, see `plant.integrator.advance_and_read`."""
-    return StationLaw(
-        fields[0],
-        fields[1],
-        fields[2],
-        fields[3],
-        fields[4],
-        fields[5],
-        fields[6],
-        fields[7],
-        Valve(*fields[8]),
-        Valve(*fields[9]),
-        Valve(*fields[10]),
-        Loop(*fields[11]),
-        Loop(*fields[12]),
-        Loop(*fields[13]),
-        fields[14],
-        fields[15],
-        AlarmLimits(*fields[16]),
-        EquipmentLaw(*fields[17]),
-        Overrides(*fields[18]),
-    )
 
 
 class Flows(NamedTuple):

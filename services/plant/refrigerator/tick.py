@@ -5,10 +5,12 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
+from coldloop.kernels.named import named
 from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, P1, TICK_S, V1
 from plant.components.passes import COLUMNS
-from plant.helium.properties import Helium, helium_of
+from plant.helium.properties import Helium
 from plant.numeric import RealArray
 from plant.refrigerator.equipment import (
     ACTING,
@@ -36,14 +38,12 @@ from plant.refrigerator.physics import (
     advance_along,
     evaluate_refrigerator,
     move_valves,
-    refrigerator_of,
 )
 from plant.refrigerator.station_law import (
     MEMORY_SIZE,
     StationLaw,
     StationMeasurement,
     control_station,
-    law_of,
     raised_alarms,
 )
 
@@ -167,4 +167,4 @@ def advance_program_tick(
     law: Any,  # noqa: ANN401 - any nesting of tuples
 ) -> None:
     """Do `advance_tick`; parameters, tables and law come as `plain_tuples`."""
-    advance_tick(m, u, d, ahead, refrigerator_of(plant), helium_of(helium), law_of(law))
+    advance_tick(m, u, d, ahead, named(Refrigerator, plant), named(Helium, borrowed(helium)), named(StationLaw, law))

@@ -4,6 +4,7 @@ Code counts by its instructions and constants, not by its text: docstrings, comm
 local variables do not count. Data count by value, and objects of other distributions by their names alone.
 """
 
+import contextlib
 import dataclasses
 import dis
 import functools
@@ -20,6 +21,7 @@ from typing import Any, Final, NamedTuple
 
 from coldloop.kernels.data import Plain, described
 from coldloop.kernels.implementations import Implementations, overloads_of
+from coldloop.kernels.named import parts_of
 from coldloop.kernels.ownership import is_decisive, is_decisive_module, is_own, label
 
 OF_MODULE: Final = frozenset({
@@ -170,7 +172,10 @@ class Describer:
     def _layout(self, kind: type) -> Plain:
         """Describe a class as compiled code knows it."""
         members = self.items((name, one.value) for name, one in _members(kind).items())
-        fields = self.value((getattr(kind, "_fields", ()), getattr(kind, "_field_defaults", {})))
+        parts: list[type[Any] | None] = []
+        with contextlib.suppress(NameError):  # annotations that are there for checkers of types alone
+            parts = parts_of(kind) if hasattr(kind, "_fields") else []
+        fields = self.value((getattr(kind, "_fields", ()), getattr(kind, "_field_defaults", {}), parts))
         return ("layout", label(kind), members, fields, self._implementations(kind))
 
     def _class(self, kind: type) -> Plain:
