@@ -420,7 +420,7 @@ def test_a_folder_that_calls_a_plant_of_its_own_a_cold_box_executes_nothing(
 ) -> None:  # fmt: skip
     executed, model = tmp_path / "executed", mpc / "inputs" / "model.json"
     document = json.loads(model.read_text(encoding="utf-8"))
-    document |= {"process": COLD_BOX.document(), "plant": "python"}
+    document |= {"process": COLD_BOX.model_dump(mode="json"), "plant": "python"}
     source = f"open({str(executed)!r}, 'w')\nclass P: ..."
     document["plant_parameters"] = {"source": source, "class": "P", "file": "p.py"}
     document["digest"] = digest_of(document)
