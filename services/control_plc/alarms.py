@@ -65,8 +65,6 @@ COMMANDED: Final[Mapping[int, EventKind]] = {
 }
 """The event that an operator's action asks for."""
 
-WITHOUT_DELAY: Final = AlarmSettings(band_delay_s=0.0, rules={"capacity": RuleSettings(on_delay_s=0.0)})
-
 
 class _Pending(NamedTuple):
     """A change of a condition that `active` does not show yet: it waits for its delay."""
@@ -82,10 +80,12 @@ class AlarmPanel:
 
     Args:
         journal: Where each transition is noted.
-        settings: Priorities, delays, shelving.
+        settings: Priorities, delays, shelving; without them nothing is delayed.
     """
 
-    def __init__(self, journal: Journal, settings: AlarmSettings = WITHOUT_DELAY) -> None:
+    def __init__(self, journal: Journal, settings: AlarmSettings | None = None) -> None:
+        without_delay = {"capacity": RuleSettings(on_delay_s=0.0)}
+        settings = settings or AlarmSettings(band_delay_s=0.0, rules=without_delay)
         self._journal = journal
         self._settings = settings
         self._of_the_process = {*OF_THE_PROCESS, *band_alarms(settings.process)}

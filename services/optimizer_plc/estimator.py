@@ -35,7 +35,6 @@ Array = NDArray[np.float64]
 
 MEMORY_TICKS: Final = 240
 """A minute of the cold box."""
-ANY_PLAUSIBLE: Final = PlausibilitySettings()
 UNDETECTABLE: Final = 1e-9
 """Relative size of a direction that no measurement sees."""
 
@@ -95,16 +94,16 @@ def estimator_of(
     prediction: PredictionModel,
     settings: EstimatorSettings,
     real: Real = DOUBLE,
-    plausibility: PlausibilitySettings = ANY_PLAUSIBLE,
+    plausibility: PlausibilitySettings | None = None,
 ) -> Estimator:
-    """Return the estimator that the settings name.
+    """Return the estimator that the settings name; without `plausibility` whatever sensors show is plausible.
 
     Raises:
         ConfigurationError: The simulated state is used, and is not that of the model.
     """
     kalman = settings.kind is EstimatorKind.KALMAN
     check_detectability(prediction)
-    process = prediction.process
+    process, plausible = prediction.process, plausibility or PlausibilitySettings()
     if not kalman and prediction.n_states > len(process.states):
         raise ConfigurationError(
             "optimizer_plc.program.estimator.kind=state-feedback: the model has more states than the plant reports; "
@@ -117,7 +116,7 @@ def estimator_of(
         m.outputs.transposed(), np.array(m.x0), np.array(m.u0), np.array(m.y0), m.w0, real(process.tick_s), kalman,
         settings.load_known,
         StationaryGains(*(array.astype(real, copy=False) for array in stationary)),
-        plausibility_of(plausibility, prediction, settings.sensors, len(prediction.transitions) * process.tick_s, real),
+        plausibility_of(plausible, prediction, settings.sensors, len(prediction.transitions) * process.tick_s, real),
     )  # fmt: skip
 
 
