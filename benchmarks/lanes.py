@@ -18,7 +18,8 @@ from coldloop.kernels.compiled import kernel
 from coldloop.process.cold_box import TICK_S
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from plant.cold_box.physics import REFERENCE, ColdBox
+from plant.cold_box.physics import ColdBox
+from plant.cold_box.plant_file import REFERENCE
 from plant.helium.properties import Helium, load_helium, saturation
 from plant.integrator import advance
 

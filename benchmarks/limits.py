@@ -18,7 +18,8 @@ from optimizer_plc.computing_settings import OdeSettings
 from optimizer_plc.qp.costs import matrices_of
 from optimizer_plc.qp.penalties import DEFAULT_PENALTIES
 from optimizer_plc.solvers.ode import descend, flow_in, warm_start
-from plant.cold_box.physics import REFERENCE, evaluate
+from plant.cold_box.physics import evaluate
+from plant.cold_box.plant_file import REFERENCE
 from plant.helium.properties import load_helium
 from plant.integrator import advance_along
 from plant.load import find_load

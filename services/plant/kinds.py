@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Final
 from coldloop.errors import ConfigurationError, ModelFileError
 from coldloop.kernels.first_use import kernels_of
 from coldloop.process.model_file import COLD_BOX, ModelHeader
-from plant.cold_box.physics import REFERENCE, ColdBox
+from plant.cold_box.physics import ColdBox
+from plant.cold_box.plant_file import REFERENCE
 from plant.cold_box.program import ColdBoxProgram
 from plant.components.valve import Valve
 from plant.mismatched import MismatchedPlant
@@ -66,7 +67,7 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
 def _refrigerator_and_rest(header: ModelHeader, named: Path | None) -> "tuple[Refrigerator, RefrigeratorFile]":
     """Return the refrigerator that a model file describes, and its rest: of a file that is named, or of its own."""
     from plant.refrigerator.file import SHIPPED, read_refrigerator_file, rest_in  # noqa: PLC0415 as below
-    from plant.refrigerator.physics import REFERENCE_REFRIGERATOR  # noqa: PLC0415 a cold box starts without it
+    from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR  # noqa: PLC0415 a cold box starts without it
 
     plant = REFERENCE_REFRIGERATOR if header.plant == COLD_BOX else refrigerator_in(header)
     if named is None and header.plant_rest:

@@ -1,6 +1,6 @@
 """Number types of the kernels: every kernel runs on real numbers and, for the complex step, on complex ones."""
 
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +9,7 @@ from coldloop.kernels.compiled import inlined
 
 RealArray: TypeAlias = NDArray[np.float64]
 Array: TypeAlias = NDArray[Any]  # float64 or complex128
+PA_PER_BAR: Final = 1e5
 
 
 @inlined

@@ -10,13 +10,8 @@ from typing import Any
 import pytest
 
 from coldloop.process import cold_box, station
-from plant.refrigerator.physics import (
-    COMMAND_NAMES,
-    DISTURBANCE_NAMES,
-    REFERENCE_REFRIGERATOR,
-    STATE_NAMES,
-    STATE_UNITS,
-)
+from plant.refrigerator.physics import COMMAND_NAMES, DISTURBANCE_NAMES, STATE_NAMES, STATE_UNITS
+from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 
 PAGE = (Path(__file__).parents[2] / "docs" / "equations.md").read_text(encoding="utf-8")
 PACKAGES = ("plant.components", "plant.helium", "plant.refrigerator")

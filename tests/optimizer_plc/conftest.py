@@ -26,7 +26,7 @@ from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers import Answer, Solver, make_solver
-from plant.cold_box.physics import REFERENCE
+from plant.cold_box.plant_file import REFERENCE
 from plant.cold_box.program import ColdBoxProgram
 from plant.load import find_load
 from tests.harness.records import as_transmitted

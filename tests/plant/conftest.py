@@ -18,7 +18,8 @@ from coldloop.registers.codec import codec_of
 from coldloop.registers.declaration import Role
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.registers.seal import Seal, seal_of
-from plant.cold_box.physics import REFERENCE, ColdBox, derivative, outputs
+from plant.cold_box.physics import ColdBox, derivative, outputs
+from plant.cold_box.plant_file import REFERENCE
 from plant.helium.properties import Helium, load_helium
 from plant.integrator import advance
 from plant.kinds import plant_maker

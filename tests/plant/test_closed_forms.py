@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from plant.cold_box.physics import REFERENCE, evaluate
+from plant.cold_box.physics import evaluate
+from plant.cold_box.plant_file import REFERENCE
 from plant.components.gas_valve import CHOKED, cold_valve_flow, gas_valve_flow
 from plant.components.gas_volume import SECOND_VIRIAL, GasVolume, gas_mass, gas_pressure
 from plant.components.nitrogen_bath import BOILING_POINT, LATENT_HEAT, LIQUID_DENSITY, boil, nitrogen_level
@@ -24,7 +25,7 @@ from plant.helium.properties import (
     supply_enthalpy_and_density,
 )
 from plant.numeric import RealArray
-from plant.refrigerator.precooler import Precooler
+from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 
 HELIUM = load_helium()
 BATH = REFERENCE.separator
@@ -86,7 +87,7 @@ def test_a_boiling_bath_of_constant_pressure_loses_the_liquid_that_its_heat_evap
 
 def test_the_nitrogen_bath_lasts_as_long_as_its_latent_heat() -> None:
     """While the coil is wet the heat is constant: t = dM L / Q, 19 min from 60 to 30 % with 93 g/s at 82.3 K."""
-    bath, mass, seconds = Precooler().nef5, 0.6 * 30e-3 * LIQUID_DENSITY, 0.0
+    bath, mass, seconds = REFERENCE_REFRIGERATOR.precooler.nef5, 0.6 * 30e-3 * LIQUID_DENSITY, 0.0
     C = 0.0934 * WARM_CP
     heat = C * (82.3 - BOILING_POINT) * (1.0 - np.exp(-bath.UA / C))
     while nitrogen_level(bath, mass) > 30.0:

@@ -10,7 +10,8 @@ import pytest
 from plant.cold_box.equilibrium import NoEquilibriumError, find_equilibrium
 from plant.cold_box.linearisation import linearisation_error, state_scales
 from plant.cold_box.model import build_model, parameters_digest
-from plant.cold_box.physics import REFERENCE, streams
+from plant.cold_box.physics import streams
+from plant.cold_box.plant_file import REFERENCE
 from plant.components.heat_exchanger import HeatExchanger
 from plant.helium.properties import saturation, supply_enthalpy_and_density, vapour_enthalpy_and_cp, vapour_temperature
 from plant.numeric import RealArray

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plant.cold_box.physics import REFERENCE
+from plant.cold_box.plant_file import REFERENCE
 from plant.components.gas_valve import CRITICAL_RATIO
 from plant.components.heat_exchanger import (
     HighPressureFlow,

@@ -22,7 +22,7 @@ from plant.refrigerator.equipment import (
 )
 from plant.refrigerator.events import EventSchedule, RefrigeratorEvent
 from plant.refrigerator.file import SHIPPED, read_refrigerator_file
-from plant.refrigerator.physics import REFERENCE_REFRIGERATOR
+from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 from plant.refrigerator.program import RefrigeratorProgram
 from plant.refrigerator.station_control import station_law
 from plant.refrigerator.station_settings import StationSettings

@@ -16,8 +16,8 @@ from plant.refrigerator.diagnosis import refrigerator_operating_point
 from plant.refrigerator.equilibrium import Rest
 from plant.refrigerator.exergy import LIQUID_NITROGEN, NITROGEN_VAPOUR, ExergyBalance, exergy_balance
 from plant.refrigerator.file import SHIPPED, read_refrigerator_file
-from plant.refrigerator.physics import REFERENCE_REFRIGERATOR, read
-from plant.refrigerator.plant_file import read_refrigerator
+from plant.refrigerator.physics import read
+from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR, read_refrigerator
 from plant.refrigerator.station_settings import LqWeights
 
 HELIUM = load_helium()

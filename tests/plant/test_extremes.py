@@ -12,7 +12,8 @@ from coldloop.process.range_bits import ModelRange
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.plant import StationAlarm, StationMode
-from plant.cold_box.physics import REFERENCE, ColdBox, streams
+from plant.cold_box.physics import ColdBox, streams
+from plant.cold_box.plant_file import REFERENCE
 from plant.components.phase_separator import SUPERHEAT, content, holding, outflow, separate, thinness
 from plant.components.return_line import LAMINAR, ReturnLine, return_flow
 from plant.helium.properties import (
@@ -29,12 +30,8 @@ from plant.own_model import own_header
 from plant.refrigerator.equipment import act
 from plant.refrigerator.file import SHIPPED, read_refrigerator_file
 from plant.refrigerator.linearisation import jacobian, rate_scales
-from plant.refrigerator.physics import (
-    DISTURBANCE_NAMES,
-    REFERENCE_REFRIGERATOR,
-    STATE_NAMES,
-    advance_refrigerator,
-)
+from plant.refrigerator.physics import DISTURBANCE_NAMES, STATE_NAMES, advance_refrigerator
+from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 from plant.refrigerator.program import RefrigeratorProgram
 from plant.refrigerator.tick import COMPRESSED, LEAST_FLOW, LP, TO_BOX, V1, control_tick, read_tick
 from plant.settings import PlantSettings

@@ -32,7 +32,6 @@ from plant.refrigerator.high_pressure import FIRST, Filling, hold_passes, piped,
 from plant.refrigerator.linearisation import jacobian
 from plant.refrigerator.physics import (
     BOX_STATES,
-    REFERENCE_REFRIGERATOR,
     SIGNALS,
     STATE_NAMES,
     advance_refrigerator,
@@ -41,6 +40,7 @@ from plant.refrigerator.physics import (
     inventory,
     rates,
 )
+from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 
 pytestmark = pytest.mark.usefixtures("compiles")
 

@@ -18,14 +18,12 @@ from coldloop.process.model_file import read_document, read_header, write_docume
 from coldloop.process.settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
 from plant.cold_box.diagnosis import operating_point
 from plant.cold_box.model import build_model, model_at, parameters_digest
-from plant.cold_box.physics import REFERENCE
-from plant.cold_box.plant_file import BoxParameters, PlantFile
+from plant.cold_box.plant_file import REFERENCE, BoxParameters, PlantFile
 from plant.helium.properties import load_helium
 from plant.kinds import plant_maker
 from plant.load import find_load
 from plant.own_model import own_header
-from plant.refrigerator.physics import REFERENCE_REFRIGERATOR
-from plant.refrigerator.plant_file import WARM_SECTIONS, RefrigeratorPlantFile, read_plant_file
+from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR, WARM_SECTIONS, RefrigeratorPlantFile, read_plant_file
 from plant.settings import MismatchSettings, PlantSection
 
 ROOT = Path(__file__).parents[2]

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import LtiModel
-from plant.cold_box.physics import REFERENCE
+from plant.cold_box.plant_file import REFERENCE
 from plant.cold_box.program import ColdBoxProgram
 from plant.program import MeasurementNoise, PlantProgram
 

@@ -11,7 +11,8 @@ from coldloop.kernels.named import named, plain_tuples
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.model_range import model_range
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from plant.cold_box.physics import REFERENCE, ColdBox, derivative
+from plant.cold_box.physics import ColdBox, derivative
+from plant.cold_box.plant_file import REFERENCE
 from plant.components.phase_separator import content
 from plant.helium.properties import Helium, load_helium, supply_enthalpy_and_density
 from plant.integrator import advance
@@ -23,13 +24,13 @@ from plant.refrigerator.high_pressure import FIRST
 from plant.refrigerator.physics import (
     BOX_STATES,
     COIL,
-    REFERENCE_REFRIGERATOR,
     SIGNAL_NAMES,
     STATE_NAMES,
     Refrigerator,
     evaluate_refrigerator,
     inventory,
 )
+from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 from plant.refrigerator.station_control import station_law
 from plant.refrigerator.station_settings import StationSettings
 from tests.harness.box_energy import energy_gained, energy_rates

@@ -23,13 +23,13 @@ from plant.refrigerator.linearisation import jacobian, rate_scales
 from plant.refrigerator.physics import (
     COMMAND_NAMES,
     DISTURBANCE_NAMES,
-    REFERENCE_REFRIGERATOR,
     SIGNAL_NAMES,
     STATE_NAMES,
     advance_refrigerator,
     rates,
     read,
 )
+from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 from plant.refrigerator.station_design import line_model, lq_gains
 
 HELIUM = load_helium()

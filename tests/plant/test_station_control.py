@@ -14,7 +14,7 @@ from coldloop.registers.plant import StationAlarm, StationMode, Surroundings
 from plant.kinds import plant_maker
 from plant.refrigerator.events import EventSchedule, RefrigeratorEvent
 from plant.refrigerator.file import SHIPPED, read_refrigerator_file
-from plant.refrigerator.physics import REFERENCE_REFRIGERATOR
+from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 from plant.refrigerator.program import RefrigeratorProgram
 from plant.refrigerator.station_control import StationControl
 from plant.refrigerator.station_law import SHUT, StationMeasurement, beyond, opened_by, shut_by

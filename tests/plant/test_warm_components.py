@@ -24,7 +24,8 @@ from plant.helium.properties import (
     vapour_enthalpy_and_cp,
     vapour_temperature,
 )
-from plant.refrigerator.physics import REFERENCE_REFRIGERATOR, Refrigerator, check_refrigerator
+from plant.refrigerator.physics import Refrigerator, check_refrigerator
+from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 
 HELIUM = load_helium()
 STATION = REFERENCE_REFRIGERATOR.station

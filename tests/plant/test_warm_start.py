@@ -12,7 +12,8 @@ from plant.helium.properties import load_helium
 from plant.kinds import plant_maker
 from plant.own_model import own_header
 from plant.refrigerator.file import SHIPPED, read_refrigerator_file
-from plant.refrigerator.physics import REFERENCE_REFRIGERATOR, inventory
+from plant.refrigerator.physics import inventory
+from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 from plant.refrigerator.program import RefrigeratorProgram
 from plant.refrigerator.warm_start import warm_state
 from plant.settings import PlantSettings

@@ -18,7 +18,7 @@ from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import SHIPPED_MODELS
 from plant.cold_box.model import build_model
-from plant.cold_box.physics import REFERENCE
+from plant.cold_box.plant_file import REFERENCE
 from plant.components.valve import Valve
 from rig import cli
 from rig.results.run_folder import RunFolder

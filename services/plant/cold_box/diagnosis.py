@@ -16,11 +16,11 @@ from coldloop.process.model_range import COLDEST_CELLS_K, SATURATION_BAR, WARMES
 from coldloop.process.range_bits import ModelRange
 from plant.cold_box.equilibrium import Equilibrium, NoEquilibriumError, first_guess, relaxed, rest_near
 from plant.cold_box.linearisation import state_and_load_jacobian, state_scales
-from plant.cold_box.physics import PA_PER_BAR, ColdBox, derivative, outputs, streams
+from plant.cold_box.physics import ColdBox, derivative, outputs, streams
 from plant.cold_box.plant_file import PlantFile
 from plant.components.gas_valve import CRITICAL_RATIO
 from plant.helium.properties import Helium, saturation
-from plant.numeric import RealArray
+from plant.numeric import PA_PER_BAR, RealArray
 
 FASTEST: Final = 4.0
 """Largest rate at rest, 1/s. A tick of 0.25 s follows 11 /s, and away from rest rates are up to three times as large;

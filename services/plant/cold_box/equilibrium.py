@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from plant.cold_box.linearisation import state_and_load_jacobian, state_scales
-from plant.cold_box.physics import REFERENCE, ColdBox, derivative, outputs
+from plant.cold_box.physics import ColdBox, derivative, outputs
+from plant.cold_box.plant_file import REFERENCE
 from plant.helium.properties import Helium
 from plant.integrator import advance
 from plant.numeric import RealArray

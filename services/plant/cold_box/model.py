@@ -16,8 +16,8 @@ from coldloop.process.lti_model import LtiModel, discretise
 from plant.cold_box import physics as cold_box
 from plant.cold_box.equilibrium import Equilibrium, find_equilibrium
 from plant.cold_box.linearisation import linearise
-from plant.cold_box.physics import REFERENCE, ColdBox
-from plant.cold_box.plant_file import OPERATING_INPUTS, OPERATING_LEVEL
+from plant.cold_box.physics import ColdBox
+from plant.cold_box.plant_file import OPERATING_INPUTS, OPERATING_LEVEL, REFERENCE
 from plant.helium.properties import ISOBAR_PRESSURE, Helium, load_helium
 
 

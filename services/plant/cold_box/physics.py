@@ -30,39 +30,35 @@ from plant.components.return_line import ReturnLine, return_flow
 from plant.components.turbine import Back, Expansion, Turbine, expand, throttled_flow, turbine_flow
 from plant.components.valve import Valve
 from plant.helium.properties import Helium, saturation, supply_enthalpy_and_density, vapour_temperature
-from plant.numeric import Array, at_least
+from plant.numeric import PA_PER_BAR, Array, at_least
 
 LOAD_NAME, LOAD_UNIT = "NCR22_HL", "W"
 CELLS = (8, 6, 12)  # of NEF1, NEF2, NEF34; the states are named in coldloop.process.cold_box
-PA_PER_BAR = 1e5
 
 
 class ColdBox(NamedTuple):
-    """Components and boundaries of the cold box; the defaults are the reference plant."""
+    """Components and boundaries of the cold box, in SI units; `plant.cold_box.plant_file` has the reference plant's."""
 
-    separator: PhaseSeparator = PhaseSeparator(volume=0.20)
+    separator: PhaseSeparator
     """The bath, NS1."""
-    jt_valve: Valve = Valve(flow_area=3.9e-6)
+    jt_valve: Valve
     """CV155."""
-    turbine: Turbine = Turbine(Valve(flow_area=2.6e-5), nozzle=2.2e-7, efficiency=0.70, speed_coefficient=10.0)
+    turbine: Turbine
     """The turbine with CV156."""
-    nef1: HeatExchanger = HeatExchanger(UA=1400.0, volume=6e-3, aluminium=15.0, cells=CELLS[0])
+    nef1: HeatExchanger
     """The coldest exchanger, between the bath and the mixing point."""
-    nef2: HeatExchanger = HeatExchanger(UA=2500.0, volume=6e-3, aluminium=15.0, cells=CELLS[1])
+    nef2: HeatExchanger
     """The exchanger between the mixing point and the turbine's inlet."""
-    nef34: HeatExchanger = HeatExchanger(UA=11000.0, volume=30e-3, aluminium=80.0, cells=CELLS[2])
+    nef34: HeatExchanger
     """The exchanger from the turbine's inlet up to the nitrogen pre-cooler."""
-    return_line: ReturnLine = ReturnLine(cold_resistance=0.05e5 / 0.028**2, warm_resistance=0.06e5 / 0.073**2)
+    return_line: ReturnLine
     """The low-pressure side."""
-    P_HP: float = 16e5
+    P_HP: float
     """Supply pressure, Pa, 5e5 to 19e5; the reference is that of the isobar's table."""
-    P_LP: float = 1.05e5
+    P_LP: float
     """Suction pressure of the compressor, Pa."""
-    T_in: float = 80.0
+    T_in: float
     """Temperature after the nitrogen pre-cooler, K."""
-
-
-REFERENCE = ColdBox()
 
 
 class Streams(NamedTuple):

@@ -5,28 +5,16 @@ Every key is optional; the defaults are the reference plant. Numbers of cells ar
 
 from typing import Annotated, Any, Final
 
-from pydantic import BaseModel, ConfigDict, Field
-from pydantic.fields import FieldInfo
-
 from coldloop.process.model_range import SATURATION_BAR, SUPPLY_BAR
-from plant.cold_box.physics import CELLS, PA_PER_BAR, REFERENCE, ColdBox
+from plant.cold_box.physics import CELLS, ColdBox
 from plant.components.heat_exchanger import HeatExchanger
 from plant.components.phase_separator import PhaseSeparator
 from plant.components.return_line import ReturnLine
 from plant.components.turbine import Turbine
 from plant.components.valve import Valve
+from plant.lab_units import Section, within
 
 LISTING: Final = "`coldloop docs your-refrigerator` lists the keys"
-MM2_PER_M2, G_PER_KG, L_PER_M3 = 1e6, 1e3, 1e3
-NOZZLE_UNITS: Final = 1e8
-"""g sqrt(K)/(s bar) in a kg sqrt(K)/(s Pa)."""
-
-
-def within(low: float, high: float) -> FieldInfo:
-    """Return the range of a number; texts and truth values are none."""
-    info: FieldInfo = Field(strict=True, ge=low, le=high)
-    return info
-
 
 HeatTransfer = Annotated[float, within(10, 200_000)]
 Litres = Annotated[float, within(0.1, 2000)]
@@ -36,12 +24,6 @@ Flow = Annotated[float, within(0.1, 5000)]
 
 OPERATING_INPUTS: Final = (43.0, 75.0, 36.0)  # CV155 %, NCR22_A W, CV156 %; left of the capacity maximum at 50 %
 OPERATING_LEVEL: Final = 60.0  # %
-
-
-class Section(BaseModel):
-    """A section of a plant file."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class BathSection(Section):
@@ -93,7 +75,8 @@ class ExchangerSection(Section):
 
     def component(self, cells: int) -> HeatExchanger:
         """Return the exchanger in SI units."""
-        return HeatExchanger(self.ua_w_per_k, self.volume_l / L_PER_M3, self.aluminium_kg, cells)
+        conductance, volume, aluminium = self.si
+        return HeatExchanger(conductance, volume, aluminium, cells)
 
 
 class Nef1Section(ExchangerSection):
@@ -174,28 +157,24 @@ class BoxParameters(Section):
     @property
     def box(self) -> ColdBox:
         """The cold box, in SI units."""
-        bath, turbine, line, given = self.bath, self.turbine, self.return_line, self.boundaries
+        cv156, *turbine = self.turbine.si
+        cold_drop, cold_flow, warm_drop, warm_flow = self.return_line.si
+        supply, suction, T_in = self.boundaries.si
         return ColdBox(
-            separator=PhaseSeparator(
-                bath.volume_m3, bath.wall_kg, bath.relief_pressure_bar * PA_PER_BAR, bath.relief_span_bar * PA_PER_BAR,
-                bath.relief_area_mm2 / MM2_PER_M2,
-            ),
-            jt_valve=Valve(self.cv155.area_mm2 / MM2_PER_M2),
-            turbine=Turbine(
-                Valve(turbine.cv156_area_mm2 / MM2_PER_M2), turbine.nozzle_g_sqrt_k_per_s_bar / NOZZLE_UNITS,
-                turbine.efficiency, turbine.speed_hz_per_sqrt_j_per_kg, turbine.windage_g_per_s / G_PER_KG,
-            ),
+            separator=PhaseSeparator(*self.bath.si),
+            jt_valve=Valve(*self.cv155.si),
+            turbine=Turbine(Valve(cv156), *turbine),
             nef1=self.nef1.component(CELLS[0]),
             nef2=self.nef2.component(CELLS[1]),
             nef34=self.nef34.component(CELLS[2]),
-            return_line=ReturnLine(
-                line.cold_drop_bar * PA_PER_BAR / (line.cold_flow_g_per_s / G_PER_KG) ** 2,
-                line.warm_drop_bar * PA_PER_BAR / (line.warm_flow_g_per_s / G_PER_KG) ** 2,
-            ),
-            P_HP=given.p_hp_bar * PA_PER_BAR,
-            P_LP=given.p_lp_bar * PA_PER_BAR,
-            T_in=given.t_in_k,
-        )  # fmt: skip
+            return_line=ReturnLine(cold_drop / cold_flow**2, warm_drop / warm_flow**2),
+            P_HP=supply,
+            P_LP=suction,
+            T_in=T_in,
+        )
+
+
+REFERENCE: Final = BoxParameters().box
 
 
 class PlantFile(BoxParameters):

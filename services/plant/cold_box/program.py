@@ -8,10 +8,10 @@ import numpy as np
 
 from coldloop.kernels.named import plain_tuples
 from coldloop.process.model_range import model_range
-from plant.cold_box.physics import PA_PER_BAR, ColdBox, outputs
+from plant.cold_box.physics import ColdBox, outputs
 from plant.helium.properties import load_helium
 from plant.integrator import advance_and_read
-from plant.numeric import RealArray
+from plant.numeric import PA_PER_BAR, RealArray
 from plant.program import HeatLoad, MeasurementNoise, PlantProgram
 
 

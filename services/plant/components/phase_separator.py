@@ -43,14 +43,14 @@ class PhaseSeparator(NamedTuple):
 
     volume: float
     """m3."""
-    wall: float = 50.0
+    wall: float
     """Aluminium of the vessel and what is in it, kg, that warms when the vessel is dry."""
-    relief_pressure: float = 1.8e5
+    relief_pressure: float
     """At which the relief valve to the recovery line begins to open, Pa."""
-    relief_span: float = 0.3e5
+    relief_span: float
     """Rise above it at which the valve is fully open, Pa."""
-    relief_area: float = 4e-4
-    """Its flow area then, m2: 0.9 kg/s of saturated vapour at 2.1 bar."""
+    relief_area: float
+    """Its flow area then, m2."""
 
 
 class Content(NamedTuple):

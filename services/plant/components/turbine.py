@@ -31,7 +31,7 @@ class Turbine(NamedTuple):
     """Isentropic efficiency, 0 to 1."""
     speed_coefficient: float
     """Shaft speed over the square root of the isentropic enthalpy drop, Hz/sqrt(J/kg)."""
-    windage_flow: float = 0.015
+    windage_flow: float
     """Flow (kg/s) below which windage takes the work: in proportion less of it reaches the brake."""
 
 

@@ -1,5 +1,6 @@
 """A plant that a user has written in Python: a class with its equations. Its source is in the model file."""
 
+import hashlib
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -42,7 +43,8 @@ def made_by(source: str, name: str, where: str) -> Any:  # noqa: ANN401 whatever
     Raises:
         ModelFileError: The source does not run, or has nothing of this name: one line.
     """
-    module = ModuleType(f"coldloop_plant_{name}")
+    digest = hashlib.sha256(source.encode()).hexdigest()[:12]  # another file may have a class of this name
+    module = ModuleType(f"coldloop_plant_{name}_{digest}")
     sys.modules[module.__name__] = module  # dataclasses look there
     with foreign(f"{where}: {name} cannot be made"):
         exec(compile(source, where, "exec"), vars(module))  # noqa: S102 it is what the user has written

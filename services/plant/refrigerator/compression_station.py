@@ -31,32 +31,32 @@ NOMINAL_HP: Final = 16e5
 
 
 class CompressionStation(NamedTuple):
-    """Components of S4; the defaults are the reference plant."""
+    """Components of S4, in SI units."""
 
-    hp: GasVolume = GasVolume(2.0)
+    hp: GasVolume
     """High-pressure line with oil separators, cooler and adsorber."""
-    lp: GasVolume = GasVolume(1.5)
+    lp: GasVolume
     """Low-pressure line."""
-    buffer: GasVolume = GasVolume(20.0)
+    buffer: GasVolume
     """Medium-pressure vessel."""
-    nc1: ScrewCompressor = ScrewCompressor(0.38, 0.92, 0.006, 0.55, 10.0, 0.05, 0.95)
-    nc2: ScrewCompressor = ScrewCompressor(0.38, 0.92, 0.006, 0.55, 10.0, 0.05, 0.95)
-    bypass: Valve = Valve(flow_area=3.4e-5)
-    """CV956, from the high-pressure to the low-pressure line; 50 g/s when open."""
-    discharge: Valve = Valve(flow_area=2.0e-5)
-    """CV952, from the high-pressure line to the buffer; 29 g/s when open."""
-    charge: Valve = Valve(flow_area=4.0e-5)
-    """CV953, from the buffer to the low-pressure line; 22 g/s when open and the buffer at 6 bar."""
-    actuator: Actuator = Actuator(lag=1.0, fastest=20.0)
+    nc1: ScrewCompressor
+    nc2: ScrewCompressor
+    bypass: Valve
+    """CV956, from the high-pressure to the low-pressure line."""
+    discharge: Valve
+    """CV952, from the high-pressure line to the buffer."""
+    charge: Valve
+    """CV953, from the buffer to the low-pressure line."""
+    actuator: Actuator
     """Of each of the three valves."""
-    hp_relief: ReliefValve = ReliefValve(18e5, 1e5, Valve(1.2e-4))
-    lp_relief: ReliefValve = ReliefValve(1.5e5, 0.2e5, Valve(2.5e-3))
-    buffer_relief: ReliefValve = ReliefValve(13e5, 1e5, Valve(1e-4))
-    cooler_approach: float = 5.0
+    hp_relief: ReliefValve
+    lp_relief: ReliefValve
+    buffer_relief: ReliefValve
+    cooler_approach: float
     """By how much the compressed gas is warmer than the surroundings, K."""
-    run_up: float = 6.0
+    run_up: float
     """Time constant of a compressor that starts, s."""
-    run_down: float = 1.5
+    run_down: float
     """The same for one that stops, s."""
 
 

@@ -8,10 +8,10 @@ import numpy as np
 from coldloop.process.lti_model import LtiModel
 from plant.cold_box.diagnosis import FASTEST, GROWTH, obstacles, operating_point
 from plant.cold_box.equilibrium import Equilibrium, NoEquilibriumError
-from plant.cold_box.physics import PA_PER_BAR, streams
+from plant.cold_box.physics import streams
 from plant.components.screw_compressor import compress
 from plant.helium.properties import Helium
-from plant.numeric import RealArray
+from plant.numeric import PA_PER_BAR, RealArray
 from plant.refrigerator.equilibrium import AMBIENT, Rest, find_refrigerator_equilibrium, first_guess
 from plant.refrigerator.linearisation import jacobian
 from plant.refrigerator.model import make_refrigerator_file

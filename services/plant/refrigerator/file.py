@@ -13,7 +13,8 @@ from coldloop.errors import ModelFileError
 from coldloop.process.model_file import FORMAT, read_document, write_document
 from plant.cold_box.model import parameters_digest
 from plant.helium.properties import Helium, load_helium
-from plant.refrigerator.physics import COMMAND_NAMES, REFERENCE_REFRIGERATOR, STATE_NAMES, Refrigerator
+from plant.refrigerator.physics import COMMAND_NAMES, STATE_NAMES, Refrigerator
+from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 from plant.refrigerator.station_control import StationReference
 from plant.refrigerator.station_settings import LqWeights
 

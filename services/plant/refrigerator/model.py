@@ -17,7 +17,8 @@ from plant.helium.properties import load_helium
 from plant.refrigerator.equilibrium import Rest, find_refrigerator_equilibrium
 from plant.refrigerator.file import RefrigeratorFile, refrigerator_digest
 from plant.refrigerator.linearisation import jacobian
-from plant.refrigerator.physics import REFERENCE_REFRIGERATOR, Refrigerator, check_refrigerator
+from plant.refrigerator.physics import Refrigerator, check_refrigerator
+from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 from plant.refrigerator.station_design import line_model, lq_gains
 from plant.refrigerator.station_settings import LqWeights
 from plant.settings import PlantSettings

@@ -22,14 +22,14 @@ from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
 from coldloop.kernels.named import named
 from coldloop.process import cold_box, station
-from plant.cold_box.physics import REFERENCE, ColdBox, Streams, evaluate
+from plant.cold_box.physics import ColdBox, Streams, evaluate
 from plant.components.actuator import opening_rate
 from plant.components.cell_account import WILD, widest_move
 from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow
 from plant.components.nitrogen_bath import nitrogen_level
 from plant.components.phase_separator import Content, add_to_account, content, settle_account, start_account
 from plant.helium.properties import Helium
-from plant.numeric import Array, RealArray
+from plant.numeric import PA_PER_BAR, Array, RealArray
 from plant.refrigerator.compression_station import (
     STATION_STATE_UNITS,
     STATION_STATES,
@@ -76,19 +76,15 @@ DISTURBANCE_NAMES: Final = ("NCR22_HL", "T_ambient", "leak", "nitrogen", "NC1", 
 
 SIGNAL_NAMES: Final = station.STATION_SIGNAL_NAMES
 SIGNALS: Final = len(SIGNAL_NAMES)
-PA_PER_BAR: Final = 1e5
 
 
 class Refrigerator(NamedTuple):
-    """Components of the refrigerator; the defaults are the reference plant."""
+    """Components of the refrigerator, in SI units; `plant.refrigerator.plant_file` has the reference plant's."""
 
-    box: ColdBox = REFERENCE
+    box: ColdBox
     """Its boundaries P_HP and P_LP are the pressures at rest; the equations do not read them, nor T_in."""
-    precooler: Precooler = Precooler()
-    station: CompressionStation = CompressionStation()
-
-
-REFERENCE_REFRIGERATOR: Final = Refrigerator()
+    precooler: Precooler
+    station: CompressionStation
 
 
 class Crossing(NamedTuple):

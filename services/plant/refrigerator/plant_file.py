@@ -10,30 +10,17 @@ from typing import Annotated, Any, Final
 from coldloop.config import load_configuration
 from coldloop.errors import ConfigurationError
 from coldloop.process.limits import InputLimits
-from plant.cold_box.physics import PA_PER_BAR
-from plant.cold_box.plant_file import (
-    L_PER_M3,
-    LISTING,
-    MM2_PER_M2,
-    BoxParameters,
-    ExchangerSection,
-    HeatTransfer,
-    Litres,
-    PlantFile,
-    Section,
-    within,
-)
+from plant.cold_box.plant_file import LISTING, BoxParameters, ExchangerSection, HeatTransfer, Litres, PlantFile
 from plant.components.actuator import Actuator
 from plant.components.gas_valve import ReliefValve
 from plant.components.gas_volume import GasVolume
 from plant.components.nitrogen_bath import NitrogenBath
 from plant.components.screw_compressor import ScrewCompressor
 from plant.components.valve import Valve
+from plant.lab_units import Section, within
 from plant.refrigerator.compression_station import CompressionStation
-from plant.refrigerator.physics import REFERENCE_REFRIGERATOR, Refrigerator
+from plant.refrigerator.physics import Refrigerator
 from plant.refrigerator.precooler import NEF6_CELLS, Precooler
-
-J_PER_KJ: Final = 1e3
 
 CubicMetres = Annotated[float, within(0.05, 1000)]
 Area = Annotated[float, within(0.05, 100_000)]
@@ -88,14 +75,6 @@ class CompressorSection(Section):
     """Loss of isothermal efficiency per squared logarithm of the ratio over the built-in one."""
     motor_efficiency: Share = 0.95
 
-    @property
-    def component(self) -> ScrewCompressor:
-        """The compressor, in SI units."""
-        return ScrewCompressor(
-            self.displacement_l_per_s / L_PER_M3, self.filling, self.slip, self.isothermal_efficiency,
-            self.built_in_ratio, self.mismatch, self.motor_efficiency,
-        )  # fmt: skip
-
 
 class StationSection(Section):
     """Volumes, valves and cooler of the compression station."""
@@ -139,9 +118,8 @@ class ReliefSection(Section):
     @property
     def component(self) -> ReliefValve:
         """The valve, in SI units."""
-        return ReliefValve(
-            self.pressure_bar * PA_PER_BAR, self.span_bar * PA_PER_BAR, Valve(self.area_mm2 / MM2_PER_M2)
-        )
+        pressure, span, area = self.si
+        return ReliefValve(pressure, span, Valve(area))
 
 
 class HpReliefSection(ReliefSection):
@@ -187,28 +165,22 @@ class RefrigeratorParameters(BoxParameters):
 
     @property
     def _precooler(self) -> Precooler:
-        bath = self.nef5
-        return Precooler(
-            self.nef6.component(NEF6_CELLS),
-            NitrogenBath(
-                bath.ua_w_per_k, bath.volume_l / L_PER_M3, bath.wet_level_pct, bath.capacity_kj_per_k * J_PER_KJ,
-                Valve(bath.cv167_area_mm2 / MM2_PER_M2),
-            ),
-            Actuator(bath.cv167_lag_s, bath.cv167_fastest_pct_per_s),
-        )  # fmt: skip
+        conductance, volume, wet_level, capacity, area, lag, fastest = self.nef5.si
+        bath = NitrogenBath(conductance, volume, wet_level, capacity, Valve(area))
+        return Precooler(self.nef6.component(NEF6_CELLS), bath, Actuator(lag, fastest))
 
     @property
     def _station(self) -> CompressionStation:
-        own = self.station
+        hp, lp, buffer, _, bypass, discharge, charge, lag, fastest, *rest = self.station.si
         return CompressionStation(
-            GasVolume(own.hp_volume_m3), GasVolume(own.lp_volume_m3), GasVolume(own.buffer_volume_m3),
-            self.nc1.component, self.nc2.component,
-            Valve(own.cv956_area_mm2 / MM2_PER_M2), Valve(own.cv952_area_mm2 / MM2_PER_M2),
-            Valve(own.cv953_area_mm2 / MM2_PER_M2),
-            Actuator(own.valve_lag_s, own.valve_fastest_pct_per_s),
-            self.hp_relief.component, self.lp_relief.component, self.buffer_relief.component,
-            own.cooler_approach_k, own.run_up_s, own.run_down_s,
+            GasVolume(hp), GasVolume(lp), GasVolume(buffer),
+            ScrewCompressor(*self.nc1.si), ScrewCompressor(*self.nc2.si),
+            Valve(bypass), Valve(discharge), Valve(charge), Actuator(lag, fastest),
+            self.hp_relief.component, self.lp_relief.component, self.buffer_relief.component, *rest,
         )  # fmt: skip
+
+
+REFERENCE_REFRIGERATOR: Final = RefrigeratorParameters().refrigerator
 
 
 class RefrigeratorPlantFile(RefrigeratorParameters, PlantFile):

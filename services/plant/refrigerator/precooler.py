@@ -10,7 +10,6 @@ from coldloop.kernels.compiled import kernel
 from plant.components.actuator import Actuator, check_actuator
 from plant.components.heat_exchanger import HeatExchanger, LowPressureFlow
 from plant.components.nitrogen_bath import Boiling, NitrogenBath, boil, check_nitrogen_bath
-from plant.components.valve import Valve
 from plant.components.warm_exchanger import check_warm_exchanger, transfer_warm
 from plant.helium.properties import WARM_CP
 from plant.numeric import Array
@@ -21,13 +20,13 @@ PRECOOLER_STATE_UNITS: Final = (*["K"] * (NEF6_CELLS + 1), "kg", "%")
 
 
 class Precooler(NamedTuple):
-    """Components of S3; the defaults are the reference plant."""
+    """Components of S3, in SI units."""
 
-    nef6: HeatExchanger = HeatExchanger(UA=21500.0, volume=40e-3, aluminium=150.0, cells=NEF6_CELLS)
+    nef6: HeatExchanger
     """From ambient temperature to the nitrogen bath."""
-    nef5: NitrogenBath = NitrogenBath(UA=336.44, volume=30e-3, wet_level=25.0, capacity=20e3, feed=Valve(1.3e-6))
-    """The bath; 20 g/s of nitrogen through the open feed valve."""
-    actuator: Actuator = Actuator(lag=2.0, fastest=10.0)
+    nef5: NitrogenBath
+    """The bath."""
+    actuator: Actuator
     """Of CV167."""
 
 

@@ -20,14 +20,8 @@ from plant.helium.properties import load_helium
 from plant.numeric import RealArray
 from plant.refrigerator.file import KIND, SHIPPED, RefrigeratorFile, read_refrigerator_file, refrigerator_digest
 from plant.refrigerator.linearisation import jacobian
-from plant.refrigerator.physics import (
-    DISTURBANCE_NAMES,
-    REFERENCE_REFRIGERATOR,
-    STATE_NAMES,
-    STATE_UNITS,
-    Refrigerator,
-    read,
-)
+from plant.refrigerator.physics import DISTURBANCE_NAMES, STATE_NAMES, STATE_UNITS, Refrigerator, read
+from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 from plant.refrigerator.station_design import LINES, PRESSURE_ROWS
 
 KEPT: Final = (*range(STATE_NAMES.index("T_nef5") + 1), *LINES)

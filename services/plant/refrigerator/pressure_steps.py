@@ -17,14 +17,8 @@ from coldloop.process.cold_box import INPUT_NAMES, TICK_S
 from plant.helium.properties import load_helium
 from plant.numeric import RealArray
 from plant.refrigerator.file import SHIPPED, RefrigeratorFile, read_refrigerator_file
-from plant.refrigerator.physics import (
-    COMMAND_NAMES,
-    REFERENCE_REFRIGERATOR,
-    SIGNAL_NAMES,
-    STATE_NAMES,
-    advance_and_read_refrigerator,
-    read,
-)
+from plant.refrigerator.physics import COMMAND_NAMES, SIGNAL_NAMES, STATE_NAMES, advance_and_read_refrigerator, read
+from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 from plant.refrigerator.station_control import StationControl
 from plant.refrigerator.station_law import StationMeasurement
 from plant.refrigerator.station_settings import StationControlKind, StationSettings

@@ -15,13 +15,8 @@ from plant.program import HeatLoad, MeasurementNoise
 from plant.refrigerator.equipment import ACTING, DEVIATING, GIVEN_NAMES, resting_equipment, standing_equipment
 from plant.refrigerator.events import EventSchedule
 from plant.refrigerator.file import RefrigeratorFile
-from plant.refrigerator.physics import (
-    BOX_STATES,
-    REFERENCE_REFRIGERATOR,
-    Refrigerator,
-    check_refrigerator,
-    read,
-)
+from plant.refrigerator.physics import BOX_STATES, Refrigerator, check_refrigerator, read
+from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 from plant.refrigerator.station_control import station_law
 from plant.refrigerator.station_law import Commands
 from plant.refrigerator.station_settings import StationSettings

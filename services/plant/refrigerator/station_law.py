@@ -15,10 +15,9 @@ from coldloop.registers.plant import StationMode
 from plant.components.gas_valve import CHOKED
 from plant.components.valve import Valve
 from plant.helium.properties import GAS_CONSTANT
-from plant.numeric import RealArray
+from plant.numeric import PA_PER_BAR, RealArray
 from plant.refrigerator.equipment import EquipmentLaw
 
-PA_PER_BAR: Final = 1e5
 DESIGN_TEMPERATURE: Final = 300.0
 """K, at which the controller takes the valves' flows to be."""
 ROUNDING: Final = 1e-9

@@ -11,7 +11,7 @@ from coldloop.kernels.named import named
 from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, P1, TICK_S, V1
 from plant.components.passes import COLUMNS
 from plant.helium.properties import Helium
-from plant.numeric import RealArray
+from plant.numeric import PA_PER_BAR, RealArray
 from plant.refrigerator.equipment import (
     ACTING,
     BLOCKED,
@@ -30,7 +30,6 @@ from plant.refrigerator.equipment import (
 from plant.refrigerator.physics import (
     COIL,
     DISTURBANCE_NAMES,
-    PA_PER_BAR,
     SIGNAL_NAMES,
     SIGNALS,
     STATE_NAMES,
