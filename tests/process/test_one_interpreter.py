@@ -1,5 +1,8 @@
 """Several processes in one interpreter, interleaved and in threads: each leaves what it leaves alone."""
 
+import os
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
@@ -39,6 +42,18 @@ def test_processes_run_in_threads_beside_each_other(alone: dict[str, str]) -> No
     names = 3 * [*RUNS]
     with ThreadPoolExecutor(4) as pool:
         assert list(pool.map(trace, names)) == [alone[name] for name in names]
+
+
+@pytest.mark.usefixtures("programs")
+def test_no_constant_of_a_module_follows_from_the_process_that_is_named_at_its_import() -> None:
+    named = [subprocess.Popen(
+        (sys.executable, "-P", "-m", "tests.harness.module_constants", file), stdout=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONHASHSEED": "0", "PYTHONPATH": os.pathsep.join(sys.path)},
+    ) for file in (TANK, COLUMN)]  # fmt: skip
+    of_tank, of_column = (one.communicate()[0].splitlines() for one in named)
+    assert len(of_tank) > 1000
+    assert of_tank == of_column
+    assert not [line for line in of_tank if line.startswith("settings ")]
 
 
 def test_a_process_is_read_from_either_file_and_the_cold_box_from_its_model() -> None:

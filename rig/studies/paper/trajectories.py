@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.cold_box import TICK_S
-from optimizer_plc.qp.design import ControlDesign
+from coldloop.process.cold_box import COLD_BOX, TICK_S
 from rig.studies.drawing import time_panels
 from rig.studies.request import Outcome, RunRequest, Series
 from rig.studies.solver_runs import UNLIMITED, throttled
@@ -18,7 +17,7 @@ AFTER_STEP_S = 30.0
 """A problem that follows a load step by less than this belongs to the load event."""
 QUIET_S = 120.0
 """Without a load step for this long it is quiet."""
-BANDS = tuple(zip(ControlDesign().output_low, ControlDesign().output_high, strict=True))
+BANDS = tuple((band.low, band.high) for band in COLD_BOX.bands)
 
 UNLIMITED_QPOASES = ("qpOASES, unlimited", "qpoases", UNLIMITED)
 THROTTLED_QPOASES = ("qpOASES, 10 iterations", "qpoases", 1.0)
