@@ -1,6 +1,7 @@
 """Constants of all modules as they are when a process is named at their import.
 
-`python -m tests.harness.module_constants FILE` writes a line for each constant that is plain data, and one for each section of settings that there is.
+`python -m tests.harness.module_constants FILE` writes a line for each constant that is plain data, and one for each
+section of settings that there is.
 """
 
 import gc
