@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from coldloop.config import Configuration, flattened, load_configuration
+from coldloop.errors import UsageError
 from rig.process_file.model_of import model_file_of
 from rig.settings import Settings
 
@@ -30,6 +31,8 @@ def configured(
     Raises:
         UsageError: An argument cannot be used; one line that says why.
     """
+    if not isinstance(process, str | Path | None):
+        raise UsageError(f"process: a path of a process file or a model file, not {type(process).__name__}")
     model, told = (None, []) if process is None else model_file_of(Path(process))
     for line in told:
         warnings.warn(f"{process}: {line}", stacklevel=3)
@@ -44,5 +47,8 @@ def configured(
         "session.factor": (factor, "factor"),
     }  # fmt: skip
     given = {key: (value, name) for key, (value, name) in arguments.items() if value is not None}
-    options = given | {key: (value, key) for key, value in flattened(sections).items() if value != {}}
+    own = {key: (value, key) for key, value in flattened(sections).items() if value != {}}
+    if twice := sorted(given.keys() & own.keys()):
+        raise UsageError(f"{given[twice[0]][1]}: {twice[0]} is given, too; drop one of them")
+    options = given | own
     return load_configuration(Settings, file=None if config is None else Path(config), environment={}, options=options)

@@ -2,8 +2,9 @@
 
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Final
 
@@ -11,6 +12,8 @@ from coldloop.config import model_file_in
 from coldloop.errors import UsageError
 
 OPTION: Final = "--process"
+MODEL: Final = "model.file"
+_NAMED: Final = ContextVar[Path | None]("model file of the option", default=None)
 
 
 @contextmanager
@@ -32,8 +35,25 @@ def named_process(arguments: Sequence[str]) -> Iterator[list[str]]:
         return
     from coldloop.process.settings import SHIPPED_MODELS, model_named  # noqa: PLC0415
 
-    with model_named(SHIPPED_MODELS.get(str(model), model)):
-        yield left
+    token = _NAMED.set(model if named is not None else None)
+    try:
+        with model_named(SHIPPED_MODELS.get(str(model), model)):
+            yield left
+    finally:
+        _NAMED.reset(token)
+
+
+def process_setting(assignments: Iterable[str]) -> dict[str, tuple[object, str]]:
+    """Return the setting that the option is, which a configuration file does not override.
+
+    Raises:
+        UsageError: It is among the assignments, too.
+    """
+    if (named := _NAMED.get()) is None:
+        return {}
+    if any(assignment.partition("=")[0].strip() == MODEL for assignment in assignments):
+        raise UsageError(f"--set {MODEL}: {OPTION} names the process; drop one of them")
+    return {MODEL: (str(named), OPTION)}
 
 
 def _split(arguments: Sequence[str]) -> tuple[list[str], str | None]:

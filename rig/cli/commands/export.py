@@ -75,8 +75,10 @@ def _solver(options: argparse.Namespace) -> list[Path]:
 def _settings(options: argparse.Namespace) -> "Settings":
     """Return the settings of the optimiser: those of the paper's PLC, unless the user says otherwise."""
     from coldloop.config import load_configuration
+    from rig.cli.process_option import process_setting
     from rig.plc_export.kernels.recorded_problems import SINGLE
     from rig.settings import Settings
 
     assignments = [*SINGLE, *options.assignments]
-    return load_configuration(Settings, file=options.config, assignments=assignments).settings
+    process = process_setting(options.assignments)
+    return load_configuration(Settings, file=options.config, assignments=assignments, options=process).settings

@@ -12,6 +12,7 @@ from coldloop.process.settings import settings_process, whole_ticks
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.choices import FIGURE_FORMATS, LOADS, PRESETS, SOLVERS
+from rig.cli.process_option import process_setting
 
 if TYPE_CHECKING:
     from coldloop.config import Configuration
@@ -253,7 +254,9 @@ def configuration(options: argparse.Namespace) -> "Configuration[Settings]":
         Settings,
         file=options.config,
         assignments=[*options.assignments, *given.get("further_assignments", ())],
-        options=site | {key: (given[name], flag) for name, (key, flag) in KEYS.items() if given.get(name) is not None},
+        options=site
+        | process_setting(options.assignments)
+        | {key: (given[name], flag) for name, (key, flag) in KEYS.items() if given.get(name) is not None},
     )
     if given.get("enforce"):
         from rig.runs.remarks import enforced
@@ -272,7 +275,7 @@ def operator_settings(options: argparse.Namespace) -> "OperatorSettings":
     from rig.operator_settings import OTHERS, OperatorSettings
 
     assignments = [*options.assignments, *vars(options).get("further_assignments", ())]
-    site = _tls_site(options.tls) if options.tls is not None else {}
+    site = process_setting(assignments) | (_tls_site(options.tls) if options.tls is not None else {})
     effective = load_configuration(
         OperatorSettings, file=options.config, assignments=assignments, options=site, others=OTHERS
     )

@@ -153,6 +153,8 @@ def read_document(path: Path, remedy: str = REMEDY) -> dict[str, Any]:
     try:
         if not path.exists():
             raise ModelFileError(f"{path}: no such model file; {remedy}")
+        if path.suffix == ".toml":
+            raise ModelFileError(f"{path}: a process file; `coldloop process FILE --out MODEL` makes its model file")
         document = parsed_json(read_bytes(path, remedy, ModelFileError), parse_constant=_refuse)
     except (OSError, ValueError) as error:
         raise ModelFileError(f"{path}: not a readable model file ({error}); {remedy}") from error
