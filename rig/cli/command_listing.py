@@ -52,8 +52,8 @@ def _name(action: argparse.Action) -> str:
     values = " ".join(value) if isinstance(value, tuple) else value
     if not action.option_strings:
         return f"`{values}`".replace("|", "\\|")
-    shown = f"{action.option_strings[-1]} {values}" if action.nargs != 0 else action.option_strings[-1]
-    return f"`{shown}`".replace("|", "\\|")
+    shown = (f"{option} {values}" if action.nargs != 0 else option for option in action.option_strings)
+    return f"`{', '.join(shown)}`".replace("|", "\\|")
 
 
 def _cell(text: str) -> str:

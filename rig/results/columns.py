@@ -128,7 +128,7 @@ EVENTS: Final = (
 
 FILES: Final = {
     "trace.parquet": (f"One row a tick of {TICK_UNIT}", TRACE),
-    "updates.parquet": ("One row an update whose sequence was played", UPDATES),
+    "updates.parquet": ("One row an update that no load step cut off; `verdict` says whether it was played", UPDATES),
     "events.parquet": ("One row an event of the journals: modes, alarms, commands", EVENTS),
 }
 

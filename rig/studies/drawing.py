@@ -4,12 +4,13 @@ import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import ArrayLike
 
 from coldloop.number_text import ends_text
@@ -33,6 +34,8 @@ from rig.studies.study import StudyResult
 COLUMN_IN: Final = 88 / 25.4
 """Width of a column of a journal, for figures without panels side by side."""
 PAGE_IN: Final = 180 / 25.4
+LONGEST_NAME: Final = 28
+"""Of a row in a figure of one column."""
 JOURNAL: Final = STYLE | {"font.size": 8, "axes.titlesize": 8, "legend.fontsize": 7}
 
 
@@ -58,6 +61,20 @@ def spans_decade(values: ArrayLike) -> bool:
     finite = np.asarray(values, dtype=float)
     finite = finite[np.isfinite(finite)]
     return bool(len(finite) and finite.min() > 0 and finite.max() > 10 * finite.min())
+
+
+def ratio_scale(axes: Axes, which: Literal["x", "y"], values: ArrayLike) -> None:
+    """Let ratios that span a decade have a logarithmic axis, with plain marks where they span two at most."""
+    found = np.ravel(values)
+    found = found[np.isfinite(found) & (found > 0)]
+    if not spans_decade(found):
+        return
+    axes.set(**{f"{which}scale": "log"})
+    if found.max() < 100 * found.min():
+        axis = axes.xaxis if which == "x" else axes.yaxis
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())
 
 
 def spread(axes: Axes, x: ArrayLike, values: ArrayLike, colour: str, label: str) -> None:
@@ -163,7 +180,7 @@ def cost_bars(result: StudyResult, cases: Iterable[str], width: float, *, logari
             offset = (width + 0.02) * (number - 0.5 * (len(cases) - 1))
             place.bar(np.arange(len(names)) + offset, heights, width, color=colour, label=case)
         if logarithmic:
-            place.set_yscale("log")
+            ratio_scale(place, "y", [float(row[2]) for row in result.rows])
         place.set_xticks(range(len(names)), names, rotation=0 if len(names) < 9 else 60)
         place.set_xlabel("load")
         place.set_ylabel("$J^{BF}$ (1)")
@@ -177,16 +194,19 @@ def ratio_rows(
     """Draw ratios with their intervals: a row for each name, in it a point for each series (the outer keys)."""
     names = list(next(iter(ratios.values())))
     with panels(1, 1, height_in) as (figure, (place,)):
+        if max(map(len, names)) > LONGEST_NAME:
+            figure.set_figwidth(PAGE_IN)
         for number, ((series, by_name), colour) in enumerate(zip(ratios.items(), COLOURS, strict=False)):
             rows = np.arange(len(names)) + gap * (number - 0.5 * (len(ratios) - 1))
             found = [by_name[name] for name in names]
-            place.plot([one.value for one in found], rows, "o", markersize=25 * gap, color=colour, label=series)
+            place.plot([one.value for one in found], rows, "o", markersize=6 if len(ratios) == 1 else 3.5, color=colour,
+                       label=series)  # fmt: skip
             place.hlines(rows, [one.low for one in found], [one.high for one in found], color=colour, linewidth=0.9)
         place.axvline(1.0, color="#888888", linewidth=0.8)
         place.set_yticks(range(len(names)), names)
-        place.invert_yaxis()
-        place.set_xscale("log")
-        place.set_xlabel(textwrap.fill(label, 44))
+        place.set_ylim(len(names) - 0.5, -0.5)
+        ratio_scale(place, "x", [one[:3] for by_name in ratios.values() for one in by_name.values()])
+        figure.supxlabel(textwrap.fill(label, 44), fontsize=8)
         legend_outside(figure, place, columns)
     return figure
 

@@ -3,6 +3,7 @@
 import csv
 import io
 import platform
+import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -71,8 +72,8 @@ def _write(study: Study, result: StudyResult, folder: Path) -> None:
 
 
 def figure_file(name: str) -> str:
-    """Return the file name of a figure."""
-    return f"{name.replace(' ', '-')}.png"
+    """Return the file name of a figure; LaTeX takes `%` for a comment."""
+    return re.sub(r"[^\w.-]+", "-", name) + ".png"
 
 
 LONGEST_TABLE = 24

@@ -11,6 +11,7 @@ import shutil
 import subprocess
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, redirect_stdout
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import NamedTuple
 
@@ -79,6 +80,10 @@ delay_ms = 1
 """
 
 
+BEGIN = datetime(2026, 3, 2, 6, tzinfo=timezone(timedelta(hours=1)))
+"""Of what a historian has recorded."""
+
+
 class Example(NamedTuple):
     """A block of a page."""
 
@@ -144,6 +149,17 @@ def shortened(command: str, *, whole: bool = False) -> str:
     return command
 
 
+def historian_export() -> str:
+    """Return the record of the tank as a historian writes it: tags, dates, decimal commas; some readings are bad."""
+    record = (ROOT / "examples" / "processes" / "quadruple_tank_record.csv").read_text(encoding="utf-8")
+    lines = ["Zeitstempel;P101.SP;P102.SP;FI7.SP;LT1.PV;LT2.PV;Quality"]
+    for k, row in enumerate(record.splitlines()[1:]):
+        seconds, *cells = row.split(",")
+        stamp = (BEGIN + timedelta(seconds=float(seconds))).isoformat()
+        lines.append(";".join([stamp, *(cell.replace(".", ",") for cell in cells), "192" if k % 97 != 50 else "0"]))
+    return "\r\n".join(lines) + "\r\n"
+
+
 class Reader:
     """Does what a page says, in a folder with the files that pages take as given.
 
@@ -164,6 +180,9 @@ class Reader:
         (folder / "my_plan.toml").write_text(PLAN)
         for name, example in (("my_box", "smaller_turbine"), ("efficient_refrigerator", "efficient_refrigerator")):
             (folder / f"{name}.toml").write_bytes((ROOT / "examples" / f"{example}.toml").read_bytes())
+        (folder / "export.csv").write_text(historian_export())
+        record = (ROOT / "examples" / "processes" / "quadruple_tank_record.toml").read_text(encoding="utf-8")
+        (folder / "tank.toml").write_text(record.replace("quadruple_tank_record.csv", "record.csv"), encoding="utf-8")
         for name, watts in (("my_hours.csv", 400), ("another.csv", 370)):
             (folder / name).write_text(f"time_s,load_w\n0,384\n5,{watts}\n")
 

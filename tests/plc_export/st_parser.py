@@ -108,23 +108,24 @@ class Parser:
         while self.tokens[self.at][0] != "end":
             head = self.take("TYPE", "FUNCTION", "FUNCTION_BLOCK", "PROGRAM", "CONFIGURATION")
             if head == "TYPE":
-                self._types()
+                self._type_block()
             elif head == "CONFIGURATION":
                 self._configuration()
             else:
                 self._unit(head)
 
-    def _types(self) -> None:
-        while not self.skip("END_TYPE"):
-            name = self.name()
-            assert name not in self.library.arrays
-            for text in (":", "ARRAY", "[", "0", ".."):
-                self.take(text)
-            size = self.integer() + 1
-            self.take("]")
-            self.take("OF")
-            self.library.arrays[name] = size, self.take(*ELEMENTARY)
-            self.take(";")
+    def _type_block(self) -> None:
+        """Read a TYPE block, which has one type: not every tool takes a second one there."""
+        name = self.name()
+        assert name not in self.library.arrays
+        for text in (":", "ARRAY", "[", "0", ".."):
+            self.take(text)
+        size = self.integer() + 1
+        self.take("]")
+        self.take("OF")
+        self.library.arrays[name] = size, self.take(*ELEMENTARY)
+        self.take(";")
+        self.take("END_TYPE")
 
     def _configuration(self) -> None:
         self.name()

@@ -125,9 +125,11 @@ def test_a_place_that_a_command_has_itself_is_refused_wherever_it_was_set(
     file.write_text('[plant.server]\nhost = "0.0.0.0"\n')
     assert_refused(coldloop(*command.split(), "--config", file), USAGE, str(file), "plant.server.host: has no effect")
     file.write_text('[plant.server]\nhost = "127.0.0.1"\n')
-    monkeypatch.setenv("COLDLOOP__CONTROL_PLC__PLANT__PORT", "7000")
-    refused = coldloop(*command.split(), "--config", file)
-    assert_refused(refused, USAGE, "COLDLOOP__CONTROL_PLC__PLANT__PORT: has no effect")
+    for variable, value in (("CONTROL_PLC__PLANT__PORT", "7000"), ("PLANT__SERVER__HOST", "::1")):
+        with monkeypatch.context() as context:
+            context.setenv(f"COLDLOOP__{variable}", value)
+            refused = coldloop(*command.split(), "--config", file)
+            assert_refused(refused, USAGE, f"COLDLOOP__{variable}: has no effect on this command: ")
 
 
 def test_output_that_cannot_show_a_character_shows_another(monkeypatch: pytest.MonkeyPatch) -> None:

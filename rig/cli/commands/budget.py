@@ -40,7 +40,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
                         help="with --plc: whether an adaptive updating period pays there under these loads, against "
                         "--updating-period or the best fixed one")  # fmt: skip
     parser.add_argument("--updating-period", dest="period", type=fixed_updating_period, metavar="SECONDS",
-                        help="one updating period (default: 1, 2.5 and 5 s)")  # fmt: skip
+                        help="one updating period (default: a fifth, a half and all of a sampling period)")  # fmt: skip
     parser.add_argument("--certify", type=positive_count, nargs="?", const=USUAL_SCENARIOS, metavar="N",
                         help="how many iterations are enough, by N sampled scenarios, with its confidence "
                         f"(default: {USUAL_SCENARIOS})")  # fmt: skip

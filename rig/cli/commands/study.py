@@ -45,7 +45,7 @@ def add_scale_options(parser: argparse.ArgumentParser) -> None:
     scale.add_argument("--draws", "--seeds", dest="seeds", type=positive_count, metavar="N",
                        help="draws of each load; of a file, draws of the sensors' noise (default: the study's own)"
                        )  # fmt: skip
-    scale.add_argument("--quick", action="store_true", help="one seed, ten minutes, fewer points")
+    scale.add_argument("--quick", action="store_true", help="one draw, ten minutes, fewer points")
     parser.add_argument("--workers", type=positive_count, metavar="N", help="processes to use (default: one a core)")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="a running Dask scheduler, such as tcp://host:8786")
     parser.add_argument("--out", type="into", default=Path("studies"), help="folder for all results (default: studies)")

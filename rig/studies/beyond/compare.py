@@ -104,7 +104,6 @@ def _figure(variants: tuple[Variant, ...], ratios: list[Interval], by_draw: Arra
     place = figure.axes[0]
     if not spans_decade(by_draw):
         place.set_xscale("linear")
-    place.set_ylim(len(rows) - 0.5, -0.5)
     for number, over in enumerate(by_draw[1:]):
         place.plot(over, np.full(len(over), number + 0.2), "|", color="#888888", markersize=5)
     return figure

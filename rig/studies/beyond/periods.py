@@ -14,7 +14,7 @@ from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.loaded import PROCESS
 from rig.figures.plot import COLOURS
 from rig.studies.adaptive_gain import FIXED_S, over_best_fixed, pays
-from rig.studies.drawing import legend_outside, panels
+from rig.studies.drawing import legend_outside, panels, ratio_scale
 from rig.studies.intervals import Interval, geometric_mean, mean_ratio
 from rig.studies.loop_cost import ADAPTIVE, require_costs
 from rig.studies.request import Outcome, RunRequest
@@ -126,16 +126,17 @@ def _text(cell: str | float) -> str:
 
 def _figure(costs: dict[str, Array], means: dict[str, float]) -> Figure:
     """Draw, for each regime, each fixed period's cost over that of the adaptive one, and their geometric mean."""
-    with panels(1, len(costs), 2.6) as (figure, places):
+    beside = min(2, len(costs))
+    with panels(len(costs) // beside, beside, 2.6 if beside == 1 else 4.4) as (figure, places):
         for place, (regime, by_period) in zip(places, costs.items(), strict=True):
             over = by_period[1:] / by_period[0]
             place.plot(FIXED_S, over, "-", color=COLOURS[0], alpha=0.25, linewidth=0.8)
             place.plot(FIXED_S, [geometric_mean(one) for one in over], ".-", color=COLOURS[0], label="geometric mean")
             place.plot(means[regime], 1.0, "*", color=COLOURS[1], markersize=9, label="adaptive, at its mean period")
             place.axhline(1.0, color=COLOURS[1], linewidth=0.8)
-            place.set_yscale("log")
+            ratio_scale(place, "y", over)
             place.set_title(regime)
-            place.set_xlabel("fixed period (s)")
-        places[0].set_ylabel("$J^{BF}$ over that of the adaptive period (1)")
+        figure.supxlabel("fixed period (s)", fontsize=8)
+        figure.supylabel("$J^{BF}$ over that of the adaptive period (1)", fontsize=8)
         legend_outside(figure, places[0])
     return figure

@@ -153,4 +153,4 @@ def controllers_figure(found: Found) -> Figure:
         controller: {condition: over_own(found, condition, controller)[0] for condition in CONDITIONS}
         for controller in CONTROLLERS
     }
-    return ratio_rows(ratios, f"J_BF over that of the same controller on the plant {NOMINAL} (1)", 5.5, 0.2, 3)
+    return ratio_rows(ratios, f"J_BF over that of the same controller on the plant {NOMINAL} (1)", 8.0, 0.27, 3)

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rig.figures.plot import ACCENT, INK, THIRD
+from rig.figures.plot import ACCENT, DASHES, INK, THIRD
 from rig.studies import published
 from rig.studies.beyond.penalty_variants import AS_PRINTED, TUNED, PenaltyVariant
 from rig.studies.drawing import hour_panels, paper
@@ -84,7 +84,8 @@ def period_figure(timed: Mapping[PenaltyVariant, PeriodCosts], periods: Sequence
     def draw(name: str, place: Axes) -> None:
         for setting, costs in presets.items():
             of_hour = next(of_load for load, of_load in costs.items() if load.name == name)["J_open_mean"]
-            place.plot(periods, of_hour / of_hour.min(), color=colours[setting.preset], marker=".",
+            colour = colours[setting.preset]
+            place.plot(periods, of_hour / of_hour.min(), color=colour, linestyle=DASHES[colour], marker=".",
                        label=setting.label)  # fmt: skip
         theirs = published.updating_period().get(name)
         if theirs:

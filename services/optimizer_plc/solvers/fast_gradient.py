@@ -6,8 +6,8 @@ Hessian with all rows pushing, an upper bound of the curvature anywhere.
 
 - An iteration is one gradient, one projection, one extrapolation.
 - A truncated answer is a point of the box that minimises nothing yet. With momentum J is not monotonic (Definition 1
-  of the paper), but nearly; l = 30 (`docs/solvers.md`). Adaptive restart (O'Donoghue and Candes, 2015) drops the
-  momentum when it points uphill.
+  of the paper), but nearly; l = 30 (`docs/evidence-solvers.md`). Adaptive restart (O'Donoghue and Candes, 2015) drops
+  the momentum when it points uphill.
 """
 
 from typing import NamedTuple
