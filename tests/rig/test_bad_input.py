@@ -116,22 +116,6 @@ def test_a_wrong_option_is_told_with_what_would_be_right(
     assert_refused(coldloop(*arguments), USAGE, *parts)
 
 
-@pytest.mark.parametrize("command", ["run", "up", "chaos kill"])
-def test_a_place_that_a_command_has_itself_is_refused_wherever_it_was_set(
-    command: str, coldloop: "Coldloop", tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The default may be repeated: `coldloop config` writes it."""
-    file = tmp_path / "config.toml"
-    file.write_text('[plant.server]\nhost = "0.0.0.0"\n')
-    assert_refused(coldloop(*command.split(), "--config", file), USAGE, str(file), "plant.server.host: has no effect")
-    file.write_text('[plant.server]\nhost = "127.0.0.1"\n')
-    for variable, value in (("CONTROL_PLC__PLANT__PORT", "7000"), ("PLANT__SERVER__HOST", "::1")):
-        with monkeypatch.context() as context:
-            context.setenv(f"COLDLOOP__{variable}", value)
-            refused = coldloop(*command.split(), "--config", file)
-            assert_refused(refused, USAGE, f"COLDLOOP__{variable}: has no effect on this command: ")
-
-
 def test_output_that_cannot_show_a_character_shows_another(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr(sys, "stdout", stream)

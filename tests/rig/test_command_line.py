@@ -255,6 +255,23 @@ def test_an_option_without_effect_is_refused(words: list[str], part: str, coldlo
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("command", ["run", "up", "chaos kill"])
+def test_a_place_that_a_command_has_itself_is_refused_wherever_it_was_set(
+    command: str, coldloop: "Coldloop", tmp_path: Path
+) -> None:
+    """The default may be repeated: `coldloop config` writes it."""
+    file = tmp_path / "config.toml"
+    file.write_text('[plant.server]\nhost = "0.0.0.0"\n')
+    (said,) = coldloop(*command.split(), "--config", file).complaints
+    assert f"{file}: plant.server.host: has no effect" in said
+    file.write_text('[plant.server]\nhost = "127.0.0.1"\n')
+    for variable, value in (("CONTROL_PLC__PLANT__PORT", "7000"), ("PLANT__SERVER__HOST", "::1")):
+        name = f"COLDLOOP__{variable}"
+        refused = coldloop(*command.split(), "--config", file, environment={name: value})
+        assert refused.code == 2
+        assert refused.complaints[0].startswith(f"coldloop: {name}: has no effect on this command: ")
+
+
 @pytest.mark.usefixtures("programs")
 @pytest.mark.parametrize("command", ["run --in-process --duration 2s", "certificates", "model", "chaos kill"])
 def test_a_device_as_the_place_for_results_is_refused_and_stays(command: str, coldloop: "Coldloop") -> None:
