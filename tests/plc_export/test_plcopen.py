@@ -141,13 +141,13 @@ def declarations(listed: ET.Element, keyword: str) -> Iterator[str]:
 
 def text_of(project: ET.Element) -> str:
     """Return Structured Text from the elements, as an importer makes it."""
-    lines = ["TYPE"]
+    lines = []
     for data_type in child(project, "types/dataTypes"):
         array = child(data_type, "baseType/array")
         size = child(array, "dimension")
         kind = type_in(child(array, "baseType"))
-        lines.append(f"{data_type.get('name')} : ARRAY [{size.get('lower')}..{size.get('upper')}] OF {kind};")
-    lines.append("END_TYPE")
+        bounds = f"{size.get('lower')}..{size.get('upper')}"
+        lines += ["TYPE", f"{data_type.get('name')} : ARRAY [{bounds}] OF {kind};", "END_TYPE"]
     for pou in child(project, "types/pous"):
         keyword = next(each for each, kind in POUS.items() if kind == pou.get("pouType"))
         result = pou.find(f"{{{NAMESPACE}}}interface/{{{NAMESPACE}}}returnType")
