@@ -1,5 +1,6 @@
 """The option --process: the process of a command, and of the services that it starts."""
 
+import argparse
 import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -10,6 +11,7 @@ from typing import Final
 
 from coldloop.config import model_file_in
 from coldloop.errors import UsageError
+from coldloop.service.command_line import add_configuration_options
 
 OPTION: Final = "--process"
 MODEL: Final = "model.file"
@@ -18,13 +20,15 @@ _NAMED: Final = ContextVar[Path | None]("model file of the option", default=None
 
 @contextmanager
 def named_process(arguments: Sequence[str]) -> Iterator[list[str]]:
-    """Let settings be for the process that the arguments name, or the environment; give the arguments without it.
+    """Let settings be for the process that arguments, environment or configuration name; give the other arguments.
 
     Raises:
         ColdloopError: There is no such file, or it cannot be made into a model file.
     """
     left, named = _split(arguments)
-    model = Path(str(in_environment)) if (in_environment := model_file_in(os.environ)) else None
+    file, assignments = _configured(left)
+    configured = model_file_in(os.environ, file, assignments)
+    model = Path(str(configured)) if configured else None
     if named is not None:
         from rig.process_file.model_of import model_file_of  # noqa: PLC0415 most commands are for the cold box
 
@@ -41,6 +45,17 @@ def named_process(arguments: Sequence[str]) -> Iterator[list[str]]:
             yield left
     finally:
         _NAMED.reset(token)
+
+
+def _configured(arguments: Sequence[str]) -> tuple[Path | None, list[str]]:
+    """Return the configuration file and the assignments among the arguments; the command itself refuses wrong ones."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    add_configuration_options(parser)
+    try:
+        options, _ = parser.parse_known_args(arguments)
+    except argparse.ArgumentError:
+        return None, []
+    return options.config, options.assignments
 
 
 def process_setting(assignments: Iterable[str]) -> dict[str, tuple[object, str]]:

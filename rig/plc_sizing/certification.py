@@ -28,7 +28,7 @@ from optimizer_plc.qp.costs import augmented_cost
 from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.settings import ProgramSettings, SolverName
 from optimizer_plc.solvers import Solver, make_solver
-from plant.load import HOURS, telegraph
+from plant.load import HOURS, drawn
 from rig.cosim.ideal_loop import run_ideal_loop
 from rig.cosim.scenario import Scenario
 from rig.results.recording import Recorder
@@ -107,8 +107,9 @@ def iterations_needed(solver: Solver, problem: Problem, tolerance: float, floor:
 def scenario_problems(settings: Settings, number: int) -> list[Problem]:
     """Return the problems of a scenario, at instants of 5 s of the converged loop."""
     draw = random.Random(OWN_SEEDS + number)  # noqa: S311 not for secrets; the one generator stable over versions
-    family = HOURS[draw.choice(FAMILIES)]._replace(seed=OWN_SEEDS + number)
-    profile = telegraph(family, load(settings.model.file).w0)
+    hour = draw.choice(FAMILIES)
+    family = HOURS[hour]._replace(seed=OWN_SEEDS + number)
+    profile = drawn(family, hour, load(settings.model.file).w0, settings.process)
     problems: list[Problem] = []
     scenario = Scenario(SCENARIO_TICKS, profile, 0.0, number)
     run_ideal_loop(

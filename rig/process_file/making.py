@@ -101,8 +101,8 @@ def declaration_digest(file: Process, folder: Path) -> str:
     def look(value: object) -> None:
         for each in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
             look(each)
-        if isinstance(value, str) and value and (place := folder / value.partition(":")[0]).is_file():
-            named[place.name] = file_digest(place)
+        if isinstance(value, str) and value and (folder / (place := value.partition(":")[0])).is_file():
+            named[place] = file_digest(folder / place)
 
     said = file.model_dump(mode="json")
     look(said)

@@ -1,6 +1,5 @@
 """The model file of what a user names as a process."""
 
-import hashlib
 from pathlib import Path
 from typing import Final
 
@@ -25,18 +24,19 @@ def model_file_of(path: Path, *, in_child: bool = False) -> tuple[Path, list[str
         raise UsageError(f"{path}: no such file; name a process file or a model file")
     if path.suffix != ".toml":
         return path.resolve(), []
-    place = hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
-    out = find_cache_folder("processes") / f"{path.stem}-{place}.json"
 
     def work() -> str:
         from rig.process_file.judgement import described  # noqa: PLC0415 a model file is read without
         from rig.process_file.making import made_from  # noqa: PLC0415
 
         made = made_from(path)
-        made.model.save(out)
-        return described(made)
+        out = find_cache_folder("processes") / f"{path.stem}-{made.model.digest[:12]}.json"
+        if not out.exists():  # what is there may be in use
+            made.model.save(out)
+        return f"{out}\n{described(made)}"
 
     from rig.process_file.in_child import text_of_child  # noqa: PLC0415
 
     said = text_of_child(path, work, LIMIT_S) if in_child else work()
-    return out, [line for line in said.splitlines() if line.startswith("warning")]
+    out, *lines = said.splitlines()
+    return Path(out), [line for line in lines if line.startswith("warning")]

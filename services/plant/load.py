@@ -117,6 +117,15 @@ def named_families(name: str) -> list[LoadFamily] | None:
     return [HOURS[hour]._replace(seed=HOURS[hour].seed + seeds) for hour in NAMED[base]]
 
 
+def drawn(family: LoadFamily, name: str, mean: float, process: Process) -> LoadProfile:
+    """Return an hour of a family about the mean load of a process.
+
+    Raises:
+        LoadFileError: As `_stretched`.
+    """
+    return telegraph(family if process.load.has_named_loads else _stretched(family, name, mean, process), mean)
+
+
 def _stretched(family: LoadFamily, name: str, mean: float, process: Process) -> LoadFamily:
     """Return a family whose largest step is the way from the mean to the nearer end of the load's span.
 
@@ -137,16 +146,14 @@ def find_load(name: str, mean_w: float, process: Process) -> LoadProfile:
         LoadFileError: There is neither such a name nor a file that can be read, or the mean is too low for its steps.
     """
     families = named_families(name)
-    if families is not None and not process.load.has_named_loads:
-        return concatenated([telegraph(_stretched(family, name, mean_w, process), mean_w) for family in families])
     if families is not None:
         lowest = mean_w + min(step for family in families for step in family.steps)
-        if lowest < process.load.stored_span[0]:
+        if process.load.has_named_loads and lowest < process.load.stored_span[0]:
             raise LoadFileError(
                 f"load {name}: would go down to {lowest:.0f} W about {mean_w:.0f} W, the load of the model's operating"
                 " point; name a CSV file with loads of this plant"
             )
-        return concatenated([telegraph(family, mean_w) for family in families])
+        return concatenated([drawn(family, name, mean_w, process) for family in families])
     path = Path(name)
     if not path.exists():
         raise LoadFileError(f"load {name}: neither a file nor one of {', '.join(NAMED)}")

@@ -260,13 +260,14 @@ def _read_toml(file: Path, option: str) -> dict[str, Any]:
         raise ConfigurationError(f"{file}: not TOML: {error}") from None
 
 
-def model_file_in(environment: Mapping[str, str]) -> object:
-    """Return the model file that the environment names, or None.
+def model_file_in(environment: Mapping[str, str], file: Path | None, assignments: Iterable[str]) -> object:
+    """Return the model file that the environment, a configuration file and assignments name, or None.
 
     Raises:
-        ConfigurationError: It does so as until version 0.3.
+        ConfigurationError: The file cannot be read, or the environment names a process as until version 0.3.
     """
-    return next((value for key, value, _ in _from_environment(environment) if key == "model.file"), None)
+    entries = (*_from_file(file, "--config"), *_from_environment(environment), *map(_assigned, assignments))
+    return {key: value for key, value, _ in entries}.get("model.file")
 
 
 def _parsed(value: str) -> object:

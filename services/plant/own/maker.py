@@ -69,13 +69,13 @@ def own_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlan
         return _fmu_plant_maker(header, noise_of_seed, disturbances, w0)
     if header.plant == PYTHON:
         parameters = header.plant_parameters
-        equations = equations_of(parameters["source"], parameters["class"], parameters["file"])
-
+        made_now = partial(equations_of, parameters["source"], parameters["class"], parameters["file"])
+        made_now()  # a source that does not run is refused before a session begins
         kind = partial(HiddenPythonPlant, rest=parameters["rest"]) if "rest" in parameters else PythonPlant
 
         def make(load: HeatLoad, seed: int) -> PlantProgram:
-            return kind(
-                equations, x0=header.x0, u0=header.u0, load=load, disturbances=disturbances, noise=noise_of_seed(seed),
+            return kind(  # each session has an instance of its own, for a class may have a memory
+                made_now(), x0=header.x0, u0=header.u0, load=load, disturbances=disturbances, noise=noise_of_seed(seed),
                 process=process,
             )  # fmt: skip
 

@@ -11,6 +11,7 @@ import shutil
 import stat
 import sys
 import tempfile
+import threading
 import time
 import zlib
 from pathlib import Path
@@ -30,6 +31,7 @@ OF_OLDER_VERSIONS: Final = "kernels-" + 16 * "[0-9a-f]"
 CHECKSUM_BYTES: Final = 4
 KEPT_DAYS: Final = 60
 DAY_S: Final = 86_400.0
+_MASK: Final = threading.Lock()
 
 
 class CacheFolder:
@@ -148,8 +150,9 @@ def _usual_roots() -> list[Path]:
 
 def _lets_others_write() -> bool:
     """Return whether everyone can write to new files of this process."""
-    mask = os.umask(0o077)
-    os.umask(mask)
+    with _MASK:  # it is read by setting it
+        mask = os.umask(0o077)
+        os.umask(mask)
     return not mask & stat.S_IWOTH
 
 

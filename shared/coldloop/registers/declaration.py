@@ -253,7 +253,7 @@ class Block:
     """By which sizes, names, units and ranges are."""
 
     def __hash__(self) -> int:
-        return hash((self.name, self.address, self.record))  # codecs are found by it in each tick
+        return hash((self.name, self.address, self.record, self.process))  # codecs are found by it in each tick
 
     @cached_property
     def fields(self) -> Mapping[str, Field]:
