@@ -16,6 +16,7 @@ from coldloop.process.cold_box import COLD_BOX, L1, OUTPUT_NAMES, OUTPUT_UNITS, 
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Mode
+from coldloop.registers.maps import maps_of
 from optimizer_plc.qp.design import ControlDesign
 from plant.kinds import plant_maker
 from plant.load import find_load
@@ -103,13 +104,13 @@ def of_sensors(rig: OneProcessRig) -> list[Event]:
 def run(settings: Settings, load_name: str, seed: int, output: int, fault: str, ticks: int) -> Outcome:
     """Run a load with a fault."""
     header = own_header(settings.model.file)
-    load = load_table(find_load(load_name, header.w0), COLD_BOX)
+    load = load_table(find_load(load_name, header.w0, COLD_BOX), COLD_BOX)
     exact = settings.plant.model_copy(update={"sensors": type(settings.plant.sensors)()})
     made = plant_maker(header, exact)(load, seed)
     plant = FaultySensors(made, settings.plant.sensors.deviations, seed, output, fault)
     rig = OneProcessRig(settings, compiled=False)
     control, optimizer = rig.control, rig.optimizer
-    programs, listener = Programs(cast("PlantProgram", plant), control, optimizer), Recorder(ticks)
+    programs, listener = Programs(cast("PlantProgram", plant), control, optimizer, maps_of(COLD_BOX)), Recorder(ticks)
     optimizer.restart(0.0)
     control.restart(session=1)
     while control.tick < round(SETTLED_S / TICK_S):

@@ -5,7 +5,7 @@ from argparse import ArgumentTypeError
 from typing import Final, NamedTuple
 
 from coldloop.errors import UsageError
-from coldloop.process.settings import whole_ticks
+from coldloop.process.updating_periods import whole_ticks
 
 LONGEST_TICKS: Final = 2**32 - 1
 """Ticks are 32-bit numbers on the bus."""

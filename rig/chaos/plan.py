@@ -11,7 +11,8 @@ from coldloop.config import Configuration
 from coldloop.errors import LoadFileError, UsageError
 from coldloop.parsing import parsed_toml
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.settings import ProcessSettings, one_of, settings_process, whole_ticks, within
+from coldloop.process.settings import ProcessSettings, one_of, settings_process, within
+from coldloop.process.updating_periods import whole_ticks
 from coldloop.session.settings import TimeMode
 from coldloop.text_file import read_text
 from plant.load import concatenated, find_load, named_families, telegraph

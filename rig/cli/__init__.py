@@ -13,11 +13,8 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from coldloop import __version__
-from coldloop.config import MODEL_FILE
 from coldloop.errors import ColdloopError, UsageError, printable
-from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.settings import settings_process
-from rig.cli.process_option import OPTION, named_process
+from rig.cli.process_option import OPTION, is_another, named_process
 from rig.interruption import INTERRUPTION
 
 GROUPS: Final = {
@@ -172,8 +169,10 @@ def _execute(parser: argparse.ArgumentParser, given: Sequence[str]) -> int:
         parser.prog = " ".join([parser.prog, *given[: options.execute is not None]])
         parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     named = given[1] if len(given) > 1 else None
-    if given and given[0] in OF_THE_COLD_BOX and named not in OF_ANY_PROCESS and settings_process() != COLD_BOX:
-        sys.stderr.write(f"coldloop: {given[0]}: of the cold box alone; leave out {OPTION} and unset {MODEL_FILE}\n")
+    if given and given[0] in OF_THE_COLD_BOX and named not in OF_ANY_PROCESS and is_another():
+        sys.stderr.write(
+            f"coldloop: {given[0]}: of the cold box alone; leave out {OPTION} and unset COLDLOOP__MODEL__FILE\n"
+        )
         return UsageError.exit_code
     if options.execute is None:
         parser.print_help()

@@ -9,12 +9,12 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Final
 
-from coldloop.config import model_file_in
 from coldloop.errors import UsageError
 from coldloop.service.command_line import add_configuration_options
 
 OPTION: Final = "--process"
 MODEL: Final = "model.file"
+VARIABLES: Final = ("COLDLOOP__MODEL__FILE", "COLDLOOP_PROCESS")
 _NAMED: Final = ContextVar[Path | None]("model file of the option", default=None)
 
 
@@ -26,9 +26,7 @@ def named_process(arguments: Sequence[str]) -> Iterator[list[str]]:
         ColdloopError: There is no such file, or it cannot be made into a model file.
     """
     left, named = _split(arguments)
-    file, assignments = _configured(left)
-    configured = model_file_in(os.environ, file, assignments)
-    model = Path(str(configured)) if configured else None
+    model = _configured(left)
     if named is not None:
         from rig.process_file.model_of import model_file_of  # noqa: PLC0415 most commands are for the cold box
 
@@ -47,15 +45,30 @@ def named_process(arguments: Sequence[str]) -> Iterator[list[str]]:
         _NAMED.reset(token)
 
 
-def _configured(arguments: Sequence[str]) -> tuple[Path | None, list[str]]:
-    """Return the configuration file and the assignments among the arguments; the command itself refuses wrong ones."""
+def _configured(arguments: Sequence[str]) -> Path | None:
+    """Return the model file of the configuration; what is wrong with the arguments the command itself says."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     add_configuration_options(parser)
     try:
         options, _ = parser.parse_known_args(arguments)
     except argparse.ArgumentError:
-        return None, []
-    return options.config, options.assignments
+        return None
+    if not (options.config or options.assignments or any(map(os.environ.get, VARIABLES))):
+        return None
+    from coldloop.config import model_file_in  # noqa: PLC0415 it takes time
+
+    named = model_file_in(os.environ, options.config, options.assignments)
+    return Path(str(named)) if named else None
+
+
+def is_another() -> bool:
+    """Return whether the process of settings is another than the cold box."""
+    if "coldloop.process.settings" not in sys.modules:
+        return False
+    from coldloop.process.cold_box import COLD_BOX  # noqa: PLC0415 it takes time
+    from coldloop.process.settings import settings_process  # noqa: PLC0415
+
+    return settings_process() != COLD_BOX
 
 
 def process_setting(assignments: Iterable[str]) -> dict[str, tuple[object, str]]:

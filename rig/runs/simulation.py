@@ -24,7 +24,7 @@ from coldloop.config import Configuration
 from coldloop.errors import UsageError
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.settings import whole_ticks
+from coldloop.process.updating_periods import whole_ticks
 from coldloop.registers.audit import Event
 from rig.cosim.one_process import OneProcessRig
 from rig.durations import duration

@@ -15,7 +15,8 @@ from pydantic import BaseModel, ConfigDict, FiniteFloat, PositiveFloat, model_va
 from coldloop.process.cold_box import LEVEL_LOOP, T5_LOOP
 from coldloop.process.limits import InputLimits
 from coldloop.process.sections import Band, Loop
-from coldloop.process.settings import ProcessSettings, declared, whole_ticks, within
+from coldloop.process.settings import ProcessSettings, declared, within
+from coldloop.process.updating_periods import whole_ticks
 from coldloop.safety.sequence import Inputs
 
 

@@ -12,16 +12,8 @@ from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, Endpoint
 from coldloop.modbus.settings import ServerSettings
 from coldloop.process.limits import InputLimits
 from coldloop.process.sections import FURTHEST_WEIGHT
-from coldloop.process.settings import (
-    TOLERANCE,
-    ProcessSettings,
-    RootSettings,
-    declared,
-    settings_process,
-    whole_ticks,
-    within,
-)
-from coldloop.process.updating_periods import SHORTEST_TICKS
+from coldloop.process.settings import ProcessSettings, RootSettings, declared, settings_process, within
+from coldloop.process.updating_periods import SHORTEST_TICKS, TOLERANCE, whole_ticks
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop.service.metrics_settings import MetricsSettings

@@ -7,7 +7,7 @@ import numpy as np
 from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
 from coldloop.kernels.named import named
-from plant.cold_box.physics import ColdBox, evaluate
+from plant.cold_box.physics import OUTPUTS, ColdBox, evaluate
 from plant.cold_box.settling import settle_box
 from plant.components.phase_separator import add_to_account, content, start_account
 from plant.helium.properties import Helium
@@ -22,7 +22,7 @@ def advance(x: RealArray, u: RealArray, w: float, dt: float, box: ColdBox, heliu
     the result is the same to the bit everywhere.
     """
     slope = np.empty(x.shape[0])
-    evaluate(x, u, w, box, helium, slope, np.empty(22))
+    evaluate(x, u, w, box, helium, slope, np.empty(OUTPUTS))
     return advance_along(x, slope, u, w, dt, box, helium)
 
 
@@ -32,7 +32,7 @@ def advance_along(
 ) -> RealArray:
     """Return the state after `dt` seconds, where `slope` (28,), dx/dt at `x`, is known; it is overwritten."""
     n = x.shape[0]
-    y = np.empty(22)
+    y = np.empty(OUTPUTS)
     stage, total = np.empty(n), np.empty(n)
     stages, slopes = np.empty((4, n)), np.empty((4, n))
     account = start_account(content(box.separator, x[0], x[1], helium), slope)
@@ -74,7 +74,7 @@ def advance_and_read(
     recognise nested named tuples, 5 us for plain ones, and this kernel is called every tick.
     """
     plant, tables = named(ColdBox, box), named(Helium, borrowed(helium))
-    y = np.empty(22)
+    y = np.empty(OUTPUTS)
     if not held:
         evaluate(x, u, w, plant, tables, slope, y)
     ahead = advance_along(x, slope, u, w, dt, plant, tables)

@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from coldloop.errors import LoadFileError
-from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.declaration import Process
+from coldloop.process.declaration import REFERENCE_TICK_S, Process
 from coldloop.process.load_profile import LoadProfile, read_load_file
 
-SECOND_TICKS: Final = int(1.0 / COLD_BOX.tick_s)
-"""Ticks of what is a second in the families below: of the cold box it is one."""
+SECOND_TICKS: Final = round(1.0 / REFERENCE_TICK_S)
+"""Ticks of what is a second in the families below, of a process that is not stretched."""
 HOUR_TICKS: Final = 3600 * SECOND_TICKS
 LARGEST_STEP: Final = 200.0
 """Of the six families, W."""

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from plant.cold_box.physics import evaluate
+from plant.cold_box.physics import OUTPUTS, evaluate
 from plant.cold_box.plant_file import REFERENCE
 from plant.components.gas_valve import CHOKED, cold_valve_flow, gas_valve_flow
 from plant.components.gas_volume import SECOND_VIRIAL, GasVolume, gas_mass, gas_pressure
@@ -124,7 +124,7 @@ def entropy_produced(x: RealArray, u: RealArray, w: float) -> float:
     Of the bath dS = (dU - g dM)/T, with g = h_v - T s_v the free enthalpy of both phases; a cell of gas and wall stores
     C dT/T.
     """
-    dx, y = np.empty_like(x), np.empty(22)
+    dx, y = np.empty_like(x), np.empty(OUTPUTS)
     s, warm, relief, _ = evaluate(x, u, w, REFERENCE, HELIUM, dx, y)
     sat, heat = saturation(x[0], HELIUM), u[1] + w
     mass = s.m_jt - s.m_v - relief

@@ -103,6 +103,13 @@ def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
         load(path)
 
 
+def test_a_model_of_another_tick_is_refused(model: LtiModel, tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    replace(model, A_tick=model.A_tick @ model.A_tick).save(path)
+    with pytest.raises(ModelFileError, match=r"A_tick is not that of A over a tick of 0.25 s; make a new one"):
+        load(path)
+
+
 def test_a_model_checks_its_shapes_when_it_is_made(model: LtiModel) -> None:
     with pytest.raises(ValueError, match="B has shape"):
         replace(model, B=np.zeros((28, 2)))

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from plant.cold_box.physics import OUTPUTS
 from plant.components.gas_volume import gas_mass
 from plant.components.heat_exchanger import HeatExchanger
 from plant.components.passes import (
@@ -68,7 +69,7 @@ MOVES = {
 def filling(x: RealArray, u: RealArray, v: RealArray, d: RealArray) -> tuple[Filling, RealArray]:
     """Return how the passes fill, and dx/dt."""
     dx = np.empty_like(x)
-    crossing = evaluate_refrigerator(x, u, v, d, PLANT, HELIUM, dx, np.empty(22), np.empty(SIGNALS))
+    crossing = evaluate_refrigerator(x, u, v, d, PLANT, HELIUM, dx, np.empty(OUTPUTS), np.empty(SIGNALS))
     return crossing.filling, dx
 
 
@@ -184,7 +185,7 @@ def test_what_the_passes_give_the_compressors_need_not() -> None:
 
 def given_by_passes(x: RealArray, u: RealArray, v: RealArray, d: RealArray) -> float:
     """Return what leaves the passes beyond what enters, kg/s."""
-    crossing = evaluate_refrigerator(x, u, v, d, PLANT, HELIUM, np.empty_like(x), np.empty(22), np.empty(SIGNALS))
+    crossing = evaluate_refrigerator(x, u, v, d, PLANT, HELIUM, np.empty_like(x), np.empty(OUTPUTS), np.empty(SIGNALS))
     return crossing.high.mass_flow - crossing.filling.entering
 
 

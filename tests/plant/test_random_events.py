@@ -11,7 +11,7 @@ from coldloop.kernels.named import named, plain_tuples
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.model_range import model_range
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from plant.cold_box.physics import ColdBox, derivative
+from plant.cold_box.physics import OUTPUTS, ColdBox, derivative
 from plant.cold_box.plant_file import REFERENCE
 from plant.components.phase_separator import content
 from plant.helium.properties import Helium, load_helium, supply_enthalpy_and_density
@@ -78,7 +78,7 @@ def held(
 ) -> tuple[RealArray, RealArray]:
     """Return the state after some ticks, and the sums of `accounted_tick`; `equipment` is overwritten."""
     plant, helium = named(Refrigerator, plain), named(Helium, borrowed(tables))
-    sums, y, signals = np.zeros(4), np.empty(22), np.empty(len(SIGNAL_NAMES))
+    sums, y, signals = np.zeros(4), np.empty(OUTPUTS), np.empty(len(SIGNAL_NAMES))
     evaluate_refrigerator(x, u, v, d, plant, helium, np.empty(x.shape[0]), y, signals)
     for _ in range(ticks):
         x = accounted_tick(x, y, signals, equipment, u, v, d, plant, helium, law, sums)

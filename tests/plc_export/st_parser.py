@@ -108,13 +108,13 @@ class Parser:
         while self.tokens[self.at][0] != "end":
             head = self.take("TYPE", "FUNCTION", "FUNCTION_BLOCK", "PROGRAM", "CONFIGURATION")
             if head == "TYPE":
-                self._type()
+                self._type_block()
             elif head == "CONFIGURATION":
                 self._configuration()
             else:
                 self._unit(head)
 
-    def _type(self) -> None:
+    def _type_block(self) -> None:
         """Read a TYPE block, which has one type: not every tool takes a second one there."""
         name = self.name()
         assert name not in self.library.arrays

@@ -18,6 +18,7 @@ from rig.plc_export.structured_text.optimizer_files import OptimizerText
 from rig.plc_export.structured_text.plcopen import plcopen_xml
 from rig.plc_export.structured_text.printer import StructuredTextPrinter
 from rig.plc_export.structured_text.register_table import register_table
+from tests.harness.records import CONTROL_MAP
 from tests.plc_export.matiec import NEEDS_MATIEC, joined, self_test
 from tests.plc_export.recorded_optimizers import OPTIMISERS, disturbed_updates, recorded_updates, recorder
 from tests.plc_export.st_interpreter import Machine
@@ -233,6 +234,6 @@ def test_the_table_of_registers_names_variables_that_there_are(texts: dict[str, 
     blocks = {f"cl_optimizer_{name}": name for name in ("plan", "solve", "answered")}
     units = parsed(*texts.values()).units
     known = {f"{name}.{variable}" for block, name in blocks.items() for variable in units[block].variables}
-    named = set(re.findall(r"`((?:plan|solve|answered)\.\w+)`", register_table()))
+    named = set(re.findall(r"`((?:plan|solve|answered)\.\w+)`", register_table(CONTROL_MAP)))
     assert len(named) > 15
     assert named <= known

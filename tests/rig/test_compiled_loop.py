@@ -139,7 +139,7 @@ def test_the_guard_is_the_same_compiled(
 ) -> None:
     limits = plain(InputLimits(slew_s=slew_s, rate_reference=reference))
     state = beginning(limits, (43.0, 75.0, 36.0))
-    records, tick = guard_records(state), 0
+    records, tick = guard_records(state, limits), 0
     for wanted, update, ticks in history:
         for repetition in range(ticks):
             began = update and repetition == 0

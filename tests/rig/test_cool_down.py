@@ -39,7 +39,7 @@ def assert_balanced(run: Simulation) -> None:
     """The plant with the inputs of a run: its helium is constant, and it has gained what crossed its boundary."""
     section = {"kind": "refrigerator", "refrigerator": {"start": "warm"}}
     maker = plant_maker(HEADER, PlantSettings.model_validate({"plant": section}).plant)
-    plant = maker(load_table(find_load(str(LOAD), HEADER.w0), COLD_BOX), 1)
+    plant = maker(load_table(find_load(str(LOAD), HEADER.w0, COLD_BOX), COLD_BOX), 1)
     assert isinstance(plant, RefrigeratorProgram)
     parameters, tables, sums = plain_tuples(plant.plant), plain_tuples(HELIUM), np.zeros(4)
     before, block = plant.memory, run.recording.block

@@ -141,7 +141,7 @@ def changed(**fields: object) -> Callable[[Path], None]:
         (changed(programs="others"), UsageError, r"done by another version of Coldloop"),
         (changed(runs="others"), UsageError, r"of another configuration \(load files differ\)"),
         (
-            changed(options={"seeds": 2, "ticks": 120, "loads": ["e"], "quick": True, "variants": []}),
+            changed(options={"seeds": 2, "ticks": 120, "loads": ["e"], "quick": True, "settings": [], "variants": []}),
             UsageError,
             r"of another configuration \(seeds 2 there, 1 here\); give all shards and the merge the same options",
         ),

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TextIO
 
 from coldloop.errors import ResultsError, UsageError
-from coldloop.process.declaration import Process
-from coldloop.registers.audit import Event, EventKind
-from coldloop.service.event_text import describe, utc_text
 from rig.cli.commands.choices import SERVICES
 from rig.cli.commands.options import add_rig_options, endpoint, operator_settings, rig_endpoints
 
 if TYPE_CHECKING:
     from coldloop.modbus.endpoints import Endpoint
+    from coldloop.process.declaration import Process
+    from coldloop.registers.audit import Event
     from rig.cosim.journal_reader import JournalReader
 
 COLUMNS: Final = ("number", "boot", "utc", "tick", "plant_time_s", "kind", "subject", "cause", "value", "who")
@@ -51,6 +50,8 @@ class Since(NamedTuple):
 
 
 def _kinds(text: str) -> tuple[int, ...]:
+    from coldloop.registers.audit import EventKind
+
     known = {kind.name.lower().replace("_", "-"): kind for kind in EventKind if kind}
     try:
         return tuple(known[name.strip().lower().replace("_", "-").replace(" ", "-")] for name in text.split(","))
@@ -135,10 +136,12 @@ def _warnings(reader: "JournalReader", peer: str) -> Iterator[str]:
 class _Lines:
     """Writes one line an event to standard output."""
 
-    def __init__(self, process: Process) -> None:
+    def __init__(self, process: "Process") -> None:
         self._process = process
 
-    def write(self, events: Sequence[Event]) -> None:
+    def write(self, events: "Sequence[Event]") -> None:
+        from coldloop.service.event_text import describe, utc_text
+
         for event in events:
             sys.stdout.write(
                 f"{event.number:>7}  {utc_text(event)}  boot {event.boot}  tick {event.tick} "
@@ -153,12 +156,12 @@ class _Lines:
 class _CsvFile:
     """Writes a CSV file, which appears with the first events."""
 
-    def __init__(self, path: Path, process: Process) -> None:
+    def __init__(self, path: Path, process: "Process") -> None:
         self._path, self._process = path, process
         self._file: TextIO | None = None
         self._events = 0
 
-    def write(self, events: Sequence[Event]) -> None:
+    def write(self, events: "Sequence[Event]") -> None:
         """Append events."""
         present = self._path.exists()
         try:
@@ -188,7 +191,9 @@ class _CsvFile:
             sys.stdout.write(f"{self._events} events in {self._path}\n")
 
 
-def _cells(event: Event, process: Process) -> list[str]:
+def _cells(event: "Event", process: "Process") -> list[str]:
+    from coldloop.service.event_text import describe, utc_text
+
     text = describe(event, process)
     time = f"{event.tick * process.tick_s:.2f}"
     return [

@@ -8,7 +8,6 @@ import sys
 from typing import Final
 
 from coldloop.errors import UsageError
-from coldloop.process.settings import settings_process
 from rig.cli.commands.options import (
     add_rig_options,
     add_to_subcommands,
@@ -40,7 +39,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     cut.add_argument("seconds", type=_seconds, help="duration in real time")
     cut.set_defaults(fault=_cut)
     sensor = what.add_parser("sensor", help="make a sensor fail: not a number, frozen, or a given value")
-    sensor.add_argument("output", metavar="OUTPUT", help=f"such as {settings_process().banded[-1].name}")
+    sensor.add_argument("output", metavar="OUTPUT", help="its name")
     sensor.add_argument("shows", metavar="dead|stuck|VALUE|none", help="none ends the fault")
     sensor.set_defaults(fault=_sensor)
     add_to_subcommands(what)

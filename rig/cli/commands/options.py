@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from coldloop.errors import UsageError
-from coldloop.process.settings import settings_process, whole_ticks
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.choices import FIGURE_FORMATS, LOADS, PRESETS, SOLVERS
@@ -55,6 +54,9 @@ def fixed_updating_period(text: str) -> float:
 
 
 def _period(text: str, what: str) -> float:
+    from coldloop.process.settings import settings_process
+    from coldloop.process.updating_periods import whole_ticks
+
     process = settings_process()
     try:
         ticks = whole_ticks(float(text), process.tick_s)
@@ -79,11 +81,15 @@ def check_load(name: str | None) -> None:
     Raises:
         UsageError: There is no such load, or the process has none.
     """
-    process = settings_process()
-    if name is not None and not process.has_load:
-        raise UsageError(f"load '{name}': {process.name} has no load; leave it out")
-    if name is not None and name.partition("@")[0] not in LOADS and not (name and Path(name).exists()):
+    if name is None:
+        return
+    if name.partition("@")[0] not in LOADS and not (name and Path(name).exists()):
         raise UsageError(f"load '{name}': neither a file nor one of {', '.join(LOADS)}")
+    from coldloop.process.settings import settings_process
+
+    process = settings_process()
+    if not process.has_load:
+        raise UsageError(f"load '{name}': {process.name} has no load; leave it out")
 
 
 def endpoint(text: str) -> HostPort:
@@ -121,7 +127,7 @@ def add_to_subcommands(what: "argparse._SubParsersAction[argparse.ArgumentParser
 
 def add_loop_options(parser: argparse.ArgumentParser, loads: str) -> None:
     """Declare what the loop does; `loads` says which loads there are besides those with a name."""
-    loads = f"{loads}a CSV file time_s,{settings_process().load.column}"
+    loads = f"{loads}a CSV file of times and loads"
     load = parser.add_argument("--load", type="name", help=f"{', '.join(LOADS)}, {loads} (default: 2h)")
     load.completer = lambda **_: LOADS  # type: ignore[attr-defined]  # argcomplete looks for it
     parser.add_argument("--solver", choices=SOLVERS, help="default: ode")

@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import UsageError
-from coldloop.process.declaration import Process
-from coldloop.process.settings import settings_process, whole_ticks
 from rig.cli.commands.options import (
     add_rig_options,
     add_to_subcommands,
@@ -22,6 +20,7 @@ from rig.cli.commands.options import (
 from rig.durations import LONGEST_TICKS
 
 if TYPE_CHECKING:
+    from coldloop.process.declaration import Process
     from coldloop.process.limits import InputLimits
     from rig.live.operator_request import Work
 
@@ -30,6 +29,8 @@ MODES: Final = ("auto", "classical", "manual")
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
+    from coldloop.process.settings import settings_process
+
     add_rig_options(parser)
     process = settings_process()
     number = f"{_unit(process)}, or a CSV file time_s,{process.load.column}"
@@ -61,11 +62,14 @@ def declare(parser: argparse.ArgumentParser) -> None:
     add_to_subcommands(what)
 
 
-def _unit(process: Process) -> str:
+def _unit(process: "Process") -> str:
     return {"W": "watts"}.get(process.load.unit, process.load.unit)
 
 
 def _seconds(text: str) -> float:
+    from coldloop.process.settings import settings_process
+    from coldloop.process.updating_periods import whole_ticks
+
     tick_s = settings_process().tick_s
     try:
         ticks = whole_ticks(float(text), tick_s)
@@ -112,7 +116,7 @@ def _command(options: argparse.Namespace, limits: "InputLimits") -> tuple[tuple[
     return services, lambda clients: work(clients, command)
 
 
-def _stream(options: argparse.Namespace, process: Process) -> tuple[tuple[str, ...], "Work"]:
+def _stream(options: argparse.Namespace, process: "Process") -> tuple[tuple[str, ...], "Work"]:
     from coldloop.operating.execution import stream_load
     from coldloop.process.load_profile import read_load_file
 
@@ -138,10 +142,13 @@ def _load(options: argparse.Namespace) -> dict[str, object]:
 
 
 def _tick(options: argparse.Namespace) -> int:
+    from coldloop.process.settings import settings_process
+
     return 0 if options.at is None else round(options.at / settings_process().tick_s)
 
 
 def _acknowledgement(options: argparse.Namespace) -> dict[str, object]:
+    from coldloop.process.settings import settings_process
     from coldloop.registers.safety import ALL_ALARMS, AlarmAction, alarms_of
     from coldloop.service.event_text import alarm_word
 

@@ -9,11 +9,12 @@ All functions are kernels and take x (28 states, `STATE_NAMES`), u (3 inputs, `I
 real or complex.
 """
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from coldloop.kernels.compiled import inlined, kernel
+from coldloop.process import cold_box
 from plant.components.gas_valve import CRITICAL_RATIO, cold_valve_flow
 from plant.components.heat_exchanger import HeatExchanger, HighPressureFlow, LowPressureFlow, exchange
 from plant.components.phase_separator import (
@@ -33,6 +34,7 @@ from plant.helium.properties import Helium, saturation, supply_enthalpy_and_dens
 from plant.numeric import PA_PER_BAR, Array, at_least
 
 LOAD_NAME, LOAD_UNIT = "NCR22_HL", "W"
+OUTPUTS: Final = len(cold_box.OUTPUT_NAMES)
 CELLS = (8, 6, 12)  # of NEF1, NEF2, NEF34; the states are named in coldloop.process.cold_box
 
 

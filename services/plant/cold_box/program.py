@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from coldloop.kernels.named import plain_tuples
+from coldloop.process.cold_box import TICK_S
 from coldloop.process.model_range import model_range
 from plant.cold_box.physics import ColdBox, outputs
 from plant.helium.properties import load_helium
@@ -38,7 +39,7 @@ class ColdBoxProgram(PlantProgram):
         u0: Sequence[float],
         load: HeatLoad,
         noise: MeasurementNoise | None = None,
-        tick_s: float = 0.25,
+        tick_s: float = TICK_S,
     ) -> None:
         if not 0.0 < tick_s <= 0.5:
             raise ValueError(f"a tick of {tick_s} s is outside 0 to 0.5 s")

@@ -11,6 +11,7 @@ import numpy as np
 
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.station import STATION_SIGNAL_NAMES
+from plant.cold_box.physics import OUTPUTS
 from plant.helium.entropy import entropy, supply_entropy
 from plant.helium.properties import Helium, saturation, supply_enthalpy_and_density, vapour_enthalpy_and_cp
 from plant.refrigerator.equilibrium import AMBIENT, Rest
@@ -84,7 +85,7 @@ class _Exergies(NamedTuple):
 def exergy_balance(rest: Rest, plant: Refrigerator, helium: Helium) -> ExergyBalance:
     """Return the balance of a refrigerator at rest; the heater counts as load, its electricity is left out."""
     crossing = evaluate_refrigerator(
-        rest.x, rest.u, rest.v, rest.d, plant, helium, np.empty_like(rest.x), np.empty(22), np.empty(SIGNALS)
+        rest.x, rest.u, rest.v, rest.d, plant, helium, np.empty_like(rest.x), np.empty(OUTPUTS), np.empty(SIGNALS)
     )
     signals = dict(zip(STATION_SIGNAL_NAMES, rest.signals.tolist(), strict=True))
     e, s = _exergies(rest, crossing, signals, plant, helium), crossing.cold

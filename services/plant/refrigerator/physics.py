@@ -22,7 +22,7 @@ from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
 from coldloop.kernels.named import named
 from coldloop.process import cold_box, station
-from plant.cold_box.physics import ColdBox, Streams, evaluate
+from plant.cold_box.physics import OUTPUTS, ColdBox, Streams, evaluate
 from plant.components.actuator import opening_rate
 from plant.components.cell_account import WILD, widest_move
 from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow
@@ -219,7 +219,7 @@ def advance_refrigerator(
     everywhere.
     """
     slope, signals = np.empty(x.shape[0]), np.empty(SIGNALS)
-    cells = evaluate_refrigerator(x, u, v, d, plant, helium, slope, np.empty(22), signals).filling.cells
+    cells = evaluate_refrigerator(x, u, v, d, plant, helium, slope, np.empty(OUTPUTS), signals).filling.cells
     return advance_along(x, slope, cells, PA_PER_BAR * signals[1], u, v, d, dt, plant, helium)
 
 
@@ -251,7 +251,7 @@ def advance_along(
         helium: Tables.
     """
     n = x.shape[0]
-    slope, y, signals = np.empty(n), np.empty(22), np.empty(SIGNALS)
+    slope, y, signals = np.empty(n), np.empty(OUTPUTS), np.empty(SIGNALS)
     stage, total = np.empty(n), np.empty(n)
     stages = np.empty((4, n))
     account = start_account(content(plant.box.separator, x[0], x[1], helium), first)

@@ -31,6 +31,10 @@ UNNAMED: dict[str, Any] = {
 """What a model file leaves out."""
 MATRICES = ("A", "B", "F", "C", "D", "G", "A_tick", "B_tick", "F_tick")
 
+HALVINGS = 20
+LARGEST_DIFFERENCE = 1e-6
+"""Between A_tick and what A says of a tick; another tick differs by more."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class DiscreteModel:
@@ -216,4 +220,15 @@ def load(path: Path) -> LtiModel:
             f"{path}: {len(model.state_names)} states in the model file, a {process.name} has {len(process.states)}; "
             f"{REMEDY}"
         )
+    if not model.process and not _is_of_tick(model, process.tick_s):
+        raise ModelFileError(f"{path}: A_tick is not that of A over a tick of {process.tick_s:g} s; {REMEDY}")
     return model
+
+
+def _is_of_tick(model: LtiModel, tick_s: float) -> bool:
+    """Return whether A_tick is exp(A tick), by squaring what a millionth of a tick gives."""
+    part = model.A * (tick_s / 2**HALVINGS)
+    step = np.eye(len(part)) + part + part @ part / 2.0
+    for _ in range(HALVINGS):
+        step = step @ step
+    return bool(np.abs(step - model.A_tick).max() < LARGEST_DIFFERENCE)

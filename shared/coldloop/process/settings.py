@@ -5,7 +5,6 @@ A section that has defaults or bounds of its process is a `ProcessSettings`. The
 by itself is for the cold box, or for what `settings_of` says; `model_named` says it for a command.
 """
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -223,15 +222,3 @@ def process_of(path: Path) -> Process:
 @lru_cache(maxsize=8)
 def _process_of(path: Path, _version: object) -> Process:
     return declared_process(read_document(path), path)
-
-
-TOLERANCE: Final = 1e-9
-"""Share of a tick: 0.3 s are three ticks of 0.1 s, although floats do not think so."""
-
-
-def whole_ticks(seconds: float, tick_s: float) -> int | None:
-    """Return how many ticks a time is; None if it is no multiple of a tick, or not finite."""
-    ticks = seconds / tick_s
-    if not math.isfinite(ticks) or abs(ticks - round(ticks)) > TOLERANCE * max(1.0, abs(ticks)):
-        return None
-    return round(ticks)

@@ -4,6 +4,8 @@ import math
 from typing import Final, NamedTuple
 
 SHORTEST_TICKS: Final = 2
+TOLERANCE: Final = 1e-9
+"""Share of a tick: 0.3 s are three ticks of 0.1 s, although floats do not think so."""
 ROUNDING: Final = 1e-5
 """Share of an iteration that may be missing: times come through registers in single precision."""
 
@@ -48,3 +50,11 @@ class ComputingTimes(NamedTuple):
         """Return the updating period of a q, in ticks; of one beyond the ladder its longest."""
         ladder = self.ladder()
         return ladder[min(q, len(ladder)) - 1]
+
+
+def whole_ticks(seconds: float, tick_s: float) -> int | None:
+    """Return how many ticks a time is; None if it is no multiple of a tick, or not finite."""
+    ticks = seconds / tick_s
+    if not math.isfinite(ticks) or abs(ticks - round(ticks)) > TOLERANCE * max(1.0, abs(ticks)):
+        return None
+    return round(ticks)
