@@ -1,4 +1,4 @@
-"""Puts the pages of `docs/` into the wheel, where `coldloop docs` finds them; an image of a service has none."""
+"""Puts pages and examples into the wheel, for `coldloop docs` and `coldloop new`; an image of a service has none."""
 
 from pathlib import Path
 from typing import Any
@@ -12,5 +12,9 @@ class Pages(BuildHookInterface):  # type: ignore[type-arg]
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Add the pages, but to an editable installation, which reads them where they are."""
         if version != "editable":
-            pages = Path(self.root, "docs").glob("*.md")
+            pages, examples = Path(self.root, "docs").glob("*.md"), Path(self.root, "examples")
             build_data["force_include"].update({str(page): f"rig/pages/{page.name}" for page in pages})
+            build_data["force_include"].update({
+                str(file): f"rig/examples/{file.relative_to(examples)}"
+                for file in examples.rglob("*.*") if file.is_file() and file.suffix != ".pyc"
+            })  # fmt: skip

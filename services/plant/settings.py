@@ -196,7 +196,7 @@ class PlantSection(ProcessSettings):
     """How much too fast the rack's clock is in real time, in millionths: for tests of those who follow it."""
     watchdog: WatchdogSettings = Field(default_factory=WatchdogSettings)
     rate_limited: bool = True
-    """No output moves by more than `limits.rate` in one tick of the rackfor any writer; the safe state does."""
+    """No output moves by more than `limits.rate` in one tick of the rack, for any writer; the safe state does."""
     retain: RetainSettings = RetainSettings()
 
 

@@ -4,6 +4,8 @@ import json
 import subprocess
 from pathlib import Path
 
+from rig.cli import main
+from rig.cli.commands.new import EXAMPLES
 from tests.harness.processes import PROGRAM_S, Processes
 
 PAGE = Path(__file__).parents[2] / "docs" / "your-plant.md"
@@ -30,6 +32,14 @@ def test_a_newcomer_gets_what_the_page_shows(processes: Processes, tmp_path: Pat
     assert summary["ticks"] == 2400
     assert "budget" in page
     assert "fits" in coldloop("--process", "heater/process.toml", "budget", "--plc", "siemens-s7-1511-1-pn")
+
+
+def test_each_file_of_the_examples_belongs_to_one_that_can_be_had(tmp_path: Path) -> None:
+    for name in EXAMPLES:
+        assert main(["new", str(tmp_path), "--example", name]) == 0
+    there = {file.name for file in (PAGE.parents[1] / "examples").rglob("*.*") if file.suffix != ".pyc"}
+    assert {file.name for file in tmp_path.iterdir()} == there
+    assert main(["new", str(tmp_path), "--example", "wood_berry"]) == 2
 
 
 def test_a_folder_that_is_in_use_is_left_alone(processes: Processes, tmp_path: Path) -> None:
