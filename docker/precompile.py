@@ -144,6 +144,13 @@ def linear_models() -> None:
     make_refrigerator_file()
 
 
+def transfer_functions() -> None:
+    """Let a minute of a plant of transfer functions pass."""
+    from rig import simulate  # noqa: PLC0415 not in the images
+
+    simulate("a", process=ROOT / "examples" / "processes" / "wood_berry.toml", duration_s=60)
+
+
 def run_modules() -> None:
     """Import what a run needs besides kernels, so that its bytecode is written."""
     for module in (
@@ -185,6 +192,7 @@ PARTS: Final[dict[str, tuple[Callable[[], None], int]]] = {
     "hybrid-in-one-process": (in_one_process(optimizer_plc={"program": {"solver": "hybrid"}}), 25),
     "fast-gradient-in-one-process": (in_one_process(optimizer_plc={"program": {"solver": "fast-gradient"}}), 25),
     "linear-models": (linear_models, 20),
+    "transfer-functions": (transfer_functions, 5),
     "run-modules": (run_modules, 4),
     "all-modules": (all_modules, 13),
     "tests": (tests, 9),
