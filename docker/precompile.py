@@ -148,6 +148,7 @@ def transfer_functions() -> None:
     """Let a minute of a plant of transfer functions pass."""
     from rig import simulate  # noqa: PLC0415 not in the images
 
+    import_module("rig.cosim.compiled.own_plants")  # what it registers counts in the names of kernels
     simulate("a", process=ROOT / "examples" / "processes" / "wood_berry.toml", duration_s=60)
 
 
