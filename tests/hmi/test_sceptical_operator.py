@@ -304,7 +304,8 @@ def test_a_substituted_value_is_no_line_like_others(operated: "Page", site: Site
         for kind in ("tag", "bar"):
             at = f"#overview .{kind}[data-name=T5]"
             eventually(lambda: operated.locator(f"{at} .stale, {at}.stale").count(), f"{kind}: crossed out")  # noqa: B023
-            assert operated.locator(f"{at}[data-quality=simulated], {at} [data-quality=simulated]").count()
+            now = f"{at}[data-quality=simulated], {at} [data-quality=simulated]"
+            eventually(lambda: operated.locator(now).count(), f"{kind}: its quality")  # noqa: B023
         assert operated.text_content("#overview .tag[data-name=T5] .mark") == "S"
         view(operated, "trends")
         eventually(lambda: operated.evaluate(BLANK), "the line is interrupted")
