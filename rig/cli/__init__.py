@@ -14,7 +14,7 @@ from typing import Any, Final, NoReturn
 
 from coldloop import __version__
 from coldloop.errors import ColdloopError, UsageError, printable
-from rig.cli.process_option import OPTION, is_another, named_process
+from rig.cli.process_option import OPTION, VARIABLES, is_another, named_process
 from rig.interruption import INTERRUPTION
 
 GROUPS: Final = {
@@ -170,9 +170,7 @@ def _execute(parser: argparse.ArgumentParser, given: Sequence[str]) -> int:
         parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     named = given[1] if len(given) > 1 else None
     if given and given[0] in OF_THE_COLD_BOX and named not in OF_ANY_PROCESS and is_another():
-        sys.stderr.write(
-            f"coldloop: {given[0]}: of the cold box alone; leave out {OPTION} and unset COLDLOOP__MODEL__FILE\n"
-        )
+        sys.stderr.write(f"coldloop: {given[0]}: of the cold box alone; leave out {OPTION} and unset {VARIABLES[0]}\n")
         return UsageError.exit_code
     if options.execute is None:
         parser.print_help()

@@ -53,11 +53,12 @@ def _configured(arguments: Sequence[str]) -> Path | None:
         options, _ = parser.parse_known_args(arguments)
     except argparse.ArgumentError:
         return None
-    if not (options.config or options.assignments or any(map(os.environ.get, VARIABLES))):
+    file = options.config if options.config and options.config.is_file() else None  # a pipe can be read once
+    if not (file or options.assignments or any(map(os.environ.get, VARIABLES))):
         return None
     from coldloop.config import model_file_in  # noqa: PLC0415 it takes time
 
-    named = model_file_in(os.environ, options.config, options.assignments)
+    named = model_file_in(os.environ, file, options.assignments)
     return Path(str(named)) if named else None
 
 

@@ -31,8 +31,7 @@ def model_file_of(path: Path, *, in_child: bool = False) -> tuple[Path, list[str
 
         made = made_from(path)
         out = find_cache_folder("processes") / f"{path.stem}-{made.model.digest[:12]}.json"
-        if not out.exists():  # what is there may be in use
-            made.model.save(out)
+        made.model.save(out)
         return f"{out}\n{described(made)}"
 
     from rig.process_file.in_child import text_of_child  # noqa: PLC0415

@@ -70,8 +70,7 @@ def advance_and_read(
     """Return the state after `dt` seconds and the outputs there.
 
     `slope` (28,) becomes dx/dt at the new state. Where inputs and load are `held`, it is that at `x` from the step
-    before, which saves one of five evaluations. `box` and `helium` come as `plain_tuples`: numba takes 30 us a call to
-    recognise nested named tuples, 5 us for plain ones, and this kernel is called every tick.
+    before, which saves one of five evaluations. `box` and `helium` come as `plain_tuples`.
     """
     plant, tables = named(ColdBox, box), named(Helium, borrowed(helium))
     y = np.empty(OUTPUTS)

@@ -13,6 +13,7 @@ import coldloop
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from rig import simulate
+from rig.cli import main
 from tests.harness.process_files import COLUMN, TANK
 
 RUNS: Final[dict[str, tuple[Path | None, float]]] = {
@@ -62,3 +63,14 @@ def test_a_process_is_read_from_either_file_and_the_cold_box_from_its_model() ->
     assert tank == coldloop.Process.read(TANK)
     assert coldloop.Process.read(DEFAULT_MODEL_FILE) == COLD_BOX
     assert coldloop.simulate is simulate
+
+
+def test_a_configuration_from_a_pipe_is_read_once_and_obeyed(capsys: pytest.CaptureFixture[str]) -> None:
+    out, into = os.pipe()
+    os.write(into, b"[plant]\nseed = 7\n")
+    os.close(into)
+    try:
+        assert main(["config", "--config", f"/dev/fd/{out}"]) == 0
+    finally:
+        os.close(out)
+    assert "plant.seed = 7 " in capsys.readouterr().out
