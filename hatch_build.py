@@ -13,8 +13,8 @@ class Pages(BuildHookInterface):  # type: ignore[type-arg]
         """Add the pages, but to an editable installation, which reads them where they are."""
         if version != "editable":
             pages, examples = Path(self.root, "docs").glob("*.md"), Path(self.root, "examples")
-            build_data["force_include"].update({str(page): f"rig/pages/{page.name}" for page in pages})
+            build_data["force_include"].update({str(page): f"coldloop_rig/pages/{page.name}" for page in pages})
             build_data["force_include"].update({
-                str(file): f"rig/examples/{file.relative_to(examples)}"
+                str(file): f"coldloop_rig/examples/{file.relative_to(examples)}"
                 for file in examples.rglob("*.*") if file.is_file() and file.suffix != ".pyc"
             })  # fmt: skip

@@ -13,13 +13,13 @@ from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus, Status
 from coldloop.registers.maps import maps_of
 from coldloop.service.start import run_event_loop
-from plant.load import find_load
-from plant.own_model import own_header
-from rig.cosim.local_services import LocalServices
-from rig.cosim.scenario import Scenario
-from rig.cosim.session_client import SessionClient
-from rig.cosim.wiring import START_PATIENCE_S
-from rig.settings import Settings
+from coldloop_plant.load import find_load
+from coldloop_plant.own_model import own_header
+from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.cosim.session_client import SessionClient
+from coldloop_rig.cosim.wiring import START_PATIENCE_S
+from coldloop_rig.settings import Settings
 
 CONTROL_MAP = maps_of(COLD_BOX).control_plc
 

@@ -25,12 +25,12 @@ from coldloop.registers.common import ServerStatistics
 from coldloop.registers.control_plc import ProcessNow
 from coldloop.registers.maps import maps_of
 from coldloop.registers.safety import WatchdogStatus
-from plant.load import find_load
-from rig.cosim.local_services import LocalServices
-from rig.cosim.scenario import Scenario
-from rig.cosim.session_client import SessionClient
-from rig.results.recording import LinkStatistics, Recorder
-from rig.settings import Settings
+from coldloop_plant.load import find_load
+from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.cosim.session_client import SessionClient
+from coldloop_rig.results.recording import LinkStatistics, Recorder
+from coldloop_rig.settings import Settings
 
 PLANT_MAP, CONTROL_MAP, _ = maps_of(COLD_BOX)
 

@@ -17,12 +17,12 @@ from coldloop.process.cold_box import OUTPUT_NAMES, TICK_S
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.process.station import STATION_SIGNAL_NAMES
-from plant.kinds import plant_maker
-from plant.own_model import own_header
-from plant.program import PlantProgram
-from plant.settings import PlantSettings
-from rig.figures.plot import COLOURS
-from rig.studies.drawing import panels
+from coldloop_plant.kinds import plant_maker
+from coldloop_plant.own_model import own_header
+from coldloop_plant.program import PlantProgram
+from coldloop_plant.settings import PlantSettings
+from coldloop_rig.figures.plot import COLOURS
+from coldloop_rig.studies.drawing import panels
 
 HEADER = own_header(DEFAULT_MODEL_FILE)
 COLUMNS = ("minute", "L1", "T1", "T5", "P12", "P11", "lost", "imbalance")

@@ -31,12 +31,12 @@ from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers.common import STATISTICS_BLOCK
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.maps import maps_of
-from rig import cli
-from rig.chaos.resources import resident_mb
-from rig.cli.certificate_files import CLIENTS
-from rig.cosim.local_services import LocalServices
-from rig.cosim.wiring import SERVICES
-from rig.settings import Settings
+from coldloop_rig import cli
+from coldloop_rig.chaos.resources import resident_mb
+from coldloop_rig.cli.certificate_files import CLIENTS
+from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.cosim.wiring import SERVICES
+from coldloop_rig.settings import Settings
 
 MAPS = maps_of(COLD_BOX).by_service
 

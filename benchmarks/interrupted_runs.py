@@ -42,7 +42,7 @@ class End(NamedTuple):
 
 def coldloop(*words: str) -> list[str]:
     """Return a command line."""
-    return [sys.executable, "-m", "rig", *words]
+    return [sys.executable, "-m", "coldloop_rig", *words]
 
 
 def interrupt(command: tuple[str, ...], number: signal.Signals, after_s: float, out: Path, *, under_way: bool) -> End:

@@ -8,14 +8,14 @@ from pathlib import Path
 from coldloop.config import Configuration, load_configuration
 from coldloop.process.cold_box import TICK_S
 from coldloop.session.settings import TimeMode
-from rig.chaos.evaluation import Evaluation
-from rig.chaos.experiment import perform
-from rig.chaos.faults import Kill, Pause
-from rig.chaos.plan import ChaosPlan
-from rig.chaos.progress import ChaosProgress
-from rig.chaos.report import summary_lines, write_report
-from rig.results.folders import claim_folder
-from rig.settings import Settings
+from coldloop_rig.chaos.evaluation import Evaluation
+from coldloop_rig.chaos.experiment import perform
+from coldloop_rig.chaos.faults import Kill, Pause
+from coldloop_rig.chaos.plan import ChaosPlan
+from coldloop_rig.chaos.progress import ChaosProgress
+from coldloop_rig.chaos.report import summary_lines, write_report
+from coldloop_rig.results.folders import claim_folder
+from coldloop_rig.settings import Settings
 
 IN_FLIGHT_MS = 20.0
 """In real time the signal comes up to so much after a tick, with the rig moving on: anywhere in a scan or a solve."""

@@ -14,19 +14,19 @@ from qp_solvers import RecordedProblem, record
 
 from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.process.lti_model import load
-from optimizer_plc.computing_settings import OdeSettings
-from optimizer_plc.qp.costs import matrices_of
-from optimizer_plc.qp.penalties import DEFAULT_PENALTIES
-from optimizer_plc.solvers.ode import descend, flow_in, warm_start
-from plant.cold_box.physics import evaluate
-from plant.cold_box.plant_file import REFERENCE
-from plant.helium.properties import load_helium
-from plant.integrator import advance_along
-from plant.load import find_load
-from rig.cosim.one_process import OneProcessRig
-from rig.cosim.scenario import Scenario
-from rig.results.recording import Recorder
-from rig.settings import Settings
+from coldloop_optimizer_plc.computing_settings import OdeSettings
+from coldloop_optimizer_plc.qp.costs import matrices_of
+from coldloop_optimizer_plc.qp.penalties import DEFAULT_PENALTIES
+from coldloop_optimizer_plc.solvers.ode import descend, flow_in, warm_start
+from coldloop_plant.cold_box.physics import evaluate
+from coldloop_plant.cold_box.plant_file import REFERENCE
+from coldloop_plant.helium.properties import load_helium
+from coldloop_plant.integrator import advance_along
+from coldloop_plant.load import find_load
+from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.results.recording import Recorder
+from coldloop_rig.settings import Settings
 
 
 class Floors(NamedTuple):

@@ -12,12 +12,12 @@ from coldloop.process.lti_model import load
 from coldloop.registers.maps import maps_of
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.service.start import run_event_loop
-from plant.load import find_load
-from rig.cosim.local_services import LocalServices
-from rig.cosim.scenario import Scenario
-from rig.cosim.session_client import SessionClient
-from rig.results.recording import Recorder
-from rig.settings import Settings
+from coldloop_plant.load import find_load
+from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.cosim.session_client import SessionClient
+from coldloop_rig.results.recording import Recorder
+from coldloop_rig.settings import Settings
 
 PLANT_MAP = maps_of(COLD_BOX).plant
 

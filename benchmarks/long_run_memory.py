@@ -15,14 +15,14 @@ import numpy as np
 from coldloop.config import load_configuration
 from coldloop.process.cold_box import TICK_S
 from coldloop.process.lti_model import load as load_model
-from plant.load import HOUR_TICKS, HOURS, concatenated, telegraph
-from rig.cosim.job import Job
-from rig.figures.worker import FigureProcess
-from rig.results.folders import claim_folder
-from rig.results.recording import SampleBlock, Sink
-from rig.results.way import Way
-from rig.runs.running import make_scenario, run_into
-from rig.settings import Settings
+from coldloop_plant.load import HOUR_TICKS, HOURS, concatenated, telegraph
+from coldloop_rig.cosim.job import Job
+from coldloop_rig.figures.worker import FigureProcess
+from coldloop_rig.results.folders import claim_folder
+from coldloop_rig.results.recording import SampleBlock, Sink
+from coldloop_rig.results.way import Way
+from coldloop_rig.runs.running import make_scenario, run_into
+from coldloop_rig.settings import Settings
 
 NAMES: Final = "abcdef"
 DRAW_SEEDS: Final = 1000

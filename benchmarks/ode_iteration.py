@@ -13,8 +13,8 @@ import numpy as np
 from qp_solvers import RecordedProblem, record
 from scipy.linalg import lapack
 
-from optimizer_plc.computing_settings import OdeSettings
-from optimizer_plc.solvers.ode import ode_solver
+from coldloop_optimizer_plc.computing_settings import OdeSettings
+from coldloop_optimizer_plc.solvers.ode import ode_solver
 
 ITERATIONS = 10
 """Of each problem."""

@@ -19,15 +19,15 @@ import aiohttp
 from coldloop.config import load_configuration
 from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.process.lti_model import load as load_model
-from hmi.settings import HmiSettings
-from plant.load import find_load
-from rig.cosim.local_services import LocalServices
-from rig.cosim.ports import ReservedPorts
-from rig.cosim.scenario import Scenario
-from rig.cosim.session_client import SessionClient
-from rig.live.page_process import PageProcess
-from rig.results.recording import LinkStatistics, Recorder
-from rig.settings import Settings
+from coldloop_hmi.settings import HmiSettings
+from coldloop_plant.load import find_load
+from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.cosim.ports import ReservedPorts
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.cosim.session_client import SessionClient
+from coldloop_rig.live.page_process import PageProcess
+from coldloop_rig.results.recording import LinkStatistics, Recorder
+from coldloop_rig.settings import Settings
 
 TREND = "api/trend?names=L1,T5,CV155,NCR22_A,CV156,load&seconds=300&points=900"
 TREND_S = 0.5

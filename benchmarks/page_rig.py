@@ -110,7 +110,7 @@ class Rig:
 
     def run(self, *words: object) -> str:
         """Run a command of Coldloop to its end; return what it printed."""
-        command = [sys.executable, "-m", "rig", *self._process_of(words), *map(str, words)]
+        command = [sys.executable, "-m", "coldloop_rig", *self._process_of(words), *map(str, words)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode not in {0, 3}:
             raise RuntimeError(f"{words}: {done.stdout} {done.stderr}")
@@ -119,7 +119,7 @@ class Rig:
     def start(self, *words: object, ports: bool = True) -> subprocess.Popen[str]:
         """Start a command, by default on the ports of this rig."""
         more = ("--port-base", str(self.base)) if ports else ()
-        command = [sys.executable, "-m", "rig", *self._process_of(words), *map(str, words), *more]
+        command = [sys.executable, "-m", "coldloop_rig", *self._process_of(words), *map(str, words), *more]
         return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     def _process_of(self, words: tuple[object, ...]) -> tuple[str, ...]:

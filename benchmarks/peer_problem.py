@@ -15,12 +15,12 @@ import numpy as np
 
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load
-from optimizer_plc.qp.design import ControlDesign, trivial_design
-from optimizer_plc.qp.prediction import PredictionModel, state_weights
-from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
-from optimizer_plc.settings import ProgramSettings, SolverName
-from optimizer_plc.solvers import make_solver
-from rig.settings import Settings
+from coldloop_optimizer_plc.qp.design import ControlDesign, trivial_design
+from coldloop_optimizer_plc.qp.prediction import PredictionModel, state_weights
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
+from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
+from coldloop_optimizer_plc.solvers import make_solver
+from coldloop_rig.settings import Settings
 
 LOAD_STEP_W = 40.0
 ITERATIONS = 200

@@ -1,6 +1,6 @@
 """PIQP, ProxQP, Clarabel and QPALM on the controller's problems, cut off after a number of iterations.
 
-All but ProxQP are the outside solvers of these names (`optimizer_plc/solvers/outside_libraries.py`). ProxQP, an
+All but ProxQP are the outside solvers of these names (`coldloop_optimizer_plc/solvers/outside_libraries.py`). ProxQP, an
 augmented Lagrangian method, gets the same problems with soft rows and begins at the guess; an iteration of it is one
 Newton step in one outer iteration. What comes back is projected into the box and judged by J. Optional:
 `pip install -r benchmarks/qp_peers.txt`, and `pip install 'coldloop[qpalm]'`.
@@ -12,8 +12,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from optimizer_plc.qp.problem import QuadraticProblem
-from optimizer_plc.solvers.outside_libraries import TOLERANCE, UNBOUNDED, Clarabel, Library, Piqp, Qpalm, SoftProblem
+from coldloop_optimizer_plc.qp.problem import QuadraticProblem
+from coldloop_optimizer_plc.solvers.outside_libraries import (
+    TOLERANCE,
+    UNBOUNDED,
+    Clarabel,
+    Library,
+    Piqp,
+    Qpalm,
+    SoftProblem,
+)
 
 Array = NDArray[np.float64]
 

@@ -19,15 +19,15 @@ from qp_peers import TO_THE_END, installed_peers, peer_answer
 from coldloop.errors import ConfigurationError
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.lti_model import load
-from optimizer_plc.qp.costs import augmented_cost
-from optimizer_plc.qp.problem import QuadraticProblem
-from optimizer_plc.settings import ProgramSettings, SolverName
-from optimizer_plc.solvers import Answer, Solver, judged, make_solver
-from plant.load import find_load
-from rig.cosim.one_process import OneProcessRig
-from rig.cosim.scenario import Scenario
-from rig.results.recording import Recorder
-from rig.studies.settings import settings_of
+from coldloop_optimizer_plc.qp.costs import augmented_cost
+from coldloop_optimizer_plc.qp.problem import QuadraticProblem
+from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
+from coldloop_optimizer_plc.solvers import Answer, Solver, judged, make_solver
+from coldloop_plant.load import find_load
+from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.results.recording import Recorder
+from coldloop_rig.studies.settings import settings_of
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ def main() -> None:
                         help="may be repeated (default: 1 for 2min, 20 for 1h)")  # fmt: skip
     for factor, duration in parser.parse_args().case or [("1", "2min"), ("20", "1h")]:
         with tempfile.TemporaryDirectory() as folder:
-            command = [sys.executable, "-m", "rig", "run", "--mode", "realtime", "--factor", factor,
+            command = [sys.executable, "-m", "coldloop_rig", "run", "--mode", "realtime", "--factor", factor,
                        "--duration", duration, "--load", "a", "--out", folder]  # fmt: skip
             subprocess.run(command, check=True, capture_output=True)
             summary = json.loads((Path(folder) / "summary.json").read_text())

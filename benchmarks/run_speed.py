@@ -11,7 +11,7 @@ from pathlib import Path
 def realtime_factor(*options: str) -> tuple[float, str]:
     """Run; return the speed and the hash of the trace."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "rig", "run", "--out", folder, *options]
+        command = [sys.executable, "-m", "coldloop_rig", "run", "--out", folder, *options]
         subprocess.run(command, check=True, capture_output=True)
         summary = json.loads((Path(folder) / "summary.json").read_text())
     return float(summary["realtime_factor"]), str(summary["trace_sha256"])

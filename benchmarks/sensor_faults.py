@@ -17,16 +17,16 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.maps import maps_of
-from optimizer_plc.qp.design import ControlDesign
-from plant.kinds import plant_maker
-from plant.load import find_load
-from plant.own_model import own_header
-from plant.program import PlantProgram
-from plant.settings import MismatchSettings
-from rig.cosim.one_process import OneProcessRig, Programs, load_table
-from rig.cosim.scenario import Scenario
-from rig.results.recording import Recorder
-from rig.settings import Settings
+from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_plant.kinds import plant_maker
+from coldloop_plant.load import find_load
+from coldloop_plant.own_model import own_header
+from coldloop_plant.program import PlantProgram
+from coldloop_plant.settings import MismatchSettings
+from coldloop_rig.cosim.one_process import OneProcessRig, Programs, load_table
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.results.recording import Recorder
+from coldloop_rig.settings import Settings
 
 BANDS = ControlDesign()
 SETTLED_S = 300.0

@@ -17,9 +17,9 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from coldloop.config import PREFIX, to_environment
-from rig.cosim.ports import HOST, ReservedPorts
-from rig.cosim.wiring import SERVICES, endpoints_on, wired
-from rig.settings import Settings
+from coldloop_rig.cosim.ports import HOST, ReservedPorts
+from coldloop_rig.cosim.wiring import SERVICES, endpoints_on, wired
+from coldloop_rig.settings import Settings
 
 READ_MAGIC: Final = bytes((0, 1, 0, 0, 0, 6, 1, 3, 0, 0, 0, 2))
 """Function 3: two registers from 0 on, which hold 123.456 in every map."""
@@ -46,7 +46,7 @@ def service_start(service: str, environment: Mapping[str, str]) -> float:
         own = to_environment(wired(settings, endpoints_on(ports.numbers, settings)))
         start = time.perf_counter()
         with subprocess.Popen(
-            [sys.executable, "-m", service, "--with-parent"],
+            [sys.executable, "-m", f"coldloop_{service}", "--with-parent"],
             env={**environment, **own}, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL,
         ) as process:  # fmt: skip
             try:
@@ -62,7 +62,7 @@ def service_start(service: str, environment: Mapping[str, str]) -> float:
 def short_run(environment: Mapping[str, str]) -> float:
     """Return the time (s) of a run of 10 s of plant time in one process, with its figure."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "rig", "run", "--in-process", "--duration", "10s", "--out", folder]
+        command = [sys.executable, "-m", "coldloop_rig", "run", "--in-process", "--duration", "10s", "--out", folder]
         start = time.perf_counter()
         subprocess.run(command, check=True, capture_output=True, env=environment)
         return time.perf_counter() - start

@@ -6,11 +6,11 @@ import time
 from pathlib import Path
 
 from coldloop.process.cold_box import TICK_S
-from rig.durations import duration
-from rig.studies import STUDIES
-from rig.studies.execution import Workers
-from rig.studies.results import conduct
-from rig.studies.study import StudyOptions
+from coldloop_rig.durations import duration
+from coldloop_rig.studies import STUDIES
+from coldloop_rig.studies.execution import Workers
+from coldloop_rig.studies.results import conduct
+from coldloop_rig.studies.study import StudyOptions
 
 
 def seconds(workers: int, options: StudyOptions) -> float:

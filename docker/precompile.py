@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from optimizer_plc.program import OptimizerProgram
-    from optimizer_plc.settings import ProgramSettings
-    from plant.settings import PlantKind
+    from coldloop_optimizer_plc.program import OptimizerProgram
+    from coldloop_optimizer_plc.settings import ProgramSettings
+    from coldloop_plant.settings import PlantKind
 
 LOOK_S: Final = 0.2
 WAITING: Final = 2
@@ -33,7 +33,7 @@ SELDOM: Final = re.compile(r"/site-packages/(.*/tests?/|(pip|setuptools|mypy|myp
 
 def plant() -> None:
     """Make each plant that is ours, which compiles its kernels."""
-    from plant.settings import PlantKind  # noqa: PLC0415 not in every image
+    from coldloop_plant.settings import PlantKind  # noqa: PLC0415 not in every image
 
     for kind in PlantKind:
         if kind is not PlantKind.OF_PROCESS:
@@ -42,9 +42,9 @@ def plant() -> None:
 
 def default_plant() -> None:
     """Make the plant of the default settings."""
-    from plant.settings import PlantSection  # noqa: PLC0415
+    from coldloop_plant.settings import PlantSection  # noqa: PLC0415
 
-    import_module("plant.runtime")
+    import_module("coldloop_plant.runtime")
     _make_plant(PlantSection().kind)
 
 
@@ -52,8 +52,8 @@ def _make_plant(kind: "PlantKind") -> None:
     from coldloop.process.load_profile import LoadProfile  # noqa: PLC0415
     from coldloop.process.model_file import read_header  # noqa: PLC0415
     from coldloop.process.settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
-    from plant.kinds import plant_maker  # noqa: PLC0415
-    from plant.settings import PlantSection  # noqa: PLC0415
+    from coldloop_plant.kinds import plant_maker  # noqa: PLC0415
+    from coldloop_plant.settings import PlantSection  # noqa: PLC0415
 
     header = read_header(DEFAULT_MODEL_FILE)
     plant_maker(header, PlantSection(kind=kind))(LoadProfile((0,), (header.w0,)), 1)
@@ -73,7 +73,7 @@ def solvers_in(arithmetic: str) -> Callable[[], None]:
     """Return what makes the program with each solver that has kernels of its own, in one precision."""
 
     def make() -> None:
-        from optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings  # noqa: PLC0415
+        from coldloop_optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings  # noqa: PLC0415
 
         for solver in SINGLE_PRECISION_SOLVERS:
             _make_optimizer(ProgramSettings.model_validate({"solver": solver, "arithmetic": arithmetic}))
@@ -83,9 +83,9 @@ def solvers_in(arithmetic: str) -> Callable[[], None]:
 
 def default_optimizer() -> None:
     """Make the program of the default settings."""
-    from optimizer_plc.settings import ProgramSettings  # noqa: PLC0415
+    from coldloop_optimizer_plc.settings import ProgramSettings  # noqa: PLC0415
 
-    import_module("optimizer_plc.runtime")
+    import_module("coldloop_optimizer_plc.runtime")
     _make_optimizer(ProgramSettings())
 
 
@@ -94,9 +94,9 @@ def default_solver() -> None:
 
     Kernels are the same whatever the estimator; this one takes no gains.
     """
-    from optimizer_plc import scheme  # noqa: PLC0415
-    from optimizer_plc.program import OptimizerProgram  # noqa: PLC0415
-    from optimizer_plc.settings import ProgramSettings  # noqa: PLC0415
+    from coldloop_optimizer_plc import scheme  # noqa: PLC0415
+    from coldloop_optimizer_plc.program import OptimizerProgram  # noqa: PLC0415
+    from coldloop_optimizer_plc.settings import ProgramSettings  # noqa: PLC0415
 
     class SolvesFirst(OptimizerProgram):
         def _compile_kernels(self, *_: object) -> None:
@@ -111,7 +111,7 @@ def _make_optimizer(settings: "ProgramSettings", kind: "type[OptimizerProgram] |
     from coldloop.process.limits import InputLimits  # noqa: PLC0415
     from coldloop.process.lti_model import load  # noqa: PLC0415
     from coldloop.process.settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
-    from optimizer_plc.program import OptimizerProgram  # noqa: PLC0415
+    from coldloop_optimizer_plc.program import OptimizerProgram  # noqa: PLC0415
 
     (kind or OptimizerProgram)(load(DEFAULT_MODEL_FILE), settings, InputLimits())
 
@@ -120,10 +120,10 @@ def in_one_process(**changes: Any) -> Callable[[], None]:  # noqa: ANN401 sectio
     """Return what lets a minute pass in one process: the compiled loop, and the programs for what is unusual."""
 
     def minute() -> None:
-        from rig.cosim.one_process import OneProcessRig  # noqa: PLC0415 not in the images
-        from rig.results.recording import Recorder  # noqa: PLC0415
-        from rig.runs.running import make_scenario  # noqa: PLC0415
-        from rig.settings import Settings  # noqa: PLC0415
+        from coldloop_rig.cosim.one_process import OneProcessRig  # noqa: PLC0415 not in the images
+        from coldloop_rig.results.recording import Recorder  # noqa: PLC0415
+        from coldloop_rig.runs.running import make_scenario  # noqa: PLC0415
+        from coldloop_rig.settings import Settings  # noqa: PLC0415
 
         settings = Settings.model_validate(changes)
         scenario = make_scenario(settings, 240)
@@ -135,10 +135,10 @@ def in_one_process(**changes: Any) -> Callable[[], None]:  # noqa: ANN401 sectio
 def linear_models() -> None:
     """Linearise both plants, which takes kernels of complex numbers."""
     from coldloop.process.settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
-    from optimizer_plc.qp.design import ControlDesign  # noqa: PLC0415
-    from plant.cold_box.plant_file import PlantFile  # noqa: PLC0415
-    from plant.refrigerator.model import make_refrigerator_file  # noqa: PLC0415
-    from rig.cli.model_listing import describe_model  # noqa: PLC0415 not in the images
+    from coldloop_optimizer_plc.qp.design import ControlDesign  # noqa: PLC0415
+    from coldloop_plant.cold_box.plant_file import PlantFile  # noqa: PLC0415
+    from coldloop_plant.refrigerator.model import make_refrigerator_file  # noqa: PLC0415
+    from coldloop_rig.cli.model_listing import describe_model  # noqa: PLC0415 not in the images
 
     describe_model(DEFAULT_MODEL_FILE, PlantFile(), ControlDesign())
     make_refrigerator_file()
@@ -146,24 +146,34 @@ def linear_models() -> None:
 
 def transfer_functions() -> None:
     """Let a minute of a plant of transfer functions pass."""
-    from rig import simulate  # noqa: PLC0415 not in the images
+    from coldloop_rig import simulate  # noqa: PLC0415 not in the images
 
-    import_module("rig.cosim.compiled.own_plants")  # what it registers counts in the names of kernels
+    import_module("coldloop_rig.cosim.compiled.own_plants")  # what it registers counts in the names of kernels
     simulate("a", process=ROOT / "examples" / "processes" / "wood_berry.toml", duration_s=60)
 
 
 def run_modules() -> None:
     """Import what a run needs besides kernels, so that its bytecode is written."""
     for module in (
-        "control_plc.runtime", "rig.cli", "rig.cli.commands.run", "rig.runs.running", "rig.cosim.networked_run",
-        "rig.cosim.one_process", "rig.progress", "rig.figures.worker", "rig.figures.run_plot",
+        "coldloop_control_plc.runtime", "coldloop_rig.cli", "coldloop_rig.cli.commands.run", "coldloop_rig.runs.running", "coldloop_rig.cosim.networked_run",
+        "coldloop_rig.cosim.one_process", "coldloop_rig.progress", "coldloop_rig.figures.worker", "coldloop_rig.figures.run_plot",
     ):  # fmt: skip
         import_module(module)
 
 
 def all_modules() -> None:
     """Write the bytecode of the project and of what is installed, but for tests and what is seldom imported."""
-    projects = [find_spec(name) for name in ("coldloop", "plant", "control_plc", "optimizer_plc", "hmi", "rig")]
+    projects = [
+        find_spec(name)
+        for name in (
+            "coldloop",
+            "coldloop_plant",
+            "coldloop_control_plc",
+            "coldloop_optimizer_plc",
+            "coldloop_hmi",
+            "coldloop_rig",
+        )
+    ]
     folders = [place for spec in projects if spec for place in spec.submodule_search_locations or ()]
     for folder in (*folders, sysconfig.get_path("purelib")):
         compileall.compile_dir(folder, quiet=2, rx=SELDOM)  # some packages have templates that are no Python

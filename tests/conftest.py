@@ -18,9 +18,9 @@ from _pytest.fixtures import FixtureDef
 from hypothesis import settings
 
 from coldloop.config import PREFIX
-from rig import cli
-from rig.cosim.ports import ReservedPorts
-from rig.figures.worker import FigureProcess
+from coldloop_rig import cli
+from coldloop_rig.cosim.ports import ReservedPorts
+from coldloop_rig.figures.worker import FigureProcess
 from tests.harness.budget import BudgetPlugin
 from tests.harness.lanes import USES, Lane, Watch, judge, lane_of, table
 from tests.harness.processes import Processes

@@ -10,11 +10,15 @@ from tests.harness.processes import Processes
 
 ROOT = Path(__file__).parents[1]
 SERVICES = ("plant", "control_plc", "optimizer_plc", "hmi")
-PACKAGES = {"coldloop": ROOT / "shared", **dict.fromkeys(SERVICES, ROOT / "services"), "rig": ROOT}
+PACKAGES = {
+    "coldloop": ROOT / "shared",
+    **{f"coldloop_{name}": ROOT / "services" / name for name in SERVICES},
+    "coldloop_rig": ROOT / "rig",
+}
 MAY_IMPORT = {
     "coldloop": {"coldloop"},
-    **{service: {service, "coldloop"} for service in SERVICES},
-    "rig": {"rig", "coldloop", *SERVICES},
+    **{service: {service, "coldloop"} for service in PACKAGES if service not in ("coldloop", "coldloop_rig")},
+    "coldloop_rig": set(PACKAGES),
 }
 
 
@@ -49,7 +53,7 @@ def test_a_package_imports_only_what_lies_below_it(package: str) -> None:
 
 def test_the_control_plc_runs_without_numpy_numba_and_scipy(processes: Processes) -> None:
     modules = [
-        ".".join(source.relative_to(ROOT / "services").with_suffix("").parts).removesuffix(".__init__")
+        ".".join(source.relative_to(ROOT / "services" / "control_plc").with_suffix("").parts).removesuffix(".__init__")
         for source in (ROOT / "services" / "control_plc").rglob("*.py")
     ]
     program = (
@@ -58,14 +62,23 @@ def test_the_control_plc_runs_without_numpy_numba_and_scipy(processes: Processes
         "print(*sorted({name.partition('.')[0] for name in sys.modules}))"
     )
     loaded = set(processes.run_python(program)[0].split())
-    assert "control_plc" in loaded
-    assert not loaded & {"numpy", "numba", "scipy", "osqp", "pyarrow", "plant", "optimizer_plc", "rig"}
+    assert "coldloop_control_plc" in loaded
+    assert not loaded & {
+        "numpy",
+        "numba",
+        "scipy",
+        "osqp",
+        "pyarrow",
+        "coldloop_plant",
+        "coldloop_optimizer_plc",
+        "coldloop_rig",
+    }
 
 
 def test_a_short_run_in_one_process_loads_what_it_needs_and_no_more(tmp_path: Path, processes: Processes) -> None:
     """Each of these would take as long as much of the rest; the figure is drawn by a process of its own."""
     program = (
-        "import sys\nfrom rig import cli\n"
+        "import sys\nfrom coldloop_rig import cli\n"
         f"assert cli.main(['run', '--in-process', '--duration', '2s', '--out', {str(tmp_path / 'run')!r}]) == 0\n"
         "print(*sorted({name.partition('.')[0] for name in sys.modules}), file=sys.stderr)"
     )
@@ -78,8 +91,18 @@ def test_a_short_run_in_one_process_loads_what_it_needs_and_no_more(tmp_path: Pa
 @pytest.mark.parametrize("service", ["plant", "control_plc", "optimizer_plc"])
 def test_a_service_loads_what_it_needs_and_no_more(service: str, processes: Processes) -> None:
     program = f"import sys\nsys.argv = ['{service}', '--version']\nimport runpy\nfrom contextlib import suppress\n"
-    program += f"with suppress(SystemExit): runpy.run_module('{service}', run_name='__main__')\n"
+    program += f"with suppress(SystemExit): runpy.run_module('coldloop_{service}', run_name='__main__')\n"
     program += "print(*sorted({name.partition('.')[0] for name in sys.modules}), file=sys.stderr)"
     loaded = set(processes.run_python(program)[1].split())
-    assert service in loaded
-    assert not loaded & {"pandas", "matplotlib", "pyarrow", "scipy", "rich", "aiomqtt", "cryptography", "cffi", "rig"}
+    assert f"coldloop_{service}" in loaded
+    assert not loaded & {
+        "pandas",
+        "matplotlib",
+        "pyarrow",
+        "scipy",
+        "rich",
+        "aiomqtt",
+        "cryptography",
+        "cffi",
+        "coldloop_rig",
+    }

@@ -11,9 +11,9 @@ FLOORS = {
     "shared/coldloop": [
         ["process"], ["kernels", "session"], ["registers"], ["safety", "modbus"], ["service"], ["operating"],
     ],
-    "services/plant": [["helium"], ["components"], ["cold_box"], ["refrigerator", "rack"], ["own"]],
-    "services/optimizer_plc": [["qp"], ["solvers", "rules"]],
-    "rig": [
+    "services/plant/coldloop_plant": [["helium"], ["components"], ["cold_box"], ["refrigerator", "rack"], ["own"]],
+    "services/optimizer_plc/coldloop_optimizer_plc": [["qp"], ["solvers", "rules"]],
+    "rig/coldloop_rig": [
         ["results"], ["figures", "cosim"], ["plc_sizing"], ["runs", "plc_export"], ["studies", "chaos", "process_file"],
         ["live"], ["testing", "report"], ["cli"],
     ],

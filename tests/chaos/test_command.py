@@ -11,7 +11,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from rig.chaos.plan import shipped_plans
+from coldloop_rig.chaos.plan import shipped_plans
 from tests.harness.processes import Processes
 
 if TYPE_CHECKING:
@@ -98,9 +98,9 @@ def assert_recorded_as_an_ordinary_run(coldloop: "Coldloop", out: Path, ordinary
 
 
 SOON_ON_DISK = """
-import sys, rig.results.file_sinks
-rig.results.file_sinks.GROUP_TICKS = rig.results.file_sinks.HELD_BACK_TICKS = 256
-from rig.__main__ import main
+import sys, coldloop_rig.results.file_sinks
+coldloop_rig.results.file_sinks.GROUP_TICKS = coldloop_rig.results.file_sinks.HELD_BACK_TICKS = 256
+from coldloop_rig.__main__ import main
 sys.exit(main())
 """
 """The program `coldloop`, which writes ticks in small groups: the first ones are in the file after a minute."""

@@ -4,9 +4,9 @@ import pytest
 
 from coldloop.errors import LoadFileError, UsageError
 from coldloop.process.settings import settings_of
-from rig.chaos.faults import Drop, Kill, Reset
-from rig.chaos.plan import SHIPPED, SPREAD_S, ChaosPlan, find_plan, parse_plan, shipped_plans
-from rig.process_file.making import made_from
+from coldloop_rig.chaos.faults import Drop, Kill, Reset
+from coldloop_rig.chaos.plan import SHIPPED, SPREAD_S, ChaosPlan, find_plan, parse_plan, shipped_plans
+from coldloop_rig.process_file.making import made_from
 from tests.harness.process_files import COLUMN
 
 KINDS = {

@@ -9,9 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from coldloop.config import DEFAULT, Configuration, load_configuration, to_environment
 from coldloop.errors import ConfigurationError, UsageError
-from control_plc.settings import ControlSettings
-from optimizer_plc.settings import OptimizerSettings
-from rig.settings import Settings
+from coldloop_control_plc.settings import ControlSettings
+from coldloop_optimizer_plc.settings import OptimizerSettings
+from coldloop_rig.settings import Settings
 
 Write = Callable[[str], Path]
 

@@ -7,8 +7,8 @@ import pytest
 from coldloop.config import flattened, load_configuration
 from coldloop.errors import ConfigurationError, UsageError
 from coldloop.parsing import MOST_LEVELS, parsed_json, parsed_toml
-from rig import simulate
-from rig.settings import Settings
+from coldloop_rig import simulate
+from coldloop_rig.settings import Settings
 
 Nested = Callable[[int], str]
 FORMS: tuple[Nested, ...] = (

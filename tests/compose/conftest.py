@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from rig import cli
-from rig.cosim.ports import ReservedPorts
+from coldloop_rig import cli
+from coldloop_rig.cosim.ports import ReservedPorts
 
 ROOT = Path(__file__).parents[2]
 SERVICES = ("plant", "control-plc", "optimizer-plc")
@@ -148,7 +148,7 @@ def coldloop() -> Callable[..., None]:
 
     def run(*arguments: str) -> None:
         done = subprocess.run(
-            [sys.executable, "-m", "rig", "run", *arguments], cwd=ROOT, check=False, stdin=subprocess.DEVNULL,
+            [sys.executable, "-m", "coldloop_rig", "run", *arguments], cwd=ROOT, check=False, stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=600,
         )  # fmt: skip
         if done.returncode:

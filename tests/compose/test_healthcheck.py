@@ -20,7 +20,7 @@ from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.control_plc import ControlSession
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.plant import PlantSession
-from rig.cli.certificates import Authority
+from coldloop_rig.cli.certificates import Authority
 from tests.harness.process_files import made
 from tests.harness.processes import END_S, Processes
 from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP

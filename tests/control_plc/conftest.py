@@ -12,8 +12,8 @@ from coldloop.registers.control_plc import Acknowledgement, Plan, SequenceHeader
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.registers.safety import AlarmKind, AlarmState
 from coldloop.safety.sequence import InputSequence, with_checksum
-from control_plc.program import ControlProgram, OperatingPoint
-from control_plc.settings import ControlSection
+from coldloop_control_plc.program import ControlProgram, OperatingPoint
+from coldloop_control_plc.settings import ControlSection
 from tests.harness.records import Row, as_transmitted
 
 MODEL = 0xC01D1005

@@ -12,8 +12,8 @@ from coldloop.registers.audit import EventKind
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmPriority, AlarmState
 from coldloop.registers.text import from_words
 from coldloop.service.journal import Journal
-from control_plc.alarm_settings import DEFAULT_RULES, OF_THE_PROCESS, AlarmSettings
-from control_plc.alarms import TRANSITIONS, AlarmPanel
+from coldloop_control_plc.alarm_settings import DEFAULT_RULES, OF_THE_PROCESS, AlarmSettings
+from coldloop_control_plc.alarms import TRANSITIONS, AlarmPanel
 
 KIND = AlarmKind.FIRST_BAND
 NAME = "l1_band"

@@ -14,12 +14,12 @@ from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.plant import Measurement
-from control_plc.classical import ClassicalLoops, ClassicalSettings, LevelLoop, PiController, PiSettings
-from control_plc.program import ControlProgram, make_program
-from control_plc.settings import ControlSection, ControlStrategy
-from plant.kinds import make_program as make_plant
-from plant.load import find_load
-from plant.settings import SensorSettings
+from coldloop_control_plc.classical import ClassicalLoops, ClassicalSettings, LevelLoop, PiController, PiSettings
+from coldloop_control_plc.program import ControlProgram, make_program
+from coldloop_control_plc.settings import ControlSection, ControlStrategy
+from coldloop_plant.kinds import make_program as make_plant
+from coldloop_plant.load import find_load
+from coldloop_plant.settings import SensorSettings
 from tests.harness.records import Row, as_transmitted
 
 NCR22, CV156 = 1, 2

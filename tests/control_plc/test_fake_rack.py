@@ -35,14 +35,14 @@ from coldloop.safety.lease import Lease
 from coldloop.safety.sequence import InputSequence, with_checksum
 from coldloop.service.journal import Journal
 from coldloop.session.time_base import TimeBase
-from control_plc.plant_link import PlantLink
-from control_plc.program import make_program
-from control_plc.rack_clock import PHASE, RackClock
-from control_plc.retained_state import ControlStateStore, RetainedControlState
-from control_plc.scan_cycle import ScanCycle
-from control_plc.settings import ControlSection
-from plant.rack.rack import Rack, Session
-from plant.settings import SafeAction, WatchdogSettings
+from coldloop_control_plc.plant_link import PlantLink
+from coldloop_control_plc.program import make_program
+from coldloop_control_plc.rack_clock import PHASE, RackClock
+from coldloop_control_plc.retained_state import ControlStateStore, RetainedControlState
+from coldloop_control_plc.scan_cycle import ScanCycle
+from coldloop_control_plc.settings import ControlSection
+from coldloop_plant.rack.rack import Rack, Session
+from coldloop_plant.settings import SafeAction, WatchdogSettings
 from tests.harness.records import Row, as_transmitted
 
 HEADER = read_header(DEFAULT_MODEL_FILE)

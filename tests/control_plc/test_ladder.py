@@ -13,7 +13,7 @@ from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Heartbeat, Mode, Operator, OperatorMode, Update, Verdict
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import AlarmAction, AlarmCommand, AlarmKind, AlarmState
-from control_plc.program import ControlProgram
+from coldloop_control_plc.program import ControlProgram
 from tests.control_plc.conftest import HOLD_TICKS, alarm, section
 from tests.harness.records import Row, as_transmitted
 

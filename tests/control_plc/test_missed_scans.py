@@ -12,8 +12,8 @@ from coldloop.process.limits import InputLimits
 from coldloop.registers.control_plc import LinkCause, Mode, Operator, OperatorMode, Verdict
 from coldloop.registers.safety import AlarmKind
 from coldloop.session.time_base import TimeBase
-from control_plc.guard import OutputGuard
-from control_plc.retained_state import ControlStateStore, RetainedControlState
+from coldloop_control_plc.guard import OutputGuard
+from coldloop_control_plc.retained_state import ControlStateStore, RetainedControlState
 from tests.harness.records import Row, as_transmitted
 
 if TYPE_CHECKING:

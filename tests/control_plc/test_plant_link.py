@@ -10,9 +10,9 @@ from coldloop.registers.control_plc import LinkCause, PlantLinkState
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import AlarmKind
 from coldloop.service.journal import Journal
-from control_plc.alarms import AlarmPanel
-from control_plc.plant_link import FROZEN_TICKS, PlantLink
-from control_plc.scan_cycle import cause_of
+from coldloop_control_plc.alarms import AlarmPanel
+from coldloop_control_plc.plant_link import FROZEN_TICKS, PlantLink
+from coldloop_control_plc.scan_cycle import cause_of
 
 HOLDER = 77
 U = (43.0, 75.0, 36.0)

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from coldloop.process.declaration import LAST_NUMBER
 from coldloop.process.limits import InputLimits
 from coldloop.registers.control_plc import Mode, Plan, Update, Verdict
-from control_plc.guard import OutputGuard
-from control_plc.player import SequencePlayer
+from coldloop_control_plc.guard import OutputGuard
+from coldloop_control_plc.player import SequencePlayer
 from tests.harness.records import Row, as_transmitted
 
 if TYPE_CHECKING:

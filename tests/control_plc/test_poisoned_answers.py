@@ -25,12 +25,12 @@ from coldloop.registers.plant import Measurement
 from coldloop.registers.seal import sealed_bytes
 from coldloop.safety.lease import SIMPLE_CLIENT
 from coldloop.service.journal import Journal
-from control_plc.plant_link import PlantLink
-from control_plc.program import make_program
-from control_plc.runtime import ControlPlc
-from control_plc.scan_cycle import ScanCycle
-from control_plc.settings import ControlSection, ControlSettings
-from plant.rack.outputs import AppliedOutputs
+from coldloop_control_plc.plant_link import PlantLink
+from coldloop_control_plc.program import make_program
+from coldloop_control_plc.runtime import ControlPlc
+from coldloop_control_plc.scan_cycle import ScanCycle
+from coldloop_control_plc.settings import ControlSection, ControlSettings
+from coldloop_plant.rack.outputs import AppliedOutputs
 from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP, as_transmitted, sealed
 from tests.link.poison import values_of
 

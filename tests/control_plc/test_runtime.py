@@ -32,14 +32,14 @@ from coldloop.registers.declaration import Block
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.safety.retained import RetainedFile
-from control_plc.certificate_watch import EXPIRES_SOON, UNREADABLE
-from control_plc.program import ControlProgram
-from control_plc.retained_state import OWNER
-from control_plc.runtime import ControlPlc
-from control_plc.sessions import ADOPT_AFTER_S
-from control_plc.settings import ControlSettings
-from rig.cli.certificates import Authority
-from rig.cosim.ports import ReservedPorts
+from coldloop_control_plc.certificate_watch import EXPIRES_SOON, UNREADABLE
+from coldloop_control_plc.program import ControlProgram
+from coldloop_control_plc.retained_state import OWNER
+from coldloop_control_plc.runtime import ControlPlc
+from coldloop_control_plc.sessions import ADOPT_AFTER_S
+from coldloop_control_plc.settings import ControlSettings
+from coldloop_rig.cli.certificates import Authority
+from coldloop_rig.cosim.ports import ReservedPorts
 from tests.harness.records import CONTROL_MAP, PLANT_MAP, sealed
 
 WITHIN_S = 60.0
@@ -138,7 +138,7 @@ async def test_scans_that_are_not_made_are_alarmed_from_outside_of_them(monkeypa
     ended = asyncio.Event()
     async with running(SmallRack(1)) as plc:
         monkeypatch.setattr(plc, "_scan", ended.wait)
-        monkeypatch.setattr("control_plc.rack_finder.SEARCH_S", WITHIN_S)
+        monkeypatch.setattr("coldloop_control_plc.rack_finder.SEARCH_S", WITHIN_S)
         watch = asyncio.create_task(plc.watch_scans())
         ask(plc, ControlSession(1, 1, 10.0))
         await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.SYNCHRONISED)
@@ -191,7 +191,7 @@ async def test_autostart_leaves_a_session_to_the_operator_who_is_about_to_ask_fo
 ) -> None:
     """He writes to the rack first, and then to the control PLC."""
     rack, clock = SmallRack(1), StandingClock()
-    monkeypatch.setattr("control_plc.sessions.time", clock)
+    monkeypatch.setattr("coldloop_control_plc.sessions.time", clock)
     async with running(rack, session={"autostart": True, "mode": "realtime", "factor": 50.0}) as plc:
         await until(lambda: rack.written)
         rack.begin(2)
@@ -281,7 +281,7 @@ async def test_certificates_that_cannot_be_read_for_a_while_end_nothing(
     authority = Authority.new("site", 20)
     for file, pair in ((tmp_path / "ca", authority.pair), (certificate, authority.issue_client("a", "control"))):
         file.write_bytes(pair.certificate_pem)
-    monkeypatch.setattr("control_plc.certificate_watch.PERIOD_S", 0.01)
+    monkeypatch.setattr("coldloop_control_plc.certificate_watch.PERIOD_S", 0.01)
     tls = {"certificate": certificate, "key": tmp_path / "key", "ca": tmp_path / "ca"}
     async with running(control_plc={"server": {"tls": tls}}) as plc:
         watching = asyncio.create_task(plc.certificates.run())

@@ -4,7 +4,7 @@ import pytest
 
 from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES
 from coldloop.process.settings import settings_of
-from control_plc.sensors import MOVES, SensorCheckSettings, SensorMonitor
+from coldloop_control_plc.sensors import MOVES, SensorCheckSettings, SensorMonitor
 
 REST = tuple(10.0 + place for place in range(22))
 INPUTS = (43.0, 75.0, 36.0)

@@ -27,9 +27,9 @@ from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.safety.sequence import InputSequence, with_checksum
 from coldloop.session.time_base import TimeBase
-from control_plc.program import ControlProgram, make_program
-from control_plc.retained_state import ControlStateStore, RetainedControlState
-from control_plc.settings import ControlSection
+from coldloop_control_plc.program import ControlProgram, make_program
+from coldloop_control_plc.retained_state import ControlStateStore, RetainedControlState
+from coldloop_control_plc.settings import ControlSection
 from tests.harness.records import Row, as_transmitted
 
 HEADER = read_header(DEFAULT_MODEL_FILE)

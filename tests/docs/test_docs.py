@@ -10,13 +10,13 @@ import yaml
 from pydantic import BaseModel
 
 from coldloop.process.declaration import Process
-from rig.cli import make_parser
-from rig.cli.command_listing import command_listing
-from rig.cli.commands.docs import anchor, headings
-from rig.cli.key_listing import key_listing
-from rig.cli.register_listing import FORMATS
-from rig.plc_sizing.profile import PlcProfile
-from rig.settings import Settings
+from coldloop_rig.cli import make_parser
+from coldloop_rig.cli.command_listing import command_listing
+from coldloop_rig.cli.commands.docs import anchor, headings
+from coldloop_rig.cli.key_listing import key_listing
+from coldloop_rig.cli.register_listing import FORMATS
+from coldloop_rig.plc_sizing.profile import PlcProfile
+from coldloop_rig.settings import Settings
 from tests.harness.path_options import path_table
 from tests.harness.records import MAPS
 

@@ -19,7 +19,7 @@ import pytest
 
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.control_plc import LadderStatus, Mode
-from rig import cli
+from coldloop_rig import cli
 from tests.conftest import Coldloop, draw_nothing
 from tests.harness.processes import Process, Processes
 from tests.harness.records import CONTROL_MAP

@@ -4,7 +4,7 @@ from typing import Final
 
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import LoadProfile
-from plant.load import find_load
+from coldloop_plant.load import find_load
 
 PROGRAM: Final = "optimizer_plc.program."
 NOISE: Final = ("plant.sensors.level=0.02", "plant.sensors.speed=0.5", "plant.sensors.temperature=0.02")

@@ -8,13 +8,13 @@ from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
 from coldloop.kernels.named import named
 from coldloop.process.cold_box import OUTPUT_NAMES
-from plant.components.passes import MASS
-from plant.components.phase_separator import start_account
-from plant.helium.properties import Helium, supply_cell
-from plant.numeric import RealArray
-from plant.refrigerator.equipment import EquipmentLaw, act
-from plant.refrigerator.high_pressure import FIRST
-from plant.refrigerator.physics import (
+from coldloop_plant.components.passes import MASS
+from coldloop_plant.components.phase_separator import start_account
+from coldloop_plant.helium.properties import Helium, supply_cell
+from coldloop_plant.numeric import RealArray
+from coldloop_plant.refrigerator.equipment import EquipmentLaw, act
+from coldloop_plant.refrigerator.high_pressure import FIRST
+from coldloop_plant.refrigerator.physics import (
     COIL,
     SIGNAL_NAMES,
     Refrigerator,

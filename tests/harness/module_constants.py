@@ -14,16 +14,18 @@ from pathlib import Path
 from types import ModuleType
 
 import coldloop
-import control_plc
-import hmi
-import optimizer_plc
-import plant
-import rig
+import coldloop_control_plc
+import coldloop_hmi
+import coldloop_optimizer_plc
+import coldloop_plant
+import coldloop_rig
 from coldloop.process.declaration import Process
 from coldloop.process.settings import ProcessSettings, settings_of
-from rig.process_file.reading import read_process_file
+from coldloop_rig.process_file.reading import read_process_file
 
-PACKAGES = (coldloop, control_plc, hmi, optimizer_plc, plant, rig)
+PACKAGES = (
+    coldloop, coldloop_control_plc, coldloop_hmi, coldloop_optimizer_plc, coldloop_plant, coldloop_rig,
+)  # fmt: skip
 RANDOM = "NOBODYS_HASH"
 PLAIN = (bool, int, float, str, tuple, list, dict, set, frozenset, ProcessSettings, Process)
 ADDRESS = re.compile(" at 0x[0-9a-f]+")

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from rig.cli import COMMANDS, USES, make_parser
-from rig.cli.command_listing import _subparsers
-from rig.text_tables import markdown_table
+from coldloop_rig.cli import COMMANDS, USES, make_parser
+from coldloop_rig.cli.command_listing import _subparsers
+from coldloop_rig.text_tables import markdown_table
 
 REFUSED: Final = "not a regular file"
 HEADER: Final = (

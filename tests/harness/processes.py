@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 from pydantic import BaseModel
 
 from coldloop.config import PREFIX, to_environment
-from rig.cosim.ports import ReservedPorts
+from coldloop_rig.cosim.ports import ReservedPorts
 
 END_S: Final = 60.0
 """A process that is told to end has failed when it takes longer; the machine may be busy with something else."""
@@ -132,7 +132,7 @@ class Processes:
         port = self.free_port() if port is None else port
         place = f"{name}.port" if name == "hmi" else f"{name}.server.port"
         chosen = [f"--set={text}" for text in (f"{place}={port}", *assignments)]
-        words = [sys.executable, "-m", name, "--log-level", level, *chosen]
+        words = [sys.executable, "-m", f"coldloop_{name}", "--log-level", level, *chosen]
         return self._start(words, f"{name}-{port}", port=port, env=environment(settings), stderr=stderr)
 
     def coldloop(
@@ -140,7 +140,7 @@ class Processes:
         more: Mapping[str, str] | None = None,
     ) -> Process:  # fmt: skip
         """Start `coldloop` with arguments."""
-        words = [sys.executable, "-m", "rig", *map(str, arguments)]
+        words = [sys.executable, "-m", "coldloop_rig", *map(str, arguments)]
         return self._start(words, "coldloop", env=environment(more=more), cwd=cwd, stdout=stdout, stderr=stderr)
 
     def python(

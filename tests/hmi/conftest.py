@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import pytest
 
-from hmi.users import PageRole, write_user
-from rig import cli
-from rig.figures.worker import FigureProcess
-from rig.settings import Settings
+from coldloop_hmi.users import PageRole, write_user
+from coldloop_rig import cli
+from coldloop_rig.figures.worker import FigureProcess
+from coldloop_rig.settings import Settings
 from tests.harness.processes import END_S, Process, Processes
 from tests.harness.waiting import PATIENCE_S, eventually
 

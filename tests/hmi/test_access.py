@@ -20,7 +20,7 @@ from coldloop.errors import ConfigurationError, UsageError
 from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.settings import TlsSettings
 from coldloop.process.cold_box import COLD_BOX
-from hmi.access import (
+from coldloop_hmi.access import (
     LOGIN_BURST,
     LOGINS_A_MINUTE,
     PASSWORD_BURST,
@@ -33,15 +33,15 @@ from hmi.access import (
     is_own_origin,
     port_of,
 )
-from hmi.audit import Audit
-from hmi.connections import Connections
-from hmi.guard import Guard, told_in_a_line
-from hmi.page_server import PageServer, PageSite
-from hmi.process_image import Model
-from hmi.settings import HmiSection, LoginSettings
-from hmi.users import PageRole, User, Users, hash_password, write_user
-from rig.cosim.endpoints import RigEndpoints
-from rig.live.page_process import pointed_at
+from coldloop_hmi.audit import Audit
+from coldloop_hmi.connections import Connections
+from coldloop_hmi.guard import Guard, told_in_a_line
+from coldloop_hmi.page_server import PageServer, PageSite
+from coldloop_hmi.process_image import Model
+from coldloop_hmi.settings import HmiSection, LoginSettings
+from coldloop_hmi.users import PageRole, User, Users, hash_password, write_user
+from coldloop_rig.cosim.endpoints import RigEndpoints
+from coldloop_rig.live.page_process import pointed_at
 from tests.hmi.conftest import OPERATOR, VIEWER, Clock, Site
 
 WHOLE_HASH = hash_password("a long password")

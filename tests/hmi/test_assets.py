@@ -11,9 +11,9 @@ from contextlib import asynccontextmanager
 import aiohttp
 
 from coldloop.process.cold_box import COLD_BOX
-from hmi.page_server import PageServer, PageSite
-from hmi.process_image import Model
-from hmi.settings import HmiSection
+from coldloop_hmi.page_server import PageServer, PageSite
+from coldloop_hmi.process_image import Model
+from coldloop_hmi.settings import HmiSection
 from tests.hmi.conftest import Clock
 
 PLAIN, GZIP = {"Accept-Encoding": "identity"}, {"Accept-Encoding": "gzip, br"}

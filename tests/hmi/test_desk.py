@@ -26,9 +26,9 @@ from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.plant import LoadAhead, LoadStatus
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.service.journal import Journal
-from control_plc.alarms import AlarmPanel
-from hmi.operator_desk import CONFIRM_WITHIN_S, CommandResult, OperatorDesk, PremisesChangedError
-from hmi.process_image import Model
+from coldloop_control_plc.alarms import AlarmPanel
+from coldloop_hmi.operator_desk import CONFIRM_WITHIN_S, CommandResult, OperatorDesk, PremisesChangedError
+from coldloop_hmi.process_image import Model
 from tests.harness.records import MAPS
 from tests.hmi.conftest import Clock
 

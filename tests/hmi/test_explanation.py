@@ -18,10 +18,10 @@ from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, T5
 from coldloop.registers.codec import blank
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, UpdatingRuleKind, UpdatingRuleStatus
-from hmi import explanation, sentences
-from hmi.explanation import Branch, Explanation, increments_of
-from hmi.sentences import sentence
-from optimizer_plc.rules import Algorithm1, Observation, algorithm_1, assess
+from coldloop_hmi import explanation, sentences
+from coldloop_hmi.explanation import Branch, Explanation, increments_of
+from coldloop_hmi.sentences import sentence
+from coldloop_optimizer_plc.rules import Algorithm1, Observation, algorithm_1, assess
 from tests.harness.records import MAPS, as_transmitted
 
 getcontext().prec = 40

@@ -17,16 +17,16 @@ from coldloop.registers.control_plc import LadderStatus, Mode, Plan, ProcessNow
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmPriority, AlarmState
 from coldloop.service.metrics import exposition
-from hmi.access import Party
-from hmi.broadcast import WAITING, Broadcast
-from hmi.documents import MOST_MARKS, alarms_document, catalog, encoded, state_document, trend_document
-from hmi.page_metrics import page_families
-from hmi.polling import Poller
-from hmi.process_image import STALE_S, JournalEntry, Model
-from hmi.reading import safe_cell
-from hmi.signals import signals_of, words_in
-from hmi.trends import MOST_ROWS, TrendStore, thin
-from rig.process_file.making import made_from
+from coldloop_hmi.access import Party
+from coldloop_hmi.broadcast import WAITING, Broadcast
+from coldloop_hmi.documents import MOST_MARKS, alarms_document, catalog, encoded, state_document, trend_document
+from coldloop_hmi.page_metrics import page_families
+from coldloop_hmi.polling import Poller
+from coldloop_hmi.process_image import STALE_S, JournalEntry, Model
+from coldloop_hmi.reading import safe_cell
+from coldloop_hmi.signals import signals_of, words_in
+from coldloop_hmi.trends import MOST_ROWS, TrendStore, thin
+from coldloop_rig.process_file.making import made_from
 from tests.harness.process_files import COLUMN
 from tests.harness.records import MAPS
 from tests.hmi.conftest import Clock

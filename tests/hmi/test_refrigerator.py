@@ -12,10 +12,10 @@ import pytest
 from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES
 from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
 from coldloop.registers.plant import StationAlarm, StationStatus
-from hmi.assets import STATIC
-from hmi.compression_station import plant_document
-from hmi.process_image import Model
-from hmi.signals import signals_of
+from coldloop_hmi.assets import STATIC
+from coldloop_hmi.compression_station import plant_document
+from coldloop_hmi.process_image import Model
+from coldloop_hmi.signals import signals_of
 from tests.harness.records import MAPS
 from tests.harness.waiting import eventually
 from tests.hmi.conftest import Served, Site, opened, record, write_registers

@@ -14,12 +14,12 @@ import pytest
 
 from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind
-from hmi.explanation import Branch
-from hmi.process_image import JournalEntry, Model
-from hmi.quality import SOUND
-from hmi.replay import Replay
-from rig.live.recorded_page import RecordedPage
-from rig.results.run_folder import RunFolder
+from coldloop_hmi.explanation import Branch
+from coldloop_hmi.process_image import JournalEntry, Model
+from coldloop_hmi.quality import SOUND
+from coldloop_hmi.replay import Replay
+from coldloop_rig.live.recorded_page import RecordedPage
+from coldloop_rig.results.run_folder import RunFolder
 from tests.conftest import Coldloop
 from tests.harness.processes import END_S, Processes
 from tests.harness.waiting import eventually

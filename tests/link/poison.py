@@ -10,7 +10,7 @@ from typing import Any, Final
 from coldloop.registers.codec import RecordCodec, codec_of
 from coldloop.registers.declaration import Block, Field, Kind, RegisterMap
 from coldloop.registers.seal import Seal, seal_of, sealed_bytes
-from rig.chaos.faults import Direction
+from coldloop_rig.chaos.faults import Direction
 from tests.harness.records import map_of
 
 READS: Final = (3, 23)

@@ -12,8 +12,8 @@ from typing import Any, Final
 
 import pytest
 
-from rig.cosim.wiring import SERVICES
-from rig.settings import Settings
+from coldloop_rig.cosim.wiring import SERVICES
+from coldloop_rig.settings import Settings
 from tests.harness.processes import Ended, Process, Processes
 from tests.harness.records import MAPS
 from tests.harness.treated_link import TreatedLink

@@ -25,7 +25,7 @@ from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap, Role
-from rig.cli.certificates import Authority, Pair
+from coldloop_rig.cli.certificates import Authority, Pair
 from tests.harness.records import PLANT_MAP
 
 PATIENCE_S = 100.0

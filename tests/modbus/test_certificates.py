@@ -14,7 +14,7 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.settings import TlsSettings
 from coldloop.modbus.tls import certificate_days_left, first_expiry, server_context
-from rig.cli.certificates import Authority, Pair, revoked_now
+from coldloop_rig.cli.certificates import Authority, Pair, revoked_now
 from tests.harness.records import CONTROL_MAP
 
 if TYPE_CHECKING:

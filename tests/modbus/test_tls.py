@@ -15,7 +15,7 @@ from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.settings import TlsSettings
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import AwaitUpdate, Grant, SequenceRow
-from rig.cli.certificates import Authority
+from coldloop_rig.cli.certificates import Authority
 from tests.harness.records import CONTROL_MAP
 
 if TYPE_CHECKING:

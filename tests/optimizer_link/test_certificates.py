@@ -8,9 +8,9 @@ import pytest
 
 from coldloop.modbus.settings import TlsSettings
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
-from optimizer_plc.runtime import OptimizerPlc
-from optimizer_plc.settings import OptimizerSettings
-from rig.cli.certificates import Authority, Pair
+from coldloop_optimizer_plc.runtime import OptimizerPlc
+from coldloop_optimizer_plc.settings import OptimizerSettings
+from coldloop_rig.cli.certificates import Authority, Pair
 
 if TYPE_CHECKING:
     from tests.optimizer_link.conftest import Listen, PlayedControlPlc, Until

@@ -14,7 +14,7 @@ from coldloop.registers.bank import Caller
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import AwaitUpdate, Verdict
 from coldloop.registers.optimizer_plc import ControlLinkState, Optimization, OptimizerSession
-from optimizer_plc.runtime import SHORTEST_WAIT_S
+from coldloop_optimizer_plc.runtime import SHORTEST_WAIT_S
 from tests.harness.records import OPTIMIZER_MAP
 
 if TYPE_CHECKING:

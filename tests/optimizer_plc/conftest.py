@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import optimizer_plc.program
+import coldloop_optimizer_plc.program
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel, load
@@ -17,18 +17,18 @@ from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.plant import Measurement
 from coldloop.safety.sequence import InputSequence
-from control_plc.program import make_program
-from control_plc.settings import ControlSection
-from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.qp.design import ControlDesign
-from optimizer_plc.qp.penalties import Preset
-from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
-from optimizer_plc.settings import ProgramSettings
-from optimizer_plc.solvers import Answer, Solver, make_solver
-from plant.cold_box.plant_file import REFERENCE
-from plant.cold_box.program import ColdBoxProgram
-from plant.load import find_load
+from coldloop_control_plc.program import make_program
+from coldloop_control_plc.settings import ControlSection
+from coldloop_optimizer_plc.program import OptimizerProgram
+from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.prediction import PredictionModel
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
+from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.solvers import Answer, Solver, make_solver
+from coldloop_plant.cold_box.plant_file import REFERENCE
+from coldloop_plant.cold_box.program import ColdBoxProgram
+from coldloop_plant.load import find_load
 from tests.harness.records import as_transmitted
 from tests.harness.reference_qp import solved_by_daqp
 
@@ -121,7 +121,7 @@ def recorded_jumps(model: LtiModel, hour: str, minutes: float) -> list[Jump]:
     """Run the closed loop at an updating period of 5 s; return what followed each load jump of more than 40 W."""
     recorder = Recorder(make_solver(ProgramSettings(preset=Preset.PAPER)))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(optimizer_plc.program, "make_solver", lambda _settings: recorder)
+        patch.setattr(coldloop_optimizer_plc.program, "make_solver", lambda _settings: recorder)
         settings = ProgramSettings(preset=Preset.PAPER, updating_period_s=5.0)
         optimizer = OptimizerProgram(model, settings, InputLimits())
     control = make_program(read_header(DEFAULT_MODEL_FILE), ControlSection(), InputLimits())

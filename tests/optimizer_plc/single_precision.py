@@ -14,20 +14,20 @@ from typing import Any
 import numba
 from numba.core.dispatcher import Dispatcher
 
-import optimizer_plc
+import coldloop_optimizer_plc
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.control_plc import Update, Verdict
-from optimizer_plc.computing_settings import Arithmetic, EstimatorKind, EstimatorSettings
-from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.settings import ProgramSettings, SolverName
+from coldloop_optimizer_plc.computing_settings import Arithmetic, EstimatorKind, EstimatorSettings
+from coldloop_optimizer_plc.program import OptimizerProgram
+from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
 
 
 def kernels() -> dict[str, Dispatcher]:
     """Return all kernels of the optimiser by module and name."""
     found = {}
-    for info in pkgutil.walk_packages(optimizer_plc.__path__, "optimizer_plc."):
+    for info in pkgutil.walk_packages(coldloop_optimizer_plc.__path__, "coldloop_optimizer_plc."):
         if not info.name.endswith("__main__"):
             module = importlib.import_module(info.name)
             here = [value for value in vars(module).values() if isinstance(value, Dispatcher)]

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
-from optimizer_plc.computing_settings import Arithmetic, EstimatorKind, OdeSettings
-from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.qp.arithmetic import real_of
-from optimizer_plc.qp.costs import augmented_cost
-from optimizer_plc.qp.penalties import Preset
-from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
-from optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings
-from optimizer_plc.solvers.ode import ode_solver
+from coldloop_optimizer_plc.computing_settings import Arithmetic, EstimatorKind, OdeSettings
+from coldloop_optimizer_plc.program import OptimizerProgram
+from coldloop_optimizer_plc.qp.arithmetic import real_of
+from coldloop_optimizer_plc.qp.costs import augmented_cost
+from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
+from coldloop_optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings
+from coldloop_optimizer_plc.solvers.ode import ode_solver
 from tests.harness.processes import Processes
 from tests.optimizer_plc.single_precision import code, has_double
 
@@ -43,7 +43,9 @@ def test_no_kernel_computes_with_a_double_in_single_precision(processes: Process
     called, faults = json.loads(processes.run_python(program)[0])
     assert not faults
     assert set(called) >= {f"optimizer_plc.{name}" for name in ON_LINE}
-    assert called.count("optimizer_plc.scheme.solve") == len({solver for solver, _ in cases}), "one method a solver"
+    assert called.count("coldloop_optimizer_plc.scheme.solve") == len({solver for solver, _ in cases}), (
+        "one method a solver"
+    )
 
 
 @numba.njit

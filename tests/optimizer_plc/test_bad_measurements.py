@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from coldloop.process.cold_box import L1, OUTPUT_NAMES
 from coldloop.process.lti_model import LtiModel
-from optimizer_plc.computing_settings import Arithmetic, EstimatorKind, EstimatorSettings
-from optimizer_plc.estimator import (
+from coldloop_optimizer_plc.computing_settings import Arithmetic, EstimatorKind, EstimatorSettings
+from coldloop_optimizer_plc.estimator import (
     Belief,
     Estimator,
     correct,
@@ -21,10 +21,10 @@ from optimizer_plc.estimator import (
     no_belief,
     stationary_gains,
 )
-from optimizer_plc.plausibility import imputed, note_surprise
-from optimizer_plc.qp.arithmetic import DOUBLE, Real, real_of
-from optimizer_plc.qp.linear_algebra import add_transposed_product, respond
-from optimizer_plc.qp.prediction import PredictionModel
+from coldloop_optimizer_plc.plausibility import imputed, note_surprise
+from coldloop_optimizer_plc.qp.arithmetic import DOUBLE, Real, real_of
+from coldloop_optimizer_plc.qp.linear_algebra import add_transposed_product, respond
+from coldloop_optimizer_plc.qp.prediction import PredictionModel
 
 Array = NDArray[np.float64]
 

@@ -5,13 +5,13 @@ import pytest
 from pydantic import ValidationError
 
 from coldloop.process.limits import InputLimits
-from optimizer_plc.qp.costs import indicators
-from optimizer_plc.qp.design import ControlDesign
-from optimizer_plc.qp.penalties import Preset
-from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
-from optimizer_plc.settings import ProgramSettings
-from rig import simulate
+from coldloop_optimizer_plc.qp.costs import indicators
+from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.prediction import PredictionModel
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
+from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_rig import simulate
 
 LIMITS = InputLimits()
 

@@ -18,7 +18,7 @@ from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
 from coldloop.service.journal import Journal
-from optimizer_plc.control_link import REPEAT_S, ControlLink
+from coldloop_optimizer_plc.control_link import REPEAT_S, ControlLink
 
 S = ControlLinkState
 BUSY = RequestRefusedError("another client holds the lease", 6)

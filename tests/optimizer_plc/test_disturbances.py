@@ -14,8 +14,8 @@ from coldloop.errors import ConfigurationError
 from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, T5
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
-from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, signals_of
-from optimizer_plc.estimator import (
+from coldloop_optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, signals_of
+from coldloop_optimizer_plc.estimator import (
     begin_prediction,
     check_detectability,
     correct,
@@ -24,12 +24,12 @@ from optimizer_plc.estimator import (
     predict,
     stationary_gains,
 )
-from optimizer_plc.qp.design import ControlDesign
-from optimizer_plc.qp.linear_algebra import respond
-from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
-from rig import simulate
-from rig.testing import LiveRig, up
+from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.qp.linear_algebra import respond
+from coldloop_optimizer_plc.qp.prediction import PredictionModel
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
+from coldloop_rig import simulate
+from coldloop_rig.testing import LiveRig, up
 
 Array = NDArray[np.float64]
 

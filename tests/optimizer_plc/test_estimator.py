@@ -11,13 +11,13 @@ from coldloop.process.cold_box import L1
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Update
-from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, NoiseReference
-from optimizer_plc.estimator import begin_at_rest, begin_prediction, correct, estimator_of, no_belief, predict
-from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.qp.linear_algebra import respond
-from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.rest import rest_map
-from optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, NoiseReference
+from coldloop_optimizer_plc.estimator import begin_at_rest, begin_prediction, correct, estimator_of, no_belief, predict
+from coldloop_optimizer_plc.program import OptimizerProgram
+from coldloop_optimizer_plc.qp.linear_algebra import respond
+from coldloop_optimizer_plc.qp.prediction import PredictionModel
+from coldloop_optimizer_plc.qp.rest import rest_map
+from coldloop_optimizer_plc.settings import ProgramSettings
 
 Array = NDArray[np.float64]
 

@@ -10,15 +10,15 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.sections import Forecast
 from coldloop.process.settings import settings_of
-from optimizer_plc.computing_settings import EstimatorSettings
-from optimizer_plc.estimator import estimator_of
-from optimizer_plc.forecasts import Forecasts
-from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.qp.condensing import condense
-from optimizer_plc.qp.design import ControlDesign
-from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.profile import interpolation
-from optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.computing_settings import EstimatorSettings
+from coldloop_optimizer_plc.estimator import estimator_of
+from coldloop_optimizer_plc.forecasts import Forecasts
+from coldloop_optimizer_plc.program import OptimizerProgram
+from coldloop_optimizer_plc.qp.condensing import condense
+from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.qp.prediction import PredictionModel
+from coldloop_optimizer_plc.qp.profile import interpolation
+from coldloop_optimizer_plc.settings import ProgramSettings
 
 DESIGN = ControlDesign()
 WEIGHTS = interpolation(DESIGN.decision_instants, np.arange(1.0, DESIGN.horizon + 1))

@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
-from optimizer_plc.qp.penalties import Preset
-from optimizer_plc.qp.problem import PredictiveProblem
-from optimizer_plc.settings import ProgramSettings, SolverName
-from optimizer_plc.solvers import Answer, Solver, hybrid, make_solver
-from optimizer_plc.solvers.hybrid import (
+from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem
+from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
+from coldloop_optimizer_plc.solvers import Answer, Solver, hybrid, make_solver
+from coldloop_optimizer_plc.solvers.hybrid import (
     HybridMethod,
     allowed_in,
     in_slots,
@@ -22,8 +22,8 @@ from optimizer_plc.solvers.hybrid import (
     picoseconds,
     slots_begun,
 )
-from optimizer_plc.solvers.interface import Costs
-from optimizer_plc.solvers.kernel_solver import KERNELS
+from coldloop_optimizer_plc.solvers.interface import Costs
+from coldloop_optimizer_plc.solvers.kernel_solver import KERNELS
 
 if TYPE_CHECKING:
     from tests.optimizer_plc.conftest import Jump, Situations

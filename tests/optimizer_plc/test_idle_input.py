@@ -8,8 +8,8 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Plan, Update
 from coldloop.safety.sequence import InputSequence
-from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.settings import ProgramSettings, SolverName
+from coldloop_optimizer_plc.program import OptimizerProgram
+from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
 
 P5, P6, T5 = (OUTPUT_NAMES.index(name) for name in ("P5", "P6", "T5"))
 CV156 = INPUT_NAMES.index("CV156")

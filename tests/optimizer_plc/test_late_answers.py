@@ -9,11 +9,11 @@ from coldloop.process.cold_box import TICK_S, TICKS_PER_SAMPLE
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Update, Verdict
-from optimizer_plc.budget import PlcBudget
-from optimizer_plc.decisions import PROVEN
-from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.scheme import shortest_sequence
-from optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.budget import PlcBudget
+from coldloop_optimizer_plc.decisions import PROVEN
+from coldloop_optimizer_plc.program import OptimizerProgram
+from coldloop_optimizer_plc.scheme import shortest_sequence
+from coldloop_optimizer_plc.settings import ProgramSettings
 
 
 def period(program: OptimizerProgram, model: LtiModel) -> int:

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from optimizer_plc.qp.linear_algebra import (
+from coldloop_optimizer_plc.qp.linear_algebra import (
     add_product,
     add_transposed_product,
     by_columns,

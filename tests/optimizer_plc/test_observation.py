@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import optimizer_plc.program
+import coldloop_optimizer_plc.program
 from coldloop.kernels.compiled import kernel
 from coldloop.process.cold_box import TICK_S
 from coldloop.process.limits import InputLimits
@@ -20,14 +20,14 @@ from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Plan, Update
 from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
 from coldloop.safety.sequence import InputSequence
-from optimizer_plc import solvers
-from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings
-from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.qp.penalties import Preset
-from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
-from optimizer_plc.rules import Assessment, Observation
-from optimizer_plc.rules.interface import decides_by
-from optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc import solvers
+from coldloop_optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings
+from coldloop_optimizer_plc.program import OptimizerProgram
+from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
+from coldloop_optimizer_plc.rules import Assessment, Observation
+from coldloop_optimizer_plc.rules.interface import decides_by
+from coldloop_optimizer_plc.settings import ProgramSettings
 
 pytestmark = pytest.mark.usefixtures("compiles")
 
@@ -102,8 +102,8 @@ class Bench:
     def __init__(self, model: LtiModel, problem: PredictiveProblem, monkeypatch: pytest.MonkeyPatch) -> None:
         self.rule = NotingRule(np.zeros(1, np.int64), np.zeros((20, 8)))
         self.model, self.problem = model, problem
-        monkeypatch.setattr(optimizer_plc.program, "make_rule", lambda *_: self.rule)
-        monkeypatch.setattr(optimizer_plc.program, "make_solver", lambda _: KnownSolver())
+        monkeypatch.setattr(coldloop_optimizer_plc.program, "make_rule", lambda *_: self.rule)
+        monkeypatch.setattr(coldloop_optimizer_plc.program, "make_solver", lambda _: KnownSolver())
         settings = ProgramSettings(
             preset=Preset.PAPER, interrupting_load_step_w=10.0,
             estimator=EstimatorSettings(kind=EstimatorKind.STATE_FEEDBACK),

@@ -6,10 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from optimizer_plc.computing_settings import OdeSettings
-from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
-from optimizer_plc.solvers import KernelSolver
-from optimizer_plc.solvers.ode import ode_solver
+from coldloop_optimizer_plc.computing_settings import OdeSettings
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
+from coldloop_optimizer_plc.solvers import KernelSolver
+from coldloop_optimizer_plc.solvers.ode import ode_solver
 
 if TYPE_CHECKING:
     from tests.optimizer_plc.conftest import Jump, PenalisedOptimum, Situations

@@ -8,15 +8,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from optimizer_plc.computing_settings import OdeSettings
-from optimizer_plc.qp import costs, linear_algebra
-from optimizer_plc.qp.penalties import PenaltySettings
-from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
-from optimizer_plc.settings import SolverName
-from optimizer_plc.solvers import fast_gradient, interior_point, ode
-from optimizer_plc.solvers.ode import flow_in
-from rig.plc_sizing import operations
-from rig.plc_sizing.reference_plc import (
+from coldloop_optimizer_plc.computing_settings import OdeSettings
+from coldloop_optimizer_plc.qp import costs, linear_algebra
+from coldloop_optimizer_plc.qp.penalties import PenaltySettings
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
+from coldloop_optimizer_plc.settings import SolverName
+from coldloop_optimizer_plc.solvers import fast_gradient, interior_point, ode
+from coldloop_optimizer_plc.solvers.ode import flow_in
+from coldloop_rig.plc_sizing import operations
+from coldloop_rig.plc_sizing.reference_plc import (
     ACTIVE_ROWS,
     QPOASES_ON_LAPTOP_S,
     cholesky_times,
@@ -24,8 +24,8 @@ from rig.plc_sizing.reference_plc import (
     residuals,
     slow_down,
 )
-from rig.plc_sizing.sizes import Pattern, QpSizes, dense_sizes, sizes_without_zeros
-from rig.plc_sizing.solver_counts import SOLVERS
+from coldloop_rig.plc_sizing.sizes import Pattern, QpSizes, dense_sizes, sizes_without_zeros
+from coldloop_rig.plc_sizing.solver_counts import SOLVERS
 
 
 class Counted:

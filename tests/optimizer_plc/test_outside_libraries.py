@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from coldloop.errors import ConfigurationError
-from optimizer_plc import entry_points
-from optimizer_plc.computing_settings import DaqpSettings, OutsideSettings
-from optimizer_plc.entry_points import Part, made
-from optimizer_plc.qp.problem import QuadraticProblem
-from optimizer_plc.solvers.daqp import DaqpSolver
-from optimizer_plc.solvers.outside import OutsideSolver
-from optimizer_plc.solvers.outside_libraries import softened
-from rig.settings import Settings
-from rig.testing.conformance import problems_of, requirements
+from coldloop_optimizer_plc import entry_points
+from coldloop_optimizer_plc.computing_settings import DaqpSettings, OutsideSettings
+from coldloop_optimizer_plc.entry_points import Part, made
+from coldloop_optimizer_plc.qp.problem import QuadraticProblem
+from coldloop_optimizer_plc.solvers.daqp import DaqpSolver
+from coldloop_optimizer_plc.solvers.outside import OutsideSolver
+from coldloop_optimizer_plc.solvers.outside_libraries import softened
+from coldloop_rig.settings import Settings
+from coldloop_rig.testing.conformance import problems_of, requirements
 
 PROJECT: Final = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 POINTS: Final[dict[str, str]] = PROJECT["entry-points"]["coldloop.solvers"]

@@ -19,26 +19,26 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Plan, Update
 from coldloop.registers.optimizer_plc import UpdatingRuleKind
-from optimizer_plc import entry_points
-from optimizer_plc.budget import BudgetSettings, PlcBudget
-from optimizer_plc.computing_settings import OutsideSettings
-from optimizer_plc.estimator import no_belief
-from optimizer_plc.outside_estimator import Measured, OutsideEstimator, PlantModel
-from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.problem import QuadraticProblem
-from optimizer_plc.rules import Assessment, Observation, assess
-from optimizer_plc.rules.outside import OutsideRule
-from optimizer_plc.settings import ProgramSettings
-from optimizer_plc.solvers.outside import OutsideSolver
-from rig.settings import Settings
-from rig.testing.conformance import problems_of, requirements
-from rig.testing.estimator_conformance import estimator_requirements
-from rig.testing.rule_conformance import rule_requirements
+from coldloop_optimizer_plc import entry_points
+from coldloop_optimizer_plc.budget import BudgetSettings, PlcBudget
+from coldloop_optimizer_plc.computing_settings import OutsideSettings
+from coldloop_optimizer_plc.estimator import no_belief
+from coldloop_optimizer_plc.outside_estimator import Measured, OutsideEstimator, PlantModel
+from coldloop_optimizer_plc.program import OptimizerProgram
+from coldloop_optimizer_plc.qp.prediction import PredictionModel
+from coldloop_optimizer_plc.qp.problem import QuadraticProblem
+from coldloop_optimizer_plc.rules import Assessment, Observation, assess
+from coldloop_optimizer_plc.rules.outside import OutsideRule
+from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.solvers.outside import OutsideSolver
+from coldloop_rig.settings import Settings
+from coldloop_rig.testing.conformance import problems_of, requirements
+from coldloop_rig.testing.estimator_conformance import estimator_requirements
+from coldloop_rig.testing.rule_conformance import rule_requirements
 from tests.harness.processes import PROGRAM_S, Processes
 
 if TYPE_CHECKING:
-    from optimizer_plc.estimator import Estimator
+    from coldloop_optimizer_plc.estimator import Estimator
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "outside_package"
 Array = NDArray[np.float64]
@@ -393,7 +393,7 @@ def test_the_example_is_installed_and_runs_with_no_edit_here(processes: Processe
     assert hashes[::2] == hashes[1::2]
     assert len(set(hashes)) == 3
     for words in (("scaled-gradient",), ("trust", "rule"), ("running-covariance", "estimator")):
-        conformance = ("-m", "rig.testing.conformance", *words)
+        conformance = ("-m", "coldloop_rig.testing.conformance", *words)
         report = processes.python(*conformance, more=beside, **pipes).ended(PROGRAM_S)
         assert report.code == 0, report.out + report.err
 

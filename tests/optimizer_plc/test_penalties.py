@@ -8,20 +8,20 @@ from pydantic import ValidationError
 
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.limits import InputLimits
-from optimizer_plc.computing_settings import (
+from coldloop_optimizer_plc.computing_settings import (
     PENALTY_WEIGHT,
     EstimatorKind,
     EstimatorSettings,
     OdeSettings,
     PlausibilitySettings,
 )
-from optimizer_plc.qp.costs import augmented_cost, indicators
-from optimizer_plc.qp.design import ControlDesign
-from optimizer_plc.qp.penalties import PenaltySettings, Preset, presets_of
-from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
-from optimizer_plc.settings import ProgramSettings
-from optimizer_plc.solvers.ode import ode_solver
+from coldloop_optimizer_plc.qp.costs import augmented_cost, indicators
+from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.qp.penalties import PenaltySettings, Preset, presets_of
+from coldloop_optimizer_plc.qp.prediction import PredictionModel
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
+from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.solvers.ode import ode_solver
 
 if TYPE_CHECKING:
     from tests.optimizer_plc.conftest import Optimum, PenalisedOptimum, Situations

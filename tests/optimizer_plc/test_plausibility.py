@@ -5,14 +5,22 @@ import pytest
 from numpy.typing import NDArray
 
 from coldloop.process.cold_box import L1, OUTPUT_NAMES, OUTPUT_UNITS, T5, TICK_S
-from optimizer_plc.computing_settings import Arithmetic, PlausibilitySettings
-from optimizer_plc.estimator import Belief, Estimator, begin_prediction, correct, estimator_of, no_belief, predict
-from optimizer_plc.plausibility import MISSING, USED, new_readings, suspects_of, wanders_off
-from optimizer_plc.qp.arithmetic import DOUBLE, Real, real_of
-from optimizer_plc.qp.linear_algebra import respond
-from optimizer_plc.qp.penalties import Preset
-from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.computing_settings import Arithmetic, PlausibilitySettings
+from coldloop_optimizer_plc.estimator import (
+    Belief,
+    Estimator,
+    begin_prediction,
+    correct,
+    estimator_of,
+    no_belief,
+    predict,
+)
+from coldloop_optimizer_plc.plausibility import MISSING, USED, new_readings, suspects_of, wanders_off
+from coldloop_optimizer_plc.qp.arithmetic import DOUBLE, Real, real_of
+from coldloop_optimizer_plc.qp.linear_algebra import respond
+from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.prediction import PredictionModel
+from coldloop_optimizer_plc.settings import ProgramSettings
 
 Array = NDArray[np.float64]
 

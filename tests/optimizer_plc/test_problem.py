@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from coldloop.process.cold_box import L1, T5
 from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.lti_model import LtiModel
-from optimizer_plc.qp import costs
-from optimizer_plc.qp.costs import augmented_cost, indicators, matrices_of, quadratic_cost
-from optimizer_plc.qp.design import ControlDesign, trivial_design
-from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
+from coldloop_optimizer_plc.qp import costs
+from coldloop_optimizer_plc.qp.costs import augmented_cost, indicators, matrices_of, quadratic_cost
+from coldloop_optimizer_plc.qp.design import ControlDesign, trivial_design
+from coldloop_optimizer_plc.qp.prediction import PredictionModel
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 
 if TYPE_CHECKING:
     from tests.optimizer_plc.conftest import Optimum, Situations

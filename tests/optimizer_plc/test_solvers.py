@@ -13,19 +13,19 @@ from coldloop.errors import ConfigurationError
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Verdict
-from optimizer_plc.computing_settings import FastGradientSettings, InteriorPointSettings, QpoasesSettings
-from optimizer_plc.qp.penalties import Preset
-from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
-from optimizer_plc.settings import OptimizerSection, ProgramSettings, SolverName
-from optimizer_plc.solvers import Solver, judged, make_solver, qpoases
-from optimizer_plc.solvers.fast_gradient import fast_gradient_solver, step_sizes, stiffest_hessian
-from optimizer_plc.solvers.interior_point import interior_point_solver
-from optimizer_plc.solvers.qpoases import QpoasesSolver
-from plant.load import find_load
-from rig.cosim.one_process import OneProcessRig
-from rig.cosim.scenario import Scenario
-from rig.results.recording import Recorder
-from rig.settings import Settings
+from coldloop_optimizer_plc.computing_settings import FastGradientSettings, InteriorPointSettings, QpoasesSettings
+from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
+from coldloop_optimizer_plc.settings import OptimizerSection, ProgramSettings, SolverName
+from coldloop_optimizer_plc.solvers import Solver, judged, make_solver, qpoases
+from coldloop_optimizer_plc.solvers.fast_gradient import fast_gradient_solver, step_sizes, stiffest_hessian
+from coldloop_optimizer_plc.solvers.interior_point import interior_point_solver
+from coldloop_optimizer_plc.solvers.qpoases import QpoasesSolver
+from coldloop_plant.load import find_load
+from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.results.recording import Recorder
+from coldloop_rig.settings import Settings
 
 if TYPE_CHECKING:
     from tests.harness.processes import Processes
@@ -280,9 +280,9 @@ def test_a_problem_without_solution_leaves_the_guess_and_the_next_one_is_solved(
 def test_no_solver_prints(processes: "Processes") -> None:
     program = (
         "import numpy as np\n"
-        "from optimizer_plc.qp.problem import QuadraticProblem\n"
-        "from optimizer_plc.settings import ProgramSettings, SolverName\n"
-        "from optimizer_plc.solvers import make_solver\n"
+        "from coldloop_optimizer_plc.qp.problem import QuadraticProblem\n"
+        "from coldloop_optimizer_plc.settings import ProgramSettings, SolverName\n"
+        "from coldloop_optimizer_plc.solvers import make_solver\n"
         "one = np.ones(1)\n"
         "for name in SolverName:\n"
         "    solver = make_solver(ProgramSettings(solver=name))\n"
@@ -309,8 +309,8 @@ def test_without_casadi_qpoases_says_what_to_do(monkeypatch: pytest.MonkeyPatch)
 def test_casadi_is_not_imported_unless_it_is_needed(processes: "Processes") -> None:
     program = (
         "import sys\n"
-        "from optimizer_plc.settings import ProgramSettings\n"
-        "from optimizer_plc.solvers import make_solver\n"
+        "from coldloop_optimizer_plc.settings import ProgramSettings\n"
+        "from coldloop_optimizer_plc.solvers import make_solver\n"
         "make_solver(ProgramSettings())\n"
         "print('casadi' in sys.modules)"
     )

@@ -14,17 +14,17 @@ from scipy.optimize import linprog
 from coldloop.process.cold_box import COLD_BOX, L1, OUTPUT_NAMES, T5
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
-from optimizer_plc.computing_settings import Arithmetic, EstimatorSettings
-from optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
-from optimizer_plc.qp.arithmetic import DOUBLE, Real, real_of
-from optimizer_plc.qp.costs import quadratic_cost
-from optimizer_plc.qp.design import ControlDesign, Target
-from optimizer_plc.qp.penalties import Preset
-from optimizer_plc.qp.prediction import PredictionModel, state_weights
-from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
-from optimizer_plc.qp.target import TargetSearch, find_target, rest_of, target_search
-from optimizer_plc.settings import ProgramSettings
-from rig import simulate
+from coldloop_optimizer_plc.computing_settings import Arithmetic, EstimatorSettings
+from coldloop_optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
+from coldloop_optimizer_plc.qp.arithmetic import DOUBLE, Real, real_of
+from coldloop_optimizer_plc.qp.costs import quadratic_cost
+from coldloop_optimizer_plc.qp.design import ControlDesign, Target
+from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.prediction import PredictionModel, state_weights
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
+from coldloop_optimizer_plc.qp.target import TargetSearch, find_target, rest_of, target_search
+from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_rig import simulate
 
 Array = NDArray[np.float64]
 

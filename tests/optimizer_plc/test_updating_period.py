@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.registers.optimizer_plc import UpdatingRuleKind
-from optimizer_plc.budget import BudgetSettings, PlcBudget
-from optimizer_plc.rules import (
+from coldloop_optimizer_plc.budget import BudgetSettings, PlcBudget
+from coldloop_optimizer_plc.rules import (
     Algorithm1,
     Assessment,
     ContractionRule,
@@ -18,9 +18,9 @@ from optimizer_plc.rules import (
     assess,
     make_rule,
 )
-from optimizer_plc.rules.assessment import assessed
-from optimizer_plc.rules.interface import MEMORY, decide_by
-from optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.rules.assessment import assessed
+from coldloop_optimizer_plc.rules.interface import MEMORY, decide_by
+from coldloop_optimizer_plc.settings import ProgramSettings
 
 RULE = Algorithm1(q_first=9, q_min=2, q_max=19, delta=2)
 
@@ -173,7 +173,7 @@ def test_multiplying_all_costs_by_a_constant_changes_nothing(observation: Observ
 
 @given(observation=observations)
 def test_the_response_increment_is_the_derivative_of_the_response_time(observation: Observation) -> None:
-    """t_r(q) = -q / log K(q), with K moving at its increment (`rig/report/slips.md`, ruling 10)."""
+    """t_r(q) = -q / log K(q), with K moving at its increment (`rig/coldloop_rig/report/slips.md`, ruling 10)."""
     a, q = assess(observation), observation.iterations
     if not 1e-6 < a.contraction < 0.99:
         return

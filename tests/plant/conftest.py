@@ -18,14 +18,14 @@ from coldloop.registers.codec import codec_of
 from coldloop.registers.declaration import Role
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.registers.seal import Seal, seal_of
-from plant.cold_box.physics import ColdBox, derivative, outputs
-from plant.cold_box.plant_file import REFERENCE
-from plant.helium.properties import Helium, load_helium
-from plant.integrator import advance
-from plant.kinds import plant_maker
-from plant.numeric import RealArray
-from plant.rack.registers import RackRegisters
-from plant.settings import PlantSettings
+from coldloop_plant.cold_box.physics import ColdBox, derivative, outputs
+from coldloop_plant.cold_box.plant_file import REFERENCE
+from coldloop_plant.helium.properties import Helium, load_helium
+from coldloop_plant.integrator import advance
+from coldloop_plant.kinds import plant_maker
+from coldloop_plant.numeric import RealArray
+from coldloop_plant.rack.registers import RackRegisters
+from coldloop_plant.settings import PlantSettings
 from tests.harness.records import PLANT_MAP, sealed
 
 R = TypeVar("R", bound=tuple[Any, ...])

@@ -7,16 +7,16 @@ from hypothesis import strategies as st
 
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from plant.cold_box.physics import OUTPUTS, evaluate
-from plant.cold_box.plant_file import REFERENCE
-from plant.components.gas_valve import CHOKED, cold_valve_flow, gas_valve_flow
-from plant.components.gas_volume import SECOND_VIRIAL, GasVolume, gas_mass, gas_pressure
-from plant.components.nitrogen_bath import BOILING_POINT, LATENT_HEAT, LIQUID_DENSITY, boil, nitrogen_level
-from plant.components.phase_separator import content, separate
-from plant.components.turbine import expand
-from plant.components.valve import Valve
-from plant.helium.entropy import entropy, supply_entropy
-from plant.helium.properties import (
+from coldloop_plant.cold_box.physics import OUTPUTS, evaluate
+from coldloop_plant.cold_box.plant_file import REFERENCE
+from coldloop_plant.components.gas_valve import CHOKED, cold_valve_flow, gas_valve_flow
+from coldloop_plant.components.gas_volume import SECOND_VIRIAL, GasVolume, gas_mass, gas_pressure
+from coldloop_plant.components.nitrogen_bath import BOILING_POINT, LATENT_HEAT, LIQUID_DENSITY, boil, nitrogen_level
+from coldloop_plant.components.phase_separator import content, separate
+from coldloop_plant.components.turbine import expand
+from coldloop_plant.components.valve import Valve
+from coldloop_plant.helium.entropy import entropy, supply_entropy
+from coldloop_plant.helium.properties import (
     GAS_CONSTANT,
     WARM_CP,
     load_helium,
@@ -24,8 +24,8 @@ from plant.helium.properties import (
     supply_cell,
     supply_enthalpy_and_density,
 )
-from plant.numeric import RealArray
-from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_plant.numeric import RealArray
+from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 
 HELIUM = load_helium()
 BATH = REFERENCE.separator

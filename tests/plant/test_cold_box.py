@@ -7,14 +7,19 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 import pytest
 
-from plant.cold_box.equilibrium import NoEquilibriumError, find_equilibrium
-from plant.cold_box.linearisation import linearisation_error, state_scales
-from plant.cold_box.model import build_model, parameters_digest
-from plant.cold_box.physics import streams
-from plant.cold_box.plant_file import REFERENCE
-from plant.components.heat_exchanger import HeatExchanger
-from plant.helium.properties import saturation, supply_enthalpy_and_density, vapour_enthalpy_and_cp, vapour_temperature
-from plant.numeric import RealArray
+from coldloop_plant.cold_box.equilibrium import NoEquilibriumError, find_equilibrium
+from coldloop_plant.cold_box.linearisation import linearisation_error, state_scales
+from coldloop_plant.cold_box.model import build_model, parameters_digest
+from coldloop_plant.cold_box.physics import streams
+from coldloop_plant.cold_box.plant_file import REFERENCE
+from coldloop_plant.components.heat_exchanger import HeatExchanger
+from coldloop_plant.helium.properties import (
+    saturation,
+    supply_enthalpy_and_density,
+    vapour_enthalpy_and_cp,
+    vapour_temperature,
+)
+from coldloop_plant.numeric import RealArray
 
 if TYPE_CHECKING:
     from conftest import Plant

@@ -5,20 +5,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plant.cold_box.plant_file import REFERENCE
-from plant.components.gas_valve import CRITICAL_RATIO
-from plant.components.heat_exchanger import (
+from coldloop_plant.cold_box.plant_file import REFERENCE
+from coldloop_plant.components.gas_valve import CRITICAL_RATIO
+from coldloop_plant.components.heat_exchanger import (
     HighPressureFlow,
     LowPressureFlow,
     driving_difference,
     exchange,
     take_up,
 )
-from plant.components.phase_separator import content, level, separate
-from plant.components.return_line import return_flow
-from plant.components.turbine import expand, turbine_flow
-from plant.components.valve import valve_mass_flow
-from plant.helium.properties import (
+from coldloop_plant.components.phase_separator import content, level, separate
+from coldloop_plant.components.return_line import return_flow
+from coldloop_plant.components.turbine import expand, turbine_flow
+from coldloop_plant.components.valve import valve_mass_flow
+from coldloop_plant.helium.properties import (
     load_helium,
     saturation,
     supply_cell,

@@ -8,7 +8,7 @@ import pytest
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.plant import StationAlarm, StationMode, Surroundings
-from plant.refrigerator.equipment import (
+from coldloop_plant.refrigerator.equipment import (
     ADMISSION,
     BLOCKED,
     GIVEN_NAMES,
@@ -20,12 +20,12 @@ from plant.refrigerator.equipment import (
     start_compressors,
     throttled,
 )
-from plant.refrigerator.events import EventSchedule, RefrigeratorEvent
-from plant.refrigerator.file import SHIPPED, read_refrigerator_file
-from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from plant.refrigerator.program import RefrigeratorProgram
-from plant.refrigerator.station_control import station_law
-from plant.refrigerator.station_settings import StationSettings
+from coldloop_plant.refrigerator.events import EventSchedule, RefrigeratorEvent
+from coldloop_plant.refrigerator.file import SHIPPED, read_refrigerator_file
+from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_plant.refrigerator.program import RefrigeratorProgram
+from coldloop_plant.refrigerator.station_control import station_law
+from coldloop_plant.refrigerator.station_settings import StationSettings
 
 FILE = read_refrigerator_file(SHIPPED)
 V1, T3 = OUTPUT_NAMES.index("V1"), OUTPUT_NAMES.index("T3")

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plant.helium import properties as helium_at
-from plant.helium.properties import Helium, load_helium
+from coldloop_plant.helium import properties as helium_at
+from coldloop_plant.helium.properties import Helium, load_helium
 
 HELIUM: Helium = load_helium()
 bath_pressures = st.floats(0.9e5, 1.9e5)
@@ -21,7 +21,7 @@ def coolprop(name: str, first: str, x: float, second: str, y: float) -> float:
 @given(T=st.floats(4.0, 300.0))
 def test_the_16_bar_isobar_agrees(T: float) -> None:
     pytest.importorskip("CoolProp.CoolProp")
-    from plant.helium.tabulate import aluminium_heat_capacity  # noqa: PLC0415 loads CoolProp
+    from coldloop_plant.helium.tabulate import aluminium_heat_capacity  # noqa: PLC0415 loads CoolProp
 
     h, rho = helium_at.supply_enthalpy_and_density(16e5, T, HELIUM)
     h_cell, rho_cp, c_wall = helium_at.supply_cell(16e5, T, HELIUM.isobar, HELIUM.departure)

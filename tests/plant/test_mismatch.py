@@ -8,9 +8,9 @@ from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
-from plant.kinds import plant_maker
-from plant.program import MeasurementNoise, PlantProgram
-from plant.settings import MismatchSettings, PlantKind, PlantSection, SensorSettings
+from coldloop_plant.kinds import plant_maker
+from coldloop_plant.program import MeasurementNoise, PlantProgram
+from coldloop_plant.settings import MismatchSettings, PlantKind, PlantSection, SensorSettings
 
 HEADER = read_header(DEFAULT_MODEL_FILE)
 LEVEL = OUTPUT_NAMES.index("L1")

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from plant.cold_box.physics import OUTPUTS
-from plant.components.gas_volume import gas_mass
-from plant.components.heat_exchanger import HeatExchanger
-from plant.components.passes import (
+from coldloop_plant.cold_box.physics import OUTPUTS
+from coldloop_plant.components.gas_volume import gas_mass
+from coldloop_plant.components.heat_exchanger import HeatExchanger
+from coldloop_plant.components.passes import (
     CAPACITY,
     COLUMNS,
     CUBICS,
@@ -26,12 +26,12 @@ from plant.components.passes import (
     read_cells,
     supply_at,
 )
-from plant.helium.properties import load_helium, supply_cell, supply_enthalpy_and_density
-from plant.numeric import Array, RealArray
-from plant.refrigerator.file import SHIPPED, read_refrigerator_file
-from plant.refrigerator.high_pressure import FIRST, Filling, hold_passes, piped, read_passes, side_pressure
-from plant.refrigerator.linearisation import jacobian
-from plant.refrigerator.physics import (
+from coldloop_plant.helium.properties import load_helium, supply_cell, supply_enthalpy_and_density
+from coldloop_plant.numeric import Array, RealArray
+from coldloop_plant.refrigerator.file import SHIPPED, read_refrigerator_file
+from coldloop_plant.refrigerator.high_pressure import FIRST, Filling, hold_passes, piped, read_passes, side_pressure
+from coldloop_plant.refrigerator.linearisation import jacobian
+from coldloop_plant.refrigerator.physics import (
     BOX_STATES,
     SIGNALS,
     STATE_NAMES,
@@ -41,7 +41,7 @@ from plant.refrigerator.physics import (
     inventory,
     rates,
 )
-from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 
 pytestmark = pytest.mark.usefixtures("compiles")
 

@@ -9,9 +9,9 @@ from coldloop.errors import ColdloopError
 from coldloop.registers.bank import ANYBODY
 from coldloop.registers.plant import Actuators, PlantSession
 from coldloop.session.clock import Pacer
-from plant.rack.registers import RackRegisters
-from plant.runtime import PlantRuntime
-from plant.settings import PlantSettings
+from coldloop_plant.rack.registers import RackRegisters
+from coldloop_plant.runtime import PlantRuntime
+from coldloop_plant.settings import PlantSettings
 from tests.harness.records import PLANT_MAP
 
 OUTPUTS = Actuators(0, (43.0, 75.0, 36.0), session=1)
@@ -45,8 +45,8 @@ class SleepersClock:
 @pytest.mark.parametrize("clock_error_ppm", [-50_000.0, 0.0, 50_000.0])
 async def test_the_clock_is_as_fast_as_is_configured(clock_error_ppm: float, monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SleepersClock()
-    monkeypatch.setattr("plant.runtime.time", clock)
-    monkeypatch.setattr("plant.runtime.Pacer", partial(Pacer, now=clock.monotonic))
+    monkeypatch.setattr("coldloop_plant.runtime.time", clock)
+    monkeypatch.setattr("coldloop_plant.runtime.Pacer", partial(Pacer, now=clock.monotonic))
     monkeypatch.setattr("coldloop.session.clock.sleep", clock.sleep)
     plant = runtime("realtime", clock_error_ppm=clock_error_ppm)
 

@@ -9,18 +9,18 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from coldloop.process.cold_box import OUTPUT_NAMES
-from plant.cold_box.equilibrium import Equilibrium
-from plant.cold_box.model import build_model
-from plant.helium.properties import (
+from coldloop_plant.cold_box.equilibrium import Equilibrium
+from coldloop_plant.cold_box.model import build_model
+from coldloop_plant.helium.properties import (
     WARM_CP,
     load_helium,
 )
-from plant.integrator import advance
-from plant.numeric import RealArray
-from plant.refrigerator.equilibrium import Rest, find_refrigerator_equilibrium
-from plant.refrigerator.file import SHIPPED, read_refrigerator_file, refrigerator_digest
-from plant.refrigerator.linearisation import jacobian, rate_scales
-from plant.refrigerator.physics import (
+from coldloop_plant.integrator import advance
+from coldloop_plant.numeric import RealArray
+from coldloop_plant.refrigerator.equilibrium import Rest, find_refrigerator_equilibrium
+from coldloop_plant.refrigerator.file import SHIPPED, read_refrigerator_file, refrigerator_digest
+from coldloop_plant.refrigerator.linearisation import jacobian, rate_scales
+from coldloop_plant.refrigerator.physics import (
     COMMAND_NAMES,
     DISTURBANCE_NAMES,
     SIGNAL_NAMES,
@@ -29,8 +29,8 @@ from plant.refrigerator.physics import (
     rates,
     read,
 )
-from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from plant.refrigerator.station_design import line_model, lq_gains
+from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_plant.refrigerator.station_design import line_model, lq_gains
 
 HELIUM = load_helium()
 PLANT = REFERENCE_REFRIGERATOR

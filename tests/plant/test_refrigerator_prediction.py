@@ -7,13 +7,13 @@ from coldloop.process.cold_box import OUTPUT_NAMES, STATE_NAMES
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load
 from coldloop.process.settings import SHIPPED_MODELS, ModelSettings
-from optimizer_plc.qp.design import ControlDesign
-from optimizer_plc.qp.prediction import state_weights
-from plant.refrigerator.events import EventSchedule
-from plant.refrigerator.file import SHIPPED, read_refrigerator_file
-from plant.refrigerator.prediction import prediction_model
-from plant.refrigerator.program import RefrigeratorProgram
-from plant.refrigerator.station_settings import StationSettings
+from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.qp.prediction import state_weights
+from coldloop_plant.refrigerator.events import EventSchedule
+from coldloop_plant.refrigerator.file import SHIPPED, read_refrigerator_file
+from coldloop_plant.refrigerator.prediction import prediction_model
+from coldloop_plant.refrigerator.program import RefrigeratorProgram
+from coldloop_plant.refrigerator.station_settings import StationSettings
 
 MODEL = load(SHIPPED_MODELS["refrigerator"])
 FILE = read_refrigerator_file(SHIPPED)

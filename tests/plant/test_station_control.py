@@ -11,15 +11,15 @@ from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.plant import StationAlarm, StationMode, Surroundings
-from plant.kinds import plant_maker
-from plant.refrigerator.events import EventSchedule, RefrigeratorEvent
-from plant.refrigerator.file import SHIPPED, read_refrigerator_file
-from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from plant.refrigerator.program import RefrigeratorProgram
-from plant.refrigerator.station_control import StationControl
-from plant.refrigerator.station_law import SHUT, StationMeasurement, beyond, opened_by, shut_by
-from plant.refrigerator.station_settings import StationSettings
-from plant.settings import PlantSection
+from coldloop_plant.kinds import plant_maker
+from coldloop_plant.refrigerator.events import EventSchedule, RefrigeratorEvent
+from coldloop_plant.refrigerator.file import SHIPPED, read_refrigerator_file
+from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_plant.refrigerator.program import RefrigeratorProgram
+from coldloop_plant.refrigerator.station_control import StationControl
+from coldloop_plant.refrigerator.station_law import SHUT, StationMeasurement, beyond, opened_by, shut_by
+from coldloop_plant.refrigerator.station_settings import StationSettings
+from coldloop_plant.settings import PlantSection
 
 FILE = read_refrigerator_file(SHIPPED)
 HP, LP, LEVEL, LOST = (STATION_SIGNAL_NAMES.index(name) for name in ("P12", "P11", "L_N2", "lost"))

@@ -7,16 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plant.components.actuator import Actuator, opening_rate
-from plant.components.gas_valve import CHOKED, CRITICAL_RATIO, gas_valve_flow, relief_flow
-from plant.components.gas_volume import gas_density, gas_mass, gas_pressure
-from plant.components.heat_exchanger import STILL, LowPressureFlow
-from plant.components.nitrogen_bath import BOILING_POINT, LATENT_HEAT, LIQUID_DENSITY, boil, nitrogen_level
-from plant.components.parameters import ParameterError
-from plant.components.screw_compressor import compress
-from plant.components.valve import Valve
-from plant.components.warm_exchanger import exchanged_heat, transfer_warm
-from plant.helium.properties import (
+from coldloop_plant.components.actuator import Actuator, opening_rate
+from coldloop_plant.components.gas_valve import CHOKED, CRITICAL_RATIO, gas_valve_flow, relief_flow
+from coldloop_plant.components.gas_volume import gas_density, gas_mass, gas_pressure
+from coldloop_plant.components.heat_exchanger import STILL, LowPressureFlow
+from coldloop_plant.components.nitrogen_bath import BOILING_POINT, LATENT_HEAT, LIQUID_DENSITY, boil, nitrogen_level
+from coldloop_plant.components.parameters import ParameterError
+from coldloop_plant.components.screw_compressor import compress
+from coldloop_plant.components.valve import Valve
+from coldloop_plant.components.warm_exchanger import exchanged_heat, transfer_warm
+from coldloop_plant.helium.properties import (
     WARM_CP,
     load_helium,
     saturation,
@@ -24,8 +24,8 @@ from plant.helium.properties import (
     vapour_enthalpy_and_cp,
     vapour_temperature,
 )
-from plant.refrigerator.physics import Refrigerator, check_refrigerator
-from plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_plant.refrigerator.physics import Refrigerator, check_refrigerator
+from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
 
 HELIUM = load_helium()
 STATION = REFERENCE_REFRIGERATOR.station

@@ -8,9 +8,9 @@ import numpy as np
 
 from coldloop.config import load_configuration
 from coldloop.registers.control_plc import Update
-from rig.plc_export.kernels.recorded_problems import SINGLE
-from rig.plc_export.kernels.recorded_updates import GoldenUpdate, UpdateRecorder
-from rig.settings import Settings
+from coldloop_rig.plc_export.kernels.recorded_problems import SINGLE
+from coldloop_rig.plc_export.kernels.recorded_updates import GoldenUpdate, UpdateRecorder
+from coldloop_rig.settings import Settings
 from tests.harness.records import as_transmitted
 
 PROGRAM: Final = "optimizer_plc.program."

@@ -8,13 +8,13 @@ import pytest
 
 from coldloop.errors import UsageError
 from coldloop.process.limits import InputLimits
-from rig.plc_export.c.bit_flips import flipped
-from rig.plc_export.c.guard_files import GuardExport
-from rig.plc_export.c.optimizer_files import OptimizerExport
-from rig.plc_export.c.solver_files import OdeExport
-from rig.plc_export.kernels.golden_calls import golden_calls
-from rig.plc_export.kernels.guard_program import GuardKernels
-from rig.plc_export.kernels.recorded_problems import ITERATIONS, GoldenVectors
+from coldloop_rig.plc_export.c.bit_flips import flipped
+from coldloop_rig.plc_export.c.guard_files import GuardExport
+from coldloop_rig.plc_export.c.optimizer_files import OptimizerExport
+from coldloop_rig.plc_export.c.solver_files import OdeExport
+from coldloop_rig.plc_export.kernels.golden_calls import golden_calls
+from coldloop_rig.plc_export.kernels.guard_program import GuardKernels
+from coldloop_rig.plc_export.kernels.recorded_problems import ITERATIONS, GoldenVectors
 from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, write
 from tests.plc_export.recorded_optimizers import OPTIMISERS, recorded_updates, recorder
 

@@ -10,20 +10,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coldloop.config import load_configuration
-from optimizer_plc.computing_settings import OdeSettings
-from optimizer_plc.qp.problem import QuadraticProblem
-from optimizer_plc.solvers.ode import ode_solver
-from rig.plc_export.kernels.counted import Counter, counted_iterations, counted_updates, counter_of
-from rig.plc_export.kernels.ode_program import OdeProgram
-from rig.plc_export.kernels.recorded_problems import ITERATIONS, SINGLE, GoldenVectors
-from rig.plc_export.tree.counting import CountedProgram
-from rig.plc_sizing import operations
-from rig.plc_sizing.budget_tables import problem_of
-from rig.plc_sizing.exported import cost_text, misfits, read_cost
-from rig.plc_sizing.operations import Operations
-from rig.plc_sizing.profile import PlcProfile, find_profile
-from rig.plc_sizing.sizes import dense_sizes
-from rig.settings import Settings
+from coldloop_optimizer_plc.computing_settings import OdeSettings
+from coldloop_optimizer_plc.qp.problem import QuadraticProblem
+from coldloop_optimizer_plc.solvers.ode import ode_solver
+from coldloop_rig.plc_export.kernels.counted import Counter, counted_iterations, counted_updates, counter_of
+from coldloop_rig.plc_export.kernels.ode_program import OdeProgram
+from coldloop_rig.plc_export.kernels.recorded_problems import ITERATIONS, SINGLE, GoldenVectors
+from coldloop_rig.plc_export.tree.counting import CountedProgram
+from coldloop_rig.plc_sizing import operations
+from coldloop_rig.plc_sizing.budget_tables import problem_of
+from coldloop_rig.plc_sizing.exported import cost_text, misfits, read_cost
+from coldloop_rig.plc_sizing.operations import Operations
+from coldloop_rig.plc_sizing.profile import PlcProfile, find_profile
+from coldloop_rig.plc_sizing.sizes import dense_sizes
+from coldloop_rig.settings import Settings
 from tests.plc_export.recorded_optimizers import recorded_updates, recorder
 
 if TYPE_CHECKING:

@@ -12,14 +12,14 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from rig.plc_export.kernels.ode_program import leaves
-from rig.plc_export.structured_text.lowering import Lowering
-from rig.plc_export.structured_text.places import Record
-from rig.plc_export.structured_text.printer import StructuredTextPrinter, block_name, memory
-from rig.plc_export.structured_text.slicing import one_iteration_a_call
-from rig.plc_export.tree.nodes import RecordType
-from rig.plc_export.tree.reading import Program
-from rig.plc_export.tree.subset import UnfitKernelError, type_of
+from coldloop_rig.plc_export.kernels.ode_program import leaves
+from coldloop_rig.plc_export.structured_text.lowering import Lowering
+from coldloop_rig.plc_export.structured_text.places import Record
+from coldloop_rig.plc_export.structured_text.printer import StructuredTextPrinter, block_name, memory
+from coldloop_rig.plc_export.structured_text.slicing import one_iteration_a_call
+from coldloop_rig.plc_export.tree.nodes import RecordType
+from coldloop_rig.plc_export.tree.reading import Program
+from coldloop_rig.plc_export.tree.subset import UnfitKernelError, type_of
 from tests.plc_export.st_interpreter import Machine
 
 Array = NDArray[np.float32]
@@ -115,7 +115,9 @@ class Exported:
             listed = ", ".join(map(printer.number, constants["scale", "weights"]))
             values["cl_weights"] = f"cl_reals_{N} := [{listed}]"
         globals_ = "".join(f"{name} : {value};" for name, value in values.items())
-        functions = files("rig.plc_export").joinpath("structured_text/functions.st").read_text(encoding="ascii")
+        functions = (
+            files("coldloop_rig.plc_export").joinpath("structured_text/functions.st").read_text(encoding="ascii")
+        )
         configuration = f"CONFIGURATION c VAR_GLOBAL {globals_} END_VAR END_CONFIGURATION"
         self.machine = Machine(printer.types(), functions, blocks, configuration)
         self.instance = self.machine.instance(block_name(self.block))

@@ -7,16 +7,16 @@ from hypothesis import strategies as st
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
-from rig.plc_export.kernels.recorded_problems import GoldenVector, GoldenVectors, answered
-from rig.plc_export.structured_text import pausing
-from rig.plc_export.structured_text.lowering import GIVEN, Lowering
-from rig.plc_export.structured_text.optimizer_files import OptimizerText
-from rig.plc_export.structured_text.pausing import BUSY, PIECE, Pausing
-from rig.plc_export.structured_text.printer import StructuredTextPrinter, block_name, interface_names
-from rig.plc_export.structured_text.solver_files import WORK, StructuredTextExport
-from rig.plc_export.templates import template
-from rig.plc_export.tree.reading import Program
-from rig.plc_export.tree.subset import UnfitKernelError, type_of
+from coldloop_rig.plc_export.kernels.recorded_problems import GoldenVector, GoldenVectors, answered
+from coldloop_rig.plc_export.structured_text import pausing
+from coldloop_rig.plc_export.structured_text.lowering import GIVEN, Lowering
+from coldloop_rig.plc_export.structured_text.optimizer_files import OptimizerText
+from coldloop_rig.plc_export.structured_text.pausing import BUSY, PIECE, Pausing
+from coldloop_rig.plc_export.structured_text.printer import StructuredTextPrinter, block_name, interface_names
+from coldloop_rig.plc_export.structured_text.solver_files import WORK, StructuredTextExport
+from coldloop_rig.plc_export.templates import template
+from coldloop_rig.plc_export.tree.reading import Program
+from coldloop_rig.plc_export.tree.subset import UnfitKernelError, type_of
 from tests.plc_export.paused_kernels import KERNELS, S, Z, five_hundred
 from tests.plc_export.recorded_optimizers import recorded_updates, recorder
 from tests.plc_export.st_interpreter import Machine

@@ -14,15 +14,15 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from rig.plc_export.structured_text import constants
-from rig.plc_export.structured_text.constants import Constants, configuration, in_pieces, types_in
-from rig.plc_export.structured_text.lowering import Lowering
-from rig.plc_export.structured_text.optimizer_files import state_types
-from rig.plc_export.structured_text.places import Record
-from rig.plc_export.structured_text.printer import StructuredTextPrinter, global_name, section
-from rig.plc_export.templates import template
-from rig.plc_export.tree.reading import Program
-from rig.plc_export.tree.subset import UnfitKernelError, type_of
+from coldloop_rig.plc_export.structured_text import constants
+from coldloop_rig.plc_export.structured_text.constants import Constants, configuration, in_pieces, types_in
+from coldloop_rig.plc_export.structured_text.lowering import Lowering
+from coldloop_rig.plc_export.structured_text.optimizer_files import state_types
+from coldloop_rig.plc_export.structured_text.places import Record
+from coldloop_rig.plc_export.structured_text.printer import StructuredTextPrinter, global_name, section
+from coldloop_rig.plc_export.templates import template
+from coldloop_rig.plc_export.tree.reading import Program
+from coldloop_rig.plc_export.tree.subset import UnfitKernelError, type_of
 from tests.plc_export.st_interpreter import Machine
 
 Array = NDArray[np.float32]

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.plc_export.kernels.ode_program import PER_PROBLEM
-from rig.plc_export.kernels.recorded_problems import ITERATIONS, GoldenVector, GoldenVectors
-from rig.plc_export.structured_text import constants
-from rig.plc_export.structured_text.names import LONGEST, Names, identifier
-from rig.plc_export.structured_text.printer import StructuredTextPrinter
-from rig.plc_export.structured_text.solver_files import WORK, StructuredTextExport, sum_of
-from rig.plc_export.tree.subset import UnfitKernelError
+from coldloop_rig.plc_export.kernels.ode_program import PER_PROBLEM
+from coldloop_rig.plc_export.kernels.recorded_problems import ITERATIONS, GoldenVector, GoldenVectors
+from coldloop_rig.plc_export.structured_text import constants
+from coldloop_rig.plc_export.structured_text.names import LONGEST, Names, identifier
+from coldloop_rig.plc_export.structured_text.printer import StructuredTextPrinter
+from coldloop_rig.plc_export.structured_text.solver_files import WORK, StructuredTextExport, sum_of
+from coldloop_rig.plc_export.tree.subset import UnfitKernelError
 from tests.plc_export.st_interpreter import Machine
 
 NUMBER = re.compile(r"(REAL#|-)\d\.\d{9}E[+-]\d\d")

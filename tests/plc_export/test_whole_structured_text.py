@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from coldloop.process.limits import InputLimits
-from optimizer_plc.program import OptimizerProgram
-from rig.plc_export.kernels.golden_calls import golden_calls
-from rig.plc_export.kernels.guard_program import GuardKernels
-from rig.plc_export.kernels.recorded_updates import integers_of
-from rig.plc_export.structured_text.constants import LARGEST_LIST
-from rig.plc_export.structured_text.guard_files import GuardText
-from rig.plc_export.structured_text.optimizer_files import OptimizerText
-from rig.plc_export.structured_text.plcopen import plcopen_xml
-from rig.plc_export.structured_text.printer import StructuredTextPrinter
-from rig.plc_export.structured_text.register_table import register_table
+from coldloop_optimizer_plc.program import OptimizerProgram
+from coldloop_rig.plc_export.kernels.golden_calls import golden_calls
+from coldloop_rig.plc_export.kernels.guard_program import GuardKernels
+from coldloop_rig.plc_export.kernels.recorded_updates import integers_of
+from coldloop_rig.plc_export.structured_text.constants import LARGEST_LIST
+from coldloop_rig.plc_export.structured_text.guard_files import GuardText
+from coldloop_rig.plc_export.structured_text.optimizer_files import OptimizerText
+from coldloop_rig.plc_export.structured_text.plcopen import plcopen_xml
+from coldloop_rig.plc_export.structured_text.printer import StructuredTextPrinter
+from coldloop_rig.plc_export.structured_text.register_table import register_table
 from tests.harness.records import CONTROL_MAP
 from tests.plc_export.matiec import NEEDS_MATIEC, joined, self_test
 from tests.plc_export.recorded_optimizers import OPTIMISERS, disturbed_updates, recorded_updates, recorder

@@ -10,12 +10,12 @@ from coldloop.config import load_configuration
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
 from coldloop.registers.audit import EventKind
-from rig.cosim import one_process
-from rig.cosim.compiled import stretches
-from rig.cosim.compiled.stretches import CompiledStretches, Stretch
-from rig.cosim.scenario import Scenario
-from rig.results.recording import MemorySink
-from rig.settings import Settings
+from coldloop_rig.cosim import one_process
+from coldloop_rig.cosim.compiled import stretches
+from coldloop_rig.cosim.compiled.stretches import CompiledStretches, Stretch
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.results.recording import MemorySink
+from coldloop_rig.settings import Settings
 from tests.harness.process_configurations import load_of_shares
 from tests.rig.test_precompile import FirstTick, compiled_kernels
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load
 from coldloop.process.settings import settings_of
-from optimizer_plc.qp.design import ControlDesign
-from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
+from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.qp.prediction import PredictionModel
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 from tests.harness.reference_qp import solved_by_daqp
 
 Array = NDArray[np.float64]

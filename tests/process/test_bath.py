@@ -15,8 +15,8 @@ from coldloop.errors import ColdloopError
 from coldloop.process.cold_box import COLD_BOX, L1, T5
 from coldloop.process.lti_model import load
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from rig.process_file.judgement import described
-from rig.process_file.making import made_from
+from coldloop_rig.process_file.judgement import described
+from coldloop_rig.process_file.making import made_from
 from tests.harness.process_files import TANK
 from tests.harness.processes import Processes
 from tests.process.bath_laws import answers

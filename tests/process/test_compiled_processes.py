@@ -5,7 +5,7 @@ from typing import Final
 
 import pytest
 
-from rig.process_file.making import made_from
+from coldloop_rig.process_file.making import made_from
 from tests.harness.process_configurations import CASES
 from tests.harness.process_files import PROCESSES
 from tests.process.both_ways import both_ways

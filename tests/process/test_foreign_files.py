@@ -15,15 +15,15 @@ from coldloop.errors import ColdloopError
 from coldloop.kernels.cache_folder import find_cache_folder
 from coldloop.process.model_file import read_document
 from coldloop.service.telemetry_settings import TelemetrySettings
-from hmi.users import PageRole, Users, write_user
-from plant.own.maker import _fmu_of, file_digest
-from rig.chaos.plan import find_plan
-from rig.cli.commands.options import _tls_site
-from rig.plc_sizing.profile import find_profile
-from rig.process_file.judgement import described
-from rig.process_file.making import made_from
-from rig.process_file.reading import read_process_file
-from rig.process_file.step_test import from_step_test
+from coldloop_hmi.users import PageRole, Users, write_user
+from coldloop_plant.own.maker import _fmu_of, file_digest
+from coldloop_rig.chaos.plan import find_plan
+from coldloop_rig.cli.commands.options import _tls_site
+from coldloop_rig.plc_sizing.profile import find_profile
+from coldloop_rig.process_file.judgement import described
+from coldloop_rig.process_file.making import made_from
+from coldloop_rig.process_file.reading import read_process_file
+from coldloop_rig.process_file.step_test import from_step_test
 from tests.process.test_process_file import HEATER, ONE_BY_ONE, made
 
 EXAMPLES: Final = Path(__file__).parents[2] / "examples" / "processes"

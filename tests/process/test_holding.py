@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rig.plc_sizing.holding import Waiting, waiting
-from rig.process_file.judgement import described
-from rig.process_file.making import Made, made_from
+from coldloop_rig.plc_sizing.holding import Waiting, waiting
+from coldloop_rig.process_file.judgement import described
+from coldloop_rig.process_file.making import Made, made_from
 from tests.harness.processes import Processes
 from tests.harness.unstable_plants import pendulum, stirred_tank
 from tests.process.runs import started

@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from coldloop.errors import ColdloopError
-from rig.process_file.historian import Request, record_of
-from rig.process_file.reading import read_process_file
-from rig.process_file.step_test import from_step_test
+from coldloop_rig.process_file.historian import Request, record_of
+from coldloop_rig.process_file.reading import read_process_file
+from coldloop_rig.process_file.step_test import from_step_test
 from tests.process.test_step_test import FILE, answered, steps
 
 Array = NDArray[np.float64]

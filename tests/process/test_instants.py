@@ -6,10 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.errors import StudyError
-from optimizer_plc.qp.design import ControlDesign
-from rig.studies.adaptive_gain import over_best_fixed
-from rig.studies.instants import Judged, candidates, losses, proposed, spread
-from rig.studies.instants_figure import drawn
+from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_rig.studies.adaptive_gain import over_best_fixed
+from coldloop_rig.studies.instants import Judged, candidates, losses, proposed, spread
+from coldloop_rig.studies.instants_figure import drawn
 
 
 @given(st.integers(1, 30), st.integers(1, 400))

@@ -12,8 +12,8 @@ import pytest
 import coldloop
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from rig import simulate
-from rig.cli import main
+from coldloop_rig import simulate
+from coldloop_rig.cli import main
 from tests.harness.process_files import COLUMN, TANK
 
 RUNS: Final[dict[str, tuple[Path | None, float]]] = {

@@ -12,8 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from coldloop.errors import ColdloopError
-from rig.process_file.judgement import described
-from rig.process_file.making import made_from
+from coldloop_rig.process_file.judgement import described
+from coldloop_rig.process_file.making import made_from
 from tests.harness.processes import Processes
 from tests.process.runs import run
 

@@ -16,10 +16,10 @@ from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
 from coldloop.process.model_file import read_header
 from coldloop.process.sections import Lag
-from rig.process_file.judgement import described
-from rig.process_file.linearised import lag_model
-from rig.process_file.making import Made, made_from
-from rig.process_file.matrices import realised
+from coldloop_rig.process_file.judgement import described
+from coldloop_rig.process_file.linearised import lag_model
+from coldloop_rig.process_file.making import Made, made_from
+from coldloop_rig.process_file.matrices import realised
 from tests.harness.installed import installed
 from tests.harness.unstable_plants import pendulum, stirred_tank
 

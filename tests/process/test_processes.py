@@ -9,7 +9,7 @@ import pytest
 
 from coldloop.process.model_file import read_document, write_document
 from coldloop.registers.control_plc import Mode
-from rig.process_file.making import made_from
+from coldloop_rig.process_file.making import made_from
 from tests.harness.process_files import COLUMN, TANK, made
 from tests.harness.processes import Processes
 from tests.harness.unstable_plants import pendulum

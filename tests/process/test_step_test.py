@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ColdloopError
 from coldloop.process.lti_model import discretise
-from rig.process_file.gain_intervals import gains_after, half_widths
-from rig.process_file.identified import Record, identified
-from rig.process_file.judgement import described
-from rig.process_file.making import Made, made_from
+from coldloop_rig.process_file.gain_intervals import gains_after, half_widths
+from coldloop_rig.process_file.identified import Record, identified
+from coldloop_rig.process_file.judgement import described
+from coldloop_rig.process_file.making import Made, made_from
 
 Array = NDArray[np.float64]
 

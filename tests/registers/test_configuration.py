@@ -16,7 +16,7 @@ from coldloop.registers.configuration import (
     lines_of,
     publish_configuration,
 )
-from plant.settings import SHOWN, PlantSection, PlantSettings, SensorSettings
+from coldloop_plant.settings import SHOWN, PlantSection, PlantSettings, SensorSettings
 from tests.harness.records import PLANT_MAP
 
 

@@ -10,27 +10,27 @@ from typing import NamedTuple, TypeVar
 import pytest
 from pydantic import BaseModel
 
-import control_plc.runtime
-import optimizer_plc.runtime
-import plant.runtime
+import coldloop_control_plc.runtime
+import coldloop_optimizer_plc.runtime
+import coldloop_plant.runtime
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import Mode, Status
-from control_plc.settings import ControlSettings
-from optimizer_plc.settings import OptimizerSettings
-from plant.load import find_load
-from plant.settings import PlantSettings
-from rig.cosim.endpoints import RigEndpoints
-from rig.cosim.one_process import OneProcessRig
-from rig.cosim.ports import ReservedPorts
-from rig.cosim.scenario import Scenario
-from rig.cosim.session_client import SessionClient
-from rig.cosim.wiring import SERVICES, endpoints_on, wired
-from rig.results.recording import Recorder, Recording
-from rig.settings import Settings
+from coldloop_control_plc.settings import ControlSettings
+from coldloop_optimizer_plc.settings import OptimizerSettings
+from coldloop_plant.load import find_load
+from coldloop_plant.settings import PlantSettings
+from coldloop_rig.cosim.endpoints import RigEndpoints
+from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.cosim.ports import ReservedPorts
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.cosim.session_client import SessionClient
+from coldloop_rig.cosim.wiring import SERVICES, endpoints_on, wired
+from coldloop_rig.results.recording import Recorder, Recording
+from coldloop_rig.settings import Settings
 from tests.harness import configurations
 from tests.harness.processes import Processes
 
@@ -138,9 +138,9 @@ async def services_in_this_loop(
     endpoints = endpoints_on(reserved.numbers, ordered)
     settings = wired(ordered, endpoints)
     serving: dict[str, Callable[[], Awaitable[None]]] = {
-        "plant": lambda: plant.runtime.serve(part(PlantSettings, settings)),
-        "control_plc": lambda: control_plc.runtime.serve(part(ControlSettings, settings)),
-        "optimizer_plc": lambda: optimizer_plc.runtime.serve(part(OptimizerSettings, settings)),
+        "plant": lambda: coldloop_plant.runtime.serve(part(PlantSettings, settings)),
+        "control_plc": lambda: coldloop_control_plc.runtime.serve(part(ControlSettings, settings)),
+        "optimizer_plc": lambda: coldloop_optimizer_plc.runtime.serve(part(OptimizerSettings, settings)),
     }
     tasks = [asyncio.ensure_future(serving[name]()) for name in services]
     try:

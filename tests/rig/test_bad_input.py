@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-import rig.cosim.networked_run
+import coldloop_rig.cosim.networked_run
 from coldloop.process.model_file import read_document, write_document
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from rig.__main__ import _open_closed_streams
+from coldloop_rig.__main__ import _open_closed_streams
 from tests.harness.processes import Processes
 
 if TYPE_CHECKING:
@@ -227,7 +227,7 @@ def test_a_damaged_model_file_is_refused(
     file = tmp_path / "model.json"
     file.write_bytes(content)
     outcome = coldloop(*RUN, "--set", f"model.file={file}", "--out", results)
-    assert_refused(outcome, FAILURE, str(file), part, "python -m plant.cold_box.model")
+    assert_refused(outcome, FAILURE, str(file), part, "python -m coldloop_plant.cold_box.model")
     assert not results.exists()
 
 
@@ -241,7 +241,7 @@ def test_a_model_file_that_is_not_there_is_named(coldloop: "Coldloop", tmp_path:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rig.cosim.networked_run, "ATTACH_PATIENCE_S", 0.1)
+    monkeypatch.setattr(coldloop_rig.cosim.networked_run, "ATTACH_PATIENCE_S", 0.1)
 
 
 @pytest.fixture

@@ -8,12 +8,12 @@ import pytest
 
 from coldloop.process.cold_box import LEVEL_BAND, T5_BAND
 from coldloop.process.limits import InputLimits
-from optimizer_plc.settings import ProgramSettings
-from plant.cold_box.capacity import LOOP_MARGIN, held_loads
-from plant.cold_box.physics import derivative
-from plant.cold_box.plant_file import REFERENCE
-from plant.helium.properties import load_helium
-from rig import Simulation, simulate
+from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_plant.cold_box.capacity import LOOP_MARGIN, held_loads
+from coldloop_plant.cold_box.physics import derivative
+from coldloop_plant.cold_box.plant_file import REFERENCE
+from coldloop_plant.helium.properties import load_helium
+from coldloop_rig import Simulation, simulate
 
 pytestmark = pytest.mark.usefixtures("compiles")
 

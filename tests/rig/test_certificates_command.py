@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from coldloop.config import load_configuration
 from coldloop.modbus.access import Caller, caller_with
 from coldloop.modbus.tls import client_context, server_context
-from rig.settings import Settings
+from coldloop_rig.settings import Settings
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop

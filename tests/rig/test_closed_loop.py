@@ -13,13 +13,13 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Verdict
-from optimizer_plc.qp.design import ControlDesign
-from optimizer_plc.settings import OptimizerSection, ProgramSettings
-from plant.kinds import make_program
-from plant.settings import SensorSettings
-from rig.cosim.scenario import Scenario
-from rig.results.recording import Recording
-from rig.settings import Settings
+from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.settings import OptimizerSection, ProgramSettings
+from coldloop_plant.kinds import make_program
+from coldloop_plant.settings import SensorSettings
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.results.recording import Recording
+from coldloop_rig.settings import Settings
 
 if TYPE_CHECKING:
     from tests.rig.conftest import Simulate

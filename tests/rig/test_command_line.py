@@ -14,15 +14,15 @@ from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.sections import NO_LOAD
 from coldloop.process.settings import settings_of
 from coldloop.session.settings import TimeMode
-from optimizer_plc.qp.penalties import Preset
-from optimizer_plc.settings import SolverName
-from plant.load import NAMED
-from rig.chaos.plan import shipped_plans
-from rig.cli import COMMANDS, EXTRAS, make_parser
-from rig.cli.commands import choices
-from rig.cli.register_listing import FORMATS
-from rig.cli.tag_exports import EXPORTS
-from rig.studies import APART, STUDIES
+from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.settings import SolverName
+from coldloop_plant.load import NAMED
+from coldloop_rig.chaos.plan import shipped_plans
+from coldloop_rig.cli import COMMANDS, EXTRAS, make_parser
+from coldloop_rig.cli.commands import choices
+from coldloop_rig.cli.register_listing import FORMATS
+from coldloop_rig.cli.tag_exports import EXPORTS
+from coldloop_rig.studies import APART, STUDIES
 from tests.harness.processes import Ended, Processes
 from tests.harness.records import MAPS
 
@@ -62,7 +62,7 @@ def test_the_names_that_are_offered_are_those_that_exist() -> None:
 
 ONE_AFTER_THE_OTHER = """
 import json, sys
-from rig.cli import main
+from coldloop_rig.cli import main
 for words in json.loads(sys.argv[1]):
     try: code = main(words)
     except SystemExit as end: code = end.code
@@ -197,7 +197,7 @@ def test_a_line_is_completed(line: str, offered: str, tmp_path: Path, python: Py
     answer = tmp_path / "answer"
     answer.touch()
     python(
-        "-m", "rig", _ARGCOMPLETE="1", COMP_LINE=line, COMP_POINT=str(len(line)), _ARGCOMPLETE_IFS="\n",
+        "-m", "coldloop_rig", _ARGCOMPLETE="1", COMP_LINE=line, COMP_POINT=str(len(line)), _ARGCOMPLETE_IFS="\n",
         _ARGCOMPLETE_STDOUT_FILENAME=str(answer),
     )  # fmt: skip
     assert offered in answer.read_text().split()
@@ -211,7 +211,7 @@ def test_a_run_that_is_piped_writes_no_control_sequences(
     environment: dict[str, str], tmp_path: Path, python: Python
 ) -> None:
     out = tmp_path / "run"
-    done = python("-m", "rig", "run", "--in-process", "--duration", "2s", "--out", str(out), **environment)
+    done = python("-m", "coldloop_rig", "run", "--in-process", "--duration", "2s", "--out", str(out), **environment)
     assert done.code == 0
     assert "\x1b" not in done.out + done.err
     assert "\r" not in done.out + done.err
@@ -230,7 +230,7 @@ def test_an_error_that_is_not_the_outputs_is_not_called_so(
     def refused(_: object) -> int:
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
-    monkeypatch.setattr("rig.cli.commands.down.execute", refused)
+    monkeypatch.setattr("coldloop_rig.cli.commands.down.execute", refused)
     assert coldloop("down").complaints == ["coldloop: down: Operation not permitted"]
 
 

@@ -8,21 +8,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import rig.cosim.compiled.portable  # noqa: F401 lets numba compile what is plain Python
+import coldloop_rig.cosim.compiled.portable  # noqa: F401 lets numba compile what is plain Python
 from coldloop.config import load_configuration
 from coldloop.kernels.compiled import kernel
 from coldloop.kernels.single_precision import neighbour, single
 from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.audit import EventKind
-from control_plc.output_limits import admit, beginning, plain
-from rig.cosim.compiled import stretches
-from rig.cosim.compiled.control import guard_records
-from rig.cosim.compiled.stretches import CompiledStretches, Stretch
-from rig.cosim.one_process import OneProcessRig
-from rig.cosim.scenario import Scenario
-from rig.results.recording import MemorySink, Recorder
-from rig.settings import Settings
+from coldloop_control_plc.output_limits import admit, beginning, plain
+from coldloop_rig.cosim.compiled import stretches
+from coldloop_rig.cosim.compiled.control import guard_records
+from coldloop_rig.cosim.compiled.stretches import CompiledStretches, Stretch
+from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.results.recording import MemorySink, Recorder
+from coldloop_rig.settings import Settings
 from tests.harness.configurations import COMPILED, LEFT_TO_PROGRAMS, UNUSUAL
 
 pytestmark = pytest.mark.usefixtures("compiles")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from rig.cosim import compiling_services
-from rig.cosim.compiling_services import show_compiling
+from coldloop_rig.cosim import compiling_services
+from coldloop_rig.cosim.compiling_services import show_compiling
 
 SERVES = '{"event": "serving", "port": 5020}\n'
 

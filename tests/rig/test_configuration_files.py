@@ -8,9 +8,9 @@ import pytest
 
 from coldloop.config import DERIVED, as_toml, load_configuration
 from coldloop.process.cold_box import COLD_BOX
-from optimizer_plc.qp.penalties import OF_PRESETS, Preset, presets_of
-from rig import simulate
-from rig.settings import Settings
+from coldloop_optimizer_plc.qp.penalties import OF_PRESETS, Preset, presets_of
+from coldloop_rig import simulate
+from coldloop_rig.settings import Settings
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop

@@ -9,15 +9,15 @@ from coldloop.kernels.named import plain_tuples
 from coldloop.process.cold_box import COLD_BOX, L1, STATE_NAMES, T5
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.process.station import STATION_SIGNAL_NAMES
-from plant.helium.properties import load_helium
-from plant.kinds import plant_maker
-from plant.load import find_load
-from plant.numeric import RealArray
-from plant.own_model import own_header
-from plant.refrigerator.program import RefrigeratorProgram
-from plant.settings import PlantSettings
-from rig import Simulation, simulate
-from rig.cosim.one_process import load_table
+from coldloop_plant.helium.properties import load_helium
+from coldloop_plant.kinds import plant_maker
+from coldloop_plant.load import find_load
+from coldloop_plant.numeric import RealArray
+from coldloop_plant.own_model import own_header
+from coldloop_plant.refrigerator.program import RefrigeratorProgram
+from coldloop_plant.settings import PlantSettings
+from coldloop_rig import Simulation, simulate
+from coldloop_rig.cosim.one_process import load_table
 from tests.harness.energy_account import CROSSED, SIZE, WORST, accounted_program_tick
 from tests.harness.refrigerator_energy import stored_energy
 

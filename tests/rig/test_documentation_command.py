@@ -56,5 +56,5 @@ def test_what_is_not_there_is_one_line_that_lists_what_is(place: str, part: str,
 def test_a_wheel_has_the_pages_where_the_command_looks(version: str, names: set[str]) -> None:
     data: dict[str, Any] = {"force_include": {}}
     Pages.initialize(SimpleNamespace(root="."), version, data)  # type: ignore[arg-type]
-    assert names <= {target.removeprefix("rig/pages/") for target in data["force_include"].values()}
+    assert names <= {target.removeprefix("coldloop_rig/pages/") for target in data["force_include"].values()}
     assert bool(data["force_include"]) == bool(names)

@@ -9,15 +9,15 @@ import pytest
 
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.codec import WordOrder
-from control_plc.settings import ControlSection, ControlStrategy
-from optimizer_plc.computing_settings import PlausibilitySettings
-from optimizer_plc.settings import AdaptiveSettings, OptimizerSection, ProgramSettings, RuleName
-from plant.settings import PlantSection, SensorSettings
-from rig.cosim.scenario import Scenario
-from rig.settings import Settings
+from coldloop_control_plc.settings import ControlSection, ControlStrategy
+from coldloop_optimizer_plc.computing_settings import PlausibilitySettings
+from coldloop_optimizer_plc.settings import AdaptiveSettings, OptimizerSection, ProgramSettings, RuleName
+from coldloop_plant.settings import PlantSection, SensorSettings
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.settings import Settings
 
 if TYPE_CHECKING:
-    from rig.results.recording import Recording
+    from coldloop_rig.results.recording import Recording
     from tests.conftest import Coldloop
     from tests.rig.conftest import Bus, OnTheBus, Simulate
 

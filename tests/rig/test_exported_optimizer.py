@@ -18,14 +18,14 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity
 from coldloop.registers.safety import LeaseState, LeaseStatus
-from rig import cli
-from rig.cli.plc_folder import export_plc
-from rig.cosim.endpoints import REQUIRED
-from rig.cosim.scenario import Scenario
-from rig.cosim.session_client import SessionClient
-from rig.plc_export.c import exported_optimizer
-from rig.plc_export.kernels.recorded_problems import SINGLE
-from rig.settings import Settings
+from coldloop_rig import cli
+from coldloop_rig.cli.plc_folder import export_plc
+from coldloop_rig.cosim.endpoints import REQUIRED
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.cosim.session_client import SessionClient
+from coldloop_rig.plc_export.c import exported_optimizer
+from coldloop_rig.plc_export.kernels.recorded_problems import SINGLE
+from coldloop_rig.settings import Settings
 from tests.conftest import Coldloop, install_libmodbus
 from tests.harness.processes import Processes
 from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.errors import ResultsError, UsageError
-from rig.figures import worker as figure_process
-from rig.figures.worker import FigureProcess
+from coldloop_rig.figures import worker as figure_process
+from coldloop_rig.figures.worker import FigureProcess
 from tests.conftest import draw_nothing
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("processes")
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two seconds without a figure."""
-    from rig import cli  # noqa: PLC0415
+    from coldloop_rig import cli  # noqa: PLC0415
 
     folder = tmp_path_factory.mktemp("recorded") / "run"
     with pytest.MonkeyPatch.context() as monkeypatch:

@@ -17,12 +17,12 @@ from coldloop.process.cold_box import INPUT_NAMES, L1, OUTPUT_NAMES, TICK_S, TIC
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import SHIPPED_MODELS
-from plant.cold_box.model import build_model
-from plant.cold_box.plant_file import REFERENCE
-from plant.components.valve import Valve
-from rig import cli
-from rig.results.run_folder import RunFolder
-from rig.runs.identification import (
+from coldloop_plant.cold_box.model import build_model
+from coldloop_plant.cold_box.plant_file import REFERENCE
+from coldloop_plant.components.valve import Valve
+from coldloop_rig import cli
+from coldloop_rig.results.run_folder import RunFolder
+from coldloop_rig.runs.identification import (
     LEAST_S,
     Factor,
     Identification,

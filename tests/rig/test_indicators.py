@@ -11,9 +11,9 @@ from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.settings import SHIPPED_MODELS
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
-from optimizer_plc.qp.design import ControlDesign
-from rig.results.indicators import Indicators, RunEvaluation, StageCost
-from rig.results.recording import SampleBlock
+from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_rig.results.indicators import Indicators, RunEvaluation, StageCost
+from coldloop_rig.results.recording import SampleBlock
 
 DESIGN = ControlDesign()
 PRESSURE, VOLUME, FIRST_TEMPERATURE = 0, 1, 2

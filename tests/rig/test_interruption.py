@@ -12,13 +12,13 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-import rig.results.disk_reserve
-import rig.results.file_sinks
+import coldloop_rig.results.disk_reserve
+import coldloop_rig.results.file_sinks
 from coldloop.errors import LinkError
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
-from rig.cosim.one_process import OneProcessRig
-from rig.results.recording import BLOCK_TICKS, KEPT_TICKS, Recorder, SampleBlock, Sink
+from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.results.recording import BLOCK_TICKS, KEPT_TICKS, Recorder, SampleBlock, Sink
 from tests.harness.processes import Process, Processes
 
 if TYPE_CHECKING:
@@ -50,9 +50,9 @@ def assert_incomplete_but_readable(folder: Path, reason: str) -> int:
 
 
 SOON_ON_DISK = """
-import sys, rig.results.file_sinks
-rig.results.file_sinks.GROUP_TICKS = rig.results.file_sinks.HELD_BACK_TICKS = 512
-from rig.__main__ import main
+import sys, coldloop_rig.results.file_sinks
+coldloop_rig.results.file_sinks.GROUP_TICKS = coldloop_rig.results.file_sinks.HELD_BACK_TICKS = 512
+from coldloop_rig.__main__ import main
 sys.exit(main())
 """
 """The program `coldloop`, which writes ticks in small groups: the first ones are in the file after two minutes."""
@@ -108,13 +108,13 @@ def in_one_process(done: str, out: Path, processes: Processes) -> Process:
 import sys
 from coldloop.foreign import foreign
 from coldloop.registers.plant import PlantSample
-from rig.cosim.one_process import OneProcessRig
+from coldloop_rig.cosim.one_process import OneProcessRig
 
 def stuck(self, scenario, recorder):
     {done}
 
 OneProcessRig.run = stuck
-from rig.__main__ import main
+from coldloop_rig.__main__ import main
 sys.exit(main())
 """
     words = ("run", "--in-process", "--load", "6h", "--out", str(out))
@@ -143,7 +143,7 @@ def test_a_signal_ends_a_run_in_code_of_others_that_does_not_return(tmp_path: Pa
 
 
 def test_a_command_ends_though_nobody_can_be_told(processes: Processes) -> None:
-    program = "import os; from rig.interruption import end_at_once; os.close(2); end_at_once(1)"
+    program = "import os; from coldloop_rig.interruption import end_at_once; os.close(2); end_at_once(1)"
     assert processes.python("-c", program).ended(PATIENCE_S).code == 129
 
 
@@ -190,15 +190,15 @@ class SmallDisk:
 
     def __init__(self, limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
         self._limit = limit
-        write = rig.results.disk_reserve.ReservedFile.write
+        write = coldloop_rig.results.disk_reserve.ReservedFile.write
 
-        def limited(file: rig.results.disk_reserve.ReservedFile, data: bytes) -> int:
+        def limited(file: coldloop_rig.results.disk_reserve.ReservedFile, data: bytes) -> int:
             self._limit -= len(data)
             if self._limit < 0 and not file._reserve.released:  # noqa: SLF001
                 file._reserve.release()  # noqa: SLF001
             return write(file, data)
 
-        monkeypatch.setattr(rig.results.disk_reserve.ReservedFile, "write", limited)
+        monkeypatch.setattr(coldloop_rig.results.disk_reserve.ReservedFile, "write", limited)
 
 
 @pytest.mark.usefixtures("compiles", "programs")
@@ -206,7 +206,7 @@ def test_a_disk_that_fills_up_leaves_what_was_recorded(
     coldloop: "Coldloop", results: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     SmallDisk(1_000_000, monkeypatch)
-    monkeypatch.setattr(rig.results.file_sinks, "GROUP_TICKS", 1024)
+    monkeypatch.setattr(coldloop_rig.results.file_sinks, "GROUP_TICKS", 1024)
     outcome = coldloop("run", "--in-process", "--load", "a", "--figures", "png", "--out", results)
     assert outcome.code == 1
     assert "the disk is full" in outcome.complaints[-1]
@@ -244,9 +244,9 @@ def test_an_interrupt_while_modules_are_imported_is_no_traceback(number: signal.
         "from importlib.abc import MetaPathFinder\n"
         "class Interrupting(MetaPathFinder):\n"
         "    def find_spec(self, name, path, target=None):\n"
-        f"        if name == 'rig.cli': os.kill(os.getpid(), {number.value})\n"
+        f"        if name == 'coldloop_rig.cli': os.kill(os.getpid(), {number.value})\n"
         "sys.meta_path.insert(0, Interrupting())\n"
-        "from rig.__main__ import main\n"
+        "from coldloop_rig.__main__ import main\n"
         "main()\n"
     )
     ended = processes.python("-c", program, stderr=subprocess.PIPE).ended()

@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from coldloop.errors import LinkError
-from rig.cosim.kept_up import PAUSES_S, end_of, keep_up
+from coldloop_rig.cosim.kept_up import PAUSES_S, end_of, keep_up
 
 NONE = (0.0,) * len(PAUSES_S)
 
@@ -41,7 +41,7 @@ async def test_what_ends_again_and_again_is_given_up_after_five(capsys: pytest.C
 
 
 async def test_what_has_run_for_long_begins_to_count_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rig.cosim.kept_up.STEADY_S", -1.0)
+    monkeypatch.setattr("coldloop_rig.cosim.kept_up.STEADY_S", -1.0)
     process = Mortal(lives=12)
     keeping = asyncio.create_task(keep_up(process, pauses_s=NONE))
     await asyncio.wait_for(process.lives_on.wait(), 60.0)

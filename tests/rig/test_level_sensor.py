@@ -5,13 +5,13 @@ import pytest
 
 from coldloop.process.cold_box import COLD_BOX, L1, OUTPUT_UNITS
 from coldloop.registers.audit import EventKind
-from optimizer_plc.qp.design import ControlDesign
-from plant.load import find_load
-from plant.program import PlantProgram
-from rig.cosim.one_process import OneProcessRig
-from rig.cosim.scenario import Scenario
-from rig.results.recording import Recorder
-from rig.settings import Settings
+from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_plant.load import find_load
+from coldloop_plant.program import PlantProgram
+from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.results.recording import Recorder
+from coldloop_rig.settings import Settings
 
 LOW, HIGH = (band[0] for band in (ControlDesign().output_low, ControlDesign().output_high))
 SIGMA = np.array([{"%": 0.01, "Hz": 1.0, "K": 0.02, "bar": 0.001}[unit] for unit in OUTPUT_UNITS])

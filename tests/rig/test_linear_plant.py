@@ -8,12 +8,12 @@ import pytest
 from coldloop.errors import ConfigurationError
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
-from rig.cosim.linear_plant import LinearRig
-from rig.cosim.one_process import OneProcessRig
-from rig.cosim.scenario import Scenario
-from rig.results.recording import Recorder, Recording
-from rig.settings import Settings
-from rig.studies.settings import settings_of
+from coldloop_rig.cosim.linear_plant import LinearRig
+from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.results.recording import Recorder, Recording
+from coldloop_rig.settings import Settings
+from coldloop_rig.studies.settings import settings_of
 
 pytestmark = pytest.mark.usefixtures("compiles")
 

@@ -17,9 +17,9 @@ from coldloop.registers.control_plc import ControlSession, LadderStatus, Mode, P
 from coldloop.registers.optimizer_plc import OptimizerSession
 from coldloop.registers.plant import LiveLoad, LoadAhead, LoadStatus, LoadStep, PlantSession
 from coldloop.registers.safety import AlarmKind, WatchdogStatus
-from rig.cosim.journal_reader import JournalReader
-from rig.cosim.local_services import LocalServices
-from rig.settings import Settings
+from coldloop_rig.cosim.journal_reader import JournalReader
+from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.settings import Settings
 from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP, sealed
 
 pytestmark = pytest.mark.usefixtures("processes", "realtime")

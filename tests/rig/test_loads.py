@@ -9,7 +9,7 @@ import pytest
 from coldloop.errors import LoadFileError
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import LoadProfile
-from plant.load import HOUR_TICKS, NAMED, find_load
+from coldloop_plant.load import HOUR_TICKS, NAMED, find_load
 
 Write = Callable[[str | bytes], Path]
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from coldloop.errors import LinkError, PeerUnreachableError
-from rig.cosim import local_services
-from rig.cosim.local_services import LocalServices
-from rig.settings import Settings
+from coldloop_rig.cosim import local_services
+from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.settings import Settings
 
 
 async def unreachable() -> None:

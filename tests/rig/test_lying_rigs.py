@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-import control_plc.settings
-import optimizer_plc.settings
-import plant.settings
+import coldloop_control_plc.settings
+import coldloop_optimizer_plc.settings
+import coldloop_plant.settings
 from coldloop.config import selected
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
 from coldloop.registers.audit import JournalAnswer, JournalPage
@@ -30,10 +30,10 @@ from coldloop.registers.configuration import (
 from coldloop.registers.control_plc import LadderStatus, Operator
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.text import to_words
-from plant.own_model import own_header
-from rig.cosim.wiring import SERVICES
-from rig.settings import Settings
-from rig.testing.event_loop import BackgroundLoop
+from coldloop_plant.own_model import own_header
+from coldloop_rig.cosim.wiring import SERVICES
+from coldloop_rig.settings import Settings
+from coldloop_rig.testing.event_loop import BackgroundLoop
 from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 
 if TYPE_CHECKING:
@@ -41,9 +41,9 @@ if TYPE_CHECKING:
 
 MAPS = dict(zip(SERVICES, (PLANT_MAP, CONTROL_MAP, OPTIMIZER_MAP), strict=True))
 SHOWN = {
-    "plant": plant.settings.SHOWN,
-    "control_plc": control_plc.settings.SHOWN,
-    "optimizer_plc": optimizer_plc.settings.SHOWN,
+    "plant": coldloop_plant.settings.SHOWN,
+    "control_plc": coldloop_control_plc.settings.SHOWN,
+    "optimizer_plc": coldloop_optimizer_plc.settings.SHOWN,
 }
 NUMBERS = {"u16": 0xFFFF, "u32": 0xFFFFFFFF}
 
@@ -117,7 +117,7 @@ def ask(
     coldloop: "Coldloop", fake: FakeRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> "Callable[..., Outcome]":
     """A command to the fake rig, which does not move in a run."""
-    monkeypatch.setattr("rig.cosim.session_client.QUIET_S", 0.5)
+    monkeypatch.setattr("coldloop_rig.cosim.session_client.QUIET_S", 0.5)
 
     def asked(*words: object) -> "Outcome":
         if words[0] == "run":
@@ -299,7 +299,7 @@ def test_a_journal_whose_answer_never_advances_is_given_up(fake: FakeRig, ask: "
 
 
 def test_a_rig_that_answers_slowly_is_given_up(ask: "Callable[..., Outcome]", monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rig.cosim.answer_time.ANSWER_S", 0.3)
+    monkeypatch.setattr("coldloop_rig.cosim.answer_time.ANSWER_S", 0.3)
 
     async def late(*_: object) -> list[bytes]:
         await asyncio.sleep(30)

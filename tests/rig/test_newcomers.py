@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.errors import UsageError
-from rig import Simulation, simulate
-from rig.live.started_rigs import check_ports
+from coldloop_rig import Simulation, simulate
+from coldloop_rig.live.started_rigs import check_ports
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop, Outcome
@@ -107,7 +107,7 @@ def test_a_page_on_a_rig_has_a_user(
     async def serve(settings: object) -> None:
         served.append(settings.hmi)  # type: ignore[attr-defined]
 
-    monkeypatch.setattr("hmi.runtime.serve", serve)
+    monkeypatch.setattr("coldloop_hmi.runtime.serve", serve)
     ends = [f"127.0.0.1:{port}" for port in (1, 2, 3)]
     outcome = coldloop("page", "--rig", *ends, "--page-port", str(free_port))
     assert outcome.code == 0, outcome.complaints

@@ -8,17 +8,17 @@ from pathlib import Path
 import pyarrow.parquet
 import pytest
 
-import optimizer_plc.program
+import coldloop_optimizer_plc.program
 from coldloop.registers.control_plc import Update, Verdict
-from optimizer_plc.estimator import Estimator
-from optimizer_plc.program import OptimizerProgram
-from rig import cli, simulate
-from rig.cosim.one_process import OneProcessRig
-from rig.cosim.scenario import Scenario
-from rig.results.recording import MemorySink, Recorder
-from rig.runs.running import make_scenario
-from rig.settings import Settings
-from rig.studies.study import StudyResult
+from coldloop_optimizer_plc.estimator import Estimator
+from coldloop_optimizer_plc.program import OptimizerProgram
+from coldloop_rig import cli, simulate
+from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.results.recording import MemorySink, Recorder
+from coldloop_rig.runs.running import make_scenario
+from coldloop_rig.settings import Settings
+from coldloop_rig.studies.study import StudyResult
 from tests.conftest import Coldloop
 from tests.harness.records import as_transmitted
 
@@ -32,14 +32,14 @@ DIVERGING = 4.0
 @pytest.fixture
 def gains_times(monkeypatch: pytest.MonkeyPatch) -> Break:
     """Let the gains of all estimators be wrong by a factor."""
-    right = optimizer_plc.program.estimator_of
+    right = coldloop_optimizer_plc.program.estimator_of
 
     def of(factor: float) -> None:
         def wrong(*arguments: object) -> Estimator:
             c = right(*arguments)  # type: ignore[arg-type]
             return c._replace(stationary=c.stationary._replace(gains=c.stationary.gains * factor))
 
-        monkeypatch.setattr(optimizer_plc.program, "estimator_of", wrong)
+        monkeypatch.setattr(coldloop_optimizer_plc.program, "estimator_of", wrong)
 
     return of
 
@@ -120,7 +120,7 @@ def test_a_compiled_stretch_ends_where_there_is_no_answer(gains_times: Break) ->
 def test_a_study_with_such_runs_ends_with_three(
     coldloop: Coldloop, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("rig.studies.results.conduct", lambda *_: StudyResult((), [], {}, failed_runs=2))
+    monkeypatch.setattr("coldloop_rig.studies.results.conduct", lambda *_: StudyResult((), [], {}, failed_runs=2))
     done = coldloop("study", "periods", "--quick", "--out", tmp_path)
     assert done.code == 3
     assert done.complaints == ["coldloop: in 2 runs updates have no answer: what the optimiser computed is not finite"]

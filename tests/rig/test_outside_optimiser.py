@@ -24,11 +24,11 @@ from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import MAGIC, Identity
 from coldloop.registers.control_plc import LadderStatus, Mode, Status, Verdict
 from coldloop.registers.safety import LeaseState, LeaseStatus
-from rig import cli
-from rig.cosim.endpoints import REQUIRED
-from rig.cosim.scenario import Scenario
-from rig.cosim.session_client import SessionClient
-from rig.settings import Settings
+from coldloop_rig import cli
+from coldloop_rig.cosim.endpoints import REQUIRED
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.cosim.session_client import SessionClient
+from coldloop_rig.settings import Settings
 from tests.conftest import Coldloop
 from tests.harness.processes import Process, Processes
 from tests.harness.records import CONTROL_MAP

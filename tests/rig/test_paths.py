@@ -13,8 +13,8 @@ from typing import Final
 
 import pytest
 
-from rig import cli
-from rig.interpreter import PYTHON
+from coldloop_rig import cli
+from coldloop_rig.interpreter import PYTHON
 from tests.conftest import draw_nothing
 from tests.harness.path_options import PathOption, path_options
 from tests.harness.processes import environment
@@ -109,7 +109,7 @@ def test_what_is_no_file_is_one_line_in_bounded_memory(option: PathOption, tmp_p
         KINDS[kind](place)
         with growing(place) if kind == "grows" else nullcontext(), (folder / "said").open("w+") as said:
             process = subprocess.Popen(
-                [*PYTHON, "-m", "rig", *words(option, place, run)], cwd=folder, stdin=subprocess.DEVNULL,
+                [*PYTHON, "-m", "coldloop_rig", *words(option, place, run)], cwd=folder, stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL, stderr=said, env=environment(more={"XDG_RUNTIME_DIR": str(folder)}),
             )  # fmt: skip
             _, status, used = os.wait4(process.pid, 0)

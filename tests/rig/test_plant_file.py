@@ -11,16 +11,16 @@ from coldloop.errors import ModelFileError
 from coldloop.process.cold_box import COLD_BOX, L1, T5, T5_BAND
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.settings import DEFAULT_MODEL_FILE, ModelSettings
-from optimizer_plc.qp.design import ControlDesign
-from plant.cold_box.plant_file import PlantFile
-from plant.load import find_load
-from plant.numeric import RealArray
-from plant.refrigerator.plant_file import read_plant_file
-from rig import Simulation
-from rig import simulate as run_in_process
-from rig.cli.model_listing import describe_model
-from rig.cosim.scenario import Scenario
-from rig.settings import Settings
+from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_plant.cold_box.plant_file import PlantFile
+from coldloop_plant.load import find_load
+from coldloop_plant.numeric import RealArray
+from coldloop_plant.refrigerator.plant_file import read_plant_file
+from coldloop_rig import Simulation
+from coldloop_rig import simulate as run_in_process
+from coldloop_rig.cli.model_listing import describe_model
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.settings import Settings
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop

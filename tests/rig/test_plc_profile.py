@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from coldloop.errors import ColdloopError
-from optimizer_plc.budget import BudgetSettings, PlcBudget
-from rig import simulate
-from rig.plc_sizing.memory import Footprint
-from rig.plc_sizing.profile import find_profile, shipped_profiles
-from rig.plc_sizing.verdict import capacity, power_of
+from coldloop_optimizer_plc.budget import BudgetSettings, PlcBudget
+from coldloop_rig import simulate
+from coldloop_rig.plc_sizing.memory import Footprint
+from coldloop_rig.plc_sizing.profile import find_profile, shipped_profiles
+from coldloop_rig.plc_sizing.verdict import capacity, power_of
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop

@@ -8,10 +8,10 @@ import pytest
 import uvloop
 
 from coldloop.service.telemetry_settings import TelemetrySettings
-from rig.cosim.ports import HOST, ReservedPorts
-from rig.cosim.wiring import endpoints_on, wired
-from rig.live.started_rigs import DEFAULT_PORTS
-from rig.settings import Settings
+from coldloop_rig.cosim.ports import HOST, ReservedPorts
+from coldloop_rig.cosim.wiring import endpoints_on, wired
+from coldloop_rig.live.started_rigs import DEFAULT_PORTS
+from coldloop_rig.settings import Settings
 from tests.harness.processes import Processes
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="two sockets share a port in this way on Linux alone")

@@ -9,15 +9,15 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 from coldloop.kernels.compiled import forms_of
-from rig.cosim.one_process import OneProcessRig
-from rig.results.recording import Recorder
-from rig.runs.running import make_scenario
-from rig.settings import Settings
+from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.results.recording import Recorder
+from coldloop_rig.runs.running import make_scenario
+from coldloop_rig.settings import Settings
 
 pytestmark = pytest.mark.usefixtures("programs")
 
 ROOT = Path(__file__).parents[2]
-OURS = ("coldloop", "plant", "optimizer_plc", "control_plc", "rig")
+OURS = ("coldloop", "coldloop_plant", "coldloop_control_plc", "coldloop_optimizer_plc", "coldloop_rig")
 
 
 def compiled_kernels() -> int:
@@ -60,9 +60,9 @@ def test_each_image_can_compile_its_part(service: str) -> None:
 
 
 def test_the_failure_of_one_part_is_that_of_all(tmp_path: Path) -> None:
-    (tmp_path / "plant").mkdir()
-    (tmp_path / "plant" / "__init__.py").touch()
-    (tmp_path / "plant" / "settings.py").write_text("raise ImportError('broken')\n")
+    (tmp_path / "coldloop_plant").mkdir()
+    (tmp_path / "coldloop_plant" / "__init__.py").touch()
+    (tmp_path / "coldloop_plant" / "settings.py").write_text("raise ImportError('broken')\n")
     done = subprocess.run(
         [sys.executable, ROOT / "docker" / "precompile.py", "hmi", "plant", "control_plc"],
         check=False, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(tmp_path)},

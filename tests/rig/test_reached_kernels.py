@@ -12,10 +12,10 @@ from numba.core.dispatcher import Dispatcher
 from coldloop.kernels.compiled import _parts, cache_folder, forms_of
 from coldloop.kernels.ownership import label
 from coldloop.kernels.reach import reached
-from rig.cosim.one_process import OneProcessRig
-from rig.results.recording import Recorder
-from rig.runs.running import make_scenario
-from rig.settings import Settings
+from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.results.recording import Recorder
+from coldloop_rig.runs.running import make_scenario
+from coldloop_rig.settings import Settings
 from tests.rig.test_precompile import OURS
 
 pytestmark = pytest.mark.usefixtures("compiles")

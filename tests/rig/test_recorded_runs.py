@@ -23,10 +23,10 @@ from coldloop.errors import UsageError
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import read_load_file
 from coldloop.process.model_file import digest_of
-from rig import cli
-from rig.results.folders import claim_folder
-from rig.results.run_folder import RunFolder
-from rig.runs.inputs import configuration_digest, file_digest
+from coldloop_rig import cli
+from coldloop_rig.results.folders import claim_folder
+from coldloop_rig.results.run_folder import RunFolder
+from coldloop_rig.runs.inputs import configuration_digest, file_digest
 from tests.conftest import draw_nothing
 from tests.harness.processes import Processes
 

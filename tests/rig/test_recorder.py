@@ -6,7 +6,7 @@ import pytest
 
 from coldloop.errors import LinkError
 from coldloop.registers.plant import PlantSample
-from rig.results.recording import BLOCK_TICKS, KEPT_TICKS, Recorder
+from coldloop_rig.results.recording import BLOCK_TICKS, KEPT_TICKS, Recorder
 
 
 def sample(tick: int, load: float = 1.0) -> PlantSample:

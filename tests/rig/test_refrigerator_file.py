@@ -9,12 +9,12 @@ import pytest
 from coldloop.process.cold_box import COLD_BOX, T5_BAND
 from coldloop.process.lti_model import load
 from coldloop.process.settings import ModelSettings
-from plant.load import find_load
-from plant.own_model import own_header
-from plant.settings import PlantSection
-from rig import simulate as run_in_process
-from rig.cosim.scenario import Scenario
-from rig.settings import Settings
+from coldloop_plant.load import find_load
+from coldloop_plant.own_model import own_header
+from coldloop_plant.settings import PlantSection
+from coldloop_rig import simulate as run_in_process
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.settings import Settings
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop

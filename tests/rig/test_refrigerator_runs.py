@@ -10,7 +10,7 @@ import pytest
 
 from coldloop.process.cold_box import INPUT_NAMES, L1
 from coldloop.process.station import STATION_SIGNAL_NAMES
-from rig import simulate
+from coldloop_rig import simulate
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rig import simulate
+from coldloop_rig import simulate
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop

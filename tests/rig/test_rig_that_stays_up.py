@@ -14,9 +14,9 @@ import pytest
 from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.control_plc import Operator, OperatorMode
-from rig import cli
-from rig.live.link_cuts import CUT_FILES, CuttableLinks
-from rig.live.started_rigs import running_rig, state_folder
+from coldloop_rig import cli
+from coldloop_rig.live.link_cuts import CUT_FILES, CuttableLinks
+from coldloop_rig.live.started_rigs import running_rig, state_folder
 from tests.conftest import Coldloop
 from tests.harness.processes import Processes
 from tests.harness.records import CONTROL_MAP

@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from coldloop.process.cold_box import COLD_BOX, INPUT_NAMES
-from rig.figures.plot import Bounds, RunCurves, draw_run, label_marks, labels_of
-from rig.figures.run_plot import curves_of
-from rig.results.run_folder import RunFolder, _in_force
-from rig.studies.drawing import _updates
-from rig.studies.request import Outcome
+from coldloop_rig.figures.plot import Bounds, RunCurves, draw_run, label_marks, labels_of
+from coldloop_rig.figures.run_plot import curves_of
+from coldloop_rig.results.run_folder import RunFolder, _in_force
+from coldloop_rig.studies.drawing import _updates
+from coldloop_rig.studies.request import Outcome
 from tests.conftest import Coldloop
 
 TICKS = 4000

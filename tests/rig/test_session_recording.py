@@ -12,13 +12,13 @@ from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import Status
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, Optimization
 from coldloop.registers.safety import AlarmState
-from hmi.process_image import JournalEntry
-from optimizer_plc.publication import NO_UPDATE
-from rig.cosim.session_reader import UpdateReader
-from rig.cosim.session_recording import Lateness, state_of
-from rig.results.recorded import LinkStatistics
-from rig.results.recorded_alarms import alarms_after
-from rig.results.recording import Records
+from coldloop_hmi.process_image import JournalEntry
+from coldloop_optimizer_plc.publication import NO_UPDATE
+from coldloop_rig.cosim.session_reader import UpdateReader
+from coldloop_rig.cosim.session_recording import Lateness, state_of
+from coldloop_rig.results.recorded import LinkStatistics
+from coldloop_rig.results.recorded_alarms import alarms_after
+from coldloop_rig.results.recording import Records
 
 NOW = 1000
 """A tick after all that is noted."""

@@ -7,8 +7,8 @@ import pytest
 
 from coldloop.errors import UsageError
 from coldloop.process.cold_box import COLD_BOX
-from rig import Simulation, simulate
-from rig.results.columns import TRACE, files_of
+from coldloop_rig import Simulation, simulate
+from coldloop_rig.results.columns import TRACE, files_of
 from tests.harness.process_files import COLUMN, TANK
 
 
@@ -19,8 +19,8 @@ def minute() -> Simulation:
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_simulation_has_the_trace_of_the_command(minute: Simulation, tmp_path: Path) -> None:
-    from rig import cli  # noqa: PLC0415
-    from rig.results.run_folder import RunFolder  # noqa: PLC0415
+    from coldloop_rig import cli  # noqa: PLC0415
+    from coldloop_rig.results.run_folder import RunFolder  # noqa: PLC0415
 
     out = tmp_path / "run"
     assert cli.main(["run", "--in-process", "--load", "e", "--duration", "60s", "--out", str(out)]) == 0

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from rig import cli
+from coldloop_rig import cli
 from tests.harness.processes import Processes
 
-PACKAGES = ("plant", "control_plc", "optimizer_plc", "coldloop", "rig", "numpy")
+PACKAGES = ("coldloop_plant", "coldloop_control_plc", "coldloop_optimizer_plc", "coldloop", "coldloop_rig", "numpy")
 
 
 @pytest.mark.usefixtures("realtime")
@@ -26,7 +26,7 @@ def test_what_is_in_the_users_folder_is_not_run_in_the_place_of_a_service(
 def test_a_stream_that_the_caller_has_closed_is_not_taken_by_a_file(
     closed: str, tmp_path: Path, processes: Processes
 ) -> None:
-    command = f"exec {sys.executable} -m rig run --in-process --duration 10s --figures png --out run {closed}"
+    command = f"exec {sys.executable} -m coldloop_rig run --in-process --duration 10s --figures png --out run {closed}"
     shell = processes.python(
         "-c", f"import os; os.chdir({str(tmp_path)!r}); os.execv('/bin/sh', ['sh', '-c', {command!r}])"
     )

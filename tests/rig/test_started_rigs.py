@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from coldloop.errors import UsageError
-from rig.cosim.endpoints import RigEndpoints
-from rig.live.private_folder import base_folder, make_private, new_own, read_own, write_own
-from rig.live.process_faults import pause
-from rig.live.process_identity import identity_of
-from rig.live.started_rigs import (
+from coldloop_rig.cosim.endpoints import RigEndpoints
+from coldloop_rig.live.private_folder import base_folder, make_private, new_own, read_own, write_own
+from coldloop_rig.live.process_faults import pause
+from coldloop_rig.live.process_identity import identity_of
+from coldloop_rig.live.started_rigs import (
     LOCK_FILE,
     STATE_FILE,
     RigLock,
@@ -339,7 +339,7 @@ def test_ctrl_c_while_a_detached_rig_starts_ends_that(processes: "Processes") ->
 @pytest.mark.usefixtures("realtime")
 def test_of_two_that_are_started_together_one_is_up(processes: "Processes") -> None:
     base = str(processes.three_ports())
-    command = [sys.executable, "-m", "rig", "up", "--detach", "--port-base", base, "--load", "e"]
+    command = [sys.executable, "-m", "coldloop_rig", "up", "--detach", "--port-base", base, "--load", "e"]
     both = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(2)]
     ends = [(process.communicate(timeout=120), process.returncode) for process in both]
     try:
@@ -348,5 +348,7 @@ def test_of_two_that_are_started_together_one_is_up(processes: "Processes") -> N
         assert len(refusal.splitlines()) == 1
         assert rigs_up() == [running_rig(int(base))]
     finally:
-        subprocess.run([sys.executable, "-m", "rig", "down", "--port-base", base], check=True, capture_output=True)
+        subprocess.run(
+            [sys.executable, "-m", "coldloop_rig", "down", "--port-base", base], check=True, capture_output=True
+        )
     assert rigs_up() == []

@@ -12,7 +12,7 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.common import Identity
 from coldloop.registers.plant import PlantSession
-from rig.cosim.scenario import Scenario
+from coldloop_rig.cosim.scenario import Scenario
 from tests.harness.records import PLANT_MAP
 
 if TYPE_CHECKING:

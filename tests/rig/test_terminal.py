@@ -4,8 +4,8 @@ import sys
 
 import pytest
 
-from rig.terminal import Colour, coloured, cut, fitted
-from rig.text_tables import aligned
+from coldloop_rig.terminal import Colour, coloured, cut, fitted
+from coldloop_rig.text_tables import aligned
 
 ROWS = [
     ("solver", "paper s", "dense s", "default follows", "periods"),

@@ -1,4 +1,4 @@
-"""`rig.testing` and the fixture `coldloop_rigs`: rigs for test suites, ours and others'."""
+"""`coldloop_rig.testing` and the fixture `coldloop_rigs`: rigs for test suites, ours and others'."""
 
 import importlib.metadata
 import socket
@@ -10,7 +10,7 @@ import pytest
 
 from coldloop.errors import LinkError, RequestRefusedError, UsageError
 from coldloop.registers.control_plc import Mode, OperatorMode, PlantLinkState
-from rig.testing import LiveRig, Rigs, up
+from coldloop_rig.testing import LiveRig, Rigs, up
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 """Tables as text."""
 
-from rig.text_tables import aligned, markdown_table
+from coldloop_rig.text_tables import aligned, markdown_table
 
 
 def test_names_are_aligned_to_the_left_and_numbers_to_the_right() -> None:

@@ -8,11 +8,11 @@ from typing import Final
 import pytest
 from distributed import Client
 
-from rig.results.indicators import Indicators
-from rig.studies.execution import Store, Workers
-from rig.studies.request import UPDATE_COLUMNS, Outcome, RunRequest, perform
-from rig.studies.results import conduct
-from rig.studies.study import RUNS, Load, Study, StudyOptions, StudyResult, draw_of
+from coldloop_rig.results.indicators import Indicators
+from coldloop_rig.studies.execution import Store, Workers
+from coldloop_rig.studies.request import UPDATE_COLUMNS, Outcome, RunRequest, perform
+from coldloop_rig.studies.results import conduct
+from coldloop_rig.studies.study import RUNS, Load, Study, StudyOptions, StudyResult, draw_of
 
 Requests = Callable[[int], list[RunRequest]]
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.errors import ColdloopError
-from optimizer_plc.computing_settings import OutsideSettings
-from rig.studies.beyond.compare import CompareStudy
-from rig.studies.outside_parts import _digest, outside_digests
-from rig.studies.study import StudyOptions
-from rig.studies.variants import read_variants
+from coldloop_optimizer_plc.computing_settings import OutsideSettings
+from coldloop_rig.studies.beyond.compare import CompareStudy
+from coldloop_rig.studies.outside_parts import _digest, outside_digests
+from coldloop_rig.studies.study import StudyOptions
+from coldloop_rig.studies.variants import read_variants
 
 if TYPE_CHECKING:
     from tests.studies.conftest import Conducted, MakeOutcome

@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
-from optimizer_plc.qp.costs import augmented_cost
-from optimizer_plc.qp.problem import QuadraticProblem
-from rig.cosim.ideal_loop import Solved, run_ideal_loop
-from rig.cosim.scenario import Scenario
-from rig.results.recording import Recorder, Recording
-from rig.studies.request import Outcome, perform
-from rig.studies.settings import settings_of
-from rig.studies.study import Load
+from coldloop_optimizer_plc.qp.costs import augmented_cost
+from coldloop_optimizer_plc.qp.problem import QuadraticProblem
+from coldloop_rig.cosim.ideal_loop import Solved, run_ideal_loop
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.results.recording import Recorder, Recording
+from coldloop_rig.studies.request import Outcome, perform
+from coldloop_rig.studies.settings import settings_of
+from coldloop_rig.studies.study import Load
 
 Array = NDArray[np.float64]
 SETTINGS = settings_of(())

@@ -4,13 +4,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-import rig.studies.execution
-from rig.studies.execution import Workers, perform_all
-from rig.studies.identical import families, iteration_limit, never_cut_off, same_run
-from rig.studies.request import Outcome, RunRequest, perform
-from rig.studies.solver_runs import throttled
-from rig.studies.store import Store
-from rig.studies.study import Load, StudyOptions, draw_of
+import coldloop_rig.studies.execution
+from coldloop_rig.studies.execution import Workers, perform_all
+from coldloop_rig.studies.identical import families, iteration_limit, never_cut_off, same_run
+from coldloop_rig.studies.request import Outcome, RunRequest, perform
+from coldloop_rig.studies.solver_runs import throttled
+from coldloop_rig.studies.store import Store
+from coldloop_rig.studies.study import Load, StudyOptions, draw_of
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -79,14 +79,14 @@ def test_identical_runs_are_done_once(
     powers = (25.0, 1.0, 15.0, 7.0)
     asked = [throttled(load, "qpoases", power) for power in powers]
     begun: list[RunRequest] = []
-    do = rig.studies.execution._done  # noqa: SLF001 what goes to the workers
+    do = coldloop_rig.studies.execution._done  # noqa: SLF001 what goes to the workers
 
     def watched(*arguments: object) -> object:
         for request in do(*arguments):  # type: ignore[arg-type]
             begun.append(request)
             yield request
 
-    monkeypatch.setattr(rig.studies.execution, "_done", watched)
+    monkeypatch.setattr(coldloop_rig.studies.execution, "_done", watched)
     outcomes = perform_all(asked, store, Workers(1, scheduler=client.scheduler.address), "test")
     assert begun == [asked[0], asked[1]]
     assert [outcomes[request].to_json() for request in asked] == [perform(request) for request in asked]

@@ -11,17 +11,17 @@ from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind
-from rig.studies import STUDIES
-from rig.studies.beyond.coupling import CASES as PLANTS
-from rig.studies.paper.cholesky import SLOW_DOWN, SPEED
-from rig.studies.paper.solver_comparison import measures
-from rig.studies.paper.trade_off import share_falling, won_and_lost
-from rig.studies.paper.trajectories import furthest_outside, iterations_by_event, load_steps
-from rig.studies.request import Happening
-from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult
+from coldloop_rig.studies import STUDIES
+from coldloop_rig.studies.beyond.coupling import CASES as PLANTS
+from coldloop_rig.studies.paper.cholesky import SLOW_DOWN, SPEED
+from coldloop_rig.studies.paper.solver_comparison import measures
+from coldloop_rig.studies.paper.trade_off import share_falling, won_and_lost
+from coldloop_rig.studies.paper.trajectories import furthest_outside, iterations_by_event, load_steps
+from coldloop_rig.studies.request import Happening
+from coldloop_rig.studies.study import Load, Outcomes, StudyOptions, StudyResult
 
 if TYPE_CHECKING:
-    from rig.studies.request import Outcome
+    from coldloop_rig.studies.request import Outcome
     from tests.studies.conftest import MakeOutcome
 
 TICKS = 8

@@ -12,24 +12,24 @@ from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.settings import SHIPPED_MODELS
-from optimizer_plc.computing_settings import QpoasesSettings
-from optimizer_plc.qp.design import ControlDesign
-from optimizer_plc.qp.penalties import Preset
-from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
-from optimizer_plc.settings import ProgramSettings, SolverName
-from optimizer_plc.solvers import make_solver
-from plant.load import find_load
-from rig.cosim.scenario import Scenario
-from rig.studies import STUDIES
-from rig.studies.harsh_problems import harsh_request, harsh_table, harsh_values
-from rig.studies.paired_run import equal_counts, harsh_run, paired_indicators, paired_run
-from rig.studies.paired_sums import watch
-from rig.studies.paper.open_loop import LABELS, open_loop, open_loop_table, paired_request, powers_of
-from rig.studies.played_profiles import PlayedProfiles
-from rig.studies.problem_sequence import ProblemSequence, problem_sequence
-from rig.studies.request import Outcome, perform
-from rig.studies.study import StudyOptions, draw_of
+from coldloop_optimizer_plc.computing_settings import QpoasesSettings
+from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.prediction import PredictionModel
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
+from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
+from coldloop_optimizer_plc.solvers import make_solver
+from coldloop_plant.load import find_load
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.studies import STUDIES
+from coldloop_rig.studies.harsh_problems import harsh_request, harsh_table, harsh_values
+from coldloop_rig.studies.paired_run import equal_counts, harsh_run, paired_indicators, paired_run
+from coldloop_rig.studies.paired_sums import watch
+from coldloop_rig.studies.paper.open_loop import LABELS, open_loop, open_loop_table, paired_request, powers_of
+from coldloop_rig.studies.played_profiles import PlayedProfiles
+from coldloop_rig.studies.problem_sequence import ProblemSequence, problem_sequence
+from coldloop_rig.studies.request import Outcome, perform
+from coldloop_rig.studies.study import StudyOptions, draw_of
 
 if TYPE_CHECKING:
     from pathlib import Path

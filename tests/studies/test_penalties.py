@@ -9,8 +9,8 @@ import pytest
 
 from coldloop.errors import StudyError
 from coldloop.process.load_profile import LoadProfile
-from rig.studies.beyond.penalties import PenaltiesStudy, misfit
-from rig.studies.beyond.penalty_variants import (
+from coldloop_rig.studies.beyond.penalties import PenaltiesStudy, misfit
+from coldloop_rig.studies.beyond.penalty_variants import (
     OWN,
     PRESETS,
     VARIANTS,
@@ -20,12 +20,12 @@ from rig.studies.beyond.penalty_variants import (
     paired_sums,
     powers_of,
 )
-from rig.studies.paper.best_periods import FIRST, end_over_best, share_inside
-from rig.studies.paper.open_loop import paired_loads
-from rig.studies.paper.updating_period import is_inside
-from rig.studies.request import Outcome, RunRequest
-from rig.studies.settings import settings_of
-from rig.studies.study import Load, StudyOptions, first_and_fresh
+from coldloop_rig.studies.paper.best_periods import FIRST, end_over_best, share_inside
+from coldloop_rig.studies.paper.open_loop import paired_loads
+from coldloop_rig.studies.paper.updating_period import is_inside
+from coldloop_rig.studies.request import Outcome, RunRequest
+from coldloop_rig.studies.settings import settings_of
+from coldloop_rig.studies.study import Load, StudyOptions, first_and_fresh
 from tests.studies.conftest import NOTHING
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from coldloop.errors import StudyError
-from rig.studies.beyond.periods import judged
+from coldloop_rig.studies.beyond.periods import judged
 
 COSTS = np.array(
     [

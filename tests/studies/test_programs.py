@@ -15,11 +15,11 @@ import pytest
 
 from coldloop.kernels.ownership import is_decisive_module
 from coldloop.kernels.reach import reached
-from rig.cosim.compiled.cold_box_plants import advance_box
-from rig.studies.request import Procedure, RunRequest, perform, programs, programs_digest
+from coldloop_rig.cosim.compiled.cold_box_plants import advance_box
+from coldloop_rig.studies.request import Procedure, RunRequest, perform, programs, programs_digest
 
 ROOT = Path(__file__).parents[2]
-DIGEST = "from rig.studies.request import programs_digest; print(programs_digest())"
+DIGEST = "from coldloop_rig.studies.request import programs_digest; print(programs_digest())"
 SHORT = RunRequest("", (0, 30), (400.0, 300.0), 60, 0.5)
 
 
@@ -85,7 +85,18 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def digest_in(folder: Path, first: str = "", **environment: str) -> str:
     """Return what a process computes with the sources in a folder."""
-    path = os.pathsep.join(str(folder / name) for name in ("shared", "services", "."))
+    path = os.pathsep.join(
+        str(folder / name)
+        for name in (
+            "shared",
+            "services/plant",
+            "services/control_plc",
+            "services/optimizer_plc",
+            "services/hmi",
+            "rig",
+            ".",
+        )
+    )
     done = subprocess.run(
         [sys.executable, "-P", "-c", f"{first}\n{DIGEST}"], env={**os.environ, "PYTHONPATH": path, **environment},
         check=True, capture_output=True, text=True,
@@ -95,7 +106,7 @@ def digest_in(folder: Path, first: str = "", **environment: str) -> str:
 
 @pytest.mark.usefixtures("compiles")
 def test_the_digest_is_the_same_elsewhere_and_whatever_was_imported_or_done_before(copy: Path) -> None:
-    before = "import rig.cosim.compiled.own_plants, rig.cli.commands.run, rig; rig.simulate(load='a', duration_s=15)"
+    before = "import coldloop_rig.cosim.compiled.own_plants, coldloop_rig.cli.commands.run, rig; rig.simulate(load='a', duration_s=15)"
     assert digest_in(copy, before, PYTHONHASHSEED="1") == programs_digest()
 
 
@@ -103,9 +114,9 @@ def test_the_digest_is_the_same_elsewhere_and_whatever_was_imported_or_done_befo
 @pytest.mark.parametrize(
     ("file", "old", "new"),
     [
-        ("rig/cosim/compiled/cold_box_plants.py", "station[SIGNALS + 1]", "station[SIGNALS + 0]"),
+        ("rig/coldloop_rig/cosim/compiled/cold_box_plants.py", "station[SIGNALS + 1]", "station[SIGNALS + 0]"),
         ("shared/coldloop/registers/plant.py", "MAX_STATE: Final = 1e9", "MAX_STATE: Final = 1e8"),
-        ("services/plant/helium/properties.py", "COLDEST = 1.0", "COLDEST = 1.5"),
+        ("services/plant/coldloop_plant/helium/properties.py", "COLDEST = 1.0", "COLDEST = 1.5"),
     ],
 )
 def test_an_edit_of_what_a_run_uses_is_another_digest(copy: Path, file: str, old: str, new: str) -> None:
@@ -121,9 +132,9 @@ def test_an_edit_of_what_a_run_uses_is_another_digest(copy: Path, file: str, old
 @pytest.mark.usefixtures("programs")
 def test_the_edit_of_a_docstring_a_comment_or_the_page_is_not(copy: Path) -> None:
     for file, old, new in (
-        ("services/optimizer_plc/settings.py", '"""Configuration', '"""The configuration'),
-        ("services/plant/helium/properties.py", "# K, below the table", "# K, somewhat below the table"),
-        ("services/hmi/trends.py", "import math\n", "import math\n\nEXTRA = 1\n"),
+        ("services/optimizer_plc/coldloop_optimizer_plc/settings.py", '"""Configuration', '"""The configuration'),
+        ("services/plant/coldloop_plant/helium/properties.py", "# K, below the table", "# K, somewhat below the table"),
+        ("services/hmi/coldloop_hmi/trends.py", "import math\n", "import math\n\nEXTRA = 1\n"),
     ):
         text = (copy / file).read_text()
         assert old in text

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from coldloop.config import load_configuration
-from rig.settings import Settings
-from rig.studies.beyond.conditions import ESTIMATED, LINEAR, NOMINAL
-from rig.studies.beyond.robust_controllers import (
+from coldloop_rig.settings import Settings
+from coldloop_rig.studies.beyond.conditions import ESTIMATED, LINEAR, NOMINAL
+from coldloop_rig.studies.beyond.robust_controllers import (
     CONDITIONS,
     CONTROLLERS,
     DEFAULT,
@@ -16,8 +16,8 @@ from rig.studies.beyond.robust_controllers import (
     holding,
     over_own,
 )
-from rig.studies.settings import settings_of
-from rig.studies.study import StudyOptions
+from coldloop_rig.studies.settings import settings_of
+from coldloop_rig.studies.study import StudyOptions
 
 PAPER, FIXED = "paper, Algorithm 1", "tuned, fixed 2.5 s"
 HOURS = StudyOptions(ticks=60, loads=("a", "c"), seeds=1)

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from rig.report.document import (
+from coldloop_rig.report.document import (
     PLACEHOLDER,
     as_page,
     deviations,
@@ -26,8 +26,8 @@ from rig.report.document import (
     scorecard_table,
     verdict_counts,
 )
-from rig.report.reproduction import EXPLANATIONS, circumstances, lead
-from rig.report.scorecard import (
+from coldloop_rig.report.reproduction import EXPLANATIONS, circumstances, lead
+from coldloop_rig.report.scorecard import (
     FROM_POINTS,
     TOLERANCES,
     Claim,
@@ -44,12 +44,12 @@ from rig.report.scorecard import (
     verdict,
     withdrawn,
 )
-from rig.studies import STUDIES
-from rig.studies import published as paper
-from rig.studies.crossing import crossing
-from rig.studies.paper.load_response import response
-from rig.studies.paper.solver_comparison import measures
-from rig.studies.study import StudyOptions
+from coldloop_rig.studies import STUDIES
+from coldloop_rig.studies import published as paper
+from coldloop_rig.studies.crossing import crossing
+from coldloop_rig.studies.paper.load_response import response
+from coldloop_rig.studies.paper.solver_comparison import measures
+from coldloop_rig.studies.study import StudyOptions
 
 ROOT = Path(__file__).parents[2]
 FIRST = Path(__file__).with_name("tolerances-before-the-first-report.toml")
@@ -147,9 +147,9 @@ def git(*arguments: str) -> str:
 @pytest.mark.skipif(not (ROOT / ".git").exists(), reason="an unpacked source distribution has no history")
 def test_each_change_in_the_history_of_the_file_was_dated_when_it_was_made() -> None:
     """From the version before the first report on; a clone without its whole history shows what it has."""
-    log = git("log", "--reverse", "--format=%H %as", "--", "rig/report/tolerances.toml").split()
+    log = git("log", "--reverse", "--format=%H %as", "--", "rig/coldloop_rig/report/tolerances.toml").split()
     versions = [
-        (git("show", f"{commit}:rig/report/tolerances.toml"), day)
+        (git("show", f"{commit}:rig/coldloop_rig/report/tolerances.toml"), day)
         for commit, day in zip(log[::2], log[1::2], strict=True)
     ]
     shallow = git("rev-parse", "--is-shallow-repository").strip() == "true"

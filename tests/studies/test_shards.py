@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-import rig.studies.execution
+import coldloop_rig.studies.execution
 from coldloop.errors import ResultsError, StudyError, UsageError
-from rig.studies import STUDIES
-from rig.studies.execution import Workers, perform_all
-from rig.studies.request import RunRequest, perform
-from rig.studies.results import conduct
-from rig.studies.shards import Shard, conduct_shard, merge
-from rig.studies.store import Store, StoredOutcomes
-from rig.studies.study import RUNS, StudyOptions
+from coldloop_rig.studies import STUDIES
+from coldloop_rig.studies.execution import Workers, perform_all
+from coldloop_rig.studies.request import RunRequest, perform
+from coldloop_rig.studies.results import conduct
+from coldloop_rig.studies.shards import Shard, conduct_shard, merge
+from coldloop_rig.studies.store import Store, StoredOutcomes
+from coldloop_rig.studies.study import RUNS, StudyOptions
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -223,7 +223,7 @@ def test_a_folder_that_the_workers_do_not_have_is_one_line(
 def test_a_file_that_a_worker_wrote_elsewhere_is_one_line(
     requests: "Requests", running: Workers, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rig.studies.execution, "FILE_PATIENCE_S", 0.0)
+    monkeypatch.setattr(coldloop_rig.studies.execution, "FILE_PATIENCE_S", 0.0)
     monkeypatch.setattr(Store, "find", lambda *_: None)
     with pytest.raises(StudyError, match=r"a worker has written it, and it is not here; name an --out"):
         perform_all(requests(1), store, running, "test")

@@ -6,7 +6,17 @@ import sysconfig
 from pathlib import Path
 from typing import Any, Final
 
-PROJECT: Final = frozenset({"coldloop", "plant", "control_plc", "optimizer_plc", "hmi", "rig", "tests"})
+PROJECT: Final = frozenset(
+    {
+        "coldloop",
+        "coldloop_plant",
+        "coldloop_control_plc",
+        "coldloop_optimizer_plc",
+        "coldloop_hmi",
+        "coldloop_rig",
+        "tests",
+    }
+)
 """Packages that are ours wherever they are installed; what is not part of an installed distribution is ours, too."""
 NOT_DECISIVE: Final = frozenset({
     "coldloop.kernels.cache_folder", "coldloop.kernels.compiled", "coldloop.kernels.data",

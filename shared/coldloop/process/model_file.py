@@ -20,7 +20,7 @@ from coldloop.text_file import read_bytes
 from coldloop.whole_file import whole_text
 
 FORMAT = 1
-REMEDY = "make a new one with `python -m plant.cold_box.model FILE`"
+REMEDY = "make a new one with `python -m coldloop_plant.cold_box.model FILE`"
 PROCESS_REMEDY: Final = "make one with `coldloop process FILE --out MODEL`"
 COLD_BOX = "cold-box"
 """The plant of a model file that names none."""

@@ -1,6 +1,6 @@
 """Sections of a process, as a process file has them; `docs/keys.md` is made of what is said of their keys here.
 
-What is not given follows from what is, here or when the model is made (`rig.process_file.making`).
+What is not given follows from what is, here or when the model is made (`coldloop_rig.process_file.making`).
 """
 
 import struct

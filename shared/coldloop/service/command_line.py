@@ -12,7 +12,7 @@ def add_configuration_options(parser: argparse.ArgumentParser, *, again: bool = 
         again: For a subcommand: what is not given there leaves what was given before it, `--set` adds to it.
     """
     default = argparse.SUPPRESS if again else None
-    parser.register("type", "read", Path)  # as `rig.cli.USES`
+    parser.register("type", "read", Path)  # as `coldloop_rig.cli.USES`
     parser.add_argument("--config", type="read", default=default, metavar="FILE", help="configuration file (TOML)")
     parser.add_argument(
         "--set", dest="further_assignments" if again else "assignments", action="append",

@@ -22,15 +22,15 @@ from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import read_header
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.optimizer_plc import Optimization
-from plant.load import find_load
-from plant.program import PlantProgram
-from rig.cosim.one_process import OneProcessRig
-from rig.cosim.scenario import Scenario
-from rig.process_file.making import made_from
-from rig.results.driving import CONTROL, PLANT
-from rig.results.indicators import Indicators, RunEvaluation
-from rig.results.recording import MemorySink, Recorder
-from rig.settings import Settings
+from coldloop_plant.load import find_load
+from coldloop_plant.program import PlantProgram
+from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.process_file.making import made_from
+from coldloop_rig.results.driving import CONTROL, PLANT
+from coldloop_rig.results.indicators import Indicators, RunEvaluation
+from coldloop_rig.results.recording import MemorySink, Recorder
+from coldloop_rig.settings import Settings
 from tests.harness.configurations import lively
 from tests.harness.process_configurations import load_of_shares
 from tests.harness.process_files import PROCESSES

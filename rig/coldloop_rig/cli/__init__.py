@@ -1,0 +1,208 @@
+"""The command `coldloop`."""
+
+import argparse
+import errno
+import logging
+import os
+import platform
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Final, NoReturn
+
+from coldloop import __version__
+from coldloop.errors import ColdloopError, UsageError, printable
+from coldloop_rig.cli.process_option import OPTION, VARIABLES, is_another, named_process
+from coldloop_rig.interruption import INTERRUPTION
+
+GROUPS: Final = {
+    "a run": {
+        "run": "run the loop, record it, and draw a figure",
+        "rerun": "repeat a recorded run and compare the traces",
+        "plot": "draw a recorded run again, as PNG, PDF or SVG",
+        "report": "one HTML page of a recorded run, with interactive plots",
+        "compare": "a table and a figure of several recorded runs",
+        "export": "a run as CSV, MATLAB or HDF5; the optimiser as C99 or Structured Text",
+        "chaos": "a run with injected faults, and its evaluation",
+    },
+    "a rig that stays up": {
+        "up": "start a rig in real time, on fixed ports",
+        "down": "end a rig that is up",
+        "status": "mode, load, outputs, updating period, alarms",
+        "set": "load, mode, setpoint, factor, pause, resume, acknowledge",
+        "fault": "kill or pause a service, fake a sensor, cut a link",
+        "record": "record a session that is under way, to be replayed",
+        "page": "the operator's page of a rig, or of recorded runs",
+        "events": "the journal of a running service",
+        "proxy": "delays, loses, damages, cuts or refuses Modbus/TCP traffic",
+        "certificates": "certificates for Modbus/TCP Security on a test site",
+        "registers": "the register maps",
+    },
+    "a plant and its controller": {
+        "new": "a folder with a process file and a plant to begin with",
+        "process": "a process file, checked, linearised, judged, made into a model file",
+        "import": "a historian's export made into a record for a process file",
+        "budget": "what a PLC can compute, and whether an adaptive period pays there",
+        "model": "the prediction model",
+        "design": "which decision and constraint instants the problem needs",
+        "identify": "how much the gains of the model should be scaled to predict a run",
+        "exergy": "where a refrigerator loses the exergy that it is given",
+    },
+    "studies": {
+        "study": "do the runs of a study and draw its figure",
+        "reproduce": "all studies of the paper, one report and a scorecard",
+    },
+    "help and settings": {
+        "docs": "the pages of the documentation, one of them or a section",
+        "config": "the effective configuration and where each value comes from",
+        "completion": "a script that completes commands and options in a shell",
+    },
+}
+COMMANDS: Final = {name: said for group in GROUPS.values() for name, said in group.items()}
+MODULES: Final = {"import": "import_record"}
+"""Of commands that are words of Python."""
+QUESTION: Final = """Can this predictive controller run on that PLC, and how often should it update?
+A networked PLC rig for fast MPC."""
+EXTRAS: Final = {
+    "CoolProp": "tables", "aiohttp": "hmi", "casadi": "qpoases", "distributed": "studies", "fmpy": "fmu",
+    "h5py": "hdf5", "jinja2": "report", "markdown_it": "report", "pandas": "records", "plotly": "report",
+}  # fmt: skip
+"""The extra that brings a package which not every command needs."""
+OF_THE_OUTPUT: Final = (errno.ENOSPC, errno.EIO, errno.EBADF, errno.EDQUOT, errno.EFBIG)
+"""Errors of writing."""
+INTERRUPTED = 130
+OF_THE_COLD_BOX: Final = ("study", "reproduce", "model", "exergy")
+"""Commands that are about its equations, its loads or the paper's figures."""
+OF_ANY_PROCESS: Final = ("periods", "compare")
+"""Studies that are not."""
+
+
+USES: Final = {"read": Path, "name": str, "folder": Path, "export": str, "write": Path, "into": Path}
+"""Types of options that are paths: a file or a folder to read, a name or a file, sources to run, or what is written."""
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """Reports a usage error as one line, and takes no abbreviations of options."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:  # noqa: ANN401 as argparse has them
+        super().__init__(*args, **{"allow_abbrev": False, **options})
+        for use, kind in USES.items():
+            self.register("type", use, kind)
+
+    def error(self, message: str) -> NoReturn:
+        """End with exit code 2."""
+        self.exit(2, f"{self.prog}: {printable(message)}; see {self.prog} --help\n")
+
+
+def make_parser(chosen: str | None) -> argparse.ArgumentParser:
+    """Return the parser of all commands, with the options of the chosen one; other commands are not imported."""
+    parser = OneLineParser(
+        prog="coldloop", description=QUESTION, epilog=_by_group(), formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--version", action="version", version=_version())
+    parser.add_argument(OPTION, metavar="FILE", help="another process than the cold box: a process file, or a"
+                        " model file made from one")  # fmt: skip
+    parser.set_defaults(execute=None)
+    commands = parser.add_subparsers(metavar="COMMAND", parser_class=OneLineParser, help="one of those below")
+    for name in COMMANDS:
+        command = commands.add_parser(name)
+        if name == chosen:
+            module = import_module(f"coldloop_rig.cli.commands.{MODULES.get(name, name)}")
+            command.description = module.__doc__
+            module.declare(command)
+            command.set_defaults(execute=module.execute)
+    version = commands.add_parser("version")
+    version.set_defaults(execute=_print_version)
+    return parser
+
+
+def _by_group() -> str:
+    """Return the commands by what they are for."""
+    width = max(map(len, COMMANDS)) + 2
+    return (
+        "\n".join(
+            f"{group}:\n" + "".join(f"  {name:{width}}{said}\n" for name, said in commands.items())
+            for group, commands in GROUPS.items()
+        )
+        + "\ncoldloop COMMAND --help shows the options of one."
+    )
+
+
+def _version() -> str:
+    return f"coldloop {__version__} (Python {platform.python_version()})"
+
+
+def _print_version(_: argparse.Namespace) -> int:
+    sys.stdout.write(f"{_version()}\n")
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; return its exit code: 0 done, 1 failed, 2 wrong usage, 3 not finite, 130 interrupted."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    with INTERRUPTION:
+        if "_ARGCOMPLETE" in os.environ:
+            _complete()
+        try:
+            with named_process(given) as left:
+                code = _execute(make_parser(left[0] if left else None), left)
+            sys.stdout.flush()
+        except ColdloopError as error:
+            sys.stderr.write(f"coldloop: {error}\n")
+            return error.exit_code
+        except BrokenPipeError:
+            _discard_output()
+            return 0
+        except OSError as error:  # commands report errors of their own files: what is left is mostly standard output
+            place = error.filename or ("standard output" if error.errno in OF_THE_OUTPUT else given[0])
+            _discard_output()
+            sys.stderr.write(f"coldloop: {place}: {error.strerror or error}\n")
+            return 1
+        return code
+
+
+def _execute(parser: argparse.ArgumentParser, given: Sequence[str]) -> int:
+    options, unknown = parser.parse_known_args(given)
+    if unknown:
+        parser.prog = " ".join([parser.prog, *given[: options.execute is not None]])
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+    named = given[1] if len(given) > 1 else None
+    if given and given[0] in OF_THE_COLD_BOX and named not in OF_ANY_PROCESS and is_another():
+        sys.stderr.write(f"coldloop: {given[0]}: of the cold box alone; leave out {OPTION} and unset {VARIABLES[0]}\n")
+        return UsageError.exit_code
+    if options.execute is None:
+        parser.print_help()
+        return 0
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    try:
+        return int(options.execute(options))
+    except ColdloopError as error:
+        sys.stderr.write(f"coldloop: {error}\n")
+        return error.exit_code
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in EXTRAS:
+            raise
+        sys.stderr.write(f"coldloop: {given[0]} needs {package}: pip install 'coldloop[{EXTRAS[package]}]'\n")
+        return UsageError.exit_code
+    except KeyboardInterrupt:
+        sys.stderr.write("coldloop: interrupted\n")
+        return INTERRUPTED
+
+
+def _complete() -> NoReturn:
+    """Print the shell's completions of the line."""
+    from argcomplete import autocomplete  # noqa: PLC0415 only a shell needs it
+
+    words = os.environ.get("COMP_LINE", "").split()
+    parser = make_parser(words[1] if len(words) > 1 and words[1] in COMMANDS else None)
+    autocomplete(parser)
+    sys.exit(0)
+
+
+def _discard_output() -> None:
+    """Let the interpreter's last flush of standard output succeed."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

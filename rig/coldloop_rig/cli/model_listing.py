@@ -1,0 +1,175 @@
+"""The cold box at its operating point, and its linear model as both PLCs run it, as text."""
+
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from coldloop.errors import ModelFileError, printable
+from coldloop.process.cold_box import L1, T5
+from coldloop.process.limits import InputLimits
+from coldloop.process.lti_model import LtiModel, load
+from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
+from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_plant.cold_box.capacity import LOOP_MARGIN, held_loads
+from coldloop_plant.cold_box.diagnosis import operating_point
+from coldloop_plant.cold_box.equilibrium import Equilibrium
+from coldloop_plant.cold_box.linearisation import linearisation_error
+from coldloop_plant.cold_box.model import model_at
+from coldloop_plant.cold_box.physics import ColdBox
+from coldloop_plant.cold_box.plant_file import PlantFile
+from coldloop_plant.helium.properties import load_helium
+from coldloop_plant.refrigerator.diagnosis import cold_part, cooled_file, refrigerator_operating_point
+from coldloop_plant.refrigerator.equilibrium import Rest
+from coldloop_plant.refrigerator.plant_file import RefrigeratorPlantFile
+from coldloop_plant.refrigerator.station_settings import StationSettings
+
+DEFAULT_CONTROL: Final = StationSettings()
+HORIZON_S = 100.0
+"""Time after which the gains are given: the level integrates, so there are no final ones."""
+TWO_SIDED = 1e-3
+"""Difference of the derivatives from central ones from which on the plant has a kink there."""
+GRID = 21, 3
+"""Openings of CV155 and of CV156 at which it is tried which loads the plant holds."""
+
+
+class Description(NamedTuple):
+    """The model of a plant file, and what is said of it."""
+
+    model: LtiModel
+    text: str
+    box: ColdBox
+    """With the temperature after the pre-cooler that it has at rest."""
+
+
+def describe_model(
+    in_use: Path, plant: PlantFile, design: ControlDesign, control: StationSettings = DEFAULT_CONTROL
+) -> Description:
+    """Solve for the operating point and linearise there; return the model and its description.
+
+    Args:
+        in_use: Model file that is configured, which is compared by its digest.
+        plant: The cold box or the refrigerator, and its operating point.
+        design: Whose bands the outputs at rest are compared with.
+        control: Of a refrigerator's pressures; its weights decide the gains.
+
+    Raises:
+        coldloop_plant.cold_box.equilibrium.NoEquilibriumError: The plant does not come to rest there; one line that says why.
+    """
+    helium = load_helium()
+    if isinstance(plant, RefrigeratorPlantFile):
+        found = refrigerator_operating_point(plant, helium, control.weights)
+        rest, box, model = cold_part(found.rest), cooled_file(plant, found.rest).box, found.model
+        station = [*_station_lines(found.rest), *_set_point_line(plant, control)]
+    else:
+        rest, box, station = operating_point(plant, helium), plant.box, []
+        model = model_at(rest, box, helium, plant.parameters)
+    error = linearisation_error(rest.x, rest.u, rest.w, box, helium)
+    lines = [
+        *_equilibrium_lines(model, rest),
+        *station,
+        *_eigenvalue_lines(model, error),
+        *_gain_lines(model),
+        *_kink_line(error),
+        *_band_lines(rest, design),
+        f"model      sha256 {model.digest}",
+        *_in_use_line(in_use),
+    ]
+    return Description(model, "\n".join(lines) + "\n", box)
+
+
+def _in_use_line(file: Path) -> list[str]:
+    """Return digest and note of the configured model; nothing where there is none, which the command then says."""
+    try:
+        model = load(file)
+    except ModelFileError:
+        return []
+    note = [f"           {printable(model.note)}"] if model.note else []
+    return [f"in use     sha256 {model.digest} ({file})", *note]
+
+
+def _equilibrium_lines(model: LtiModel, rest: Equilibrium) -> list[str]:
+    inputs = ", ".join(
+        f"{name} {value:g} {unit}"
+        for name, value, unit in zip(model.input_names, rest.u, model.input_units, strict=True)
+    )
+    outputs = [
+        f"{name} {value:.4f} {unit}"
+        for name, value, unit in zip(model.output_names, rest.y, model.output_units, strict=True)
+    ]
+    return [
+        f"operating point: {inputs}, load {rest.w:.2f} W; cold power {rest.w + rest.u[1]:.2f} W",
+        f"residual   {rest.residual:.2e} per second (2 kPa, 1 % of level, 1 K)",
+        *(f"outputs    {'  '.join(outputs[i : i + 6])}" for i in range(0, len(outputs), 6)),
+    ]
+
+
+def _station_lines(rest: Rest) -> list[str]:
+    signals = dict(zip(STATION_SIGNAL_NAMES, rest.signals.tolist(), strict=True))
+    openings = [f"{name} {value:.2f} %" for name, value in zip(STATION_VALVE_NAMES, rest.v.tolist(), strict=True)]
+    per_watt = 1e3 * signals["E_NC"] / float(rest.d[0] + rest.u[1])
+    return [
+        f"station    {'  '.join(openings)}",
+        f"           compressors {signals['M_NC']:.1f} g/s, {signals['E_NC']:.1f} kW, {per_watt:.0f} W/W",
+        f"           bypass {signals['M_CV956']:.1f} g/s, nitrogen {signals['M_GN2']:.2f} g/s",
+    ]
+
+
+def _set_point_line(plant: RefrigeratorPlantFile, control: StationSettings) -> list[str]:
+    """Return what is to be set where the pressures at rest are not the set points."""
+    high, low = plant.boundaries.p_hp_bar, plant.boundaries.p_lp_bar
+    if (high, low) == (control.hp_bar, control.lp_bar):
+        return []
+    settings = f"--set plant.station.hp_bar={high:g} --set plant.station.lp_bar={low:g}"
+    return [f"set points {control.hp_bar:g} and {control.lp_bar:g} bar are not the pressures at rest: {settings}"]
+
+
+def _eigenvalue_lines(model: LtiModel, error: float) -> list[str]:
+    values = sorted(np.linalg.eigvals(model.A), key=lambda value: -value.real)
+    texts = [f"{v.real:.4f}" if abs(v.imag) < 1e-12 else f"{v.real:.4f}{v.imag:+.4f}i" for v in values]
+    return [
+        *(f"eigenvalues {'  '.join(texts[i : i + 10])} /s" for i in range(0, len(texts), 10)),
+        f"derivatives within {error:.1e} of extrapolated central differences (scaled)",
+    ]
+
+
+def _gain_lines(model: LtiModel) -> list[str]:
+    held = model.discretised(HORIZON_S)
+    effects = np.column_stack([model.C @ held.B + model.D, model.C @ held.F + model.G])
+    names = (*model.input_names, model.load_name)
+    units = (*model.input_units, model.load_unit)
+    return [
+        f"after {HORIZON_S:g} s of +1 {unit} {name}: L1 {effects[L1, i]:+.5f} %, T5 {effects[T5, i]:+.5f} K"
+        for i, (name, unit) in enumerate(zip(names, units, strict=True))
+    ]
+
+
+def _kink_line(error: float) -> list[str]:
+    """Return that the model holds for one side only, if so."""
+    if error < TWO_SIDED:
+        return []
+    return ["kink       derivatives differ on both sides: the second law limits cells of NEF1 or NEF2; less UA there"]
+
+
+def held_line(box: ColdBox, level: float, design: ControlDesign, limits: InputLimits) -> str:
+    """Return which loads are held with L1 as in its file and T5 within its band: some seconds of computing."""
+    openings = [np.linspace(limits.low[k], limits.high[k], count) for k, count in zip((0, 2), GRID, strict=True)]
+    heater, warmth = (limits.low[1], limits.high[1]), (design.output_low[1], design.output_high[1])
+    try:
+        with np.errstate(all="ignore"):
+            held = held_loads(box, load_helium(), level, openings[0], heater, openings[1], warmth)
+    except ValueError:
+        return "holds      no load with T5 within its band\n"
+    loads = f"[{max(held.least.w, 0.0):.0f},{max(held.largest.w - LOOP_MARGIN, 0.0):.0f}]"
+    return f"holds      loads of {loads} W at least: --set optimizer_plc.program.holdable_load_w={loads}\n"
+
+
+def _band_lines(rest: Equilibrium, design: ControlDesign) -> list[str]:
+    """Return what is to be set where an output at rest is outside its band."""
+    bands = zip((L1, T5), ("L1", "T5"), ("%", "K"), design.output_low, design.output_high, strict=True)
+    return [
+        f"outside    {name} rests at {rest.y[k]:.2f} {unit}, its band is {low:g} to {high:g} {unit}: set"
+        " optimizer_plc.program.design.output_low and output_high, and the bands of control_plc.alarms"
+        for k, name, unit, low, high in bands
+        if not low <= rest.y[k] <= high
+    ]

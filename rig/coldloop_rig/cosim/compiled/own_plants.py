@@ -1,0 +1,71 @@
+"""The linear plants of other processes in the compiled loop; those of a Python class or an FMU have no kernels."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from coldloop.kernels.compiled import kernel
+from coldloop_plant.own.linear import LinearPlant, Matrices, advance_linear
+from coldloop_plant.own.transfer_functions import LagTable, TransferFunctionPlant, advance_lags
+from coldloop_plant.program import PlantProgram
+from coldloop_rig.cosim.compiled.plants import CompiledPlant, advances
+from coldloop_rig.cosim.compiled.records import Array
+
+
+class OwnState(NamedTuple):
+    """A linear plant, or lags, between two ticks."""
+
+    x: Array
+    y: Array
+    station: Array
+    noise: Array
+    met: Array
+    """Disturbances beside the load at each tick of the trace and at the one behind it, shape (N + 1, k)."""
+    memory: Any
+    """Of lags: that of the program itself."""
+    first: int
+    """Tick of the trace's first row."""
+
+
+@advances(Matrices)
+@kernel
+def advance_undelayed(c: Matrices, plant: OwnState, u: Array, load: float, row: int) -> None:
+    """Go one tick forward with a linear plant."""
+    advance_linear(c, plant.x, u, load, plant.met[row + 1], plant.y)
+
+
+@advances(LagTable)
+@kernel
+def advance_delayed(c: LagTable, plant: OwnState, u: Array, load: float, row: int) -> None:
+    """Go one tick forward with lags, and with disturbances as the last states and outputs."""
+    now, then, own = plant.met[row], plant.met[row + 1], plant.y.shape[0] - c.measured.shape[0]
+    w = np.empty(1 + now.shape[0])
+    w[0], w[1:] = load, now
+    advance_lags(c, plant.memory, plant.first + row, u, w, plant.y[:own])
+    plant.x[plant.x.shape[0] - then.shape[0] :] = then
+    for i in range(c.measured.shape[0]):
+        plant.y[own + i] = then[c.measured[i]]
+
+
+class CompiledOwn:
+    """The program of either."""
+
+    def __init__(self, program: LinearPlant | TransferFunctionPlant) -> None:
+        self._program = program
+        self.constants = program.constants
+
+    def state(self, noise: Array, ticks: int) -> OwnState:
+        """Return the present state, and what the next `ticks` ticks bring."""
+        p = self._program
+        x, y, met = np.array(p.state), np.array(p.measure()), p.disturbances.ahead(p.tick, ticks)
+        memory = p.memory if isinstance(p, TransferFunctionPlant) else ()
+        return OwnState(x, y, np.empty(0), noise, met, memory, p.tick)
+
+    def restore(self, state: OwnState, tick: int, u: Array) -> None:
+        """Resume the program at `tick`, up to which the inputs `u` were held."""
+        self._program.take_over(tick, state.x, u, state.y)
+
+
+def of_process(program: PlantProgram) -> CompiledPlant | None:
+    """Return a program as the loop takes it; None where the plant is not linear."""
+    return CompiledOwn(program) if isinstance(program, LinearPlant | TransferFunctionPlant) else None

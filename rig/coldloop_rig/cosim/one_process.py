@@ -1,0 +1,165 @@
+"""The three programs in one process, by direct calls; what would cross the bus is rounded as the bus would round it."""
+
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+
+from coldloop.errors import LoadFileError
+from coldloop.kernels.first_use import kernels_of
+from coldloop.process.declaration import Process
+from coldloop.process.load_profile import LoadProfile
+from coldloop.process.lti_model import load as load_model
+from coldloop.registers.codec import as_transmitted
+from coldloop.registers.control_plc import Update, Verdict
+from coldloop.registers.maps import Maps, maps_of
+from coldloop.registers.optimizer_plc import Optimization
+from coldloop.registers.plant import LoadStep, Measurement, PlantSample, StationSample, plant_map
+from coldloop_control_plc.program import ControlProgram
+from coldloop_control_plc.program import make_program as make_control_program
+from coldloop_optimizer_plc.program import OptimizerProgram
+from coldloop_plant.kinds import plant_maker
+from coldloop_plant.own_model import own_header
+from coldloop_plant.program import PlantProgram
+from coldloop_plant.settings import PlantKind
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.results.recording import Recorder
+from coldloop_rig.settings import Settings
+
+if TYPE_CHECKING:
+    from coldloop_rig.cosim.compiled.stretches import CompiledStretches
+
+SHORT: Final = 10_000
+"""Ticks below which the programs are done before a loop would be compiled."""
+
+
+class Listener(Protocol):
+    """Takes what the programs do, as it would cross the bus."""
+
+    def sample(self, sample: PlantSample) -> None:
+        """Take a tick of the plant."""
+
+    def station(self, sample: StationSample) -> None:
+        """Take a tick of the compression station, where the plant has one."""
+
+    def update(self, update: Optimization) -> None:
+        """Take an update that was answered."""
+
+
+class Programs(NamedTuple):
+    """The programs of a session, connected by calls."""
+
+    plant: PlantProgram
+    control: ControlProgram
+    optimizer: OptimizerProgram
+    maps: Maps
+
+    def tick(self, listener: Listener) -> None:
+        """Do one tick."""
+        if self.control.awaiting_sequence:
+            self._deliver(listener)
+        if not self.control.player.invited:
+            self.control.optimizer_seen()  # an optimiser that idles goes on to send heartbeats
+        update = self._scan(listener)
+        if update is not None:
+            to_control = self.maps.control_plc
+            plan = self.optimizer.plan(as_transmitted(update, to_control))
+            self.control.accept_plan(as_transmitted(plan, to_control))
+
+    def _deliver(self, listener: Listener) -> None:
+        sequence = self.optimizer.solve()
+        answer = self.control.offer(sequence)
+        self.optimizer.answered(late=False)
+        listener.update(as_transmitted(self.optimizer.report(Verdict(answer.verdict)), self.maps.optimizer_plc))
+
+    def _scan(self, listener: Listener) -> Update | None:
+        plant, to_plant = self.plant, self.maps.plant
+        actuators = as_transmitted(self.control.begin_scan(), to_plant)
+        u = actuators.u
+        plant.apply(u)
+        measurement = as_transmitted(
+            Measurement(plant.tick, plant.load, plant.measure(), plant.state, actuators.session, u), to_plant
+        )
+        if plant.station is not None:
+            listener.station(as_transmitted(plant.station, to_plant))
+        listener.sample(PlantSample(plant.tick, measurement.load, u, measurement.y, measurement.x))
+        plant.advance()
+        return self.control.end_scan(measurement)
+
+
+def load_table(load: LoadProfile, process: Process) -> LoadProfile:
+    """Return a load of a process as the plant's table has it after crossing the bus.
+
+    Raises:
+        LoadFileError: The table does not take it.
+    """
+    registers = plant_map(process)
+    steps = [as_transmitted(LoadStep(*step), registers) for step in zip(load.times, load.watts, strict=True)]
+    low, high = process.load.stored_span
+    if not all(low <= step.watts <= high for step in steps):
+        raise LoadFileError(f"a load is outside {low:g} to {high:g} {process.load.unit}")
+    return LoadProfile(tuple(step.tick for step in steps), tuple(step.watts for step in steps))
+
+
+class OneProcessRig:
+    """Plant, control PLC and optimiser PLC, connected by calls.
+
+    Args:
+        settings: Configuration.
+        compiled: Whether ordinary ticks are done in compiled loops, with the same bits; by default where these have
+            been compiled already, and where the run is not `SHORT`.
+    """
+
+    def __init__(self, settings: Settings, *, compiled: bool | None = None) -> None:
+        header = own_header(settings.model.file)
+        self._settings = settings
+        self._header = header
+        self._compiled = compiled
+        program = settings.optimizer_plc.program
+        with self._kernels():
+            self.optimizer = OptimizerProgram(load_model(settings.model.file), program, settings.limits)
+        self.control = make_control_program(header, settings.control_plc, settings.limits)
+
+    def run(self, scenario: Scenario, recorder: Recorder) -> None:
+        """Run a scenario from the operating point, in lock-step."""
+        with self._kernels():
+            self._run(scenario, recorder)
+
+    def _kernels(self) -> AbstractContextManager[None]:
+        """Announce what is compiled as the kernels of a run like this one."""
+        kind, solver = self._settings.plant.kind, self._settings.optimizer_plc.program.solver_name
+        plant = kind if kind is PlantKind.REFRIGERATOR else self._settings.process.name
+        return kernels_of(f"the {plant.replace('-', ' ')} and the {solver} solver in one process", about_s=50)
+
+    def _plant(self, load: LoadProfile, seed: int) -> PlantProgram:
+        return plant_maker(self._header, self._settings.plant)(load, seed)
+
+    def _stretches(self, plant: PlantProgram, load: LoadProfile, ticks: int) -> "CompiledStretches | None":
+        """Return what runs ahead in compiled loops, where there are any."""
+        if self._compiled is False:
+            return None
+        from coldloop_rig.cosim.compiled.plants import compiled_plant  # noqa: PLC0415 only where something is compiled
+        from coldloop_rig.cosim.compiled.stretches import CompiledStretches  # noqa: PLC0415
+
+        compiled = compiled_plant(plant)
+        if compiled is None:
+            return None
+        may_compile = self._compiled is True or ticks >= SHORT
+        return CompiledStretches(plant, compiled, self.control, self.optimizer, load, may_compile=may_compile)
+
+    def _run(self, scenario: Scenario, recorder: Recorder) -> None:
+        load = load_table(scenario.load, self._settings.process)
+        plant = self._plant(load, scenario.seed)
+        programs = Programs(plant, self.control, self.optimizer, maps_of(self._settings.process))
+        self.optimizer.restart(scenario.updating_period_s)
+        noted = self.control.journal.count
+        self.control.restart(session=1)
+        stretches = self._stretches(plant, load, scenario.ticks)
+        recorder.begin()
+        while self.control.tick < scenario.ticks:
+            stretch = stretches.ahead(scenario.ticks) if stretches else None
+            if stretch is not None:
+                recorder.stretch(*stretch)
+                continue
+            programs.tick(recorder)
+            for event in self.control.journal.since(noted):
+                recorder.event(event)
+                noted = event.number

@@ -1,0 +1,50 @@
+"""What a run is to do, whichever way it is run."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from coldloop.process.load_profile import LoadProfile
+from coldloop.table import TIME
+from coldloop.whole_file import whole_text
+from coldloop_plant.load import HOUR_TICKS, named_families
+from coldloop_rig.settings import Settings
+
+INPUTS: Final = "inputs"
+LOAD_COPY: Final = f"{INPUTS}/load.csv"
+BEHIND_LAST_STEP = 1200
+"""Default time that a run continues after the last step of a load file."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """One run from the operating point on."""
+
+    ticks: int
+    load: LoadProfile
+    updating_period_s: float
+    """0 is adaptive."""
+    seed: int
+    realtime: bool = False
+    factor: float = 1.0
+
+
+def natural_ticks(name: str, load: LoadProfile) -> int:
+    """Return the default duration of a run under the load of this name or file."""
+    families = named_families(name)
+    return len(families) * HOUR_TICKS if families else load.times[-1] + BEHIND_LAST_STEP
+
+
+def with_copied_load(settings: Settings, profile: LoadProfile, folder: Path) -> Settings:
+    """Return settings that name a copy of the load in the folder of a run; those of a named load as they are.
+
+    The copy is written from what was read: a pipe is read once, and a file may change meanwhile.
+    """
+    if named_families(settings.plant.load) is not None:
+        return settings
+    (folder / INPUTS).mkdir(exist_ok=True)
+    process, steps = settings.process, zip(profile.times, profile.watts, strict=True)
+    rows = "".join(f"{tick * process.tick_s!r},{watts!r}\n" for tick, watts in steps)
+    whole_text(folder / LOAD_COPY, f"{TIME},{process.load.column}\n{rows}")
+    plant = settings.plant.model_copy(update={"load": str(folder / LOAD_COPY)})
+    return settings.model_copy(update={"plant": plant})

@@ -1,0 +1,303 @@
+"""Client of a rig on the bus, for one session at a time: begins it, grants ticks, records what happens, follows it.
+
+`coldloop run`, `up`, `chaos` and networked studies use it; what is recorded goes to the sinks of a `Recorder`.
+"""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Awaitable, Sequence
+from typing import Final, TypeVar
+
+from coldloop.errors import LinkError, ModelFileError, PeerUnreachableError
+from coldloop.modbus.client import RegisterClient
+from coldloop.operating.load_stream import LoadStream, write_table
+from coldloop.registers.common import Identity
+from coldloop.registers.control_plc import ControlSession, Grant, LadderStatus, Mode, Status
+from coldloop.registers.maps import maps_of
+from coldloop.registers.optimizer_plc import OptimizerSession
+from coldloop.registers.plant import HISTORY_ROWS, STATION_ROWS, PlantSession
+from coldloop_plant.own_model import own_header
+from coldloop_rig.cosim.answer_time import QUIET_S
+from coldloop_rig.cosim.endpoints import RigEndpoints
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.cosim.session_events import SessionEvents
+from coldloop_rig.cosim.session_reader import BATCH, SampleReader, UpdateReader
+from coldloop_rig.cosim.wiring import SERVICES
+from coldloop_rig.results.driving import CONTROL, PLANT
+from coldloop_rig.results.recording import LinkStatistics, Recorder
+from coldloop_rig.settings import Settings
+
+T = TypeVar("T")
+
+AHEAD: Final = HISTORY_ROWS - 32
+"""Ticks that the control PLC may be ahead of the recording, so that the history still has them."""
+STATION_AHEAD: Final = STATION_ROWS - 32
+"""The same where the history of the station counts too."""
+SHORTEST_PAUSE_S: Final = 0.001
+LONGEST_PAUSE_S: Final = 0.2
+LONGEST_LOCKSTEP_PAUSE_S: Final = 0.01
+"""A rig that does not move is looked at so often."""
+LAST_LOOK_S: Final = 2.0
+"""How long the events of a run that has ended are waited for."""
+CONTACT_S: Final = 1.0
+"""With `tolerant`: how long an answer may take. A stopped process must not hold up the rest for long."""
+
+
+def next_session(present: Sequence[int]) -> int:
+    """Return a number for a new session that none of the services is in; after the largest they begin with 1 again."""
+    session = max(present) % 0xFFFF_FFFF + 1
+    while session in present:
+        session += 1
+    return session
+
+
+class SessionClient:
+    """Client of the services of a rig.
+
+    Args:
+        endpoints: Where they are.
+        settings: What they are expected to run.
+        tolerant: For a rig whose parts come and go: a service that does not answer is asked again later, ticks that it
+            does not keep any more are left out. Otherwise either ends the run.
+        services: Which ones there are; without the optimiser, sessions can be started and held, and not recorded.
+    """
+
+    def __init__(
+        self,
+        endpoints: RigEndpoints,
+        settings: Settings,
+        *,
+        tolerant: bool = False,
+        services: Sequence[str] = SERVICES,
+    ) -> None:
+        self._settings = settings
+        self._tolerant = tolerant
+        self.plant, self.control, self.optimizer = map(RegisterClient.at, maps_of(settings.process), endpoints)
+        self._tick_s = settings.process.tick_s
+        every = {"plant": self.plant, "control_plc": self.control, "optimizer_plc": self.optimizer}
+        self.clients = {service: every[service] for service in services}
+        self.session = 0
+        """The session that was started last; 0 is none."""
+        self.load: LoadStream | None = None
+        """The load of the session that was started last."""
+        self.lost_contacts = 0
+        """Requests that were not answered, with `tolerant`."""
+        self._noted_events = -1
+        self._background: asyncio.Task[None] | None = None
+
+    async def connect(self, patience_s: float) -> None:
+        """Connect to all of them, and make sure that they run the model of our configuration.
+
+        Raises:
+            PeerUnreachableError: One is not there.
+            ModelFileError: One runs another model.
+        """
+        file = self._settings.model.file
+        ours = own_header(file).short_digest
+        for client in self.clients.values():
+            await client.connect(patience_s)
+            theirs = (await client.read(Identity)).model_digest
+            if theirs != ours:
+                raise ModelFileError(
+                    f"{client.peer} runs model {theirs:08x}, not {ours:08x} of {file}: give all of them the same model"
+                )
+
+    def close(self) -> None:
+        """Close the connections."""
+        if self._background is not None:
+            self._background.cancel()
+        for client in self.clients.values():
+            client.close()
+
+    # -- a session -----------------------------------------------------------------------------------------------------
+
+    async def run(self, scenario: Scenario, recorder: Recorder) -> None:
+        """Start a session for the scenario and record it to its end.
+
+        Raises:
+            LinkError: The rig stopped moving, or went faster than it could be recorded.
+        """
+        await self.begin(scenario, recorder)
+        try:
+            await self._follow()
+            await self.conclude()
+        finally:
+            await self.last_look()
+
+    async def begin(self, scenario: Scenario, recorder: Recorder) -> None:
+        """Start a session for the scenario, recorded from now on."""
+        self._events = await SessionEvents.after_now(self.control, self.plant, recorder)
+        session = await self.start(scenario)
+        self._scenario, self._recorder = scenario, recorder
+        self._samples = SampleReader(
+            self.plant, recorder, session, scenario.ticks, realtime=scenario.realtime, tolerant=self._tolerant
+        )
+        self._updates = UpdateReader(self.optimizer, recorder, session, tolerant=self._tolerant)
+        recorder.begin()
+
+    async def start(self, scenario: Scenario) -> int:
+        """Write the load and the settings of a new session to all of them; return its number.
+
+        Raises:
+            LinkError: A service does not answer or refuses.
+        """
+        session = next_session([(await client.read(Identity)).session for client in self.clients.values()])
+        self.session = session
+        realtime = int(scenario.realtime)
+        if "optimizer_plc" in self.clients:
+            await self.optimizer.write(
+                OptimizerSession(session, realtime, scenario.factor, round(scenario.updating_period_s / self._tick_s))
+            )
+        rows = await write_table(self.plant, scenario.load)
+        await self.plant.write(PlantSession(session, realtime, scenario.factor, scenario.seed, rows))
+        self.load = LoadStream(self.plant, session, scenario.load, sent=rows)
+        await self.control.write(ControlSession(session, realtime, scenario.factor))
+        return session
+
+    async def hold(self, look_s: float) -> None:
+        """Keep the session that was started last, in real time, supplied with its load until cancelled.
+
+        A load that another client writes replaces all of it, as it replaces the plant's later steps.
+
+        Raises:
+            PeerUnreachableError: The plant does not answer.
+            LinkError: It refuses the load, which is not written any more.
+        """
+        while True:
+            identity = await self.plant.read(Identity)
+            if identity.session != self.session:  # another client has begun one
+                self.load = None
+            elif self.load is not None and not self.load.done:
+                await self._supply(self.load, identity.tick)
+            await asyncio.sleep(look_s)
+
+    async def _supply(self, load: LoadStream, tick: int) -> None:
+        is_over = False
+        try:
+            is_over = await load.was_replaced()
+            if not is_over:
+                await load.feed(tick)
+        except LinkError as error:
+            is_over = not isinstance(error, PeerUnreachableError)
+            raise
+        finally:
+            if is_over and self.load is load:  # not that of a session that has begun meanwhile
+                self.load = None
+
+    async def conclude(self) -> None:
+        """Read what was still under way when the last tick was done.
+
+        Raises:
+            LinkError: The optimiser stopped before.
+        """
+        if self._background is not None:
+            await self._background
+        status = await self.contact(self.control.read(Status))
+        if status is not None and status.mode != Mode.CLASSICAL:  # the loops ask for no updates
+            last = 0 if self._scenario.realtime else status.update
+            updates = self._updates.read_until(self._scenario.ticks, last, QUIET_S)
+            await self.contact(updates, within_s=2.0 * QUIET_S)  # it gives up by itself, and says why
+            status = await self.contact(self.control.read(Status))
+        if status is not None:
+            self._recorder.link = LinkStatistics(
+                status.deadline_misses, status.overruns, status.lateness_max, status.lateness_p99
+            )
+
+    async def last_look(self) -> None:
+        """Read the last events; what ended the run is what is reported, not that these cannot be read."""
+        with contextlib.suppress(LinkError, TimeoutError):
+            async with asyncio.timeout(LAST_LOOK_S):
+                await self._events.read(CONTROL)
+                await self._events.read(PLANT)
+
+    # -- in the session ----------------------------------------------------------------------------------------------
+
+    async def _follow(self) -> None:
+        scenario, recorder = self._scenario, self._recorder
+        quiet_since = time.monotonic()
+        pause_s = min(20 * self._tick_s / scenario.factor, LONGEST_PAUSE_S) if scenario.realtime else SHORTEST_PAUSE_S
+        while (done := recorder.next_tick) < scenario.ticks:
+            await self.grant(scenario.ticks)
+            await self.look()
+            now = time.monotonic()
+            if recorder.next_tick > done:
+                quiet_since = now
+            elif now - quiet_since > max(QUIET_S, 4 * self._tick_s / scenario.factor):
+                raise LinkError(
+                    f"{self.plant.peer} has been at tick {done} for {now - quiet_since:.0f} s: "
+                    "see the logs of the control PLC and of the optimiser"
+                )
+            if not scenario.realtime:
+                pause_s = _pause_for_a_batch(pause_s, recorder.next_tick - done)
+            await asyncio.sleep(max(pause_s, SHORTEST_PAUSE_S))
+
+    async def grant(self, until: int) -> None:
+        """Advance the rig to a tick, limited by the known load and by the length of the plant's history."""
+        done = self._samples.read_until
+        most = AHEAD if self._samples.has_station is False else STATION_AHEAD
+        await self.advance(done, min(until, done + most), realtime=self._scenario.realtime)
+
+    async def advance(self, tick: int, until: int, *, realtime: bool = False) -> None:
+        """Write the load that follows a tick; in lock-step grant the ticks before `until`, as far as it is known."""
+        if self.load is not None:
+            await self.contact(self.load.feed(tick))
+        if not realtime:
+            known = None if self.load is None else self.load.known_until
+            await self.contact(self.control.write(Grant(until if known is None else min(until, known))))
+
+    async def look(self) -> int | None:
+        """Record what has happened since the last look; return the plant's tick, None when it does not answer.
+
+        With `tolerant` the events of the control PLC are read by `ladder`.
+        """
+        tick = await self.contact(self._samples.read())
+        if not self._tolerant:
+            await self._updates.read()
+            await self._events.look(CONTROL, PLANT)
+            return tick
+        if self._background is None or self._background.done():
+            if self._background is not None:
+                self._background.result()  # raises what is wrong with more than the contact
+            self._background = asyncio.create_task(self._read_updates(), name="updates")
+        if tick is not None:
+            await self.contact(self._events.look(PLANT))
+        return tick
+
+    async def _read_updates(self) -> None:
+        """Read updates in the background: a silent optimiser must not hold up the rest."""
+        await self.contact(self._updates.read())
+
+    async def ladder(self) -> LadderStatus | None:
+        """Return the state of the fail-safe ladder, and record the events of the control PLC when there are new ones.
+
+        None when it does not answer.
+        """
+        ladder = await self.contact(self.control.read(LadderStatus))
+        if ladder is None or ladder.events == self._noted_events:
+            return ladder
+        if await self.contact(self._events.read(CONTROL)) is None:
+            return None
+        self._noted_events = ladder.events
+        return ladder
+
+    async def contact(self, request: Awaitable[T], *, within_s: float = CONTACT_S) -> T | None:
+        """Return the answer to a request; with `tolerant`, None when the service does not answer in time."""
+        if not self._tolerant:
+            return await request
+        try:
+            async with asyncio.timeout(within_s):
+                return await request
+        except (PeerUnreachableError, TimeoutError):
+            self.lost_contacts += 1
+            return None
+
+
+def _pause_for_a_batch(pause_s: float, ticks: int) -> float:
+    """Return the next pause between two looks at a rig in lock-step, after one in which so many ticks were recorded.
+
+    Each look asks all three services, so it is worth some ticks; but the rig must not come to the end of its grant.
+    """
+    if ticks > 2 * BATCH:
+        return max(pause_s / 2, SHORTEST_PAUSE_S)
+    return min(pause_s * 1.5, LONGEST_LOCKSTEP_PAUSE_S) if ticks < BATCH else pause_s

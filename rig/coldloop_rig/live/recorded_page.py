@@ -1,0 +1,174 @@
+"""A run folder as the operator's page replays it."""
+
+import math
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from functools import cache, cached_property
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.config import load_configuration
+from coldloop.process.station import STATION_SIGNAL_NAMES
+from coldloop.registers.audit import EventKind
+from coldloop.registers.control_plc import Cause, Mode, ProcessNow
+from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, UpdatingRuleStatus
+from coldloop.registers.plant import SensorFaultKind, StationSample
+from coldloop.registers.safety import Alarm
+from coldloop.service.event_text import EventText, word
+from coldloop_hmi.process_image import JournalEntry
+from coldloop_hmi.quality import Doubts
+from coldloop_hmi.replay import ReplayFrame
+from coldloop_optimizer_plc.budget import PlcBudget
+from coldloop_optimizer_plc.rules import make_rule
+from coldloop_optimizer_plc.settings import OptimizerSettings
+from coldloop_optimizer_plc.solvers import make_solver
+from coldloop_rig.results.columns import STATION
+from coldloop_rig.results.recorded_alarms import alarms_after
+from coldloop_rig.results.run_folder import MOST_IN_MEMORY, MOST_LISTED, RunFolder
+
+SECTIONS: Final = ("limits", "session", "optimizer_plc", "telemetry")
+_MODES: Final = {word(mode): int(mode) for mode in Mode}
+_CAUSES: Final = {word(cause): int(cause) for cause in Cause}
+
+
+class RecordedPage:
+    """A run on disk; its trace is kept in memory, 0.5 MB an hour.
+
+    Raises:
+        UsageError: There is no run, or it cannot be read.
+    """
+
+    def __init__(self, folder: RunFolder) -> None:
+        self._folder = folder
+        self.name = folder.path.resolve().name
+        self.process = folder.process
+        names = (self.process.load.column, *self.process.input_names, *self.process.output_names)
+        with folder.reading("trace.parquet", MOST_IN_MEMORY) as file:
+            table = file.read(columns=[*names, "mode", "cause", "bad_sensors"])
+            self._values = np.column_stack([table[name].to_numpy() for name in names]).astype(np.float32)
+            self._modes = table["mode"].to_pylist()
+            self._causes = table["cause"].to_pylist()
+            bits = cache(self._bits)
+            self._bad_sensors = [bits(bad or "") for bad in table["bad_sensors"].to_pylist()]
+        self._since = _beginnings(self._modes)
+        self._settings = self._read_settings()
+        self._station = self._read_station()
+
+    @property
+    def configuration(self) -> Mapping[str, Any]:
+        """Its configuration, by dotted key."""
+        return self._folder.configuration
+
+    def _read_station(self) -> NDArray[np.float32] | None:
+        """Return signals, mode and alarms of the station, a row a tick; None of a cold box alone."""
+        if not (self._folder.path / STATION).exists():
+            return None
+        with self._folder.reading(STATION, MOST_IN_MEMORY) as file:
+            table = file.read(columns=[*STATION_SIGNAL_NAMES, "mode", "alarms"])
+        return np.column_stack([column.to_numpy() for column in table.columns]).astype(np.float32)
+
+    def _read_settings(self) -> OptimizerSettings:
+        """Return what the optimiser was configured with."""
+        values = {key: value for key, value in self._folder.configuration.items() if key.split(".")[0] in SECTIONS}
+        copy = self._folder.manifest["inputs"].get("model", {}).get("file")
+        values["model.file"] = str(self._folder.held(copy)) if copy else "cold-box"
+        options: Mapping[str, tuple[object, str]] = {key: (value, "manifest") for key, value in values.items()}
+        return load_configuration(OptimizerSettings, environment={}, options=options).settings
+
+    @property
+    def ticks(self) -> int:
+        """Ticks that were recorded."""
+        return len(self._values)
+
+    @cached_property
+    def updates(self) -> list[Optimization]:
+        """Updates whose sequence was played."""
+        with self._folder.reading("updates.parquet", MOST_LISTED) as file:
+            return [_optimization(row, self.process.tick_s) for row in file.read().to_pylist()]
+
+    @cached_property
+    def events(self) -> list[JournalEntry]:
+        """Events of the journals, in the order of their ticks."""
+        return sorted((_entry(row) for row in self._folder.events()), key=lambda entry: entry.tick)
+
+    @cached_property
+    def rule(self) -> UpdatingRuleStatus:
+        """What decided the updating period."""
+        program = self._settings.optimizer_plc.program
+        budget = PlcBudget(program.budget, make_solver(program).tau_1_s)
+        rule = make_rule(program, budget, round(program.updating_period_s / self.process.tick_s))
+        times = budget.times
+        return rule.status._replace(slots=times.slots, preparation=times.preparation, iteration=times.iteration)
+
+    @property
+    def limits(self) -> OperatingLimits:
+        """Bands, bounds and rates."""
+        design, limits = self._settings.optimizer_plc.program.design, self._settings.limits
+        return OperatingLimits(design.output_low, design.output_high, limits.low, limits.high, limits.rate)
+
+    def frame(self, tick: int) -> ReplayFrame | None:
+        """Return one tick; None if it is missing in the recording."""
+        load, *values = self._values[tick].tolist()
+        if math.isnan(load):
+            return None
+        inputs = len(self.process.inputs)
+        u, y = tuple(values[:inputs]), tuple(values[inputs:])
+        mode = _MODES.get(self._modes[tick], int(Mode.MPC))
+        cause = _CAUSES.get(self._causes[tick], int(Cause.NONE))
+        suspect, faulty = self._doubts[max(0, bisect_right(self._doubts, tick, key=lambda one: one[0]) - 1)][1:]
+        doubts = Doubts(suspect, bad=self._bad_sensors[tick], simulated=faulty)
+        return ReplayFrame(ProcessNow(tick, load, u, y), mode, cause, self._since[tick], doubts, self._station_at(tick))
+
+    @cached_property
+    def _doubts(self) -> list[tuple[int, int, int]]:
+        """Suspect and faulty sensors from a tick on, by the journals: tick, and a bit for each output of both."""
+        found = [(0, 0, 0)]
+        for entry in self.events:
+            kind, subject, cause = entry.text[:3]
+            if subject not in self.process.output_names:
+                continue
+            (_, suspect, faulty), bit = found[-1], self._bits(subject)
+            if kind == word(EventKind.SENSOR):
+                suspect = suspect & ~bit | bit * (cause == "suspect")
+            elif kind == word(EventKind.SENSOR_FAULT):
+                faulty = faulty & ~bit | bit * (cause != word(SensorFaultKind.NONE))
+            found.append((entry.tick, suspect, faulty))
+        return found
+
+    def _bits(self, names: str) -> int:
+        """Return the bits of outputs that are named in a text."""
+        return sum(1 << self.process.output_names.index(name) for name in names.split())
+
+    def alarms(self, events: Sequence[JournalEntry]) -> list[Alarm]:
+        """Return the alarms after these events."""
+        return alarms_after(events, self._folder.process)
+
+    def _station_at(self, tick: int) -> StationSample | None:
+        if self._station is None or tick >= len(self._station):
+            return None
+        *signals, mode, alarms = self._station[tick].tolist()
+        if math.isnan(mode):
+            return None
+        return StationSample(tick, tuple(signals), int(mode), int(alarms))
+
+
+def _beginnings(modes: Sequence[str]) -> list[int]:
+    """Return for each tick the one at which its mode began."""
+    found: list[int] = []
+    for tick, mode in enumerate(modes):
+        found.append(found[-1] if tick and mode == modes[tick - 1] else tick)
+    return found
+
+
+def _optimization(row: Mapping[str, Any], tick_s: float) -> Optimization:
+    names = [name for name in Optimization._fields if name != "tau_u"]
+    values: dict[str, Any] = {name: 0.0 if row[name] is None else row[name] for name in names}
+    return Optimization(**values, tau_u=round(row["tau_u_s"] / tick_s))
+
+
+def _entry(row: Mapping[str, Any]) -> JournalEntry:
+    value = "" if row["value"] is None else f"{row['value']:.7g}"
+    text = EventText(row["kind"], row["subject"], row["cause"], value, row["unit"], row["who"])
+    return JournalEntry(row["service"], row["number"], row["boot"], row["utc"], row["tick"], text)

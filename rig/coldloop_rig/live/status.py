@@ -1,0 +1,173 @@
+"""What a rig that is up is doing, read over Modbus."""
+
+import asyncio
+from collections.abc import Awaitable, Iterator
+from typing import Any, Final, NamedTuple
+
+from coldloop.errors import LinkError, PeerUnreachableError
+from coldloop.number_text import value_text
+from coldloop.operating.execution import Clients, CommandClient
+from coldloop.operating.rings import last_update
+from coldloop.process.declaration import Process
+from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode, ProcessNow
+from coldloop.registers.optimizer_plc import Optimization
+from coldloop.registers.plant import LoadStatus
+from coldloop.registers.safety import Alarm, AlarmState, alarms_of
+from coldloop.service.event_text import alarm_cause, alarm_word, word_of
+from coldloop_rig.cosim.answer_time import answered_in_time
+from coldloop_rig.terminal import Colour, coloured
+
+QUIET: Final = (AlarmState.NORMAL, AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE)
+
+
+class PlantStatus(NamedTuple):
+    """One look at the plant."""
+
+    identity: Identity
+    pace: SessionPace
+    load: LoadStatus
+
+
+class ControlStatus(NamedTuple):
+    """One look at the control PLC."""
+
+    ladder: LadderStatus
+    operator: Operator
+    y: tuple[float, ...]
+    """Outputs of the last scan; all are 0 before the first."""
+    alarms: tuple[str, ...]
+
+
+class RigStatus(NamedTuple):
+    """One look at the services of a rig."""
+
+    process: Process
+    plant: PlantStatus | None
+    """None where it does not answer, as below."""
+    control: ControlStatus | None
+    update: Optimization | None
+    """The last one that was done; None before the first as well, and of an optimiser that is not ours."""
+    silent: tuple[str, ...] = ()
+    """What is said of each service that does not answer."""
+
+
+async def read_status(clients: Clients) -> RigStatus:
+    """Return the state of a rig, of which some services may be away.
+
+    Raises:
+        LinkError: Neither the plant nor the control PLC answers, or an answer is not possible.
+    """
+    readers = {"plant": _plant, "control_plc": _control, "optimizer_plc": _update}
+    names = [name for name in readers if name in clients]
+    answers = await asyncio.gather(*(_answer(readers[name](clients[name])) for name in names))
+    found: dict[str, Any] = dict(zip(names, answers, strict=True))
+    absent = [answer for answer in answers if isinstance(answer, LinkError)]
+    plant, control, update = (
+        None if isinstance(found.get(name), LinkError) else found.get(name) for name in readers
+    )  # fmt: skip
+    if plant is None and control is None:
+        raise absent[0]
+    return RigStatus(clients[names[0]].process, plant, control, update, tuple(map(str, absent)))
+
+
+async def _answer(reading: Awaitable[Any]) -> Any:  # noqa: ANN401 of any service
+    """Return what is read, or why a service does not answer."""
+    try:
+        async with answered_in_time("to read the status"):
+            return await reading
+    except PeerUnreachableError as error:
+        return error
+
+
+async def _plant(client: CommandClient) -> PlantStatus:
+    await client.connect(0.0)
+    return PlantStatus(await client.read(Identity), await client.read(SessionPace), await client.read(LoadStatus))
+
+
+async def _control(client: CommandClient) -> ControlStatus:
+    await client.connect(0.0)
+    rows = await client.read_rows(Alarm, 0, len(alarms_of(client.process)))
+    alarms = tuple(_alarm(kind, row, client.process) for kind, row in enumerate(rows) if row.state not in QUIET)
+    return ControlStatus(
+        await client.read(LadderStatus), await client.read(Operator), (await client.read(ProcessNow)).y, alarms
+    )
+
+
+async def _update(client: CommandClient) -> Optimization | None:
+    await client.connect(0.0)
+    return await last_update(client, await client.read(Identity))
+
+
+def _alarm(kind: int, row: Alarm, process: Process) -> str:
+    cause = alarm_cause(kind, row.cause, process)
+    state = word_of(AlarmState, row.state)
+    return f"{alarm_word(kind, process)}{f' ({cause})' if cause else ''}, {state}"
+
+
+def _pace(plant: PlantStatus) -> str:
+    pace = plant.pace
+    if not plant.identity.session:
+        return "no session"
+    if not pace.realtime:
+        return "lock-step"
+    return f"paused (factor {value_text(pace.factor)})" if pace.paused else f"{value_text(pace.factor)} x real time"
+
+
+def _tau_u(status: RigStatus) -> str:
+    return "-" if status.update is None else f"{status.update.tau_u * status.process.tick_s:g} s"
+
+
+def colour(status: RigStatus) -> Colour:
+    """Return the colour of a state: good is MPC without an alarm, failed is a service that does not answer."""
+    if status.silent or status.control is None:
+        return Colour.FAILED
+    good = status.control.ladder.mode == Mode.MPC and not status.control.alarms
+    return Colour.GOOD if good else Colour.ATTENTION
+
+
+def page(status: RigStatus) -> str:
+    """Return the state as a page."""
+    state = colour(status)
+    shown = {"mode": state, "alarms": state, "absent": Colour.FAILED}
+    return "".join(
+        f"{name:8} {coloured(text, shown[name]) if name in shown else text}\n" for name, text in _rows(status)
+    )
+
+
+def _rows(status: RigStatus) -> Iterator[tuple[str, str]]:
+    plant, control, process, tick_s = status.plant, status.control, status.process, status.process.tick_s
+    if plant is not None:
+        yield "session", f"{plant.identity.session}, {_pace(plant)}, {plant.identity.tick * tick_s:.2f} s"
+    if control is not None:
+        mode, cause = word_of(Mode, control.ladder.mode), word_of(Cause, control.ladder.cause)
+        yield "mode", f"{mode} ({cause}) since {control.ladder.since * tick_s:g} s"
+        yield "operator", word_of(OperatorMode, control.operator.mode)
+    if plant is not None and process.has_load:
+        load, unit = plant.load, process.load.unit
+        then = f", {value_text(load.next_watts, unit)} from {load.next_tick * tick_s:g} s" if load.upcoming else ""
+        yield "load", f"{value_text(load.watts, unit)}{then}"
+    if control is not None:
+        known = any(control.y)  # a control PLC that was started again shows nothing before its first scan
+        for i, one in zip(process.controlled, process.banded, strict=True):
+            yield one.name, f"{control.y[i]:.3f} {one.unit}" if known else "-"
+    yield "tau_u", _tau_u(status)
+    if control is not None:
+        yield "alarms", "; ".join(control.alarms) or "none"
+    yield from (("absent", one) for one in status.silent)
+
+
+def line(status: RigStatus) -> str:
+    """Return the state as one line."""
+    plant, control, process = status.plant, status.control, status.process
+    parts = ["no plant  "] if plant is None else [f"{plant.identity.tick * process.tick_s:10.2f} s"]
+    parts.append("no control PLC" if control is None else f"{word_of(Mode, control.ladder.mode):9}")
+    if plant is not None and process.has_load:
+        parts.append(f"{plant.load.watts:6.1f} {process.load.unit}")
+    if control is not None:
+        bands = zip(process.controlled, process.banded, strict=True)
+        parts += [f"{one.name} {control.y[i]:6.2f} {one.unit}" for i, one in bands]
+    parts.append(f"tau_u {_tau_u(status):>6}")
+    if control is not None:
+        parts.append("; ".join(control.alarms) or "no alarms")
+    return "  ".join((*parts, *status.silent))

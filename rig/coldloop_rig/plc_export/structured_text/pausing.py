@@ -1,0 +1,337 @@
+"""Blocks that pause: a call does a bounded number of operations, and the next one goes on where it has stopped.
+
+A block with more operations than a piece may have becomes steps, each of which is such a piece: `STEP` says which is
+next, and all variables keep their values, as those of function blocks do. `remaining` is what a call may still do: each
+piece takes its operations from it, and no further one begins once it is used up. So a call exceeds what it was given by
+less than a piece.
+"""
+
+import math
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
+from typing import Final
+
+from coldloop_rig.plc_export.tree.counting import COUNTED
+from coldloop_rig.plc_export.tree.nodes import (
+    ArrayType,
+    Assign,
+    Block,
+    Call,
+    Count,
+    Element,
+    Expression,
+    If,
+    Kind,
+    Literal,
+    Name,
+    Operation,
+    PausingCall,
+    Return,
+    Statement,
+    Switch,
+    While,
+    walk,
+)
+from coldloop_rig.plc_export.tree.subset import UnfitKernelError
+
+PIECE: Final = 500
+"""Operations of a piece, at most."""
+# Kernels have no names with points: these are no names of theirs.
+REMAINING: Final = Name(Kind.INT, "remaining.")
+"""Parameter: operations that a call may still do."""
+ANEW: Final = Name(Kind.BOOL, "anew.")
+"""Input: begin, rather than go on."""
+BUSY: Final = Name(Kind.BOOL, "busy.")
+"""Output: there is more to do."""
+STEP: Final = Name(Kind.INT, "next.step")
+CALL_ANEW: Final = Name(Kind.BOOL, "call.anew")
+"""Whether the next call of a block that pauses is the first."""
+ONE, TRUE, FALSE = Literal(Kind.INT, 1), Literal(Kind.BOOL, 1), Literal(Kind.BOOL, 0)
+END: Final = 0
+"""The number that no step has."""
+
+
+class Pausing:
+    """Makes blocks pause.
+
+    Args:
+        entries: Blocks that have steps however little they do.
+    """
+
+    def __init__(self, entries: Collection[Block]) -> None:
+        self.entries = entries
+        self._known: dict[Block, Block] = {}
+        self._bounds: dict[Block, float] = {}
+
+    def block(self, block: Block) -> Block:
+        """Return the block that does the same: with steps where it has much to do, else in one piece.
+
+        One without operations is as it was; any other has `REMAINING` among what it shares.
+
+        Raises:
+            UnfitKernelError: A statement takes more operations than a piece has.
+        """
+        if block not in self._known:
+            self._bounds[block] = self.bound(block.body)
+            self._known[block] = self._made(block)
+        return self._known[block]
+
+    def _made(self, block: Block) -> Block:
+        bound = self._bounds[block]
+        if not bound and block not in self.entries:
+            return block
+        if bound <= PIECE and block not in self.entries:
+            return replace(block, shared=(*block.shared, REMAINING), body=self.charged(block.body))
+        steps = Steps(self, block.source)
+        first = steps.entry(block.body, END)
+        going_on = Operation(Kind.BOOL, "and", (_compared(STEP, "!=", END), _compared(REMAINING, ">", 0)))
+        body = (
+            If(ANEW, (goto(first),), ()), While(going_on, (Switch(STEP, steps.cases()),)),
+            Assign(BUSY, _compared(STEP, "!=", END)),
+        )  # fmt: skip
+        return replace(
+            block, inputs=(*block.inputs, ANEW), shared=(*block.shared, REMAINING), outputs=(*block.outputs, BUSY),
+            variables=(*block.variables, STEP, CALL_ANEW, *steps.kept), body=body,
+        )  # fmt: skip
+
+    # -- operations ----------------------------------------------------------------------------------------------------
+
+    def bound(self, statements: Sequence[Statement]) -> float:
+        """Return how many operations statements take at most; infinity where that is not known."""
+        return sum(map(self._bound, statements))
+
+    def _bound(self, statement: Statement) -> float:
+        match statement:
+            case If(condition, body, other):
+                return operations_in(condition) + max(self.bound(body), self.bound(other))
+            case Count():
+                each = self.bound(statement.body)
+                before = operations_in((statement.first, statement.last))
+                return before + (each and each * max(1, most_rounds(statement)))
+            case While(condition, body):
+                return math.inf if operations_in(condition) + self.bound(body) else 0
+            case Call(block, arguments):
+                self.block(block)
+                return operations_in(arguments) + self._bounds[block]
+        return operations_in(statement)
+
+    def charged(self, statements: Sequence[Statement]) -> tuple[Statement, ...]:
+        """Return statements that take what they do from what is left."""
+        found: list[Statement] = []
+        own = 0
+        for statement in statements:
+            before, behind = self._charged(statement)
+            own += before
+            if may_return(statement):
+                found += charge(own)
+                own = 0
+            found += behind
+        return (*found, *charge(own))
+
+    def _charged(self, statement: Statement) -> tuple[int, tuple[Statement, ...]]:
+        """Return the operations that are to be taken once, and the statement that takes its others itself."""
+        match statement:
+            case If(condition, body, other):
+                return operations_in(condition), (If(condition, self.charged(body), self.charged(other)),)
+            case Count(_, first, last, _, body) if all(isinstance(each, Assign) for each in body) and not operations_in(
+                (first, last)
+            ):
+                return 0, (*charge(operations_in(body), rounds(statement)), statement)
+            case Count(_, first, last, _, body):
+                return operations_in((first, last)), (replace(statement, body=self.charged(body)),)
+            case Call(_, arguments):
+                return operations_in(arguments), (self.called(statement),)
+        return operations_in(statement), (statement,)
+
+    def called(self, call: Call) -> Call:
+        """Return the call of the block that is made of the one that is called."""
+        block = self.block(call.block)
+        given = ((REMAINING, REMAINING),) if REMAINING in block.shared else ()
+        anew = ((ANEW, CALL_ANEW),) if ANEW in block.inputs else ()
+        count = len(call.block.inputs)
+        return Call(block, (*call.arguments[:count], *anew, *call.arguments[count:], *given), call.results)
+
+
+class Steps:
+    """The steps of one block.
+
+    Args:
+        pausing: Knows the blocks that it calls.
+        source: File and line of its kernel.
+    """
+
+    def __init__(self, pausing: Pausing, source: str) -> None:
+        self.pausing, self.source = pausing, source
+        self.kept: list[Name] = []
+        """What is computed once: last values of loops, arguments of calls."""
+        self._cases: dict[int, tuple[Statement, ...]] = {}
+
+    def cases(self) -> tuple[tuple[int, tuple[Statement, ...]], ...]:
+        """Return the steps by their numbers."""
+        return tuple(sorted(self._cases.items()))
+
+    def entry(self, statements: Sequence[Statement], after: int) -> int:
+        """Return the step that does statements, with those behind it, and goes on with the step `after`."""
+        if not statements:
+            return after
+        number = self._reserved()
+        count = self._at_once(statements)
+        done = self.pausing.charged(statements[:count])
+        rest = statements[count:]
+        if not rest:
+            leading: tuple[Statement, ...] = (goto(after),)
+        elif self._is_at_once(rest[0]) or (count and self._decided(statements[: count + 1]) > PIECE):
+            leading = (goto(self.entry(rest, after)),)
+        else:
+            leading = tuple(self._cut(rest[0], rest[1:], after))
+        self._cases[number] = (*done, *leading)
+        return number
+
+    def _reserved(self) -> int:
+        self._cases[len(self._cases) + 1] = ()
+        return len(self._cases)
+
+    def _at_once(self, statements: Sequence[Statement]) -> int:
+        """Return how many statements are one piece."""
+        bound = 0.0
+        for place, statement in enumerate(statements):
+            bound += self.pausing.bound((statement,))
+            if bound > PIECE or not self._is_at_once(statement):
+                return place
+        return len(statements)
+
+    def _decided(self, statements: Sequence[Statement]) -> float:
+        """Return the operations of a piece up to the decision that is the last of the statements, if it is one."""
+        decision = operations_in(statements[-1].condition) if isinstance(statements[-1], If) else 0
+        return self.pausing.bound(statements[:-1]) + decision
+
+    def _is_at_once(self, statement: Statement) -> bool:
+        return not may_return(statement) and self.pausing.bound((statement,)) <= PIECE
+
+    def _cut(self, statement: Statement, behind: Sequence[Statement], after: int) -> Iterator[Statement]:
+        """Yield what leads to the steps of a statement that is more than a piece, and to those behind it."""
+        match statement:
+            case Count():
+                yield from self._loop(statement, behind, after)
+            case While(condition, body):
+                head = self._reserved()
+                inner, following = self.entry(body, head), self.entry(behind, after)
+                decided = If(condition, (goto(inner),), (goto(following),))
+                self._cases[head] = (*charge(operations_in(condition)), decided)
+                yield goto(head)
+            case If(condition, body, other):
+                following = self.entry(behind, after)
+                ways = (goto(self.entry(each, following)) for each in (body, other))
+                yield from charge(operations_in(condition))
+                yield If(condition, *((each,) for each in ways))
+            case Call():
+                yield from self._called(statement, behind, after)
+            case Return():
+                yield goto(END)
+            case _:
+                raise UnfitKernelError(
+                    f"{self.source}: a statement of more than {PIECE} operations; write it as several"
+                )
+
+    def _called(self, call: Call, behind: Sequence[Statement], after: int) -> Iterator[Statement]:
+        """Yield what leads to a call; its arguments stay as they are now, as it may change what they are made of."""
+        count = len(call.block.inputs)
+        given: list[tuple[Name, Expression]] = []
+        for parameter, value in call.arguments[:count]:
+            kept = value
+            if not isinstance(value, Literal) and not (isinstance(value, Name) and "." not in value.name):
+                kept = self._keeping(value.type)  # type: ignore[arg-type]
+                yield Assign(kept, value)
+            given.append((parameter, kept))
+        yield from charge(operations_in(call.arguments))
+        place, follows = replace(call, arguments=(*given, *call.arguments[count:])), self.pausing.block(call.block)
+        if ANEW not in follows.inputs:
+            yield goto(self.entry((place, *behind), after))
+            return
+        again = self._reserved()
+        made = self.pausing.called(place)
+        self._cases[again] = (PausingCall(made, CALL_ANEW, BUSY, (goto(self.entry(behind, after)),)),)
+        yield from (Assign(CALL_ANEW, TRUE), goto(again))
+
+    def _keeping(self, kind: Kind) -> Name:
+        self.kept.append(Name(kind, f"kept.step.{len(self.kept)}"))
+        return self.kept[-1]
+
+    def _loop(self, loop: Count, behind: Sequence[Statement], after: int) -> Iterator[Statement]:
+        head, last = self._reserved(), loop.last
+        variable, first, step = loop.variable, loop.first, loop.step
+        if not isinstance(last, Literal):
+            last = self._keeping(Kind.INT)
+            yield Assign(last, loop.last)
+        next_round = Assign(variable, Operation(Kind.INT, "+", (variable, Literal(Kind.INT, step))))
+        more = Operation(Kind.BOOL, "<=" if step > 0 else ">=", (variable, last))
+        if all(map(self._is_at_once, loop.body)) and self.pausing.bound(loop.body) <= PIECE:
+            going_on = Operation(Kind.BOOL, "and", (more, _compared(REMAINING, ">", 0)))
+            rounds_at_once = While(going_on, (*self.pausing.charged(loop.body), next_round))
+            following = self.entry(behind, after)
+            over = If(Operation(Kind.BOOL, "not", (more,)), (goto(following),), ())
+            self._cases[head] = (rounds_at_once, over)
+        else:
+            inner = self.entry((*loop.body, next_round), head)
+            self._cases[head] = (If(more, (goto(inner),), (goto(self.entry(behind, after)),)),)
+        yield from charge(operations_in((first, loop.last)))
+        yield from (Assign(variable, first), goto(head))
+
+
+def may_return(statement: Statement) -> bool:
+    """Return whether there is an end of the block in a statement."""
+    return any(isinstance(node, Return) for node in walk(statement))
+
+
+def goto(step: int) -> Assign:
+    """Return what makes a step the next one."""
+    return Assign(STEP, Literal(Kind.INT, step))
+
+
+def charge(operations: int, times: Expression = ONE) -> tuple[Statement, ...]:
+    """Return what takes operations from what is left."""
+    if not operations:
+        return ()
+    taken: Expression = Operation(Kind.INT, "*", (Literal(Kind.INT, operations), times))
+    if isinstance(times, Literal):
+        taken = Literal(Kind.INT, operations * times.value)
+    return (Assign(REMAINING, Operation(Kind.INT, "-", (REMAINING, taken))),)
+
+
+def operations_in(node: object) -> int:
+    """Return the operations in what is computed once; both operands of a logical operator are."""
+    return sum(isinstance(each, Operation) and each.type is Kind.REAL and each.operator in COUNTED
+               for each in walk(node))  # fmt: skip
+
+
+def rounds(loop: Count) -> Expression:
+    """Return how often a loop is gone through."""
+    first, last, step = loop.first, loop.last, loop.step
+    if isinstance(first, Literal) and isinstance(last, Literal):
+        return Literal(Kind.INT, max(0, (last.value - first.value) // step + 1))
+    ends = (last, first) if step > 0 else (first, last)
+    between: Expression = Operation(Kind.INT, "-", ends)
+    if abs(step) > 1:
+        between = Operation(Kind.INT, "//", (between, Literal(Kind.INT, abs(step))))
+    return Operation(Kind.INT, "max", (Operation(Kind.INT, "+", (between, ONE)), Literal(Kind.INT, 0)))
+
+
+def most_rounds(loop: Count) -> float:
+    """Return how often a loop is gone through at most.
+
+    Where its ends are not numbers, its variable is an index in every round; it is infinity if that is none.
+    """
+    count = rounds(loop)
+    if isinstance(count, Literal):
+        return count.value
+    in_every_round = [each.condition if isinstance(each, If) else each for each in loop.body
+                      if isinstance(each, Assign | If)]  # fmt: skip
+    lengths = [length for node in walk(tuple(in_every_round)) if isinstance(node, Element)
+               and isinstance(node.array.type, ArrayType)
+               for index, length in zip(node.indices, node.array.type.shape, strict=True)
+               if index == loop.variable]  # fmt: skip
+    return min(lengths, default=math.inf)
+
+
+def _compared(name: Name, sign: str, number: int) -> Operation:
+    return Operation(Kind.BOOL, sign, (name, Literal(Kind.INT, number)))

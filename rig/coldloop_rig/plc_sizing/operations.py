@@ -1,0 +1,220 @@
+"""Operations of one iteration of each solver, and of the preparation, as functions of the sizes.
+
+Convention, the same for the Cholesky factorisation that the PLC's speed was measured with: an addition, subtraction,
+multiplication, division, square root or power is one operation; comparisons, minima, maxima, signs, masks and
+indices are none. Bytes are single-precision matrix elements read or written, pass by pass; vectors are left out.
+The sizes say which elements count: all, or those that can be non-zero. Active rows are mean ones.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop_rig.plc_sizing.sizes import QpSizes
+
+Array = NDArray[np.float64] | NDArray[np.int64]
+
+WORD = 4
+"""Bytes of a number."""
+
+
+class Operations(NamedTuple):
+    """Arithmetic operations, and bytes of matrices moved."""
+
+    flops: float
+    bytes: float = 0.0
+
+    def plus(self, *others: "Operations") -> "Operations":
+        """Return this and then the others."""
+        every = (self, *others)
+        return Operations(sum(one.flops for one in every), sum(one.bytes for one in every))
+
+    def times(self, count: float) -> "Operations":
+        """Return this `count` times."""
+        return Operations(self.flops * count, self.bytes * count)
+
+
+def product(elements: float) -> Operations:
+    """Return those of y += A x, where A has so many elements."""
+    return Operations(2 * elements, WORD * elements)
+
+
+def cholesky(factor: Array) -> Operations:
+    """Return those of a factorisation U' U = A, where the rows of U have so many elements right of the diagonal, (n,).
+
+    Row by row: a root, a reciprocal, the row, and its outer product with itself, subtracted from the rows below.
+    """
+    return Operations(
+        float((2 + 2 * factor + factor**2).sum()), WORD * float((1.5 * factor * (factor + 1) + 2 * factor + 1).sum())
+    )
+
+
+def dense_cholesky(n: float) -> Operations:
+    """Return those of a dense factorisation: n^3/3 + n^2/2 + 7n/6."""
+    return cholesky(np.arange(n))
+
+
+def cholesky_solve(factor: Array) -> Operations:
+    """Return those of both triangular solves."""
+    n, elements = len(factor), float(factor.sum())
+    return Operations(4 * elements + 2 * n, 2 * WORD * (elements + n))
+
+
+def gradient(s: QpSizes, active: float) -> Operations:
+    """Return those of the gradient of the augmented cost."""
+    rows = Operations(2 * s.row + 2, WORD * s.row).times(active)
+    return product(s.Phi).plus(product(s.Gamma), rows, Operations(2 * s.n))
+
+
+def augmented_cost(s: QpSizes, active: float) -> Operations:
+    """Return those of the augmented cost."""
+    return product(s.Phi).plus(product(s.Gamma), Operations(2 * s.n + 2 * active + 2))
+
+
+def stage_matrix(s: QpSizes, active: float) -> Operations:
+    """Return those of I + w Hess(J), upper triangle."""
+    outer = s.outer / s.m
+    row = Operations(2 * s.row + 2 * outer, WORD * (2 * s.row + 3 * outer))
+    return Operations(3 + s.triangle + s.n, 2 * WORD * s.triangle).plus(row.times(active))
+
+
+def ode(s: QpSizes, active: float) -> Operations:
+    """Return those of one step of TR-BDF2 that is accepted, with the same rows active at its three points."""
+    velocity = gradient(s, active).plus(Operations(s.n))
+    vectors = Operations(18 * s.n + 5)  # two stages 11n + 2, error 7n, next step size 3
+    return velocity.times(3).plus(
+        stage_matrix(s, active), cholesky(s.factor), cholesky_solve(s.factor).times(2), augmented_cost(s, active),
+        vectors,
+    )  # fmt: skip
+
+
+def ode_kept(s: QpSizes, active: float) -> Operations:
+    """Return those of the same step after another one: its first velocity and the cost's Gamma z are known."""
+    known = gradient(s, active).plus(Operations(s.n), product(s.Gamma))
+    return ode(s, active).plus(known.times(-1))
+
+
+def qpoases(s: QpSizes, active: float) -> Operations:
+    """Return those of one working-set change of a null-space active-set method with `active` constraints fixed.
+
+    After Ferreau et al., qpOASES: a parametric active-set algorithm (Math. Prog. Comp. 6, 2014), and Gill et al.,
+    Procedures for optimization problems with a mixture of bounds and general linear constraints (ACM TOMS 10, 1984):
+    products with Q = (Z Y) and H, solves with T and the Cholesky factor R of Z' H Z, the steps of all rows and of
+    the multipliers for the ratio test, then plane rotations (6 operations a pair) of Q, T and R, which are dense.
+    """
+    n, free = s.n, s.n - active
+    direction = product(n * n).times(2).plus(product(s.Phi), product(active**2), product(free**2))
+    ratio_test = product(s.Gamma).plus(product(n * active), Operations(2 * (n + s.m)))
+    rotated = free * n + (active**2 + free**2) / 2
+    return direction.plus(ratio_test, Operations(6 * rotated, 4 * WORD * rotated))
+
+
+def osqp(s: QpSizes) -> Operations:
+    """Return those of one ADMM iteration; rows are those of Gamma and the n bounds.
+
+    After Stellato et al., OSQP (Math. Prog. Comp. 12, 2020), algorithm 1. The rows' diagonal block is eliminated first,
+    so L has the rows' elements and the factor of what is left.
+    """
+    rows = s.m + s.n
+    elements = s.Gamma + s.n + float(s.factor.sum())
+    return Operations(4 * elements + (s.n + rows), 2 * WORD * elements).plus(Operations(5 * s.n + 14 * rows))
+
+
+def fast_gradient(s: QpSizes, active: float) -> Operations:
+    """Return those of one gradient step of the augmented cost with momentum; its projection only compares."""
+    return gradient(s, active).plus(Operations(9 * s.n + 8))
+
+
+def interior_point(s: QpSizes, active: float) -> Operations:
+    """Return those of one predictor and corrector step, and of the augmented cost after it."""
+    n, m = s.n, s.m
+    bounds = n + s.bounded
+    through = product(s.Gamma)  # Gamma z, or Gamma' lambda
+    away = through.plus(Operations(3 * m + 2 * n))
+    mean = Operations(2 * (m + bounds) + 1)
+    slope = product(s.Phi).plus(through, Operations(2 * n))
+    matrix = Operations(2 * bounds + 3 * m + s.Gamma + 2 * s.outer, 2 * WORD * (s.outer + s.triangle))
+    solve = through.times(2).plus(cholesky_solve(s.factor), Operations(10 * m + 5 * bounds))
+    products = Operations(4 * (m + bounds) + 4)
+    reach = Operations(2 * (2 * m + 2 * n + bounds))
+    moves = Operations(2 * (3 * n + m)).plus(reach).times(2)
+    return away.times(2).plus(
+        mean.times(2), slope, matrix, cholesky(s.factor), solve.times(2), products, moves, augmented_cost(s, active)
+    )
+
+
+def daqp(s: QpSizes, active: float) -> Operations:
+    """Return those of one working-set change of a dual active-set method with an LDL' factor of size `active`.
+
+    After Arnstroem, Bemporad, Axehill, A dual active-set solver for embedded quadratic programming using recursive
+    LDL' updates (IEEE TAC 67, 2022), with M = (I; Gamma) R^-1: the new row of M M', its row of L, two solves,
+    u = M' lambda, and all rows' slack.
+    """
+    held = product(active * s.transformed / (s.m + s.n))
+    update = held.plus(product(active**2).times(0.5))
+    direction = product(active**2).plus(held, Operations(4 * active))
+    return update.plus(direction, product(s.transformed))
+
+
+class PreparationSizes(NamedTuple):
+    """Sizes of what happens once an updating period."""
+
+    problem: QpSizes
+    rate_rows: int
+    knots: int
+    states: int
+    inputs: int
+    outputs: int
+    segments: int
+    """Runs of equal inputs in the updating period."""
+    samples: int
+    """Sampling periods in a sequence."""
+    targets: bool
+    """Whether the cost is about a target that is sought."""
+    limited: bool
+    """Whether there is a limit of the feed, by two outputs that are estimated."""
+    apart: int = 0
+    """Predictions without the watched reading, beside the filter's."""
+
+
+def preparation(sizes: PreparationSizes, active: float) -> Operations:
+    """Return those of the Kalman correction, J_k, the prediction, the instance, the shift, the start, the sequence."""
+    n, states = sizes.problem.n, sizes.states
+    correct = _response(sizes.outputs, sizes).plus(
+        product((states + 1) * sizes.outputs), Operations(states + sizes.inputs + 2 * sizes.outputs + 4)
+    )
+    predict = _response(states, sizes).times(sizes.segments)
+    apart = correct.plus(Operations(2 * sizes.outputs + 1), predict).times(sizes.apart)
+    start = gradient(sizes.problem, active).plus(Operations(3 * n + 2))
+    sequence = product(sizes.samples * sizes.inputs * sizes.knots).plus(Operations(4 * sizes.samples * sizes.inputs))
+    costs = augmented_cost(sizes.problem, active).times(2)
+    sought = target(sizes.inputs) if sizes.targets else Operations(0)
+    limit = _response(2, sizes).plus(Operations(13)) if sizes.limited else Operations(0)
+    once = (product(n * n), costs, start, sequence, sought, limit)
+    return correct.plus(predict, apart, instance(sizes).times(2), *once)
+
+
+def instance(sizes: PreparationSizes) -> Operations:
+    """Return those of phi, gamma, the bounds and the constant."""
+    s = sizes.states + 1
+    output_rows = sizes.problem.m - sizes.rate_rows
+    maps = product(sizes.problem.n * s).plus(product(output_rows * s), product(s * s))
+    if sizes.targets:
+        about = Operations(4 * sizes.inputs * sizes.knots + sizes.inputs)
+        maps = maps.plus(product(sizes.inputs * s), product(sizes.inputs * sizes.problem.n), about)
+    return maps.plus(product(sizes.rate_rows * sizes.inputs), Operations(sizes.rate_rows + 4 * sizes.inputs + 2 * s))
+
+
+def target(inputs: int) -> Operations:
+    """Return those of a target: all points of its plane where up to two bounds meet, of inputs and outlet."""
+    rows = inputs + 1
+    bounds, corners = 2 * rows, 2 * rows * (rows - 1)
+    judged = 5 * rows + 3
+    plane = Operations(judged + bounds * (judged + 3) + 3 * rows + corners * (judged + 11))
+    return plane.plus(Operations(3 * rows + 15 * inputs + 3))
+
+
+def _response(results: int, sizes: PreparationSizes) -> Operations:
+    """Return those of A x + B u + F w."""
+    return product(results * (sizes.states + sizes.inputs)).plus(Operations(results, WORD * results))

@@ -1,0 +1,262 @@
+"""What a run reports to its sinks.
+
+A rig calls the `Recorder`; the recorder passes samples on in blocks, and updates when their sequence was played, to
+its sinks. Sinks write files, evaluate, show a line, or keep all in memory.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import islice
+from typing import Final, Protocol
+
+from coldloop.errors import ColdloopError, LinkError
+from coldloop.registers.audit import Event
+from coldloop.registers.optimizer_plc import Optimization
+from coldloop.registers.plant import PlantSample, StationSample
+from coldloop_rig.results.driving import CONTROL
+from coldloop_rig.results.recorded import LinkStatistics, PendingTicks, Recording, SampleBlock, joined
+
+__all__ = ["LinkStatistics", "MemorySink", "Recorder", "Recording", "Records", "SampleBlock", "Sink"]
+
+BLOCK_TICKS: Final = 512
+"""Samples that are passed on together."""
+SETTLED_TICKS: Final = 512
+"""An update that nothing has followed for so long after its period was not cut off. In a networked run samples are
+read up to 256 ticks before the updates that go with them."""
+KEPT_TICKS: Final = BLOCK_TICKS
+"""So many of the last ticks are not passed on yet: a plant that was restarted may do some of them again."""
+
+
+class Sink:
+    """Takes what a run yields. The methods do nothing; a sink overrides those that concern it."""
+
+    def begin(self) -> None:
+        """Real time begins to count: the first tick is about to be done."""
+
+    def sample(self, sample: PlantSample) -> None:
+        """Take a tick as it is done."""
+
+    def block(self, block: SampleBlock) -> None:
+        """Take up to `BLOCK_TICKS` ticks."""
+
+    def reported(self, update: Optimization) -> None:
+        """Take an update as it is reported, before it is known whether its sequence is played."""
+
+    def update(self, update: Optimization) -> None:
+        """Take an update whose sequence was played, before the block that its period ends in is much older."""
+
+    def event(self, service: str, event: Event) -> None:
+        """Take an event of the journal of a service, `control_plc` or `plant`."""
+
+    def close(self) -> None:
+        """Nothing more comes; raises what kept the sink from its work."""
+
+
+class MemorySink(Sink):
+    """Keeps the whole run: about 220 bytes a tick."""
+
+    def __init__(self) -> None:
+        self._blocks: list[SampleBlock] = []
+        self._updates: list[Optimization] = []
+        self.events: list[tuple[str, Event]] = []
+
+    def block(self, block: SampleBlock) -> None:
+        """Keep a block."""
+        self._blocks.append(block)
+
+    def update(self, update: Optimization) -> None:
+        """Keep an update."""
+        self._updates.append(update)
+
+    def event(self, service: str, event: Event) -> None:
+        """Keep an event."""
+        self.events.append((service, event))
+
+    def recording(self, link: LinkStatistics) -> Recording:
+        """Return what was kept."""
+        block = joined(self._blocks)
+        return Recording(block.load, block.u, block.y, block.x, self._updates, link, block.station, self.events)
+
+
+class Records(Protocol):
+    """Takes what is read of a session: a recorder, or what is before one."""
+
+    @property
+    def next_tick(self) -> int:
+        """First tick that is still to come."""
+
+    def sample(self, sample: PlantSample) -> None:
+        """Take a tick."""
+
+    def station(self, sample: StationSample) -> None:
+        """Take what goes with a tick that is about to come."""
+
+    def update(self, update: Optimization) -> None:
+        """Take an update."""
+
+    def event(self, event: Event, service: str = CONTROL) -> None:
+        """Take an event."""
+
+
+class Recorder:
+    """Passes what a run yields to its sinks.
+
+    Args:
+        ticks: Length of the run.
+        sinks: Who takes it; by default a sink in memory, whose content `recording` returns.
+    """
+
+    def __init__(self, ticks: int, sinks: Sequence[Sink] | None = None) -> None:
+        self.ticks = ticks
+        self.next_tick = 0
+        """First tick that is still to come."""
+        self.missing_ticks = 0
+        """Ticks before it of which nothing is known."""
+        self.link = LinkStatistics()
+        self._memory = MemorySink()
+        self._sinks = (self._memory,) if sinks is None else tuple(sinks)
+        self._pending = PendingTicks()
+        self._stations: dict[int, StationSample] = {}
+        """Of ticks that are about to come."""
+        self._unsettled: deque[Optimization] = deque()
+        self._stop: ColdloopError | None = None
+        self._closed = False
+        self._began = self._last = time.monotonic()
+
+    def begin(self) -> None:
+        """Begin to count real time: the first tick is about to be done."""
+        self._began = self._last = time.monotonic()
+        for sink in self._sinks:
+            sink.begin()
+
+    @property
+    def wall_seconds(self) -> float:
+        """Real time from the beginning to the last sample."""
+        return self._last - self._began
+
+    def stop(self, reason: ColdloopError) -> None:
+        """Let the next sample raise `reason`: a signal handler calls this."""
+        self._stop = reason
+
+    def sample(self, sample: PlantSample) -> None:
+        """Take the next tick; or a later one, and those before it are unknown; or one of the last ones that came again.
+
+        Raises:
+            LinkError: A tick came again that is older than `KEPT_TICKS`.
+            ColdloopError: The run is to stop; the tick is recorded.
+        """
+        place = sample.tick - self._pending.first
+        if place < 0:
+            raise LinkError(
+                f"tick {sample.tick} was repeated after tick {self.next_tick - 1}: the plant was set back too far"
+            )
+        missing = max(0, sample.tick - self.next_tick)
+        again = sample.tick < self.next_tick
+        if not again:
+            self._pending.extend(missing + 1, sample)
+            self.next_tick = sample.tick + 1
+        unknown = self._pending.put(sample, self._stations.pop(sample.tick, None))
+        self.missing_ticks += missing - (again and unknown)
+        self._taken(sample)
+
+    def stretch(self, block: SampleBlock, updates: Sequence[Optimization]) -> None:
+        """Take the next ticks at once, and the updates that were reported in them; sinks see the last tick of them.
+
+        Raises:
+            ColdloopError: The run is to stop; the ticks are recorded.
+        """
+        for update in updates:
+            self.update(update)
+        self._pending.extend(len(block.load), block)
+        self._pending.put_block(block)
+        self.next_tick += len(block.load)
+        load, u, y, x = (part[-1].tolist() for part in (block.load, block.u, block.y, block.x))
+        self._taken(PlantSample(self.next_tick - 1, load, tuple(u), tuple(y), tuple(x)))
+
+    def _taken(self, sample: PlantSample) -> None:
+        """Pass on settled samples, and stop on request."""
+        self._last = time.monotonic()
+        for sink in self._sinks:
+            sink.sample(sample)
+        if self._pending.count >= BLOCK_TICKS + KEPT_TICKS:
+            self._pass_on()
+        if self._stop is not None:
+            raise self._stop
+
+    def station(self, sample: StationSample) -> None:
+        """Take what goes with a tick that is about to come, where the plant is a whole refrigerator."""
+        self._stations[sample.tick] = sample
+
+    def update(self, update: Optimization) -> None:
+        """Take the next update, also one that a load step will cut off."""
+        self._unsettled.append(update)
+        for sink in self._sinks:
+            sink.reported(update)
+        if len(self._unsettled) > BLOCK_TICKS:
+            self._settle()
+
+    def event(self, event: Event, service: str = CONTROL) -> None:
+        """Take an event of the journal of a service; before the ticks after it are older than `SETTLED_TICKS`."""
+        for sink in self._sinks:
+            sink.event(service, event)
+
+    def close(self) -> None:
+        """Pass on what is left, and close all sinks, each of them even if another one fails.
+
+        Raises:
+            OSError: A sink could not write.
+            ColdloopError: The disk is full.
+        """
+        if not self._closed:
+            self._closed = True
+            _all(self._pass_on, *(sink.close for sink in self._sinks))
+
+    def recording(self) -> Recording:
+        """Return what was recorded in memory, with the updates whose sequence was played within the run.
+
+        An update that a load step has cut off is not among them.
+        """
+        self.close()
+        return self._memory.recording(self.link)
+
+    def _pass_on(self) -> None:
+        """Pass on all blocks that are whole and old enough; at the end all that is left."""
+        self._settle()
+        kept = 0 if self._closed else KEPT_TICKS
+        calls = []
+        while self._pending.count > kept and (self._closed or self._pending.count >= BLOCK_TICKS + kept):
+            block = self._pending.take(BLOCK_TICKS)
+            calls += [partial(sink.block, block) for sink in self._sinks]
+        _all(*calls)
+
+    def _settle(self) -> None:
+        """Pass on the updates of which it is known that their sequence was played."""
+        for update in self._settled():
+            _all(*(partial(sink.update, update) for sink in self._sinks))
+
+    def _settled(self) -> Iterator[Optimization]:
+        done = self.next_tick
+        while self._unsettled:
+            update, *following = tuple(islice(self._unsettled, 2))
+            end = update.tick + update.tau_u
+            cut_off = bool(following) and following[0].tick < end
+            played = end < done and (bool(following) or self._closed or done >= end + SETTLED_TICKS)
+            if not cut_off and not played:
+                return
+            self._unsettled.popleft()
+            if not cut_off:
+                yield update
+
+
+def _all(*calls: Callable[[], None]) -> None:
+    """Make all calls, then raise the first error: what one sink cannot do does not concern the others."""
+    errors = []
+    for call in calls:
+        try:
+            call()
+        except (OSError, ColdloopError) as error:
+            errors.append(error)
+    if errors:
+        raise errors[0]

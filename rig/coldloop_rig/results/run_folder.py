@@ -1,0 +1,313 @@
+"""A folder that a run has left behind, and how it is read."""
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+
+from coldloop.errors import UsageError, printable
+from coldloop.parsing import parsed_json
+from coldloop.process.declaration import Process
+from coldloop.process.model_file import process_in, read_document
+from coldloop.registers.control_plc import Mode
+from coldloop.service.event_text import word
+from coldloop.text_file import held_file, read_text
+from coldloop_rig.durations import LONGEST_TICKS
+from coldloop_rig.results.arrow_arrays import numbers_of
+from coldloop_rig.results.columns import EVENTS, FORMAT, TRACE, files_of
+
+Curves = dict[str, NDArray[np.float64]]
+"""Columns by name; what is null is NaN."""
+
+OLDER: Final[dict[str, Any]] = {
+    "optimizer_plc.program.adaptive.rule": "algorithm-1",
+    "optimizer_plc.program.estimator.disturbances": [],
+    "optimizer_plc.program.cold_end.approach_k": 0.0,
+    "optimizer_plc.program.design.band_margin": [0.0, 0.0],
+    "optimizer_plc.program.plausibility.sigmas": 0.0,
+}
+"""Configuration of runs that were recorded before there was a key: what the preset would decide now."""
+ADAPTIVE: Final = "optimizer_plc.program.adaptive."
+GONE: Final = frozenset(
+    f"{ADAPTIVE}contraction.{name}" for name in ("q_busy", "q_quiet", "q_step", "rate", "memory", "surprise")
+)
+"""Settings of a rule that was replaced, which are in the manifests of runs that did not use it, too."""
+TAU_U: Final = "tau_u_s"
+DRAWN_TICKS: Final = 60_000
+"""A longer trace is drawn by the least and the largest value of many ticks."""
+
+
+BANDS: Final = ("optimizer_plc.program.design.output_low", "optimizer_plc.program.design.output_high")
+BOUNDS: Final = ("limits.low", "limits.high")
+"""Keys that have a number for each output with a band, and for each input."""
+ENDED: Final = "name the folder of a run that has ended"
+MOST_BYTES: Final = 2**24
+"""Of a JSON document."""
+MOST_COLUMNS: Final = 2000
+MOST_TEXT: Final = 4096
+"""Bytes of a text in a table."""
+ROW_BYTES: Final = 4096
+"""Of a row, on average, before it is compressed; `SPARE_BYTES` more for the file."""
+SPARE_BYTES: Final = 2**20
+MOST_IN_MEMORY: Final = 2_000_000
+"""Rows of a file that is read as a whole: 139 h of ticks."""
+MOST_LISTED: Final = 500_000
+"""Rows of a file of which each becomes an object of Python: events and updates."""
+Ticks = Annotated[int, Field(ge=0, le=LONGEST_TICKS)]
+
+
+class _Hashes(BaseModel):
+    model_config = ConfigDict(extra="allow", strict=True)
+
+    configuration_sha256: str
+    model_sha256: str
+    trace_sha256: str | None
+
+
+class _Input(BaseModel):
+    """A file that a run has read, or what took its place."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+    source: str
+    file: str | None
+    sha256: str = ""
+    profile_sha256: str = ""
+
+
+class _Inputs(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    load: _Input
+    model: _Input
+    refrigerator: _Input | None = None
+
+
+class _Configured(BaseModel):
+    """Keys that a figure of any run shows."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+    load: str = Field(alias="plant.load")
+    driver: str = Field(alias="control_plc.driver")
+    period: float | None = Field(alias="optimizer_plc.program.updating_period_s")
+    solver: str = Field(alias="optimizer_plc.program.solver")
+    outside: str | None = Field(alias="optimizer_plc.program.outside.solver", default=None)
+    band_low: list[FiniteFloat] = Field(alias="optimizer_plc.program.design.output_low")
+    band_high: list[FiniteFloat] = Field(alias="optimizer_plc.program.design.output_high")
+    low: list[FiniteFloat] = Field(alias="limits.low")
+    high: list[FiniteFloat] = Field(alias="limits.high")
+
+
+class _Manifest(BaseModel):
+    """What all who read a manifest count on."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+    complete: bool
+    reason: str | None
+    started_utc: str
+    coldloop: str
+    python: str
+    platform: str
+    dependencies: dict[str, str]
+    way: str
+    ticks: Ticks
+    recorded_ticks: Ticks
+    configuration: _Configured
+    inputs: _Inputs
+    hashes: _Hashes
+
+
+class RunFolder:
+    """Results on disk, of the present format.
+
+    Raises:
+        UsageError: There are none, or they are of another version, or damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.manifest = self._document("manifest.json")
+        if self.manifest.get("format") != FORMAT:
+            raise UsageError(f"{path}: results of another version of Coldloop; this one reads format {FORMAT}")
+        try:
+            _Manifest.model_validate(self.manifest)
+        except ValidationError as error:
+            first = error.errors()[0]
+            place = ".".join(map(str, first["loc"]))
+            raise UsageError(f"{path / 'manifest.json'}: {place}: {first['msg']}; it has been changed") from None
+
+    def _document(self, name: str) -> dict[str, Any]:
+        try:
+            document: dict[str, Any] = parsed_json(read_text(self.held(name), ENDED, most=MOST_BYTES))
+        except ValueError as error:
+            raise UsageError(f"{self.path / name}: {error}; {ENDED}") from None
+        if not isinstance(document, dict):
+            raise UsageError(f"{self.path / name}: not an object; {ENDED}")
+        return document
+
+    def held(self, name: str) -> Path:
+        """Return the path of a regular file in the folder, as `held_file` does."""
+        return held_file(self.path, name, ENDED)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The summary."""
+        return self._document("summary.json")
+
+    @property
+    def configuration(self) -> dict[str, Any]:
+        """The configuration by dotted key; of an older run with what held then."""
+        configured: dict[str, Any] = OLDER | self.manifest["configuration"]
+        if configured.get(f"{ADAPTIVE}rule") == "contraction":
+            return configured
+        return {key: value for key, value in configured.items() if key not in GONE}
+
+    def file(self, name: str, most: int = LONGEST_TICKS) -> pq.ParquetFile:
+        """Return a Parquet file of the run, of `most` rows at most, after a look at its footer and at its texts.
+
+        Raises:
+            UsageError: It cannot be read, or is larger than a run of so many ticks makes it, or has other types.
+        """
+        path = self.held(name)
+        try:
+            file = pq.ParquetFile(path)
+            wrong = self._excess(name, file.metadata, most) or self._other_type(name, file.schema_arrow)
+            if not wrong and _has_long_text(path, file.schema_arrow):
+                wrong = f"a text of more than {MOST_TEXT} bytes"
+        except (OSError, pa.ArrowException) as error:
+            wrong = str(error).splitlines()[0]
+        if wrong:
+            raise UsageError(f"{path}: damaged, or of something else: {wrong}")
+        return file
+
+    def _excess(self, name: str, footer: pq.FileMetaData, most: int) -> str:
+        """Return what a file has too much of, by its footer."""
+        rows, ticks = footer.num_rows, self.manifest["recorded_ticks"]
+        size = sum(footer.row_group(group).total_byte_size for group in range(footer.num_row_groups))
+        if name != EVENTS and rows > ticks:
+            return f"{rows} rows, and manifest.json says {ticks} ticks"
+        if not rows and name == TRACE:
+            return "no rows"
+        if rows > most:
+            return f"{rows} rows; {most} at most are read into memory"
+        if footer.num_columns > MOST_COLUMNS or size > SPARE_BYTES + ROW_BYTES * rows:
+            return f"{footer.num_columns} columns of {size} bytes in {rows} rows"
+        return ""
+
+    def _other_type(self, name: str, schema: pa.Schema) -> str:
+        """Return which column has another type than in our file, or one that no column of it has."""
+        kinds = {column.name: column.kind for column in files_of(self.process)[name].columns}
+        for field in schema:
+            if field.type not in ({kinds[field.name]} if field.name in kinds else {*kinds.values()}):
+                return f"{printable(field.name[:MOST_TEXT])} is {str(field.type)[:80]}"
+        return ""
+
+    @cached_property
+    def process(self) -> Process:
+        """The process that was run, as it was then.
+
+        Raises:
+            UsageError: Its declaration is none that this version makes.
+        """
+        place = f"{self.path / str(self.manifest['inputs']['model']['file'])}: process"
+        return process_in(self.model.get("process", {}), place, "use the version of Coldloop that made this run")
+
+    @property
+    def model(self) -> dict[str, Any]:
+        """The copy of its model file; empty where there is none, as of the cold box that is shipped."""
+        place: str | None = self.manifest["inputs"]["model"]["file"]
+        return read_document(self.held(place), "restore it") if place else {}
+
+    @contextmanager
+    def reading(self, name: str, most: int = LONGEST_TICKS) -> Iterator[pq.ParquetFile]:
+        """Open a Parquet file of the run; a damaged one is a one-line error.
+
+        Raises:
+            UsageError: It cannot be read, or has other columns.
+        """
+        try:
+            with self.file(name, most) as file:
+                yield file
+        except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
+            reason = (str(error) or type(error).__name__).splitlines()[0]
+            raise UsageError(f"{self.path / name}: damaged, or of something else: {reason}") from None
+
+    def series(self, columns: Sequence[str], longest: int = DRAWN_TICKS, file_name: str = TRACE) -> Curves:
+        """Return columns of the trace, or of another file with a row a tick, for drawing: `time_s` and these.
+
+        It takes constant memory.
+
+        The updating period is drawn while it was in force: in other modes than MPC it is NaN.
+
+        A trace of more than `longest` ticks is reduced to two points for each of `longest / 2` intervals.
+        """
+        names = ["time_s", *columns]
+        with self.reading(file_name) as file:
+            every = max(1, math.ceil(file.metadata.num_rows / (longest / 2))) if file.metadata.num_rows > longest else 1
+            batches = file.iter_batches(batch_size=every * 4096, columns=[*names, "mode"] if TAU_U in names else names)
+            parts = [_reduced(_in_force(batch, names), every) for batch in batches]
+            series = {name: np.concatenate([part[name] for part in parts] or [np.empty(0)]) for name in names}
+            if not np.isfinite(series["time_s"]).all() or (np.diff(series["time_s"]) < 0).any():
+                raise ValueError("time_s does not rise")
+        for keys, signals in ((BANDS, self.process.banded), (BOUNDS, self.process.inputs)):
+            for key in keys:
+                if len(self.configuration[key]) != len(signals):
+                    raise UsageError(f"{self.path / 'manifest.json'}: {key} is not of {len(signals)} numbers")
+        return series
+
+    def events(self) -> list[dict[str, Any]]:
+        """Return the events."""
+        with self.reading(EVENTS, MOST_LISTED) as file:
+            table = file.read(columns=[column.name for column in files_of(self.process)[EVENTS].columns])
+            missing = [name for name in table.column_names if name != "value" and table[name].null_count]
+            if missing:
+                raise ValueError(f"{missing[0]} is missing in a row")
+            rows: list[dict[str, Any]] = table.to_pylist()
+        return rows
+
+
+def _has_long_text(path: Path, schema: pa.Schema) -> bool:
+    """Return whether a text is too long; a few bytes may stand for the same long text in millions of rows."""
+    texts = [field.name for field in schema if pa.types.is_string(field.type)]
+    with pq.ParquetFile(path, read_dictionary=texts) as file:
+        return any(
+            len(column.dictionary) and pc.max(pc.binary_length(column.dictionary)).as_py() > MOST_TEXT
+            for batch in file.iter_batches(columns=texts) for column in batch.columns
+        )  # fmt: skip
+
+
+def _in_force(batch: pa.RecordBatch, names: Sequence[str]) -> Curves:
+    """Return columns as numbers; the updating period only where MPC was active, or the mode is not known."""
+    series = batch_series(batch.select(names))
+    if TAU_U in series:
+        is_mpc = pc.fill_null(pc.equal(batch["mode"], word(Mode.MPC)), fill_value=True)
+        series[TAU_U] = np.where(is_mpc.to_numpy(zero_copy_only=False), series[TAU_U], np.nan)
+    return series
+
+
+def batch_series(batch: pa.RecordBatch) -> Curves:
+    """Return the columns of a batch as numbers."""
+    return {name: numbers_of(batch[name]) for name in batch.schema.names}
+
+
+def _reduced(series: Curves, every: int) -> Curves:
+    """Return for each interval of so many ticks the least and the largest value of each column."""
+    if every == 1:
+        return series
+    starts = np.arange(0, len(series["time_s"]), every)
+    reduced: Curves = {}
+    for name, values in series.items():
+        pair = [np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)]
+        reduced[name] = np.stack(pair, axis=1).ravel()
+    return reduced

@@ -1,0 +1,210 @@
+"""The loop from Python: a run in memory, in one process.
+
+from coldloop_rig import simulate
+
+result = simulate(load="a", solver="ode", updating_period="adaptive", duration_s=600)
+result.summary["J_BF"]
+result.trace.to_dict()["T5"]
+result.plot("run.png")
+"""
+
+import warnings
+from argparse import ArgumentTypeError
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from matplotlib.figure import Figure
+
+from coldloop import __version__
+from coldloop.config import Configuration
+from coldloop.errors import UsageError
+from coldloop.process.declaration import Process
+from coldloop.process.lti_model import load as load_model
+from coldloop.process.updating_periods import whole_ticks
+from coldloop.registers.audit import Event
+from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.durations import duration
+from coldloop_rig.figures.plot import Bounds, RunCurves, draw_run, labels_of
+from coldloop_rig.figures.run_plot import at_times, pressure_limits, save_figure, title_of
+from coldloop_rig.python_settings import Period, configured
+from coldloop_rig.results.driving import DrivingHistory
+from coldloop_rig.results.indicators import RunEvaluation, StageCost
+from coldloop_rig.results.recording import MemorySink, Recorder, Recording
+from coldloop_rig.results.run_folder import batch_series
+from coldloop_rig.results.tables import events_table, station_table, trace_table, updates_table
+from coldloop_rig.runs.remarks import certificate, enforced, too_slow
+from coldloop_rig.runs.run_files import summary_of
+from coldloop_rig.runs.running import make_scenario
+from coldloop_rig.settings import Settings
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a result; its columns are those of `rig/coldloop_rig/results/columns.py`."""
+
+    arrow: pa.Table
+
+    def __repr__(self) -> str:
+        """Return how large it is, and what is in it."""
+        return f"Table({self.arrow.num_rows} rows of {', '.join(self.arrow.column_names)})"
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The unit of each column."""
+        return {field.name: field.metadata[b"unit"].decode() for field in self.arrow.schema}
+
+    def to_pandas(self) -> Any:  # noqa: ANN401 pandas is not a dependency
+        """Return the table as a DataFrame, with the units in `attrs["units"]`; needs pandas."""
+        frame = self.arrow.to_pandas()
+        frame.attrs["units"] = self.units
+        return frame
+
+    def to_dict(self) -> dict[str, list[Any]]:
+        """Return the columns as lists by name."""
+        columns: dict[str, list[Any]] = self.arrow.to_pydict()
+        return columns
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """The result of `simulate`."""
+
+    recording: Recording
+    """The trace as arrays."""
+    summary: dict[str, Any]
+    """What `summary.json` has."""
+    configuration: dict[str, Any]
+    """The effective configuration by dotted key."""
+    process: Process
+    """What was run."""
+    _cost: StageCost
+    _events: tuple[tuple[str, Event], ...]
+
+    def __repr__(self) -> str:
+        """Return what was run, for how long, and the trace."""
+        program = "optimizer_plc.program."
+        tau_u = self.configuration[f"{program}updating_period_s"]
+        return (
+            f"Simulation(load={self.configuration['plant.load']!r}, solver={self.configuration[f'{program}solver']!r}, "
+            f"updating_period={tau_u or 'adaptive'!r}, {self.summary['ticks']} ticks, "
+            f"trace {self.summary['trace_sha256'][:12]})"
+        )
+
+    @cached_property
+    def trace(self) -> Table:
+        """One row a tick."""
+        history = DrivingHistory(self.process)
+        for service, event in self._events:
+            history.event(service, event)
+        return Table(trace_table(self.recording.block, self.recording.updates, self._cost, history))
+
+    @cached_property
+    def updates(self) -> Table:
+        """One row an update whose sequence was played."""
+        return Table(updates_table(self.recording.updates, self.process))
+
+    @cached_property
+    def events(self) -> Table:
+        """One row a change of mode or of an alarm."""
+        return Table(events_table(self._events, self.process))
+
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Return the figure of the run; with a path it is written there too, as .png, .pdf or .svg."""
+        (batch,) = self.trace.arrow.select(["time_s", *labels_of(self.process)]).to_batches()
+        series, block = batch_series(batch), self.recording.block
+        pressures = pressure_limits(self.configuration) if block.station.size else {}
+        if pressures:
+            (station,) = station_table(block, self.process).select(["time_s", *pressures]).to_batches()
+            series |= at_times(batch_series(station), series["time_s"])
+        curves = RunCurves(
+            self.process,
+            series,
+            self.events.arrow.to_pylist(),
+            Bounds.of(self.configuration, self.process),
+            title_of(self.configuration, self.process),
+            f"trace {self.summary['trace_sha256'][:12]}  ·  coldloop {__version__}  ·  in-process",
+            pressures,
+        )
+        figure = draw_run(curves)
+        if path is not None:
+            save_figure(figure, Path(path))
+        return figure
+
+
+def simulate(
+    load: str | Path | None = None,
+    solver: str | None = None,
+    updating_period: Period | None = None,
+    *,
+    process: str | Path | None = None,
+    duration_s: float | str | None = None,
+    seed: int | None = None,
+    config: str | Path | None = None,
+    enforce: bool = False,
+    **settings: Mapping[str, Any] | object,
+) -> Simulation:
+    """Run the three programs in this process, in lock-step; return what they did.
+
+    Args:
+        load: Named load such as `a`, or a CSV file with the columns time_s and load_w; by default `2h`.
+        solver: `ode`, `qpoases`, `osqp`, `fast-gradient`, `interior-point`, `hybrid` or `daqp`; by default `ode`.
+        updating_period: Seconds, from 2 ticks to a sampling period (0.5 to 5 s); `adaptive`, the default.
+        process: Process file, or a model file that was made from one; by default the cold box.
+        duration_s: Plant time in seconds, multiples of a tick, or a text such as `10min`; by default that of the load.
+        seed: Seed of the sensors' noise; by default 1.
+        config: TOML file with further settings, such as one that `coldloop config` has written. An argument that is
+            given comes before it.
+        enforce: Lengthen the updating period to what the PLC takes. Otherwise a warning says where it is too short,
+            or too long for a plant with a mode that grows.
+        settings: Sections of the configuration, such as `plant={"sensors": {"level": 0.01}}`; they come before the
+            file. The environment has no influence.
+
+    Raises:
+        UsageError: An argument cannot be used; one line that says why.
+    """
+    effective = configured(
+        load=load, solver=solver, updating_period=updating_period, seed=seed, config=config, sections=settings,
+        process=process,
+    )  # fmt: skip
+    if enforce:
+        effective = enforced(effective)
+    slow, lost = too_slow(effective.settings.optimizer_plc.program), certificate(effective.settings, only_lost=True)
+    for line in filter(None, (slow, lost)):
+        warnings.warn(line, stacklevel=2)
+    return _run(effective, _ticks(duration_s, effective.settings.process.tick_s))
+
+
+def _ticks(duration_s: float | str | None, tick_s: float) -> int | None:
+    if duration_s is None:
+        return None
+    if isinstance(duration_s, str):
+        try:
+            return duration(duration_s).ticks(tick_s, "duration_s")
+        except ArgumentTypeError as error:
+            raise UsageError(f"duration_s: {error}") from None
+    ticks = whole_ticks(duration_s, tick_s)
+    if ticks is None or ticks <= 0:
+        raise UsageError(f"duration_s={duration_s}: not a positive multiple of {tick_s} s")
+    return ticks
+
+
+def _run(effective: Configuration[Settings], ticks: int | None) -> Simulation:
+    settings = effective.settings
+    scenario = make_scenario(settings, ticks)
+    model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
+    evaluation, memory = RunEvaluation(model, design), MemorySink()
+    recorder = Recorder(scenario.ticks, [evaluation, memory])
+    OneProcessRig(settings).run(scenario, recorder)
+    recorder.close()
+    return Simulation(
+        recording=memory.recording(recorder.link),
+        summary=summary_of(evaluation, recorder, realtime=False, reason=None),
+        configuration={key: value for key, value, _ in effective.effective() if value is not None},
+        process=settings.process,
+        _cost=StageCost(model, design),
+        _events=tuple(memory.events),
+    )

@@ -1,0 +1,73 @@
+"""Whether an adaptive updating period pays on a PLC: the closed loop under some loads, against fixed periods."""
+
+from collections.abc import Callable, Sequence
+from itertools import product
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.process.declaration import Process
+from coldloop.process.updating_periods import SHORTEST_TICKS
+from coldloop_optimizer_plc.budget import PlcBudget
+from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.settings import Settings
+from coldloop_rig.studies.intervals import Interval, geometric_mean, mean_ratio
+from coldloop_rig.studies.loop_cost import ADAPTIVE, loop_cost, require_costs
+
+SHARES: Final = (0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
+"""Of a sampling period: updating periods that are compared, unless one is given."""
+
+
+def fixed_periods(process: Process) -> tuple[float, ...]:
+    """Return the updating periods, s, that are compared."""
+    ticks = sorted({round(share * process.ticks_per_sample) for share in SHARES})
+    return tuple(each * process.tick_s for each in ticks if each >= SHORTEST_TICKS)
+
+
+def adaptive_gain(
+    settings: Settings, names: Sequence[str], period_s: float | None, done: Callable[[int, int], None]
+) -> str:
+    """Return, as a sentence, J_BF of the adaptive period over that of the best fixed one.
+
+    The best is chosen on the same loads, which favours it.
+
+    Args:
+        settings: With the power of the PLC.
+        names: Loads, named ones or files.
+        period_s: The fixed period to compare with; None for the best of `fixed_periods` in which an iteration fits.
+        done: Is called with the number of runs done and that of all.
+    """
+    program = settings.optimizer_plc.program
+    budget = PlcBudget(program.budget, program.iteration_s)
+    periods = fixed_periods(settings.process)
+    fitting = [period for period in periods if budget.times.holds(round(period / settings.process.tick_s))]
+    fixed = fitting or [periods[-1]] if period_s is None else [period_s]
+    rig, runs = OneProcessRig(settings), list(product((ADAPTIVE, *fixed), names))
+    costs = []
+    for number, (period, name) in enumerate(runs):
+        done(number, len(runs))
+        costs.append(loop_cost(settings, name, period, rig.run))
+    best, ratio = over_best_fixed(np.array(costs).reshape(-1, len(names)))
+    which = f"a fixed {fixed[best - 1]:g} s" + (", the best fixed one" if len(fixed) > 1 else "")
+    loads = f"load{'s' if len(names) > 1 else ''} {', '.join(names)}"
+    return f"With {loads} an adaptive period costs {ratio.text()} of {which}: {pays(ratio)}."
+
+
+def over_best_fixed(costs: NDArray[np.float64]) -> tuple[int, Interval]:
+    """Return which row is the best fixed period, and the cost of the first row, the adaptive one, over its.
+
+    Args:
+        costs: A row for each period, a column for each load.
+
+    Raises:
+        StudyError: A loop costs nothing.
+    """
+    require_costs(costs)
+    best = min(range(1, len(costs)), key=lambda which: geometric_mean(costs[which]))
+    return best, mean_ratio(costs[0], costs[best])
+
+
+def pays(ratio: Interval) -> str:
+    """Return whether it does, in words; of costs, those of the adaptive period over others."""
+    return ratio.in_words("it pays", "it does not pay", "one load has no interval; name several")

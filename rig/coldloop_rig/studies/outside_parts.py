@@ -1,0 +1,33 @@
+"""Digests of somebody else's solver, rule and estimator: an outcome that they decided is kept under their source."""
+
+import hashlib
+import sys
+from functools import lru_cache
+from pathlib import Path
+
+from coldloop_optimizer_plc.computing_settings import OutsideSettings
+from coldloop_optimizer_plc.entry_points import Part, loaded
+
+
+def outside_digests(settings: OutsideSettings) -> dict[str, str]:
+    """Return the digest of each outside part that the settings name, by `part name`.
+
+    Raises:
+        ConfigurationError: A part is not installed, or cannot be imported.
+    """
+    names = {part: getattr(settings, part) for part in Part}
+    return {f"{part} {name}": _digest(part, name) for part, name in names.items() if name}
+
+
+@lru_cache(maxsize=64)
+def _digest(part: Part, name: str) -> str:
+    """Return the digest of all Python files of the package, or of the module if it is in none."""
+    made = loaded(part, name)
+    module = sys.modules[getattr(made, "__module__", type(made).__module__).partition(".")[0]]
+    folders = [Path(folder) for folder in getattr(module, "__path__", ())]
+    files = [file for folder in folders for file in sorted(folder.rglob("*.py"))]
+    own = getattr(module, "__file__", None)
+    content = hashlib.sha256(f"{made.__module__}.{getattr(made, '__qualname__', '')}".encode())
+    for file in files or ([Path(own)] if own else []):
+        content.update(file.read_bytes())
+    return content.hexdigest()[:20]

@@ -1,0 +1,283 @@
+"""A rig for a test: three services on localhost behind proxies, and calls that wait for their result."""
+
+import asyncio
+import contextlib
+import tempfile
+import time
+from collections.abc import Callable, Coroutine, Iterator, Mapping
+from contextlib import AsyncExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Final, Literal, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from coldloop.errors import LinkError, PeerUnreachableError, UsageError
+from coldloop.modbus.client import RegisterClient
+from coldloop.process.settings import settings_of
+from coldloop.registers.common import Identity
+from coldloop.registers.maps import maps_of
+from coldloop_rig.chaos.faults import AnyFault, WrongModel
+from coldloop_rig.chaos.injection import Injector
+from coldloop_rig.chaos.models import WRONG_MODEL, save_wrong_model
+from coldloop_rig.chaos.proxied_services import ProxiedServices
+from coldloop_rig.cosim.answer_time import QUIET_S
+from coldloop_rig.cosim.endpoints import RigEndpoints
+from coldloop_rig.cosim.session_client import SessionClient
+from coldloop_rig.cosim.wiring import SERVICES, START_PATIENCE_S
+from coldloop_rig.python_settings import Period, configured
+from coldloop_rig.runs.running import check_certificates, make_scenario
+from coldloop_rig.settings import Settings
+from coldloop_rig.testing.event_loop import BackgroundLoop
+from coldloop_rig.testing.named_registers import NamedRegisters
+
+T = TypeVar("T")
+
+LOOK_S: Final = 0.01
+"""Between two looks at the tick of the plant, in real time."""
+END_S: Final = 1.0
+"""How long the end of a process may take to be known after its connections were closed."""
+FEED_S: Final = 0.5
+"""Between two looks at the load that the plant knows of, in a session in real time."""
+_FAULT: Final[TypeAdapter[AnyFault]] = TypeAdapter(AnyFault)
+
+
+class LiveRig:
+    """Three services with a session under way. `up` makes one.
+
+    A rig in lock-step moves only in `advance` and `wait_until`; one in real time moves by itself. All methods are to be
+    called from one thread. What the services refuse, and a service that has ended, raise `LinkError`.
+    """
+
+    def __init__(self, settings: Settings, folder: Path) -> None:
+        self.settings = settings
+        """Their configuration, but for the ports."""
+        maps, self._tick_s = maps_of(settings.process), settings.process.tick_s
+        self._scenario = make_scenario(settings)
+        self._folder = folder
+        self._proxied = ProxiedServices(settings, folder, str(settings.plant.seed))
+        self.endpoints: RigEndpoints = self._proxied.services.endpoints
+        """Where the services listen."""
+        self._loop = BackgroundLoop()
+        self._stack = AsyncExitStack()
+        self._driver = SessionClient(self.endpoints, settings)
+        self._clients = {
+            service: RegisterClient.at(register_map, endpoint)
+            for service, register_map, endpoint in zip(SERVICES, maps, self.endpoints, strict=True)
+        }
+        self.plant, self.control_plc, self.optimizer_plc = (
+            NamedRegisters(register_map, endpoint, self._clients[service], self._call)
+            for service, register_map, endpoint in zip(SERVICES, maps, self.endpoints, strict=True)
+        )
+        self._injector = Injector(self._proxied.services, self._proxied.proxies, self._clients["plant"], folder)
+
+    # -- time ----------------------------------------------------------------------------------------------------------
+
+    @property
+    def time_s(self) -> float:
+        """Plant time of the session, s."""
+        return float(self.plant.read("identity.tick")) * self._tick_s
+
+    def advance(self, seconds: float) -> float:
+        """Let `seconds` of plant time pass (a multiple of 0.25); return the plant time at the end.
+
+        Raises:
+            LinkError: Plant time does not move for 20 s.
+        """
+        ticks = seconds / self._tick_s
+        if not ticks > 0 or ticks != round(ticks):
+            raise UsageError(f"advance({seconds}): not a positive multiple of {self._tick_s} s")
+        return float(self._call(self._advanced(round(ticks)))) * self._tick_s
+
+    async def _advanced(self, ticks: int) -> int:
+        tick = (await self._clients["plant"].read(Identity)).tick
+        until, moved = tick + ticks, time.monotonic()
+        while tick < until:
+            if not self._scenario.realtime:
+                await self._driver.advance(tick, until)
+            await asyncio.sleep(LOOK_S)
+            before, tick = tick, (await self._clients["plant"].read(Identity)).tick
+            if tick != before:
+                moved = time.monotonic()
+            elif time.monotonic() - moved > max(QUIET_S, 4 * self._tick_s / self._scenario.factor):
+                raise LinkError(
+                    f"the plant is at {tick * self._tick_s:g} s of plant time for {QUIET_S:g} s: see the logs in "
+                    f"{self._folder / 'logs'}"
+                )
+        return tick
+
+    def wait_until(self, condition: Callable[[], bool], within_s: float = 60.0) -> float:
+        """Wait until `condition()` is true, for at most `within_s` of plant time; return the plant time then.
+
+        The condition is looked at every 0.25 s of plant time in lock-step, and a hundred times a second in real time.
+        While plant time is stopped, as without the plant, real time counts.
+
+        Raises:
+            TimeoutError: It did not become true; with what it has read last.
+        """
+        start, deadline = self._tick_or_none(), time.monotonic() + within_s / self._scenario.factor + QUIET_S
+        while seen := self._unmet(condition):
+            tick = self._tick_or_none()
+            start = tick if start is None else start
+            if tick is not None and start is not None and (tick - start) * self._tick_s >= within_s:
+                raise TimeoutError(f"the condition was not met within {within_s:g} s of plant time: {seen}")
+            if self._scenario.realtime or tick is None:
+                if time.monotonic() > deadline:
+                    raise TimeoutError(
+                        f"the condition was not met within {within_s:g} s, and plant time does not advance: {seen}"
+                    )
+                time.sleep(LOOK_S)
+            else:
+                self.advance(self._tick_s)
+        return self.time_s
+
+    def _unmet(self, condition: Callable[[], bool]) -> str:
+        """Return what a condition has read that is not met; nothing if it is."""
+        services = {service: getattr(self, service) for service in SERVICES}
+        for one in services.values():
+            one.latest.clear()
+        if condition():
+            return ""
+        read = (f"{service} {name} = {seen}" for service, one in services.items() for name, seen in one.latest.items())
+        return ", ".join(read) or "it has read no register by name"
+
+    def _tick_or_none(self) -> int | None:
+        try:
+            return int(self.plant.read("identity.tick"))
+        except PeerUnreachableError:
+            return None
+
+    # -- faults --------------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def fault(self, kind: str, **parameters: object) -> Iterator[None]:
+        """Inject a fault during the context; at its end, wait until stopped services answer again.
+
+        Args:
+            kind: One of those of a chaos plan, such as `kill`, `pause`, `drop` or `sensor`.
+            parameters: What belongs to it there, but for its times: `process="optimizer"`, `link="plant"`, ...
+
+        Raises:
+            UsageError: There is no such fault, or a parameter is missing or wrong.
+        """
+        with settings_of(self.settings.process):
+            fault = _parsed(kind, parameters)
+        if isinstance(fault, WrongModel):
+            save_wrong_model(self.settings.model.file, self._folder / WRONG_MODEL)
+        self._call(self._injector.begin(fault))
+        try:
+            yield
+        finally:
+            self._call(self._ended(fault))
+
+    async def _ended(self, fault: AnyFault) -> None:
+        service = await self._injector.end(fault)
+        if service is not None:
+            await self._clients[service].connect(START_PATIENCE_S)
+
+    def log(self, service: str) -> Path:
+        """Return the log of `plant`, `control_plc` or `optimizer_plc`: one JSON object a line."""
+        if service not in SERVICES:
+            raise UsageError(f"unknown service '{service}'; choose from {', '.join(SERVICES)}")
+        return self._proxied.services.log(service)
+
+    # -- start and end -------------------------------------------------------------------------------------------------
+
+    def _call(self, work: Coroutine[Any, Any, T]) -> T:
+        services = self._proxied.services
+        try:
+            return self._loop.call(services.during(work))
+        except PeerUnreachableError:
+            if len(services.processes) == len(SERVICES):  # none was stopped on purpose: has one ended?
+                self._loop.call(services.during(asyncio.sleep(END_S)))
+            raise
+
+    def _start(self) -> None:
+        self._loop.call(self._started())
+
+    async def _started(self) -> None:
+        await self._stack.enter_async_context(self._proxied)
+        await self._proxied.services.during(self._driver.connect(START_PATIENCE_S))
+        await self._proxied.connect_links()
+        await self._proxied.services.during(self._driver.start(self._scenario))
+        if self._scenario.realtime:
+            task = asyncio.create_task(self._fed(), name="load of the session")
+            self._stack.callback(task.cancel)
+
+    async def _fed(self) -> None:
+        while True:
+            with contextlib.suppress(LinkError):  # the plant is away on purpose: it is looked at again
+                await self._driver.hold(FEED_S)
+            await asyncio.sleep(FEED_S)
+
+    def _stop(self) -> None:
+        try:
+            self._loop.call(self._stopped())
+        finally:
+            self._loop.close()
+
+    async def _stopped(self) -> None:
+        for client in self._clients.values():
+            client.close()
+        self._driver.close()
+        await self._stack.aclose()
+
+
+def _parsed(kind: str, parameters: Mapping[str, object]) -> AnyFault:
+    for name in ("at_s", "duration_s", "offset_ms"):
+        if name in parameters:
+            raise UsageError(
+                f"fault '{kind}': {name} belongs to a plan; here the context decides when it begins and ends"
+            )
+    try:
+        return _FAULT.validate_python({"kind": kind, "duration_s": 1.0, **parameters})
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"] if part != kind)
+        raise UsageError(f"fault '{kind}': {f'{where}: ' if where else ''}{first['msg']}") from None
+
+
+@contextmanager
+def up(
+    load: str | Path | None = None,
+    *,
+    mode: Literal["lockstep", "realtime"] | None = None,
+    factor: float | None = None,
+    solver: str | None = None,
+    updating_period: Period | None = None,
+    process: str | Path | None = None,
+    seed: int | None = None,
+    config: str | Path | None = None,
+    folder: str | Path | None = None,
+    **settings: Mapping[str, object],
+) -> Iterator[LiveRig]:
+    """Start plant, control PLC and optimiser PLC on free ports of localhost, and begin a session; stop them at the end.
+
+    Args:
+        load: Named load such as `a`, or a CSV file with the columns time_s and load_w, whose last value is held; by
+            default `2h`.
+        mode: `lockstep`, the default: plant time passes only in `advance` and `wait_until`; `realtime`: by the clock.
+        factor: In real time: seconds of plant time in a second; by default 1.
+        solver: `ode`, `qpoases`, `osqp`, `fast-gradient`, `interior-point`, `hybrid` or `daqp`; by default `ode`.
+        updating_period: Seconds, from 2 ticks to a sampling period (0.5 to 5 s); `adaptive`, the default.
+        process: Process file, or a model file that was made from one; by default the cold box.
+        seed: Seed of the sensors' noise, and of which frames a fault hits; by default 1.
+        config: TOML file with further settings. An argument that is given comes before it.
+        folder: Takes the logs; a temporary one if not given.
+        settings: Sections of the configuration, such as `control_plc={"driver": "classical"}`; they come before the
+            file. The environment has no influence.
+
+    Raises:
+        UsageError: An argument cannot be used.
+        LinkError: A service ended, or did not answer in time.
+    """
+    effective = configured(
+        load=load, solver=solver, updating_period=updating_period, seed=seed, config=config, sections=settings,
+        process=process, mode=mode, factor=factor,
+    )  # fmt: skip
+    check_certificates(effective.settings)
+    with contextlib.ExitStack() as stack:
+        place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="coldloop-")) if folder is None else folder)
+        rig = LiveRig(effective.settings, place)
+        stack.callback(rig._stop)  # noqa: SLF001 the two are one
+        rig._start()  # noqa: SLF001
+        yield rig

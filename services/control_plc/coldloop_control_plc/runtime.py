@@ -1,0 +1,406 @@
+"""The control PLC on the bus: client of the plant's rack, server of the optimiser and of operators.
+
+A scan makes one exchange (FC23) with the rack, and only while the link is synchronised (`plant_link.py`); otherwise
+the rack is read until it is. In lock-step the next scan waits for what it needs: the operator's grant, the optimiser's
+plan, and at an updating instant its sequence, while an optimiser is connected. In real time it waits for the clock
+only, which follows that of the rack (`rack_clock.py`).
+"""
+
+import asyncio
+import contextlib
+import logging
+import time
+from typing import Final
+
+from coldloop import __version__
+from coldloop.config import selected
+from coldloop.errors import LinkError, PeerUnreachableError
+from coldloop.modbus.client import RegisterClient
+from coldloop.modbus.server import DeviceIdentity, ModbusServer
+from coldloop.process.declaration import LAST_TICK
+from coldloop.process.model_file import read_header
+from coldloop.registers.audit import EventKind
+from coldloop.registers.bank import RegisterBank
+from coldloop.registers.common import SessionPace
+from coldloop.registers.configuration import publish_configuration
+from coldloop.registers.control_plc import ControlSession
+from coldloop.registers.maps import maps_of
+from coldloop.registers.plant import Measurement
+from coldloop.registers.safety import AlarmKind, WatchdogTime
+from coldloop.service.logs import dropped
+from coldloop.service.metrics_server import MetricsServer
+from coldloop.service.start import SERVING
+from coldloop.service.telemetry import Telemetry
+from coldloop.session.time_base import TimeBase
+from coldloop_control_plc.certificate_watch import CertificateWatch
+from coldloop_control_plc.client_requests import Clients
+from coldloop_control_plc.plant_link import FROZEN_S, FROZEN_TICKS, PlantLink
+from coldloop_control_plc.program import make_program
+from coldloop_control_plc.publication import ControlPublication
+from coldloop_control_plc.rack_clock import PHASE, RackClock
+from coldloop_control_plc.rack_finder import RackFinder
+from coldloop_control_plc.retained_state import ControlStateStore
+from coldloop_control_plc.scan_cycle import ScanCycle
+from coldloop_control_plc.scan_watch import LOOK_S, ScanWatch
+from coldloop_control_plc.sessions import Sessions
+from coldloop_control_plc.settings import SHOWN, ControlSettings
+
+log = logging.getLogger("coldloop.control_plc")
+
+ANSWER_TICKS: Final = 8
+"""In real time a later answer is stale: the rack is read again."""
+SHORTEST_PATIENCE_S: Final = 0.1
+LONGEST_SLEEP_S: Final = 0.25
+"""In real time it is seen so often whether an operator has called meanwhile."""
+REPACED_S: Final = 0.5
+"""Between two changes of the time base in real time: each reads the rack before outputs are written again."""
+KEEP_ALIVE_S: Final = 1.0
+"""While paused, the rack is asked something so often."""
+
+
+STATE_REFUSED: Final = 1
+"""Cause of the alarm STATE_NOT_RETAINED: at the start there was one that is not used."""
+
+
+class ControlPlc:
+    """Connects the program to the registers and to the rack."""
+
+    def __init__(self, settings: ControlSettings) -> None:
+        header = read_header(settings.model.file)
+        process, maps = settings.process, maps_of(settings.process)
+        section = settings.control_plc
+        self._settings = settings
+        self._store = ControlStateStore(section.retain.file, header.short_digest, process)
+        recalled = self._store.recall()
+        self._program = program = make_program(header, section, settings.limits)
+        program.journal.continue_from(self._store.boot, recalled.events if recalled else 0)
+        if recalled is not None:
+            program.recall(recalled.operator, recalled.alarms, recalled.watchdog, recalled.tick)
+        self.sessions = Sessions(program, settings.session, recalled)
+        self._link = PlantLink(program.alarms, program.journal, self._store.holder)
+        self._cycle = ScanCycle(program, self._link, self._adopt)
+        self._plant = RegisterClient.at(maps.plant, section.plant)
+        self._clock = RackClock(self.sessions.pace.factor, time.monotonic(), process.tick_s)
+        if self.sessions.kept is not None:
+            self._clock.synchronise(self.sessions.kept.tick + PHASE, time.monotonic())
+        self._finder = RackFinder(self._plant, self._link, self._cycle, self._clock, power_up_s=section.power_up_s)
+        self.bank = RegisterBank(maps.control_plc, section.word_order)
+        publish_configuration(self.bank, selected(settings, SHOWN))
+        self.publication = ControlPublication(
+            program, self.sessions, self._link, self.bank, header.short_digest, self._keep
+        )
+        self.clients = Clients(program, settings.limits, self.bank, self.publication, self.sessions)
+        certificates = [tls for tls in (section.server.tls, section.plant.tls) if tls is not None]
+        self.certificates = CertificateWatch(certificates, program, self.publication.safety)
+        self._watch = ScanWatch()
+        self._ticks_per_second = max(1, round(1 / process.tick_s))
+        self._lost_lines = 0
+        self._awaiting_since: float | None = None
+        self._repaced = -REPACED_S
+        """When the time base was changed last, s."""
+        self.bank.put(program.operator)
+        self.bank.put(WatchdogTime(program.watchdog.time))
+        program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None), int(self._store.refused))
+        if self.sessions.kept is not None:
+            self._link.starting()  # other clients must not take this for a PLC without a session
+        if self._store.refused:
+            program.alarms.raised(AlarmKind.STATE_NOT_RETAINED, STATE_REFUSED)
+        self._publish()
+
+    def close(self) -> None:
+        """Disconnect from the rack, and save the retained state."""
+        self._plant.close()
+        self._keep()
+        self._store.close()
+
+    # -- scan cycle ----------------------------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Scan until cancelled; a rack that is not there is waited for."""
+        while True:
+            if self.clients.asked is not None:
+                self._start(self.clients.asked)
+            elif self.clients.pending_time_base is not None and self._may_change_pace:
+                self._change_pace(self.clients.pending_time_base)
+            elif not self.sessions.expected:
+                await self._stand_by()
+            elif self.sessions.pace.paused and self.sessions.kept is None:
+                await self._while_paused()
+            elif not self._link.synchronised:
+                await self._look()
+            elif await (self._until_clock() if self.sessions.pace.realtime else self._until_granted()):
+                await self._scan()
+
+    async def _stand_by(self) -> None:
+        """Wait for a session; until the rack has answered once, look for it."""
+        if self._finder.reached:
+            self.clients.changed.clear()
+            await self.clients.changed.wait()
+            return
+        if await self._finder.reach():
+            self._link.end()
+        else:
+            await self._finder.pause(self.clients.changed)
+        self._publish()
+
+    async def _until_clock(self) -> bool:
+        """Wait for the scan's time; return whether it may begin: after a missed tick, the rack is read first.
+
+        It always yields, however late it is.
+        """
+        program, due = self._program, self._clock.due(self._program.tick)
+        while (left := due - time.monotonic()) > LONGEST_SLEEP_S:
+            await asyncio.sleep(LONGEST_SLEEP_S)
+            if self._is_called:
+                return False
+        await asyncio.sleep(max(0.0, left))
+        if self._is_called:
+            return False
+        lateness = max(0.0, time.monotonic() - due)
+        self.publication.lateness.add(lateness)
+        if lateness * 1000 > self._settings.control_plc.scan_tolerance_ms:
+            self.publication.overruns += 1
+            program.alarms.pulse(AlarmKind.SCAN_OVERRUN)
+        if lateness > self._clock.tick_s and program.tick:  # at tick 0 the rack's clock waits for us
+            self._link.missed_scans()
+        return self._link.synchronised
+
+    @property
+    def _is_called(self) -> bool:
+        """An operator has requested another session, or another time base."""
+        changes = self.clients.pending_time_base is not None and self._may_change_pace
+        return self.clients.asked is not None or changes
+
+    @property
+    def _may_change_pace(self) -> bool:
+        """Whether outputs were written since the last change, so that many in a row do not starve the rack's watchdog.
+
+        In lock-step, and while paused, the watchdog does not run.
+        """
+        pace = self.sessions.pace
+        return not pace.realtime or pace.paused or time.monotonic() >= self._repaced + REPACED_S
+
+    async def _while_paused(self) -> None:
+        """Wait until an operator writes something; the connection to the rack is kept open meanwhile."""
+        self.clients.changed.clear()
+        try:
+            async with asyncio.timeout(KEEP_ALIVE_S):
+                await self.clients.changed.wait()
+        except TimeoutError:
+            with contextlib.suppress(LinkError):  # the rack is read when time resumes
+                await self._plant.read(Measurement)
+
+    async def _until_granted(self) -> bool:
+        """Wait until the next scan in lock-step has what it needs; return whether it may begin."""
+        program = self._program
+        if self._is_called:
+            return False
+        granted = program.tick < self.clients.granted
+        awaited = granted and (program.awaiting_plan or program.awaiting_sequence)
+        if granted and not awaited:
+            self._awaiting_since = None
+            return True
+        self.clients.changed.clear()
+        if awaited:
+            await self._until_answered()
+        else:
+            self._awaiting_since = None
+            await self.clients.changed.wait()
+        return False
+
+    async def _until_answered(self) -> None:
+        """Wait for a client's write; an optimiser that keeps us waiting too long is lost."""
+        now = time.monotonic()
+        since = self._awaiting_since = self._awaiting_since or now
+        try:
+            async with asyncio.timeout(since + self._settings.control_plc.ladder.optimizer_patience_s - now):
+                await self.clients.changed.wait()
+        except TimeoutError:
+            if not self.clients.changed.is_set():  # else it is this process that was late, and the answer is there
+                self._program.optimizer_lost()
+                self._awaiting_since = None
+
+    async def _scan(self) -> None:
+        program = self._program
+        if self.clients.optimizer_waits:
+            program.optimizer_seen()
+        outputs = self._cycle.begin()
+        if outputs is None:
+            return
+        asked_at = time.monotonic()
+        try:
+            if not self._plant.connected:  # a new connection is a break: the rack is read before it is written to
+                raise PeerUnreachableError(f"{self._plant.peer} has closed the connection")
+            answer = await self._plant.exchange(outputs, Measurement, patience_s=self._patience_s)
+        except LinkError as error:
+            self._finder.failed(error)
+            self._publish()
+            return
+        answered_at = time.monotonic()
+        at = (asked_at + answered_at) / 2
+        update = self._cycle.answered(answer, self._in_ticks(at))
+        if not self._link.synchronised:
+            self._publish()
+            return
+        self._finder.read_soon()
+        self._watch.scanned()
+        if self.sessions.pace.realtime and answer.tick:
+            self._clock.observe(answer.tick + answer.age, at, (answered_at - asked_at) / 2)
+        if update is not None:
+            self.clients.tell(update)
+        self._after_scan(latched=update is not None)
+
+    def _after_scan(self, *, latched: bool) -> None:
+        """Publish what has changed, and save the retained state."""
+        program, publication = self._program, self.publication
+        on_the_second = program.tick % self._ticks_per_second == 0
+        if program.track():
+            self.bank.put(program.operator)
+        if on_the_second:
+            self._watch_ourselves()
+        program.alarms.pass_by()
+        if program.process is not None:
+            self.bank.put(program.process)
+        if latched or on_the_second:
+            publication.status()
+        if publication.is_behind or on_the_second:
+            publication.safety()
+        publication.identity()
+        self._keep()
+
+    def _keep(self) -> None:
+        """Save the present state; for a session still to be resumed, the state before the restart."""
+        self._store.keep(self._program, self.sessions.pace, self.sessions.kept)
+
+    def _watch_ourselves(self) -> None:
+        """Raise the alarms about clock and memory, and note log lines that were lost."""
+        if self.sessions.pace.realtime:
+            skew = self.publication.skew = self._clock.skew()
+            self.publication.offset_ms = self._clock.offset * self._clock.tick_s * 1000
+            limit = self._settings.control_plc.skew_alarm_ppm
+            known = skew.error_ppm < limit / 4
+            self._program.alarms.report(AlarmKind.CLOCK_SKEW, condition=known and abs(skew.ppm) > limit)
+        program, lost = self._program, dropped()
+        program.alarms.report(AlarmKind.STATE_NOT_RETAINED, condition=self._store.failure is not None)
+        if lost > self._lost_lines:
+            program.journal.note(program.tick, EventKind.LOST, value=lost - self._lost_lines)
+            self._lost_lines = lost
+
+    async def watch_scans(self) -> None:
+        """Raise an alarm while no scans are made, until cancelled: by an independent clock."""
+        while True:
+            await asyncio.sleep(LOOK_S)
+            self._look_for_scans()
+
+    def _look_for_scans(self) -> None:
+        pace, alarms = self.sessions.pace, self._program.alarms
+        if not (self.sessions.running and pace.realtime and not pace.paused):
+            self._watch.scanned()
+        stopped = self._watch.look(self._clock.tick_s) and not self._link.is_alarmed
+        if stopped is not bool(alarms.rows[AlarmKind.SCANS_STOPPED].active):
+            alarms.report(AlarmKind.SCANS_STOPPED, condition=stopped)
+            self.publication.safety()
+
+    @property
+    def _patience_s(self) -> float:
+        """How long an answer of the rack may take."""
+        longest = self._settings.control_plc.plant.timeout_s
+        if not self.sessions.pace.realtime:
+            return longest
+        return min(longest, max(SHORTEST_PATIENCE_S, ANSWER_TICKS * self._clock.tick_s))
+
+    def _in_ticks(self, at: float) -> float | None:
+        """Return a moment of real time in ticks; None in lock-step."""
+        return at / self._clock.tick_s if self.sessions.pace.realtime else None
+
+    # -- out of step ---------------------------------------------------------------------------------------------------
+
+    async def _look(self) -> None:
+        """Read what the rack applies; once synchronised, resume from there."""
+        realtime = self.sessions.pace.realtime
+        answered = await self._finder.look(self.clients.changed, self._patience_s if realtime else None)
+        if not self._link.synchronised:
+            if answered and self._link.is_confirmed and not self.sessions.rack_answered():
+                self.bank.put(self._program.operator)
+                self._link.end()
+            if realtime:
+                now = self._clock.tick_at(time.monotonic())
+                self._program.alarms.now = min(max(self._program.tick, now), LAST_TICK)
+                self._program.alarms.pass_by()
+        self._publish()
+
+    # -- sessions ------------------------------------------------------------------------------------------------------
+
+    def _adopt(self, reading: Measurement) -> bool:
+        """Go over to the session of the rack, where that is ours to do."""
+        adopted = self.sessions.adopt(reading)
+        self.bank.put(self._program.operator)
+        if adopted:
+            self._begin()
+        return adopted
+
+    def _start(self, asked: ControlSession) -> None:
+        """Begin the session requested by an operator; nothing is written before the rack has been read."""
+        self.clients.asked = None
+        self.sessions.start(asked)
+        self._begin()
+        self._link.begin()
+        self._publish()
+
+    def _change_pace(self, pace: TimeBase) -> None:
+        """Switch to another time base; the rack is read before the next scan."""
+        self.clients.pending_time_base = None
+        self.sessions.pace, self._repaced = pace, time.monotonic()
+        self._set_clock()
+        self._link.repaced()
+        self._show_pace()
+        self._publish()
+        self._keep()
+        log.info("pace changed", extra={"realtime": pace.realtime, "factor": pace.factor, "paused": pace.paused})
+
+    def _begin(self) -> None:
+        """Begin the session that the program has been put into."""
+        self._set_clock()
+        self._watch.scanned()
+        self.publication.begin()
+        self.clients.begin()
+        self._show_pace()
+
+    def _set_clock(self) -> None:
+        self._clock.begin(self.sessions.pace.factor, time.monotonic())
+        self._finder.read_soon()
+        self._cycle.begin_time()
+        self._link.frozen_ticks = max(FROZEN_TICKS, FROZEN_S / self._clock.tick_s)
+
+    def _show_pace(self) -> None:
+        pace, session = self.sessions.pace, self._program.session
+        self.bank.put(ControlSession(session, int(pace.realtime), pace.factor))
+        self.bank.put(SessionPace.shown(session, pace))
+
+    def _publish(self) -> None:
+        self.publication.status()
+        self.publication.safety()
+        self.publication.identity()
+
+
+async def serve(settings: ControlSettings) -> None:
+    """Serve and scan until cancelled."""
+    plc = ControlPlc(settings)
+    identity = DeviceIdentity(product="Coldloop control PLC", revision=__version__)
+    server = ModbusServer(
+        plc.bank, settings=settings.control_plc.server, on_write=plc.clients.on_write, identity=identity,
+        on_departure=plc.clients.on_departure, on_refusal=plc.clients.on_refusal, on_close=plc.clients.on_close,
+    )  # fmt: skip
+    await server.start()
+    log.info(SERVING, extra={"host": settings.control_plc.server.host, "port": server.port})
+    try:
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(MetricsServer(settings.control_plc.metrics, plc.bank).run(), name="metrics")
+            tasks.create_task(plc.run(), name="scan cycle")
+            tasks.create_task(plc.watch_scans(), name="scan watch")
+            tasks.create_task(plc.certificates.run(), name="certificates")
+            telemetry = Telemetry(settings.telemetry, "control_plc", plc.publication.snapshot)
+            tasks.create_task(telemetry.run(), name="telemetry")
+    finally:
+        plc.close()
+        await server.close()

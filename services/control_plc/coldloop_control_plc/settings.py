@@ -1,0 +1,105 @@
+"""Configuration of the control PLC, checked when it is made and immutable after."""
+
+import math
+from enum import StrEnum
+from typing import Annotated, Final
+
+from pydantic import Field
+
+from coldloop.modbus.endpoints import CONTROL_PORT, PLANT_PORT, Endpoint
+from coldloop.modbus.settings import ServerSettings
+from coldloop.process.limits import InputLimits
+from coldloop.process.settings import ProcessSettings, RootSettings, declared, stretched, within
+from coldloop.registers.codec import WordOrder
+from coldloop.safety.retained import RetainSettings
+from coldloop.service.metrics_settings import MetricsSettings
+from coldloop.service.telemetry_settings import TelemetrySettings
+from coldloop.session.settings import SessionSettings
+from coldloop_control_plc.alarm_settings import AlarmSettings
+from coldloop_control_plc.classical import ClassicalSettings
+from coldloop_control_plc.cool_down import CoolDownSettings
+from coldloop_control_plc.sensors import SensorCheckSettings
+
+SHOWN: Final = (
+    "limits", "control_plc.scan_tolerance_ms", "control_plc.skew_alarm_ppm", "control_plc.driver",
+    "control_plc.classical", "control_plc.cool_down", "control_plc.ladder", "control_plc.sensors",
+    "control_plc.alarms",
+)  # fmt: skip
+"""What of the configuration decides results: shown in the registers."""
+
+
+class ControlServer(ServerSettings):
+    """The control PLC's server."""
+
+    port: Annotated[int, Field(ge=0, le=0xFFFF)] = CONTROL_PORT
+
+
+class PlantEndpoint(Endpoint):
+    """Where the plant's rack is."""
+
+    port: Annotated[int, Field(ge=1, le=0xFFFF)] = PLANT_PORT
+    """TCP port."""
+
+
+class ControlStrategy(StrEnum):
+    """Operating mode at the start."""
+
+    MPC = "mpc"
+    """The optimiser's sequences."""
+    CLASSICAL = "classical"
+    """The classical loops; no update is latched, and the optimiser idles."""
+
+
+class LadderSettings(ProcessSettings):
+    """How long each rung of the fail-safe ladder bears."""
+
+    hold_s: Annotated[float, Field(ge=0)] = stretched(30.0)
+    """How long the last value holds before the classical loops take over."""
+    optimizer_timeout_s: Annotated[float, within(lambda process: (0, 64_000 * process.tick_s))] = declared(
+        lambda process: max(15.0 * max(process.stretch, 1.0), 3 * process.sampling_period_s)
+    )
+    """An optimiser that gives no sign of life for so long is lost; 0 is never. Plant time, longer than any tau_u."""
+    optimizer_patience_s: Annotated[float, Field(gt=0)] = 5.0
+    """In lock-step plant time waits while the optimiser is waited for: it is lost after so long in real time."""
+
+    @property
+    def hold_ticks(self) -> int:
+        """The hold, in ticks."""
+        return round(self.hold_s / self.process.tick_s)
+
+    @property
+    def optimizer_ticks(self) -> int:
+        """The time-out, in ticks."""
+        return math.ceil(self.optimizer_timeout_s / self.process.tick_s)
+
+
+class ControlSection(ProcessSettings):
+    """Section `control_plc` of the configuration."""
+
+    server: ControlServer = ControlServer()
+    word_order: WordOrder = WordOrder.HIGH_FIRST
+    metrics: MetricsSettings = MetricsSettings()
+    plant: PlantEndpoint = PlantEndpoint()
+    power_up_s: Annotated[float, Field(ge=0)] = 10.0
+    """A rack that is powered up together with this PLC may take so long (real time) before it counts as lost."""
+    scan_tolerance_ms: Annotated[float, Field(gt=0)] = 5.0
+    """Lateness of a scan, in real time, that counts as an overrun."""
+    skew_alarm_ppm: Annotated[float, Field(gt=0)] = 500.0
+    """How much the rack's clock and ours may differ in real time before the alarm is raised."""
+    driver: ControlStrategy = ControlStrategy.MPC
+    classical: ClassicalSettings = Field(default_factory=ClassicalSettings)
+    cool_down: CoolDownSettings = CoolDownSettings()
+    """Of a cold box that is warm at the beginning."""
+    ladder: LadderSettings = Field(default_factory=LadderSettings)
+    sensors: SensorCheckSettings = Field(default_factory=SensorCheckSettings)
+    alarms: AlarmSettings = Field(default_factory=AlarmSettings)
+    retain: RetainSettings = RetainSettings()
+
+
+class ControlSettings(RootSettings):
+    """What the control PLC reads of a configuration."""
+
+    limits: InputLimits = Field(default_factory=InputLimits)
+    session: SessionSettings = SessionSettings()
+    control_plc: ControlSection = Field(default_factory=ControlSection)
+    telemetry: TelemetrySettings = TelemetrySettings()

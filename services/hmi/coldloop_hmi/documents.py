@@ -1,0 +1,319 @@
+"""What the page and other programs are sent, as JSON; `docs/operator-page.md` describes every field."""
+
+import json
+import math
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
+from itertools import islice, pairwise
+from typing import Any, Final
+
+from coldloop import __version__
+from coldloop.process.declaration import Process
+from coldloop.registers.audit import EventKind
+from coldloop.registers.codec import blank
+from coldloop.registers.control_plc import Mode
+from coldloop.registers.optimizer_plc import (
+    INPUT_SAMPLES,
+    PREDICTED_SAMPLES,
+    ModelDeviation,
+    Optimization,
+    Prediction,
+    outputs_of,
+)
+from coldloop.registers.safety import Alarm, AlarmAction, AlarmPriority, AlarmState
+from coldloop.service.event_text import alarm_cause, alarm_word, word, word_of
+from coldloop_hmi.compression_station import plant_document
+from coldloop_hmi.explanation import explain
+from coldloop_hmi.process_image import JournalEntry, Model
+from coldloop_hmi.process_view import process_document
+from coldloop_hmi.quality import qualities
+from coldloop_hmi.sentences import deviation, sentence
+from coldloop_hmi.signals import signals_of
+from coldloop_hmi.trends import Gap, ModeInterval, mode_name, rounded, thin
+
+Document = dict[str, Any]
+
+MARKED: Final = {
+    word(EventKind.ALARM_RAISED): "alarm",
+    word(EventKind.LIVE_LOAD): "load",
+    word(EventKind.LOAD): "load",
+    word(EventKind.OPERATOR_MODE): "operator",
+    word(EventKind.SETPOINT): "operator",
+    word(EventKind.SENSOR_FAULT): "fault",
+}
+"""Kinds of events that are marked on the trends, and what as."""
+BEGUN: Final = word(EventKind.SESSION)
+MOST_MARKS: Final = 1000
+EARLIER_PREDICTIONS: Final = 12
+
+
+def encoded(document: Document) -> bytes:
+    """Return a document as JSON; numbers that are not finite are null."""
+    try:
+        return _json(document)
+    except ValueError:
+        return _json(_finite_parts(document))
+
+
+def _json(document: object) -> bytes:
+    return json.dumps(document, ensure_ascii=False, separators=(",", ":"), default=str, allow_nan=False).encode()
+
+
+def _finite_parts(part: object) -> object:
+    if isinstance(part, dict):
+        return {key: _finite_parts(value) for key, value in part.items()}
+    if isinstance(part, list | tuple):
+        return [_finite_parts(value) for value in part]
+    return None if isinstance(part, float) and not math.isfinite(part) else part
+
+
+def finite(value: float | str) -> float | int | str | None:
+    """Return a value that JSON has."""
+    if isinstance(value, float):
+        return rounded(value) if math.isfinite(value) else None
+    return value
+
+
+def catalog(model: Model, *, training: bool, replay: bool) -> Document:
+    """Return what the page is made from: signals, alarms, modes."""
+    process = model.process
+    return {
+        "version": __version__,
+        "training": training,
+        "replay": replay,
+        "services": list(model.maps),
+        "signals": {
+            signal.name: {"service": service, **signal._asdict()}
+            for service, register_map in model.maps.items()
+            for signal in signals_of(register_map)
+        },
+        "trended": [name for name in model.trends.names if name != "load" or process.has_load],
+        "process": process_document(process),
+        "outputs": list(process.output_names),
+        "alarm_actions": {word(action): int(action) for action in AlarmAction},
+        "tick_s": process.tick_s,
+    }  # fmt: skip
+
+
+def alarm_document(kind: int, alarm: Alarm, process: Process) -> Document:
+    """Return one alarm in words."""
+    return {
+        "number": int(kind),
+        "name": alarm_word(kind, process),
+        "state": word_of(AlarmState, alarm.state),
+        "active": bool(alarm.active),
+        "cause": alarm_cause(kind, alarm.cause, process) if alarm.times else "",
+        "priority": int(alarm.priority),
+        "priority_word": word_of(AlarmPriority, alarm.priority),
+        "times": alarm.times,
+        "raised_s": alarm.raised * process.tick_s,
+        "returned_s": alarm.returned * process.tick_s,
+        "shelved_until_s": alarm.shelved_until * process.tick_s,
+    }
+
+
+def alarms_document(model: Model) -> list[Document]:
+    """Return all alarms: those that are active first, of these the unacknowledged ones, then by priority and age."""
+    rank: dict[int, int] = {AlarmState.UNACKNOWLEDGED: 0, AlarmState.ACKNOWLEDGED: 1, AlarmState.RETURNED: 2}
+    rows = sorted(model.alarm_rows(), key=lambda row: (rank.get(row[1].state, 3), -row[1].priority, -row[1].raised))
+    return [alarm_document(kind, alarm, model.process) for kind, alarm in rows]
+
+
+def event_document(entry: JournalEntry, tick_s: float) -> Document:
+    """Return one event in words."""
+    text = entry.text
+    return {
+        "service": entry.service, "number": entry.number, "boot": entry.boot, "utc": entry.utc, "tick": entry.tick,
+        "time_s": entry.tick * tick_s, "kind": text.kind, "subject": text.subject, "cause": text.cause,
+        "value": text.value, "unit": text.unit, "who": text.who, "sentence": text.sentence,
+    }  # fmt: skip
+
+
+def services_document(model: Model) -> Document:
+    """Return whether each service is live, and the age of what is known of it."""
+    found = {}
+    for service, source in model.sources.items():
+        age = model.age_s(service)
+        live = model.is_live(service)
+        found[service] = {
+            "live": live,
+            "age_s": None if age is None else round(age, 2),
+            "reason": "" if live else source.reason or "does not answer",
+        }
+    return found
+
+
+def state_document(model: Model, changed: Iterable[str] | None = None) -> Document:
+    """Return the state of everything that is shown; of signals only those that have changed, if these are named."""
+    process = model.process
+    names = model.values if changed is None else [name for name in changed if name in model.values]
+    found = model.record("optimizer_plc", ModelDeviation) or blank(ModelDeviation, model.maps["optimizer_plc"])
+    stale, replaced = model.stale_prefixes(), model.doubts.held | model.doubts.bad
+    not_current = [f"control_plc.process.y.{name}" for i, name in enumerate(process.output_names) if replaced >> i & 1]
+    document: Document = {
+        "whole": changed is None,
+        "tick": model.tick,
+        "time_s": model.tick * process.tick_s,
+        "services": services_document(model),
+        "plant": plant_document(model),
+        "deviation": deviation(found, process, model.doubts.suspect),
+        "commands": model.commands,
+        "stale": stale + not_current,
+        "quality": dict(qualities(model.doubts, stale, process)),
+        "values": {name: finite(model.values[name]) for name in names},
+    }
+    if model.replay is not None:
+        document["replay"] = model.replay
+    parts = set(changed) if changed is not None else {"alarms", "updates"}
+    if "alarms" in parts:
+        document["alarms"] = alarms_document(model)
+    if "updates" in parts:
+        document["update"] = explanation_document(model, None)
+    return document
+
+
+def explanation_document(model: Model, number: int | None, at_tick: int | None = None) -> Document | None:
+    """Return the explanation of the period of an update: by number, at a tick, or the last one; None without it."""
+    updates = model.updates
+    place = len(updates) - 1
+    if at_tick is not None:
+        place = bisect_right(updates, at_tick, key=lambda update: update.tick) - 1
+    elif number is not None:
+        place = next((i for i in range(len(updates) - 1, -1, -1) if updates[i].update == number), -1)
+    if place < 0:
+        return None
+    update = updates[place]
+    before = updates[place - 1] if place else None
+    after = updates[place + 1] if place + 1 < len(updates) else None
+    try:
+        found = explain(update, before, after, model.rule, model.process)
+    except (ArithmeticError, ValueError):  # numbers that no optimiser of ours writes
+        return None
+    prediction = next((one for one in reversed(model.predictions) if one.update == update.update), None)
+    document = asdict(found)
+    document["sentence"] = sentence(found, model.rule)
+    document["update"] = update._asdict()
+    document["before"] = found.before._asdict() if found.before is not None else None
+    document["increments"] = found.increments._asdict() if found.increments else None
+    document["budget"]["slack"] = found.budget.slack
+    document["time_s"] = update.tick * model.process.tick_s
+    document["neighbours"] = [before.update if before else None, after.update if after else None]
+    document["rule"] = model.rule._asdict()
+    document["prediction"] = prediction_document(prediction, model.process) if prediction else None
+    return document
+
+
+def prediction_document(prediction: Prediction, process: Process) -> Document:
+    """Return a prediction as curves over plant time."""
+    start, sample_s = prediction.tick * process.tick_s, process.sampling_period_s
+    names, banded = process.input_names, zip(process.banded, outputs_of(prediction), strict=True)
+    inputs = [prediction.u[i :: len(names)] for i in range(len(names))]
+    return {
+        "update": prediction.update,
+        "time": [start + sample * sample_s for sample in PREDICTED_SAMPLES],
+        **{one.name: list(map(rounded, ahead)) for one, ahead in banded},
+        "input_time": [start + sample * sample_s for sample in INPUT_SAMPLES],
+        **{name: [rounded(value) for value in one] for name, one in zip(names, inputs, strict=True)},
+    }
+
+
+def trend_document(
+    model: Model, names: Sequence[str], start: int, end: int, points: int, *, is_brief: bool = False
+) -> Document:
+    """Return everything that is drawn between two ticks; in brief without predictions, and of updates tau_u only."""
+    process, tick_s = model.process, model.process.tick_s
+    times, series = model.trends.thinned(names, start, end, points)
+    gaps = model.trends.gaps(start, end)
+    modes = model.trends.modes(start, end)
+    in_force = model.trends.modes(
+        start - 2 * process.ticks_per_sample, end
+    )  # with the update that the window begins with
+    shown = [one for one in model.predictions if one.tick >= start and not is_brief]
+    quantities = ("tau_u",) if is_brief else tuple(QUANTITIES)
+    limits = model.limits
+    return {
+        "now_s": model.tick * tick_s,
+        "time": times,
+        "series": series,
+        "updates": updates_document(model.updates, in_force, gaps, points, quantities, tick_s),
+        "modes": [{"from": one.start, "to": one.end, "mode": mode_name(one.mode)} for one in modes],
+        "doubtful": {name: found for name, found in model.trends.doubtful(start, end).items() if name in names},
+        **_marks(model, start, end),
+        "predictions": [prediction_document(one, process) for one in _some(shown)],
+        "planned": model.is_planned,
+        "gaps": [[max(gap.start, start) * tick_s, min(gap.end, end) * tick_s] for gap in gaps],
+        "bands": _ranges([one.name for one in process.banded], limits.output_low, limits.output_high),
+        "bounds": _ranges(process.input_names, limits.input_low, limits.input_high),
+    }
+
+
+def updates_document(
+    updates: Sequence[Optimization], modes: Sequence[ModeInterval], gaps: Sequence[Gap], points: int,
+    quantities: Sequence[str], tick_s: float,
+) -> Document:  # fmt: skip
+    """Return times, updating periods and costs of updates as far as they were in force: while MPC was active.
+
+    A period lasts until the next one, or until its stretch ends. A cost is of an instant. Elsewhere there is None, also
+    between updates of which some are missing because nothing could be read.
+    """
+    found: Document = {name: [] for name in ("time", *quantities)}
+    for stretch in modes:
+        if stretch.mode != Mode.MPC:
+            continue
+        first, last = (round(time / tick_s) for time in (stretch.start, stretch.end))
+        start = bisect_left(updates, first, key=lambda one: one.tick)
+        inside = [*islice(updates, start, bisect_right(updates, last, key=lambda one: one.tick))]
+        if not inside:
+            continue
+        columns = {name: [QUANTITIES[name](one, tick_s) for one in inside] for name in quantities}
+        lost = [tick * tick_s for tick in _lost_updates(inside, gaps)]
+        times, thinned = thin([one.tick * tick_s for one in inside], columns, points, tick_s, lost)
+        found["time"] += [*times, last * tick_s, (last + 1) * tick_s]
+        for name, values in thinned.items():
+            found[name] += [*values, values[-1] if name in PERIODS else None, None]
+    return found
+
+
+PERIODS: Final = ("tau_u", "q")
+QUANTITIES: Final[Mapping[str, Callable[[Optimization, float], float]]] = {
+    "tau_u": lambda one, tick_s: one.tau_u * tick_s,
+    "q": lambda one, _: float(one.q),
+    "J": lambda one, _: one.j_effective,
+    "J_predicted": lambda one, _: one.j_delivered,
+}
+
+
+def _lost_updates(updates: Sequence[Optimization], gaps: Sequence[Gap]) -> list[int]:
+    """Return the ticks of the updates before which some are missing because nothing could be read."""
+    return [
+        after.tick
+        for before, after in pairwise(updates)
+        if after.update != before.update + 1 and any(before.tick < gap.end and gap.start < after.tick for gap in gaps)
+    ]
+
+
+def _ranges(names: Sequence[str], low: Sequence[float], high: Sequence[float]) -> Document:
+    return {name: list(ends) for name, *ends in zip(names, low, high, strict=True)}
+
+
+def _some(predictions: list[Prediction]) -> list[Prediction]:
+    """Return the newest prediction and some of the earlier ones, evenly spaced."""
+    every = max(1, -(-len(predictions) // EARLIER_PREDICTIONS))
+    return predictions[::-1][::every][::-1]
+
+
+def _marks(model: Model, start: int, end: int) -> Document:
+    """Return the marks between two ticks, and since when they are all, s; None if there are no earlier ones."""
+    tick_s = model.process.tick_s
+    begun = max((e.utc for e in model.events if e.service == "plant" and e.text.kind == BEGUN), default="")
+    known = [entry for entry in model.events if entry.utc >= begun]  # not of a session before
+    marked = MARKED.keys() - ({word(EventKind.LOAD)} if not model.process.has_load else ())
+    found = [entry for entry in known if entry.text.kind in marked and start <= entry.tick <= end]
+    is_cut = len(found) > MOST_MARKS or (len(known) == model.events.maxlen and known[0].tick > start)
+    since_s = (found[-MOST_MARKS:] or known)[0].tick * tick_s if is_cut else None
+    marks = [
+        {"time": entry.tick * tick_s, "kind": MARKED[entry.text.kind], "text": entry.text.sentence}
+        for entry in found[-MOST_MARKS:]
+    ]
+    return {"marks": marks, "marks_since_s": since_s}

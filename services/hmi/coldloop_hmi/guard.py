@@ -1,0 +1,208 @@
+"""What every request passes: whose it is, where it comes from, how often, and the headers of every answer."""
+
+import asyncio
+import logging
+import re
+import time
+from collections.abc import Awaitable, Callable
+from typing import Final
+
+from aiohttp import hdrs, web
+from aiohttp.http_exceptions import HttpProcessingError
+
+from coldloop_hmi.access import (
+    LOCAL_NAMES,
+    REQUEST_BURST,
+    REQUESTS_A_BROWSER,
+    ClientLimit,
+    LoginLimit,
+    LoginSession,
+    LoginSessions,
+    Party,
+    host_of,
+    is_own_origin,
+    port_of,
+)
+from coldloop_hmi.audit import Audit
+from coldloop_hmi.connections import Connections
+from coldloop_hmi.settings import HmiSection
+from coldloop_hmi.users import User, Users
+
+HEADERS: Final = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
+    "connect-src 'self'; frame-src 'self'; frame-ancestors 'self'; base-uri 'none'; form-action 'self'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+SAFE: Final = frozenset({hdrs.METH_GET, hdrs.METH_HEAD})
+BY_ITSELF: Final = frozenset(
+    {"/api/stream", "/api/trend", "/api/events", "/api/audit", "/api/me", "/api/explanation", "/api/replay"}
+)
+"""What a page asks for without a hand on it: no sign of life of its user."""
+OPEN: Final = frozenset({"/", "/healthz", "/metrics", "/api/catalog", "/api/login", "/api/me", "/favicon.ico"})
+"""What is served without a login; `/metrics` looks at it itself."""
+FILES: Final = frozenset({"/", "/api/catalog", "/favicon.ico"})
+UNLIMITED: Final = frozenset({"/api/login", "/healthz"})
+"""Attempts to log in have a limit of their own; the health check costs no more than a refusal."""
+STREAM: Final = "/api/stream"
+LARGEST_OF_STRANGERS: Final = 4096
+"""Bytes of a request without a login: a name and a password, or a replay position."""
+BODY_S: Final = 5.0
+"""Within this time a request is here as a whole."""
+PASSWORDS_AT_ONCE: Final = 2
+"""Passwords that are checked at a time: each takes a core and 16 MB."""
+
+_RUN: Final = re.compile(r"\A/run/\d+/")
+
+
+def told_in_a_line(record: logging.LogRecord) -> bool:
+    """Take the traceback off what aiohttp logs of a malformed request (a filter of its logger)."""
+    error = record.exc_info[1] if record.exc_info else None
+    if isinstance(error, HttpProcessingError):
+        record.msg, record.exc_info = f"{record.getMessage()}: {error.message.splitlines()[0]}", None
+        record.args = ()
+    return True
+
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+def refusal(status: int, message: str) -> web.Response:
+    """Return a refusal, one line of JSON."""
+    return web.json_response({"error": message}, status=status)
+
+
+def host_header(request: web.Request) -> str:
+    """Return what a request calls the page; empty without a name (`request.host` then asks the name service)."""
+    return request.headers.get(hdrs.HOST, "")
+
+
+def cookie_name(request: web.Request) -> str:
+    """Return the name of a session's cookie: browsers send cookies to all ports of a host, so it names the port."""
+    return f"coldloop_session_{port_of(host_header(request)) or 'default'}"
+
+
+def path_in_site(request: web.Request) -> str:
+    """Return what is asked for of one rig or run, without the number of the run among several."""
+    return _RUN.sub("/", request.path, count=1)
+
+
+class Guard:
+    """Judges requests before anything is done.
+
+    Args:
+        settings: Of the page.
+        audit: Where refusals are noted.
+        users: Who may log in.
+        connections: Informed of requests under way.
+    """
+
+    def __init__(self, settings: HmiSection, audit: Audit, users: Users, connections: Connections) -> None:
+        self._settings = settings
+        self._audit = audit
+        self._users = users
+        self._connections = connections
+        self._checking = asyncio.Semaphore(PASSWORDS_AT_ONCE)
+        login = settings.login
+        self.sessions = LoginSessions(time.monotonic, login.idle_minutes * 60, login.longest_minutes * 60)
+        self.logins = LoginLimit(time.monotonic)
+        self.scrapes = LoginLimit(time.monotonic)
+        """Of `/metrics`: a scraper with an old password keeps nobody from logging in."""
+        self._requests = ClientLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
+        self._files = ClientLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
+        self._hosts = LOCAL_NAMES | {settings.host, *map(str.lower, settings.allowed_hosts)}
+
+    def session(self, request: web.Request) -> LoginSession | None:
+        """Return the session of a request."""
+        return self.sessions.find(
+            request.cookies.get(cookie_name(request)), is_use=path_in_site(request) not in BY_ITSELF
+        )
+
+    def who(self, request: web.Request) -> str:
+        """Return the user of a request; empty without a login."""
+        session = self.sessions.find(request.cookies.get(cookie_name(request)), is_use=False)
+        return session.user.name if session else ""
+
+    def party(self, request: web.Request) -> Party:
+        """Return who shares bounds with a request: its user, or strangers of its address."""
+        who = self.who(request)
+        return Party(who, has_session=True) if who else Party(request.remote or "", has_session=False)
+
+    async def log_in(self, name: str, password: str, address: str, limit: LoginLimit) -> User | web.Response:
+        """Return the user with this password, or the refusal; both take as long."""
+        if not limit.allows(address, name):
+            self._audit.refuse("login", who=name[:40], address=address, reason="too many attempts", has_session=False)
+            return refusal(429, "too many attempts to log in: wait a minute")
+        async with self._checking:
+            user = await asyncio.to_thread(self._users.check, name, password)
+        if user is None:
+            self._audit.refuse(
+                "login", who=name[:40], address=address, reason="wrong name or password", has_session=False
+            )
+            return refusal(401, "wrong name or password")
+        limit.succeeded(address, name)
+        return user
+
+    def _refused(self, request: web.Request, status: int, reason: str, message: str = "") -> web.Response:
+        party = self.party(request)
+        self._audit.refuse(
+            "request", who=self.who(request), address=request.remote or "", reason=reason,
+            detail=f"{request.method} {request.path} of {host_header(request)}", has_session=party.has_session,
+        )  # fmt: skip
+        return refusal(status, message or reason)
+
+    def _judge(self, request: web.Request) -> web.Response | None:
+        """Return why a request is refused; None when it is not."""
+        path, host = path_in_site(request), host_header(request)
+        is_file = path in FILES or path.startswith("/static/")
+        limit = self._files if is_file else self._requests
+        if path not in UNLIMITED and not limit.allows(self.party(request)):
+            return self._refused(request, 429, "too many requests: wait a little")
+        if host_of(host) not in self._hosts:
+            reason = "host name not allowed"
+            return self._refused(request, 421, reason, f"host '{host}' is not allowed: add it to hmi.allowed_hosts")
+        if request.method not in SAFE and not is_own_origin(request.headers.get(hdrs.ORIGIN), host):
+            return self._refused(request, 403, "commands are accepted from the page itself only, not from another site")
+        is_open = path in OPEN or is_file
+        if not is_open and not self._settings.login.anonymous_view and self.session(request) is None:
+            return refusal(401, "log in first")
+        return None
+
+    async def _receive(self, request: web.Request) -> web.Response | None:
+        """Wait for the rest of a request; return why it is refused, None when it is not."""
+        length, is_stranger = request.content_length, not self.party(request).has_session
+        if is_stranger and request.can_read_body and (length is None or length > LARGEST_OF_STRANGERS):
+            return refusal(413, f"a request has at most {LARGEST_OF_STRANGERS} bytes, and says how many: log in first")
+        try:
+            async with asyncio.timeout(BODY_S):
+                await request.read()
+        except TimeoutError:
+            return refusal(408, f"the request was not complete within {BODY_S:g} s")
+        except web.RequestPayloadError:
+            return refusal(400, "the request is malformed")
+        return None
+
+    @web.middleware
+    async def middleware(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Judge a request, answer it, and put the headers on the answer."""
+        answer: web.StreamResponse | None = self._judge(request)
+        try:
+            answer = answer or await self._receive(request)
+            if answer is None:
+                is_stream = path_in_site(request) == STREAM
+                has_session = self.party(request).has_session
+                with self._connections.serving(request, is_stream=is_stream, has_session=has_session):
+                    answer = await handler(request)
+        except web.HTTPException as error:
+            answer = refusal(error.status, error.reason)
+        if not answer.prepared:
+            add_headers(answer)
+        return answer
+
+
+def add_headers(answer: web.StreamResponse) -> None:
+    """Put the headers of every answer on it."""
+    answer.headers.update(HEADERS)
+    answer.headers.setdefault(hdrs.CACHE_CONTROL, "no-store")

@@ -1,0 +1,208 @@
+"""What the optimiser asks of the control PLC, and how it asks again for what got lost or damaged on the way."""
+
+from collections.abc import Awaitable, Callable
+from typing import Final, TypeVar
+
+from coldloop.errors import BUSY, DamagedAnswerError, LinkError, ModelFileError, RequestRefusedError
+from coldloop.modbus.client import RegisterClient
+from coldloop.modbus.endpoints import Endpoint
+from coldloop.modbus.requests import MAX_READ_WRITE_WORDS
+from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.control_plc import (
+    Acknowledgement,
+    AwaitUpdate,
+    Heartbeat,
+    LatchedUpdate,
+    Plan,
+    SequenceHeader,
+    SequenceRow,
+    Update,
+    Verdict,
+)
+from coldloop.registers.declaration import RegisterMap
+from coldloop.registers.optimizer_plc import ControlLinkState
+from coldloop.safety.sequence import InputSequence
+from coldloop.session.time_base import TimeBase
+from coldloop_optimizer_plc.control_link import ControlLink
+
+T = TypeVar("T")
+
+ATTEMPTS: Final = 3
+"""Attempts of a request whose data arrive damaged: on the way there (exception 03, bad CRC), or back."""
+ILLEGAL_VALUE: Final = 3
+DAMAGED_THERE: Final = (Verdict.BAD_CRC, Verdict.WRONG_LENGTH)
+"""Verdicts on a sequence that is not as it was sent; its number may not be either."""
+LONGEST_WAIT_S: Final = 1.0
+"""The control PLC answers a request that waits for an update after this real time at the latest."""
+
+
+class ControlClient:
+    """The control PLC, as the optimiser uses it.
+
+    Every request raises `LinkError` when the link fails, and `RequestRefusedError` with code 6 when another optimiser
+    holds the lease.
+
+    Args:
+        register_map: Of the control PLC, for the process.
+        endpoint: Where it is.
+        link: Counts damaged answers, and of the steps of an introduction.
+        model_digest: Of our model.
+        model_name: Of our model, for messages.
+
+    Raises:
+        ConfigurationError: The files for TLS cannot be used.
+    """
+
+    def __init__(
+        self, register_map: RegisterMap, endpoint: Endpoint, link: ControlLink, model_digest: int, model_name: str
+    ) -> None:
+        self._map = register_map
+        header, row = (register_map.block_of(record).row_words for record in (SequenceHeader, SequenceRow))
+        self._rows_with_header = (MAX_READ_WRITE_WORDS - header) // row
+        """Rows that fit into one request with the header that commits them: 18 of three inputs."""
+        self._endpoint = endpoint
+        self._link = link
+        self._model_digest = model_digest
+        self._model_name = model_name
+        self._client = RegisterClient.at(self._map, endpoint)
+        self._beats = 0
+
+    def close(self) -> None:
+        """Close the connection; the next request opens another."""
+        self._client.close()
+
+    def reload_certificates(self) -> None:
+        """Start over with the present files for TLS: they may have been renewed.
+
+        Raises:
+            ConfigurationError: They cannot be used.
+        """
+        if self._endpoint.tls is not None:
+            self._client.close()
+            self._client = RegisterClient.at(self._map, self._endpoint)
+
+    # -- who is there --------------------------------------------------------------------------------------------------
+
+    async def introduce(self) -> None:
+        """Connect, send our number and the digest of our model, and check that the control PLC has the same model.
+
+        Raises:
+            ModelFileError: It has another.
+        """
+        await self._client.connect(0.0)
+        self._link.answered()
+        if self._link.state is ControlLinkState.WRONG_MODEL:  # a heartbeat would keep the right optimiser out
+            await self._check_model()
+        await self._beat()
+        await self._check_model()
+        self._link.introduced()
+
+    async def _check_model(self) -> None:
+        theirs = (await self._client.read(Identity)).model_digest
+        if theirs == self._model_digest:
+            return
+        if (await self._client.read(Identity)).model_digest != theirs:  # this block is not sealed
+            raise DamagedAnswerError(f"{self._client.peer}: its identity arrived damaged")
+        raise ModelFileError(
+            f"{self._client.peer} runs model {theirs:08x}, this optimiser {self._model_digest:08x} "
+            f"({self._model_name}): give both PLCs the same model.file"
+        )
+
+    def _heartbeat(self) -> Heartbeat:
+        self._beats = (self._beats + 1) & 0xFFFF
+        return Heartbeat(self._beats, self._model_digest, self._link.holder)
+
+    async def pace(self, session: int) -> TimeBase | None:
+        """Return the time base of a session; None where the control PLC is in another, or shows none that can be."""
+
+        async def twice() -> SessionPace:  # this block is not sealed, and what it says is not asked for again
+            one, other = await self._client.read(SessionPace), await self._client.read(SessionPace)
+            if one != other:
+                raise DamagedAnswerError(f"{self._client.peer}: its pace arrived damaged")
+            return one
+
+        shown = await self._again(twice)
+        try:
+            return shown.of(session) if shown.session == session else None
+        except ValueError:
+            return None
+
+    # -- updates -------------------------------------------------------------------------------------------------------
+
+    async def next_update(self, wanted: AwaitUpdate) -> Update:
+        """Wait for an update; after `LONGEST_WAIT_S` return the last one there was, or an empty one."""
+        patience_s = self._endpoint.timeout_s + LONGEST_WAIT_S
+
+        async def waiting() -> Update:
+            try:
+                return await self._client.exchange(wanted, Update, patience_s=patience_s)
+            except DamagedAnswerError:
+                self._link.damaged()
+                return await self._client.read(Update)  # it is latched: asking to wait again could give it up
+
+        return await self._again(waiting)
+
+    async def plan(self, plan: Plan) -> None:
+        """Send the updating period."""
+        await self._again(lambda: self._client.write(plan))
+
+    async def newest(self) -> LatchedUpdate:
+        """Give a sign of life; return which update is the newest."""
+        return await self._again(lambda: self._client.exchange(self._heartbeat(), LatchedUpdate))
+
+    # -- sequences -----------------------------------------------------------------------------------------------------
+
+    async def deliver(self, sequence: InputSequence) -> Verdict:
+        """Send a sequence, the header that commits it last; return the verdict of the control PLC."""
+        for attempt in range(1, ATTEMPTS + 1):
+            answer = await self._again(lambda: self._commit(sequence))
+            if answer.verdict not in DAMAGED_THERE or attempt == ATTEMPTS:
+                break
+        if answer.number != sequence.header.number or answer.verdict not in Verdict.__members__.values():
+            raise LinkError(
+                f"{self._client.peer} acknowledges sequence {answer.number} with verdict {answer.verdict} after "
+                f"sequence {sequence.header.number}: look for a second optimiser"
+            )
+        return Verdict(answer.verdict)
+
+    async def _commit(self, sequence: InputSequence) -> Acknowledgement:
+        header, rows = sequence.header, list(map(SequenceRow, sequence.rows))
+        await self._client.write_rows(rows[self._rows_with_header :], start=self._rows_with_header)
+        try:
+            return await self._client.exchange(header, Acknowledgement, rows=rows[: self._rows_with_header])
+        except DamagedAnswerError:  # the sequence has been judged, and may have been accepted
+            self._link.damaged()
+            return await self._again(lambda: self._client.read(Acknowledgement))
+
+    async def verdict_on(self, sequence: InputSequence) -> Verdict | None:
+        """Return the verdict on a sequence whose acknowledgement was lost; None when it has not arrived."""
+        answer = await self._again(lambda: self._client.read(Acknowledgement))
+        known = answer.number == sequence.header.number and answer.verdict in Verdict.__members__.values()
+        return Verdict(answer.verdict) if known else None
+
+    # -- again ---------------------------------------------------------------------------------------------------------
+
+    async def _again(self, request: Callable[[], Awaitable[T]]) -> T:
+        """Make a request; a connection opened since the introduction introduces itself and tries again."""
+        try:
+            return await self._undamaged(request)
+        except RequestRefusedError as error:
+            if error.exception_code != BUSY:
+                raise
+        await self._beat()
+        return await self._undamaged(request)
+
+    async def _beat(self) -> None:
+        await self._undamaged(lambda: self._client.write(self._heartbeat()))
+
+    async def _undamaged(self, request: Callable[[], Awaitable[T]]) -> T:
+        """Make a request, up to `ATTEMPTS` times when it arrives damaged there (exception 03), or its answer here."""
+        for _ in range(ATTEMPTS - 1):
+            try:
+                return await request()
+            except DamagedAnswerError:
+                self._link.damaged()
+            except RequestRefusedError as error:
+                if error.exception_code != ILLEGAL_VALUE:
+                    raise
+        return await request()

@@ -1,0 +1,304 @@
+"""What the optimiser believes of the plant's state at an updating instant."""
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.errors import ConfigurationError
+from coldloop.kernels.compiled import kept, kernel
+from coldloop_optimizer_plc.computing_settings import (
+    EstimatorKind,
+    EstimatorSettings,
+    NoiseReference,
+    PlausibilitySettings,
+    signals_of,
+)
+from coldloop_optimizer_plc.open_loop import NONE, Apart, none_apart, predict_apart, watch
+from coldloop_optimizer_plc.plausibility import (
+    USED,
+    Plausibility,
+    are_finite,
+    imputed,
+    judge,
+    new_readings,
+    note_surprise,
+    plausibility_of,
+)
+from coldloop_optimizer_plc.qp.arithmetic import DOUBLE, Real
+from coldloop_optimizer_plc.qp.linear_algebra import add_transposed_product, respond
+from coldloop_optimizer_plc.qp.prediction import PredictionModel, Transition
+from coldloop_optimizer_plc.riccati import gains_after
+
+Array = NDArray[np.float64]
+
+
+MEMORY_TICKS: Final = 240
+"""A minute of the cold box."""
+UNDETECTABLE: Final = 1e-9
+"""Relative size of a direction that no measurement sees."""
+
+
+class StationaryGains(NamedTuple):
+    """What a stationary Kalman filter corrects with after periods of 1, 2, ... ticks."""
+
+    gains: Array
+    """Transposed, shape (ticks, n_y, n + 1); the load mismatch comes last."""
+    inverse_covariances: Array
+    """Inverses of the covariance of the innovation, shape (ticks, n_y, n_y)."""
+
+
+class Estimator(NamedTuple):
+    """What an estimator computes with that does not change in a session, in the on-line floating-point type.
+
+    The Kalman filter is stationary, on the LTI model with one slow load-mismatch state; a load that is known is fed in.
+    State feedback believes the simulated state; it is not free of offset, for it does not know why the model is wrong.
+    """
+
+    steps: Transition
+    """Transitions over 1, 2, ... ticks, stacked, each matrix transposed."""
+    outputs: Transition
+    """C, D, G, transposed."""
+    x0: Array
+    u0: Array
+    y0: Array
+    w0: float
+    tick_s: float
+    kalman: bool
+    """Kalman filter, or else state feedback."""
+    load_known: bool
+    stationary: StationaryGains
+    """Of the Kalman filter."""
+    plausible: Plausibility
+
+
+class Belief(NamedTuple):
+    """What an estimator believes, as deviations from the operating point; kernels overwrite it."""
+
+    numbers: Any
+    """A record, shape (1,): `w`, the load (W); `mismatch`, the share of it that no sensor saw; `since`, the ticks
+    predicted over since the last measurement."""
+    x: Array
+    """State at the last measurement, shape (n,)."""
+    predicted: Array
+    """State predicted since, shape (n,)."""
+    surprise: Array
+    """How far each output was from what the prediction and the other outputs say, over the standard deviation that the
+    filter expects: mean square over about `MEMORY_TICKS`, shape (n_y,)."""
+    readings: Any
+    """Records, shape (n_y,): which of them are believed, and since when."""
+    apart: Apart
+
+
+def estimator_of(
+    prediction: PredictionModel,
+    settings: EstimatorSettings,
+    real: Real = DOUBLE,
+    plausibility: PlausibilitySettings | None = None,
+) -> Estimator:
+    """Return the estimator that the settings name; without `plausibility` whatever sensors show is plausible.
+
+    Raises:
+        ConfigurationError: The simulated state is used, and is not that of the model.
+    """
+    kalman = settings.kind is EstimatorKind.KALMAN
+    check_detectability(prediction)
+    process, plausible = prediction.process, plausibility or PlausibilitySettings()
+    if not kalman and prediction.n_states > len(process.states):
+        raise ConfigurationError(
+            "optimizer_plc.program.estimator.kind=state-feedback: the model has more states than the plant reports; "
+            "use kalman"
+        )
+    m = prediction.rounded(real)
+    stationary = stationary_gains(prediction, settings) if kalman else StationaryGains(*np.zeros((2, 1, 1, 1)))
+    return Estimator(
+        Transition(*map(np.array, zip(*(step.transposed() for step in m.transitions.values()), strict=True))),
+        m.outputs.transposed(), np.array(m.x0), np.array(m.u0), np.array(m.y0), m.w0, real(process.tick_s), kalman,
+        settings.load_known,
+        StationaryGains(*(array.astype(real, copy=False) for array in stationary)),
+        plausibility_of(plausible, prediction, settings.sensors, len(prediction.transitions) * process.tick_s, real),
+    )  # fmt: skip
+
+
+def no_belief(n_states: int, n_outputs: int, real: Real = DOUBLE) -> Belief:
+    """Return the belief of an estimator that begins at the operating point."""
+    numbers = np.zeros(1, [("w", real), ("mismatch", real), ("since", "i8")])
+    belief = Belief(
+        numbers, np.zeros(n_states, real), np.zeros(n_states, real), np.zeros(n_outputs, real),
+        new_readings(n_outputs, real), none_apart(n_states, real),
+    )  # fmt: skip
+    forget(belief)
+    return belief
+
+
+@kernel
+def forget(belief: Belief) -> None:
+    """Begin at the operating point."""
+    b, zero = belief.numbers[0], belief.x.dtype.type(0.0)
+    belief.x[:] = zero
+    belief.predicted[:] = zero
+    belief.surprise[:] = zero
+    b.w, b.mismatch, b.since = zero, zero, 1
+    belief.apart.watch[0].age_s = NONE
+    for i in range(belief.readings.shape[0]):
+        r = belief.readings[i]
+        r.state, r.since_s, r.agreed_s, r.spikes_s = USED, zero, zero, zero
+        r.jump, r.jumped_to, r.difference = zero, zero, zero
+
+
+@kernel
+def begin_at_rest(rest: Array, belief: Belief, u: Array, load: float, load_known: bool, level: float) -> None:  # noqa: FBT001
+    """Begin where the plant would rest with the inputs u (3,), load and level, deviations; `rest` is `rest_map`'s.
+
+    A load that is measured may have moved just now: it then says more than what would let the level rest.
+    """
+    forget(belief)
+    last, inputs = rest.shape[0] - 1, u.shape[0]
+    for i in range(last + 1):
+        found = rest[i, inputs] * load + rest[i, inputs + 1] * level
+        for j in range(inputs):
+            found += rest[i, j] * u[j]
+        if i < last:
+            belief.predicted[i] = found
+        elif not load_known:
+            belief.numbers[0].mismatch = found
+    belief.x[:] = belief.predicted
+
+
+@kernel
+def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array, x: Array) -> None:
+    """Take a measurement (u_before (3,), load, y (22,), x (28,), in physical units and the on-line type).
+
+    The Kalman filter corrects by the outputs that are finite and plausible.
+    """
+    b = belief.numbers[0]
+    known = load - c.w0 if c.load_known else belief.x.dtype.type(0.0)
+    if not c.kalman:
+        for i in range(x.shape[0]):
+            belief.x[i] = x[i] - c.x0[i]
+        b.w, b.mismatch = known, belief.x.dtype.type(0.0)
+        return
+    real, period, maps = belief.x.dtype.type, min(b.since, c.stationary.gains.shape[0]) - 1, c.outputs
+    expected = respond(maps.A, maps.B, maps.F, belief.predicted, u_before - c.u0, known + b.mismatch)
+    innovation = y - c.y0 - expected
+    J = c.stationary.inverse_covariances[period]
+    if c.plausible.sigmas > 0.0:
+        innovation = judge(
+            c.plausible, belief.readings, belief.surprise, belief.predicted, y, innovation, J,
+            real(b.since) * c.tick_s,
+        )  # fmt: skip
+    believed = innovation.copy()
+    if not are_finite(innovation):
+        innovation = imputed(innovation, J)
+    if b.since <= c.stationary.gains.shape[0]:  # J is for no longer time
+        note_surprise(belief.surprise, innovation, J, real(b.since) * real(1.0 / MEMORY_TICKS))
+    correction = np.zeros(belief.x.size + 1, belief.x.dtype)
+    add_transposed_product(c.stationary.gains[period], innovation, correction)
+    belief.x[:] = belief.predicted + correction[:-1]
+    belief.predicted[:] = belief.x
+    b.mismatch += correction[belief.x.size]
+    b.w = known + b.mismatch
+    if c.plausible.watched >= 0:
+        watch(
+            c.plausible, maps, c.stationary.gains[period], J, belief, known, u_before - c.u0, y - c.y0, believed,
+            real(b.since) * c.tick_s,
+        )  # fmt: skip
+
+
+@kernel
+def begin_prediction(belief: Belief) -> None:
+    """Predict from the last measurement on."""
+    belief.predicted[:] = belief.x
+    if belief.apart.watch[0].age_s >= 0.0:
+        for which in range(belief.apart.x.shape[0]):
+            for i in range(belief.x.size):
+                belief.apart.predicted[which, i] = belief.apart.x[which, i]
+    belief.numbers[0].since = 0
+
+
+@kernel
+def predict(c: Estimator, belief: Belief, u: Array, ticks: int) -> None:
+    """Predict so many ticks further under the input deviation u (3,)."""
+    b = belief.numbers[0]
+    b.since += ticks
+    longest = c.steps.A.shape[0]
+    while ticks > 0:
+        step = min(ticks, longest)
+        A, B, F = c.steps.A[step - 1], c.steps.B[step - 1], c.steps.F[step - 1]
+        belief.predicted[:] = respond(A, B, F, belief.predicted, u, b.w)
+        if belief.apart.watch[0].age_s >= 0.0:
+            predict_apart(A, B, F, belief, u)
+        ticks -= step
+
+
+def check_detectability(prediction: PredictionModel) -> None:
+    """Check that the measurements tell the disturbances from the states and from the load (Hautus' test at 1).
+
+    Raises:
+        ConfigurationError: They do not.
+    """
+    if not prediction.disturbances:
+        return
+    n, step = prediction.n_estimated, prediction.sample
+    modes = np.vstack([
+        np.hstack([step.A[:n, :n] - np.eye(n), step.F[:n]]), np.hstack([prediction.C[:, :n], prediction.G])
+    ])  # fmt: skip
+    if not prediction.process.has_load:
+        modes = modes[:, :n]
+    modes /= np.maximum(np.linalg.norm(modes, axis=0), UNDETECTABLE)
+    _, sizes, directions = np.linalg.svd(modes)
+    if sizes[-1] > UNDETECTABLE:
+        return
+    shares = np.abs(directions[-1][n - len(prediction.disturbances) : n])
+    worst = signals_of(prediction.process)[prediction.disturbances[int(np.argmax(shares))]]
+    raise ConfigurationError(
+        f"optimizer_plc.program.estimator.disturbances: no sensor tells a constant error of {worst} from the plant's"
+        " state, the load and the other errors: leave it out"
+    )
+
+
+def state_walks(prediction: PredictionModel, settings: EstimatorSettings) -> list[float]:
+    """Return the process noise of each state of the plant's model."""
+    by_unit = {
+        "Pa": settings.pressure_noise_pa, "m3": settings.volume_noise_m3, "K": settings.temperature_noise_k,
+        "kg": settings.mass_noise_kg, "kg/s": settings.flow_noise_kg_s, "bar s": settings.integral_noise_bar_s,
+    }  # fmt: skip
+    units, states = prediction.model.state_units, prediction.process.states
+    declared = [state.walk for state in states] + [None] * (len(units) - len(states))
+    return [by_unit[unit] if walk is None else walk for walk, unit in zip(declared, units, strict=True)]
+
+
+def walks_of(prediction: PredictionModel, settings: EstimatorSettings) -> Array:
+    """Return the process noise of the states, the constants among them, and of the load mismatch, shape (n + 1,)."""
+    constants = np.array([settings.disturbance_walk * one for one in settings.sensors] + [*settings.input_walk])
+    chosen = constants[list(prediction.disturbances)]
+    return np.array([*state_walks(prediction, settings), *chosen, settings.load_walk_w])
+
+
+def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -> StationaryGains:
+    """Return what the Kalman filter corrects with after every updating period; what is forecast it leaves alone.
+
+    Raises:
+        ConfigurationError: There is none for a period.
+    """
+    nx = prediction.n_estimated
+    C = np.ascontiguousarray(np.hstack([prediction.C[:, :nx], prediction.G]))
+    steps = {ticks: (step.A[:nx, :nx], step.F[:nx, 0]) for ticks, step in prediction.transitions.items()}
+    of_time = settings.noise_reference is NoiseReference.TIME
+    drift, sensors = walks_of(prediction, settings), np.array(settings.sensors)
+    process = prediction.process
+    found = kept(
+        "kalman",
+        gains_after,
+        steps,
+        C,
+        drift,
+        sensors,
+        of_time,
+        settings.longest_riccati,
+        process.tick_s,
+        process.sampling_period_s,
+    )
+    gains, inverses = np.split(found, [nx + 1], axis=2)
+    gains = np.insert(gains, [nx] * len(prediction.ahead), 0.0, axis=2)
+    return StationaryGains(np.ascontiguousarray(gains), np.ascontiguousarray(inverses))

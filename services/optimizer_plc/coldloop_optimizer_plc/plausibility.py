@@ -1,0 +1,370 @@
+"""Readings against the prediction and against each other: the innovation of a Kalman filter, and what to believe of it.
+
+The residual of an output is its innovation less what those of the others say of it; over its standard deviation it is
+standard normal where plant and sensors are as the filter takes them, and its square is what the quadratic form of all
+innovations loses without the output. So one wrong reading has the largest residual, and without it all others agree.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.kernels.compiled import kernel
+from coldloop_optimizer_plc.computing_settings import PlausibilitySettings
+from coldloop_optimizer_plc.qp.arithmetic import Real
+from coldloop_optimizer_plc.qp.linear_algebra import cholesky, cholesky_solve
+from coldloop_optimizer_plc.qp.prediction import PredictionModel
+
+Array = NDArray[np.float64]
+
+USED: Final = 0
+"""A reading is believed."""
+MISSING: Final = 1
+"""There is no number: the control PLC has taken it out."""
+SUSPECT: Final = 2
+"""It contradicts prediction and other readings, and is left out."""
+STUCK: Final = 3
+"""The same of one that shows nothing but its noise while the prediction moves (`open_loop`)."""
+FORGETTING: Final = 0.1
+"""Share of the time without a spike that is taken off the time with one."""
+RESTART, LONGEST_WATCH = 0.5, 10.0
+"""Of `settled_s`."""
+
+READING: Final = (
+    ("state", "i8"), ("since_s", "real"), ("agreed_s", "real"), ("jump", "real"), ("jumped_to", "real"),
+    ("difference", "real"), ("spikes_s", "real"),
+)  # fmt: skip
+"""state: `USED`, `MISSING`, `SUSPECT` or `STUCK`. since_s: how long it has been that. agreed_s: for how long a suspect
+has agreed with the others again. jump, jumped_to: by how much it differed from what the others say of it after its last
+jump, and what it showed then; of one that is stuck, where. difference: by how much it differs now. spikes_s: for how
+long one that is used has been left out as a spike."""
+
+
+class Plausibility(NamedTuple):
+    """What is plausible, in the on-line floating-point type."""
+
+    sigmas: float
+    """Largest residual over its standard deviation; 0: any is plausible."""
+    allowance: Array
+    """What a plant that is not its model adds to a residual, shape (n_y,)."""
+    in_all: float
+    """Largest quadratic form of the innovations that the outputs which are left may have."""
+    longest_period_s: float
+    """Of those that inverse covariances are for."""
+    settled_s: float
+    agreeing_s: float
+    longest_s: float
+    most: int
+    model_sigmas: float
+    """Largest residual over its standard deviation, root mean square, while the model holds."""
+    constants: NDArray[np.int64]
+    """State that is the constant error of each output; below 0: it has none. Shape (n_y,)."""
+    spike_s: float
+    forgetting: float
+    low: Array
+    """Outputs whose prediction is outside of these are not judged, shape (n_y,)."""
+    high: Array
+    noise: Array
+    """Standard deviation of each sensor, shape (n_y,)."""
+    watched: int
+    """Output that is judged by predictions without it, or -1."""
+    origin: float
+    """What it shows at the operating point."""
+    movement: float
+    """Integral of the square of that about its trend from which on the reading must move, squared unit times s."""
+    restart_s: float
+    """After which such a prediction begins again where the reading moves; longer than a frozen one goes unnoticed."""
+    longest_watch_s: float
+
+
+def plausibility_of(
+    settings: PlausibilitySettings, prediction: PredictionModel, noise: Sequence[float], longest_period_s: float,
+    real: Real,
+) -> Plausibility:  # fmt: skip
+    """Return what is plausible with a model, sensors and inverse covariances for periods up to the longest."""
+    n_y = len(prediction.y0)
+    constants = np.full(n_y, -1)
+    disturbances = prediction.disturbances
+    for place, signal in enumerate(disturbances, prediction.n_estimated - len(disturbances)):
+        if signal < n_y:
+            constants[signal] = place
+    spread = 2.0 / (9.0 * n_y)  # Wilson and Hilferty: the quantile of chi-square at so many sigmas
+    in_all = n_y * (1.0 - spread + settings.sigmas * math.sqrt(spread)) ** 3
+    low, high = np.array(settings.spans, real).T
+    watched = watched_output(settings, prediction)
+    movement = (settings.movement_sigmas * noise[watched]) ** 2 * settings.settled_s
+    return Plausibility(
+        real(settings.sigmas), np.array(settings.allowances, real), real(in_all), real(longest_period_s),
+        real(settings.settled_s), real(settings.agreeing_s), real(settings.longest_s), settings.most,
+        real(settings.model_sigmas), constants, real(settings.spike_s), real(FORGETTING), low.copy(), high.copy(),
+        np.array(noise, real), watched, real(prediction.y0[watched]), real(movement),
+        real(RESTART * settings.settled_s), real(LONGEST_WATCH * settings.settled_s),
+    )  # fmt: skip
+
+
+def watched_output(settings: PlausibilitySettings, prediction: PredictionModel) -> int:
+    """Return the controlled output that has no constant error, where readings are judged; or -1."""
+    without = [output for output in prediction.constrained if output not in prediction.disturbances]
+    judged = settings.sigmas and settings.movement_sigmas and not prediction.ahead
+    return without[0] if judged and without else -1
+
+
+def new_readings(n_outputs: int, real: Real) -> Any:  # noqa: ANN401 records
+    """Return the state of all readings at a beginning: used since just now, shape (n_y,)."""
+    return np.zeros(n_outputs, [(name, real if kind == "real" else kind) for name, kind in READING])
+
+
+@kernel
+def note_surprise(surprise: Array, innovation: Array, J: Array, share: float) -> None:
+    """Let an innovation (n_y,), whose inverse covariance is J, count with a share of up to 1 in the mean squares.
+
+    (J e)_i / sqrt(J_ii) is the residual of output i given all others, over its standard deviation.
+    """
+    for i in range(surprise.shape[0]):
+        residual = residual_of(i, innovation, J)
+        surprise[i] += min(share, surprise.dtype.type(1.0)) * (residual * residual - surprise[i])
+
+
+@kernel
+def residual_of(output: int, innovation: Array, J: Array) -> float:
+    """Return the residual of an output given all others, over its standard deviation."""
+    total = innovation.dtype.type(0.0)
+    for j in range(innovation.shape[0]):
+        total += J[output, j] * innovation[j]
+    residual: float = total / np.sqrt(J[output, output])
+    return residual
+
+
+@kernel
+def are_finite(values: Array) -> bool:
+    """Return whether all of them (n,) are."""
+    finite = True
+    for i in range(values.shape[0]):
+        finite = finite and np.isfinite(values[i])
+    return finite
+
+
+@kernel
+def imputed(innovation: Array, inverse_covariance: Array) -> Array:
+    """Return the innovation (n_y,), its elements that are not finite replaced by their mean given the others.
+
+    J_MM e_M = -J_MO e_O, with the inverse covariance J (n_y, n_y): the gain for all outputs then corrects as that for
+    the others alone. Without any it is zero.
+    """
+    n, real, missing = innovation.size, innovation.dtype.type, 0
+    M, mean = np.zeros((n, n), innovation.dtype), np.zeros(n, innovation.dtype)
+    finite = np.isfinite(innovation)
+    for i in range(n):
+        if not finite[i]:
+            missing += 1
+    if missing == 1:  # most often; what follows would find the same, bit by bit
+        impute_one(innovation, inverse_covariance, mean)
+        return mean
+    for i in range(n):
+        if finite[i]:
+            M[i, i], mean[i] = real(1.0), innovation[i]
+        else:
+            for j in range(n):
+                if finite[j]:
+                    mean[i] -= inverse_covariance[i, j] * innovation[j]
+                else:
+                    M[i, j] = inverse_covariance[i, j]
+    cholesky_solve(M, cholesky(M), mean)
+    return mean
+
+
+@kernel
+def impute_one(innovation: Array, inverse_covariance: Array, mean: Array) -> None:
+    """Write what `imputed` returns where one element is not finite into `mean` (n_y,)."""
+    missing = 0
+    for i in range(mean.size):
+        if np.isfinite(innovation[i]):
+            mean[i] = innovation[i]
+        else:
+            missing = i
+    total = innovation.dtype.type(0.0)
+    for j in range(mean.size):
+        if j != missing:
+            total -= inverse_covariance[missing, j] * innovation[j]
+    pivot = np.sqrt(inverse_covariance[missing, missing])
+    mean[missing] = total / pivot / pivot
+
+
+@kernel
+def judge(
+    p: Plausibility, readings: Any, surprise: Array, predicted: Array, y: Array, innovation: Array, J: Array,  # noqa: ANN401
+    elapsed_s: float,
+) -> Array:  # fmt: skip
+    """Return the innovation (n_y,) of a measurement y (n_y,) without the elements of suspects, which are no number.
+
+    `readings` is `new_readings`'s, `surprise` that of the readings so far, `elapsed_s` the time since the judgement
+    before. Constant errors in `predicted` are set to what a reading shows that is taken back. There are no new suspects
+    after a longer time than J is for.
+    """
+    believed, returning = innovation.copy(), False
+    for i in range(innovation.shape[0]):
+        r = readings[i]
+        if r.since_s < p.settled_s <= r.since_s + elapsed_s:
+            surprise[i] = 0.0  # by what it has shown until now nobody is judged
+        r.since_s += elapsed_s
+        r.spikes_s = max(r.spikes_s - p.forgetting * elapsed_s, innovation.dtype.type(0.0))
+        if r.state == USED and not p.low[i] <= y[i] - innovation[i] <= p.high[i]:
+            r.since_s = 0.0  # there the plant is not as its model
+        if not np.isfinite(innovation[i]):
+            if r.state != STUCK:  # which it is still when it shows something again
+                enter(r, MISSING)
+        elif r.state != USED:
+            believed[i] = np.nan
+            returning = True
+    contradicting, contradicts = against_the_model(p, readings, surprise, J)
+    if returning:
+        take_back(p, readings, predicted, y, innovation, believed, J, elapsed_s, contradicting)
+    if elapsed_s <= p.longest_period_s and contradicting < 2:
+        suspect_some(p, readings, believed, J, contradicts, elapsed_s)
+    return believed
+
+
+@kernel
+def against_the_model(p: Plausibility, readings: Any, surprise: Array, J: Array) -> tuple[int, int]:  # noqa: ANN401
+    """Return how many readings that are believed and judged say that the model does not hold; one of them, or -1."""
+    count, one = 0, -1
+    for i in range(surprise.shape[0]):
+        limit = p.model_sigmas + p.allowance[i] * np.sqrt(J[i, i])
+        judged = readings[i].state == USED and readings[i].since_s >= p.settled_s
+        if judged and surprise[i] > limit * limit:
+            count, one = count + 1, i
+    return count, one
+
+
+@kernel
+def enter(r: Any, state: int) -> None:  # noqa: ANN401 a record
+    """Let a reading be in a state."""
+    if r.state != state:
+        r.state, r.since_s, r.agreed_s, r.spikes_s = state, 0.0, 0.0, 0.0
+
+
+@kernel
+def take_back(
+    p: Plausibility, readings: Any, predicted: Array, y: Array, innovation: Array, believed: Array, J: Array,  # noqa: ANN401
+    elapsed_s: float, contradicting: int,
+) -> None:  # fmt: skip
+    """Take back suspects that agree again, wander off or have been out for the longest time, and what was missing.
+
+    After a long time, or when others contradict the model, what they say of a reading is no better than the reading:
+    its constant error, if it has one, is set so that it agrees. One without (L1) counts again in full, and so only
+    where two or more contradict: one of them may itself be wrong. One that is stuck must have moved before. One that
+    agrees has been judged all the time, and no jump ends the longest time.
+    """
+    expected = imputed(believed, J)
+    for i in range(innovation.shape[0]):
+        r, difference = readings[i], innovation[i] - expected[i]
+        if r.state != USED and np.isfinite(difference):
+            largest = p.allowance[i] + p.sigmas / np.sqrt(J[i, i])
+            if abs(difference) > largest:
+                r.agreed_s = 0.0
+            else:
+                r.agreed_s += elapsed_s
+            jumps = r.since_s <= elapsed_s or abs(difference - r.difference) > largest
+            if r.state == STUCK:
+                jumps = abs(y[i] - r.jumped_to) > (p.sigmas + p.sigmas) * p.noise[i]
+                if jumps:
+                    r.state, r.agreed_s, r.since_s = SUSPECT, 0.0, 0.0
+            if jumps and r.state != STUCK:
+                r.jump, r.jumped_to = difference, y[i]
+            r.difference = difference
+            agrees = r.state == SUSPECT and r.agreed_s >= p.agreeing_s
+            model_fails = contradicting > (0 if p.constants[i] >= 0 else 1)
+            wanders = r.state == SUSPECT and wanders_off(r, y[i], largest)
+            too_long = r.state == SUSPECT and r.since_s >= p.longest_s and not jumps
+            if agrees or model_fails or wanders or too_long or r.state == MISSING:
+                believed[i] = innovation[i]
+                if not agrees and p.constants[i] >= 0:
+                    predicted[p.constants[i]] += difference
+                    believed[i] = expected[i]
+                enter(r, USED)
+                if agrees:
+                    r.since_s = p.settled_s
+
+
+@kernel
+def wanders_off(r: Any, shown: float, least: float) -> bool:  # noqa: ANN401 a record
+    """Return whether a suspect has moved away from what the others say, by itself and as far again as it had jumped.
+
+    So does a sound sensor when the plant is no longer as its model (a valve is stuck), and one that drifts, which is
+    believed, too. One that shows too much by a constant does not, nor does one that is stuck or jumps about.
+    """
+    away = r.difference - r.jump
+    moved = shown - r.jumped_to if away > 0.0 else r.jumped_to - shown
+    wanders: bool = abs(away) > max(abs(r.jump), least) and moved + moved >= abs(away)
+    return wanders
+
+
+@kernel
+def suspect_some(
+    p: Plausibility, readings: Any, believed: Array, J: Array, only: int, elapsed_s: float  # noqa: ANN401
+) -> None:  # fmt: skip
+    """Leave out readings whose residual is too large, the worst first, if what is left then agrees in all.
+
+    Where one says that the model does not hold it is the `only` one that may be wrong itself; -1: any may. A reading
+    is a suspect when it has been left out for longer than a spike.
+    """
+    before, expected, out = believed.copy(), believed.copy(), count_suspects(readings)
+    if not are_finite(believed):
+        expected = imputed(believed, J)
+    worst = least_plausible(p, readings, believed, expected, J, only)
+    if worst < 0:
+        return
+    while worst >= 0 and out < p.most:
+        believed[worst] = np.nan
+        out += 1
+        expected = imputed(believed, J)
+        worst = least_plausible(p, readings, believed, expected, J, only)
+    total = believed.dtype.type(0.0)
+    for i in range(believed.shape[0]):
+        for j in range(believed.shape[0]):
+            total += expected[i] * J[i, j] * expected[j]
+    if worst >= 0 or total > p.in_all:  # so many do not fail at once: it is the plant
+        believed[:] = before
+        return
+    for i in range(believed.shape[0]):
+        if np.isfinite(before[i]) and not np.isfinite(believed[i]):
+            r = readings[i]
+            r.spikes_s += elapsed_s + p.forgetting * elapsed_s
+            if r.spikes_s > p.spike_s:
+                enter(r, SUSPECT)
+
+
+@kernel
+def count_suspects(readings: Any) -> int:  # noqa: ANN401 records
+    """Return how many readings are suspects."""
+    count = 0
+    for i in range(readings.shape[0]):
+        if readings[i].state >= SUSPECT:
+            count += 1
+    return count
+
+
+@kernel
+def least_plausible(p: Plausibility, readings: Any, believed: Array, expected: Array, J: Array, only: int) -> int:  # noqa: ANN401
+    """Return the reading with the largest residual of those that are too large, or -1; new ones are not judged."""
+    worst, largest = -1, p.sigmas
+    for i in range(believed.shape[0]):
+        if np.isfinite(believed[i]) and readings[i].since_s >= p.settled_s and (only < 0 or only == i):
+            size = abs(residual_of(i, expected, J)) - p.allowance[i] * np.sqrt(J[i, i])
+            if size > largest:
+                worst, largest = i, size
+    return worst
+
+
+@kernel
+def suspects_of(readings: Any) -> int:  # noqa: ANN401 records
+    """Return the suspects: bit i is output i."""
+    mask, bit = 0, 1
+    for i in range(readings.shape[0]):
+        if readings[i].state >= SUSPECT:
+            mask += bit
+        bit += bit
+    return mask

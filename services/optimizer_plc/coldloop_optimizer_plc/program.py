@@ -1,0 +1,287 @@
+"""The optimiser PLC's program: the implementation scheme of the paper's section II, steps (1) to (5).
+
+For each update the control PLC latches, `plan` decides the updating period and `solve` computes the sequence that is
+played from its end on. Decisions are those of `decisions.py`, the arithmetic is that of `scheme.py`, on the one state
+of the session. Pure: no sockets, no clock, no sleeping.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.errors import ConfigurationError
+from coldloop.kernels.first_use import kernels_of
+from coldloop.process.limits import InputLimits
+from coldloop.process.lti_model import LtiModel
+from coldloop.registers.control_plc import Plan, SequenceHeader, Update, Verdict
+from coldloop.registers.optimizer_plc import (
+    INPUT_SAMPLES,
+    PREDICTED_SAMPLES,
+    ModelDeviation,
+    OperatingLimits,
+    Optimization,
+    Prediction,
+    UpdatingRuleStatus,
+)
+from coldloop.safety.sequence import InputSequence, with_checksum
+from coldloop_optimizer_plc import decisions, scheme
+from coldloop_optimizer_plc.budget import PlcBudget
+from coldloop_optimizer_plc.computing_settings import Arithmetic
+from coldloop_optimizer_plc.decisions import Latched, Starts
+from coldloop_optimizer_plc.entry_points import Part, in_its_name
+from coldloop_optimizer_plc.estimator import correct, estimator_of
+from coldloop_optimizer_plc.forecasts import Forecasts
+from coldloop_optimizer_plc.outside_estimator import OutsideEstimator
+from coldloop_optimizer_plc.qp.arithmetic import real_of
+from coldloop_optimizer_plc.qp.prediction import prediction_of
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
+from coldloop_optimizer_plc.qp.rest import rest_map
+from coldloop_optimizer_plc.qp.target import target_search
+from coldloop_optimizer_plc.rules import OutsideRule, UpdatingRule, make_rule
+from coldloop_optimizer_plc.rules.interface import decide_by
+from coldloop_optimizer_plc.session_state import empty_state
+from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.solvers import KernelSolver, make_solver
+
+Array = NDArray[np.float64]
+
+
+@np.errstate(over="ignore")
+def _single(values: Sequence[float] | Array) -> list[float]:
+    """Return numbers as registers carry them: infinite beyond single precision."""
+    single: list[float] = np.asarray(values, np.float64).astype(np.float32).tolist()
+    return single
+
+
+def _described(settings: ProgramSettings) -> str:
+    return f"the {settings.solver_name} solver{' in single precision' * (settings.arithmetic is Arithmetic.FLOAT32)}"
+
+
+class OptimizerProgram:
+    """Estimator, problem, solver and updating rule, put together."""
+
+    def __init__(self, model: LtiModel, settings: ProgramSettings, limits: InputLimits) -> None:
+        with kernels_of(_described(settings), about_s=15):
+            self.settings, self.process = settings, settings.process
+            self.model_digest = model.short_digest
+            self._real = real_of(settings.arithmetic)
+            self.disturbances = settings.estimator.disturbed
+            self._prediction = prediction = prediction_of(model, self.disturbances, settings.design)
+            self._forecasts = Forecasts(self.process, settings.design.decision_instants)
+            self.problem = PredictiveProblem(prediction, settings.design, limits, self._real, settings.penalties)
+            self.solver = make_solver(settings)
+            self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
+            self.state = empty_state(prediction.n_states, len(model.u0), len(model.y0), self.problem.size, self._real)
+            estimator = estimator_of(prediction, settings.estimator, self._real, settings.plausibility)
+            self._nothing_ahead = np.zeros(0, self._real)
+            at_rest = self.problem.at(QpParameters(self.state.belief.x, self._real(0.0), self.state.u))
+            self.method = self.solver.method(at_rest) if isinstance(self.solver, KernelSolver) else None
+            target = target_search(prediction, settings.design, limits, self._real)
+            self.constants = scheme.constants_of(
+                estimator, self.problem, target, self.solver.alpha, settings, self.budget,
+                rest_map(prediction, self._real),
+            )  # fmt: skip
+            self._compile_kernels(model)
+        self.restart(settings.updating_period_s)
+
+    def _compile_kernels(self, model: LtiModel) -> None:
+        """Go through two updates at the operating point, so that no session waits for the compiler."""
+        u, y, x = (tuple(values.tolist()) for values in (model.u0, model.y0, model.x0))
+        first = Update(0, 0, 0, 0, load=model.w0, u_before=u, u=u, y=y, x=x)
+        self.restart(0.0)
+        planned = self.plan(first)
+        sequence = self.solve()
+        if not sequence.rows:
+            raise ConfigurationError(
+                "optimizer_plc.program.design: the problem at the operating point has no finite answer; where a mode"
+                " grows the horizon may be too long: shorten decision_instants"
+            )
+        self.prediction()
+        self.answered(late=False)
+        self.plan(first._replace(update=1, tick=planned.next_update_tick, playing=sequence.header.number))
+
+    def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
+        """Forget everything and begin a session at the operating point.
+
+        Args:
+            updating_period_s: Fixed updating period; 0 is adaptive.
+            rule: Decides adaptive periods instead of the rule that the settings name.
+        """
+        fixed_ticks = round(updating_period_s / self.process.tick_s)
+        self.constants = self.constants._replace(fixed_ticks=fixed_ticks)
+        self.rule = rule or make_rule(self.settings, self.budget, fixed_ticks, self._real)
+        outside = self.settings.outside.estimator
+        self._estimator = OutsideEstimator(outside, self._prediction, self.settings.estimator) if outside else None
+        self.solver.reset()
+        for part in (self.state.numbers, self.state.playing.numbers, self.state.sent.numbers):
+            part[:] = np.zeros(1, part.dtype)
+        for array in (*self.state.playing[1:], *self.state.sent[1:], self.state.u, self.state.target, self.state.rule):
+            array[:] = 0
+        decisions.begin_session(self.constants, self.state)
+
+    @property
+    def _now(self) -> np.void:
+        """Numbers of the period under way."""
+        record: np.void = self.state.numbers[0]
+        return record
+
+    @property
+    def _sent(self) -> np.void:
+        """Numbers of the last answer."""
+        record: np.void = self.state.sent.numbers[0]
+        return record
+
+    # -- steps (4), (5) and (2): at an updating instant ---------------------------------------------------------------
+
+    def plan(self, update: Update) -> Plan:
+        """Take the update latched at t_i and decide the updating period that begins there."""
+        c, m, latched = self.constants, self.state, self._latched(update)
+        if self.plans_by_steps:
+            load_step = self._plan_by_steps(latched)
+        else:
+            starts = Starts(self.rule.first, self.rule.after_interruption())
+            load_step = decisions.take_update(c, self.rule, starts, m, latched)
+        now = self._now
+        return Plan(
+            update.update, update.tick + int(now["ticks"]), float(load_step), float(now["shortage"]),
+            int(now["suspects"]),
+        )  # fmt: skip
+
+    def _latched(self, update: Update) -> Latched:
+        u_before, u, y, x = (np.array(values, self._real) for values in (update.u_before, update.u, update.y, update.x))
+        load, ahead = self._real(update.load), self._ahead(update.tick)
+        return Latched(update.update, update.tick, update.playing, load, u_before, u, y, x, ahead)
+
+    def _ahead(self, tick: int) -> Array:
+        """Return what is forecast from a tick on."""
+        return self._forecasts.changes(tick).astype(self._real) if len(self._forecasts) else self._nothing_ahead
+
+    @property
+    def plans_by_steps(self) -> bool:
+        """Whether estimator or rule are not ours, and called between the kernels that `take_update` calls."""
+        return self._estimator is not None or isinstance(self.rule, OutsideRule)
+
+    def _plan_by_steps(self, latched: Latched) -> float:
+        """Do what `take_update` does; return the load step that ends the period, or 0."""
+        c, m = self.constants, self.state
+        wanted, load_step = decisions.follow(c, m, latched), float(c.load_step)
+        if wanted == decisions.FIRST:
+            wanted = self.rule.first
+        elif wanted == decisions.AFTER_A_STEP:
+            wanted, load_step = self.rule.after_interruption(), 0.0
+        scheme.end_period(m)
+        if self._estimator is None:
+            correct(c.estimator, m.belief, latched.u_before, latched.load, latched.y, latched.x)
+        else:
+            self._estimator.correct(c.estimator, m.belief, latched.u_before, latched.load, latched.y)
+        effective = scheme.judge_played(c, m, latched.load, latched.y)
+        if wanted == scheme.BY_THE_RULE:
+            wanted = decide_by(self.rule, m.rule, *scheme.assess_period(c, m, effective))
+        scheme.begin_period(c, m, wanted, latched.update, latched.tick, latched.load, effective)
+        return load_step
+
+    # -- step (3): during the updating period -------------------------------------------------------------------------
+
+    def answer_after_s(self) -> float:
+        """Return the plant time from the instant of the last `plan` until the PLC has computed its answer."""
+        return self.budget.answer_after_s(self._iterations)
+
+    @property
+    def _iterations(self) -> int:
+        if not self._now["planned"]:
+            raise RuntimeError("call plan before solve and answer_after_s")
+        return int(self._now["iterations"])
+
+    def solve(self) -> InputSequence:
+        """Predict the state at t_{i+1}, shift the profile, iterate; return the sequence to play from there.
+
+        It has no rows where something was not finite.
+        """
+        n = self._iterations
+        if ahead := len(self._forecasts):
+            self.state.belief.x[-ahead:] = self._ahead(int(self._now["tick"]) + int(self._now["ticks"]))
+        if isinstance(self.solver, KernelSolver):
+            scheme.solve(self.constants, self.method, self.state)
+        else:
+            qp, guess = scheme.pose(self.constants, self.state)
+            with in_its_name(Part.SOLVER, self.settings.outside.solver or self.settings.solver):
+                answer = self.solver.solve(qp, guess, (n - 1, n))
+            scheme.deliver(self.constants, self.state, qp, answer)
+        return self._sequence()
+
+    def _sequence(self) -> InputSequence:
+        """Return the last answer as the control PLC takes it."""
+        now, sent, rows = self._now, self._sent, self.state.sent.rows
+        length, held = int(sent["length"]), self.process.ticks_per_sample
+        inputs = list(map(tuple, rows[:length:held].tolist()))
+        header = SequenceHeader(
+            number=int(sent["number"]),
+            update=int(now["update"]),
+            first_tick=int(sent["first_tick"]),
+            length=length,
+            tau_u=int(now["ticks"]),
+            model_digest=self.model_digest,
+            crc=0,
+        )
+        return with_checksum(header, [inputs[tick // held] for tick in range(length)])
+
+    def answered(self, *, late: bool) -> None:
+        """Note how an answer came."""
+        decisions.note_answer(self.state, late)
+
+    # -- diagnostics --------------------------------------------------------------------------------------------------
+
+    def prediction(self) -> Prediction:
+        """Return what the last profile is expected to lead to."""
+        header, sent = self._sent, self.state.sent
+        if not header["length"]:
+            raise RuntimeError("call solve before prediction")
+        horizon = self.problem.design.horizon
+        outputs = self.problem.outputs(sent.z, QpParameters(sent.x, header["w"], sent.u_before))
+        inputs = self.problem.inputs(sent.z, horizon)
+        shown = outputs[[min(sample, horizon) - 1 for sample in PREDICTED_SAMPLES]]
+        planned = inputs[[min(sample, horizon) - 1 for sample in INPUT_SAMPLES]]
+        return Prediction(
+            int(self._now["update"]), int(header["first_tick"]), tuple(shown.T.ravel().tolist()),
+            tuple(planned.ravel().tolist()),
+        )  # fmt: skip
+
+    def model_deviation(self) -> ModelDeviation:
+        """Return how the plant differs from the model, as the filter has estimated it at the last update."""
+        belief, n_y = self.state.belief, len(self.process.outputs)
+        constants = np.zeros(n_y + len(self.process.inputs))
+        end = self._prediction.n_estimated
+        constants[list(self.disturbances)] = belief.x[end - len(self.disturbances) : end]
+        return ModelDeviation(
+            _single([belief.numbers[0]["mismatch"]])[0], tuple(_single(constants[n_y:])),
+            tuple(_single(constants[:n_y])), tuple(_single(np.sqrt(belief.surprise))),
+        )  # fmt: skip
+
+    @property
+    def operating_limits(self) -> OperatingLimits:
+        """Bands, bounds and rates that profiles keep."""
+        design, limits = self.settings.design, self.problem.limits
+        return OperatingLimits(design.output_low, design.output_high, limits.low, limits.high, limits.rate)
+
+    def rule_status(self) -> UpdatingRuleStatus:
+        """Return what decides the updating period in this session."""
+        times = self.budget.times
+        return self.rule.status._replace(slots=times.slots, preparation=times.preparation, iteration=times.iteration)
+
+    def report(self, verdict: Verdict) -> Optimization:
+        """Return what was done with the last update, once the control PLC has answered."""
+        if not (self._sent["length"] or self._now["solved"]):
+            raise RuntimeError("call solve before report")
+        now, sent = self._now, self._sent
+        of_sent, of_now = ("j_dev", "j_cst", "violation"), ("efficiency", "mismatch", "contraction", "gamma")
+        numbers = [self.state.belief.numbers[0]["mismatch"], now["effective"], sent["hot_start"], sent["delivered"]]
+        mismatch, effective, hot_start, delivered, *others = _single(
+            [*numbers, *(sent[name] for name in of_sent), *(now[name] for name in of_now)]
+        )
+        return Optimization(
+            update=int(now["update"]), tick=int(now["tick"]), tau_u=int(now["ticks"]), q=int(now["q"]),
+            iterations=int(sent["iterations"]), verdict=verdict,
+            load_mismatch=mismatch, j_effective=effective, j_hot_start=hot_start, j_delivered=delivered,
+            **dict(zip((*of_sent, *of_now), others, strict=True)),
+        )  # fmt: skip

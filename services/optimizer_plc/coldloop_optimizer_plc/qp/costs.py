@@ -1,0 +1,212 @@
+"""What a profile costs: the augmented cost J that solvers decrease, its gradient, and the indicators of section V.
+
+Gamma z - gamma and the gradient are computed here for all solvers, except by the interior-point method, which has its
+variables in its own order.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.kernels.compiled import kernel
+from coldloop_optimizer_plc.qp.linear_algebra import Columns, add_product, add_transposed_product, by_columns
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
+
+Array = NDArray[np.float64]
+
+
+@kernel
+def quadratic_cost(Phi: Array, phi: Array, z: Array) -> float:
+    """Return z' Phi z + z' phi."""
+    total = z.dtype.type(0.0)
+    for i in range(z.shape[0]):
+        row = phi[i]
+        for j in range(z.shape[0]):
+            row += Phi[i, j] * z[j]
+        total += row * z[i]
+    return total
+
+
+@kernel
+def augmented_cost(qp: QuadraticProblem, z: Array, alpha: float) -> float:
+    """Return J(z) = J_0(z) + alpha sum max(Gamma z - gamma, 0)^2, without the constant, for z inside its box."""
+    return quadratic_cost(qp.Phi, qp.phi, z) + alpha * positive_squares(row_excess(qp, z))
+
+
+@kernel
+def row_excess(qp: QuadraticProblem, z: Array) -> Array:
+    """Return Gamma z - gamma, shape (m,)."""
+    excess = -qp.gamma
+    for r in range(excess.shape[0]):
+        for j in range(z.shape[0]):
+            excess[r] += qp.Gamma[r, j] * z[j]
+    return excess
+
+
+@kernel
+def positive_squares(excess: Array) -> float:
+    """Return sum max(excess, 0)^2 over `excess` (m,)."""
+    zero = excess.dtype.type(0.0)
+    total = zero
+    for r in range(excess.shape[0]):
+        if excess[r] > zero:
+            total += excess[r] * excess[r]
+    return total
+
+
+class Matrices(NamedTuple):
+    """The constant matrices of a problem, stored for products without the zeros at the ends of columns and rows."""
+
+    Phi: Columns
+    """Shape (n, n)."""
+    Gamma: Columns
+    """Shape (m, n)."""
+    rows: Columns
+    """Gamma transposed: the rows of Gamma as columns."""
+
+
+def matrices_of(qp: QuadraticProblem) -> Matrices:
+    """Return the matrices of a problem."""
+    return Matrices(by_columns(qp.Phi), by_columns(qp.Gamma), by_columns(np.ascontiguousarray(qp.Gamma.T)))
+
+
+@kernel
+def cost_with_excess(constant: Matrices, qp: QuadraticProblem, z: Array, excess: Array, alpha: float) -> float:
+    """Return what `augmented_cost` does, to the bit, for a problem with these matrices, from `excess_by_columns`."""
+    slope = qp.phi.copy()
+    add_product(constant.Phi, z, slope)
+    total = z.dtype.type(0.0)
+    for i in range(z.shape[0]):
+        total += slope[i] * z[i]
+    return total + alpha * positive_squares(excess)
+
+
+@kernel
+def excess_by_columns(constant: Matrices, qp: QuadraticProblem, z: Array) -> Array:
+    """Return what `row_excess` does, to the bit, for a problem with these matrices."""
+    excess = -qp.gamma
+    add_product(constant.Gamma, z, excess)
+    return excess
+
+
+@kernel
+def gradient(
+    constant: Matrices, qp: QuadraticProblem, z: Array, alpha: float, result: Array, active: Array
+) -> None:  # fmt: skip
+    """Write dJ/dz into `result` (n,) and which rows push into `active` (m,) as 1.0 or 0.0."""
+    gradient_with_excess(constant, qp, z, excess_by_columns(constant, qp, z), alpha, result, active)
+
+
+@kernel
+def gradient_with_excess(
+    constant: Matrices, qp: QuadraticProblem, z: Array, excess: Array, alpha: float, result: Array, active: Array
+) -> None:  # fmt: skip
+    """Write the same where Gamma z - gamma (m,) is known."""
+    n = z.shape[0]
+    zero, one, two = z.dtype.type(0.0), z.dtype.type(1.0), z.dtype.type(2.0)
+    for i in range(n):
+        result[i] = zero
+    add_product(constant.Phi, z, result)
+    for i in range(n):
+        result[i] = two * result[i] + qp.phi[i]
+    rows = constant.rows
+    for r in range(excess.shape[0]):
+        active[r] = zero
+        if excess[r] > zero:
+            active[r] = one
+            factor = two * alpha * excess[r]
+            for j in range(rows.first[r], rows.end[r]):
+                result[j] += factor * rows.transposed[r, j]
+
+
+class ProfileCosts(NamedTuple):
+    """Predicted costs and violation of a profile."""
+
+    j_dev: float
+    """Deviation cost over the horizon."""
+    j_cst: float
+    """Violation cost over the horizon, from the predicted outputs and never from the slacks, which may lie."""
+    violation: float
+    """Largest violated row, max(Gamma p - gamma, 0), in the units of the row (%, K, or input units)."""
+
+
+class OutputMaps(NamedTuple):
+    """How the constrained outputs over the horizon of N samples follow from a profile and the parameters."""
+
+    resting: Array
+    """The b outputs with a band in turn at the operating point, shape (b N,)."""
+    of_z: Array
+    """Shape (n, b N)."""
+    of_x: Array
+    """Shape (n_x, b N)."""
+    of_w: Array
+    """Shape (b N,)."""
+    bands: Array
+    """Low, high and weight of each, shape (3, b)."""
+    row_gains: Array
+    """What the rows of Gamma were multiplied by, shape (m,)."""
+
+
+def output_maps(problem: PredictiveProblem) -> OutputMaps:
+    """Return the maps of a problem."""
+    return OutputMaps(
+        problem.resting_outputs, problem.stacked_outputs_z, problem.stacked_outputs_x, problem.stacked_outputs_w,
+        problem.bands, problem.row_gains,
+    )  # fmt: skip
+
+
+def indicators(problem: PredictiveProblem, qp: QuadraticProblem, z: Array, parameters: QpParameters) -> ProfileCosts:
+    """Return the indicators of profile z at the parameters (paper, section V); `qp` is the problem's instance there."""
+    maps, real = output_maps(problem), z.dtype.type
+    return ProfileCosts(
+        *map(float, predicted_indicators(maps, qp, z, parameters.x, real(parameters.w), problem.n_inputs))
+    )
+
+
+@kernel
+def predicted_indicators(
+    maps: OutputMaps, qp: QuadraticProblem, z: Array, x: Array, w: float, n_inputs: int
+) -> ProfileCosts:
+    """Return the indicators of profile z (n,) at the state x (n_x,) under the load w (W), both as deviations."""
+    outputs = maps.resting.copy()
+    add_transposed_product(maps.of_z, z, outputs)
+    add_transposed_product(maps.of_x, x, outputs)
+    j_cst = violation_cost(outputs, maps.of_w, w, maps.bands)
+    j_dev = deviation_cost(qp, z, n_inputs) + qp.constant
+    return ProfileCosts(j_dev, j_cst, largest_violation(qp, z, maps.row_gains))
+
+
+@kernel
+def deviation_cost(qp: QuadraticProblem, z: Array, n_inputs: int) -> float:
+    """Return J_0 of the inputs alone, without slacks and without the constant."""
+    slackless = z.copy()
+    for i in range(n_inputs, z.shape[0]):
+        slackless[i] = z.dtype.type(0.0)
+    return quadratic_cost(qp.Phi, qp.phi, slackless)
+
+
+@kernel
+def violation_cost(outputs: Array, through_w: Array, w: float, bands: Array) -> float:
+    """Return the weighted squares of what outputs + through_w w miss their bands by.
+
+    Outputs (b N) are the b that have a band, in turn; bands (3, b) are low, high and weight.
+    """
+    zero, count = outputs.dtype.type(0.0), bands.shape[1]
+    total = zero
+    for first in range(0, outputs.shape[0], count):
+        for band in range(count):
+            y = outputs[first + band] + through_w[first + band] * w
+            miss = max(y - bands[1, band], zero) + max(bands[0, band] - y, zero)
+            total += bands[2, band] * miss * miss
+    return total
+
+
+@kernel
+def largest_violation(qp: QuadraticProblem, z: Array, gains: Array) -> float:
+    """Return max(Gamma z - gamma, 0) over the rows, each divided by its gain."""
+    largest = z.dtype.type(0.0)
+    excess = row_excess(qp, z)
+    for r in range(excess.shape[0]):
+        largest = max(largest, excess[r] / gains[r])
+    return largest

@@ -1,0 +1,427 @@
+"""A throttled primal-dual interior-point method with soft rows (Mehrotra, 1992), cut off after q iterations.
+
+It minimises the same J = J_0 + alpha sum max(Gamma z - gamma, 0)^2 as the ODE-based solver. A row r has the distance
+w_r = gamma_r - (Gamma z)_r + lambda_r / (2 alpha) and the multiplier lambda_r; a bound of the box has its distance and
+its multiplier. An iteration drives all products of distance and multiplier towards one falling number mu:
+
+    (2 Phi + Gamma' D Gamma + B) dz = -dL/dz, ...    D = lambda / (w + lambda / (2 alpha)) <= 2 alpha
+
+with a predictor and a corrector that share one factorised matrix. Since D is bounded, the matrix is as well conditioned
+as that of the ODE-based solver, and single precision suffices.
+
+- Hot start: the guess, moved a little away from its bounds, and on each row the multiplier that puts it on the central
+  path for the first mu. So rows are never inconsistent, whatever the iteration after which it is cut off.
+- Structure: variables without an upper bound (the slacks) are eliminated first, where the matrix is nearly diagonal;
+  zeros of Gamma are left out.
+- A truncated answer is the point of lowest J so far, the guess included: it never rises (Definition 1 of the paper).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.kernels.compiled import kernel
+from coldloop_optimizer_plc.computing_settings import InteriorPointSettings
+from coldloop_optimizer_plc.qp.arithmetic import Real
+from coldloop_optimizer_plc.qp.costs import augmented_cost
+from coldloop_optimizer_plc.qp.linear_algebra import cholesky, cholesky_solve
+from coldloop_optimizer_plc.qp.problem import QuadraticProblem
+from coldloop_optimizer_plc.solvers.interface import Answer, Costs
+from coldloop_optimizer_plc.solvers.kernel_solver import KernelSolver, solves_by
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+SHORT_OF = 0.99
+"""Share of the way to the first bound that a step goes."""
+FINEST = 100.0
+"""mu, in units of the rounding error of 1, below which there is nothing left to win."""
+
+
+class Structure(NamedTuple):
+    """The constant matrices, variables in the order of elimination."""
+
+    order: Indices
+    """Which variable of the problem comes first, second, ..., shape (n,)."""
+    hessian: Array
+    """2 Phi, shape (n, n)."""
+    Gamma: Array
+    """Shape (m, n)."""
+    columns: Indices
+    """Of each row of Gamma the columns that are not zero, rising, filled up with -1, shape (m, at most n)."""
+
+
+class Point(NamedTuple):
+    """Where the method is, in the order of elimination."""
+
+    z: Array
+    """Shape (n,)."""
+    rows: Array
+    """Multipliers of the rows, shape (m,)."""
+    low: Array
+    """Multipliers of the lower bounds, shape (n,)."""
+    high: Array
+    """Multipliers of the upper bounds, shape (n,); 0 where there is none."""
+
+
+class Path(NamedTuple):
+    """Constants of the method, in the floating-point type of the problem."""
+
+    alpha: float
+    softness: float
+    """Of the rows, 1 / (2 alpha)."""
+    first_mu: float
+    least_mu: float
+    margin: float
+    size: float
+    """Number of variables and rows."""
+    finest: float
+    """mu below which there is nothing left to win."""
+
+
+def path_in(settings: InteriorPointSettings, size: int, real: Real) -> Path:
+    """Return the constants as scalars of a floating-point type, for a problem of so many variables and rows."""
+    return Path(
+        alpha=real(settings.alpha),
+        softness=real(0.5 / settings.alpha),
+        first_mu=real(settings.first_mu),
+        least_mu=real(settings.least_mu),
+        margin=real(settings.margin),
+        size=real(size),
+        finest=real(FINEST * np.finfo(real).eps),
+    )
+
+
+class InteriorPointMethod(NamedTuple):
+    """What the solver computes with that does not change from problem to problem."""
+
+    structure: Structure
+    path: Path
+
+
+def method_of(settings: InteriorPointSettings, problem: QuadraticProblem) -> InteriorPointMethod:
+    """Return the method for problems with these matrices."""
+    size = len(problem.phi) + len(problem.gamma)
+    return InteriorPointMethod(structure_of(problem), path_in(settings, size, problem.phi.dtype.type))
+
+
+def interior_point_solver(settings: InteriorPointSettings) -> KernelSolver:
+    """Return the solver, which keeps nothing from one problem to the next."""
+    return KernelSolver(lambda problem: method_of(settings, problem), settings.alpha, settings.tau_1_s)
+
+
+def structure_of(problem: QuadraticProblem) -> Structure:
+    """Return the matrices in the order of elimination, which begins with the variables without upper bound."""
+    order = np.argsort(np.isfinite(problem.high), kind="stable")
+    Gamma = np.ascontiguousarray(problem.Gamma[:, order])
+    columns = np.full(Gamma.shape, -1)
+    for r, row in enumerate(Gamma):
+        found = np.flatnonzero(row)
+        columns[r, : len(found)] = found
+    two = problem.Phi.dtype.type(2.0)
+    return Structure(order, np.ascontiguousarray(two * problem.Phi[np.ix_(order, order)]), Gamma, columns)
+
+
+@kernel
+def multiply_rows(constant: Structure, z: Array, result: Array) -> None:
+    """Write Gamma z into `result` (m,)."""
+    for r in range(result.shape[0]):
+        total = z.dtype.type(0.0)
+        for j in constant.columns[r]:
+            if j < 0:
+                break
+            total += constant.Gamma[r, j] * z[j]
+        result[r] = total
+
+
+@kernel
+def add_columns(constant: Structure, weights: Array, result: Array) -> None:
+    """Add Gamma' weights to `result` (n,)."""
+    for r in range(weights.shape[0]):
+        for j in constant.columns[r]:
+            if j < 0:
+                break
+            result[j] += constant.Gamma[r, j] * weights[r]
+
+
+@kernel
+def begin(
+    constant: Structure, qp: QuadraticProblem, guess: Array, path: Path, best: Array, rows: Array
+) -> tuple[float, Point]:
+    """Write the guess inside the box into `best` (n,) and zeros into `rows` (m,); return its cost and a point near."""
+    for i in range(best.shape[0]):
+        best[i] = min(max(guess[i], qp.low[i]), qp.high[i])
+    for r in range(rows.shape[0]):
+        rows[r] = qp.gamma.dtype.type(0.0)
+    cost = augmented_cost(qp, best, path.alpha)
+    mu = qp.phi.dtype.type(max(path.least_mu, path.first_mu / path.size * (cost + qp.constant)))
+    order = constant.order
+    return cost, near(
+        constant, qp.gamma, qp.low[order], qp.high[order], best[order], path.softness, mu, path.margin
+    )  # fmt: skip
+
+
+@kernel
+def descend(
+    constant: Structure,
+    qp: QuadraticProblem,
+    path: Path,
+    point: Point,
+    best: Array,
+    rows: Array,
+    cost: float,
+    count: int,
+) -> tuple[int, float, Point]:
+    """Take `count` steps from a point, or fewer once the products are as small as rounding.
+
+    `best` (n,), its cost and its multipliers `rows` (m,) are those of the cheapest point so far. Returns how many
+    steps were taken, the cost of `best`, and the point reached.
+    """
+    order = constant.order
+    phi, low, high = qp.phi[order], qp.low[order], qp.high[order]
+    for done in range(count):
+        point, moved = step(constant, phi, qp.gamma, low, high, point, path.softness, path.finest)
+        if not moved:
+            return done, cost, point
+        z = np.empty_like(best)
+        for i in range(z.shape[0]):
+            z[order[i]] = point.z[i]
+        reached = augmented_cost(qp, z, path.alpha)
+        if reached < cost:
+            cost = reached
+            best[:] = z
+            rows[:] = point.rows
+    return count, cost, point
+
+
+@kernel
+def near(
+    constant: Structure, gamma: Array, low: Array, high: Array, guess: Array, softness: float, mu: float, margin: float
+) -> Point:  # fmt: skip
+    """Return a point near the guess: inside the box, and on each row on the central path for mu."""
+    real = guess.dtype.type
+    zero, one, two = real(0.0), real(1.0), real(2.0)
+    z, of_low, of_high, rows = np.empty_like(guess), np.empty_like(guess), np.zeros_like(guess), np.empty_like(gamma)
+    for i in range(z.shape[0]):
+        bounded = np.isfinite(high[i])
+        width = high[i] - low[i] if bounded else one
+        inside = max(margin * min(width, one), real(1e-6))
+        z[i] = max(guess[i], low[i] + inside)
+        if bounded:
+            z[i] = min(z[i], high[i] - inside) if width > two * inside else low[i] + width / two
+            of_high[i] = mu / max(high[i] - z[i], real(1e-6))
+        of_low[i] = mu / max(z[i] - low[i], real(1e-6))
+    multiply_rows(constant, z, rows)
+    for r in range(rows.shape[0]):
+        excess = rows[r] - gamma[r]  # w lambda = mu and w = lambda / (2 alpha) - excess
+        root = np.sqrt(excess * excess + two * two * softness * mu)
+        rows[r] = (excess + root) / (two * softness) if excess > zero else two * mu / (root - excess)
+    return Point(z, rows, of_low, of_high)
+
+
+class Distances(NamedTuple):
+    """How far a point is from what it must not cross; all positive. The softness of rows is 1 / (2 alpha)."""
+
+    rows: Array
+    """w, shape (m,)."""
+    low: Array
+    """Shape (n,)."""
+    high: Array
+    """Shape (n,); infinite where there is no bound."""
+
+
+@kernel
+def distances(constant: Structure, gamma: Array, low: Array, high: Array, point: Point, softness: float) -> Distances:
+    """Return the distances of a point."""
+    w = np.empty_like(gamma)
+    multiply_rows(constant, point.z, w)
+    for r in range(w.shape[0]):
+        w[r] = gamma[r] - w[r] + softness * point.rows[r]
+    return Distances(w, point.z - low, high - point.z)
+
+
+@kernel
+def newton_matrix(constant: Structure, point: Point, away: Distances, softness: float) -> Array:
+    """Return 2 Phi + Gamma' D Gamma + B, upper triangle."""
+    M = constant.hessian.copy()
+    for i in range(M.shape[0]):
+        M[i, i] += point.low[i] / away.low[i]
+        if point.high[i] > 0:
+            M[i, i] += point.high[i] / away.high[i]
+    for r in range(point.rows.shape[0]):
+        weight = point.rows[r] / (away.rows[r] + softness * point.rows[r])
+        columns = constant.columns[r]
+        for a in range(columns.shape[0]):
+            i = columns[a]
+            if i < 0:
+                break
+            factor = weight * constant.Gamma[r, i]
+            for b in range(a, columns.shape[0]):
+                j = columns[b]
+                if j < 0:
+                    break
+                M[i, j] += factor * constant.Gamma[r, j]
+    return M
+
+
+@kernel
+def room(value: Array, change: Array, share: float) -> float:
+    """Return the longest step up to `share` after which all positive values are still positive."""
+    for i in range(value.shape[0]):
+        if value[i] > 0 and value[i] + share * change[i] <= 0:
+            share = -value[i] / change[i]
+    return share
+
+
+@kernel
+def mean_product(point: Point, away: Distances) -> float:
+    """Return mu, the mean product of distance and multiplier."""
+    total, count = point.z.dtype.type(0.0), point.rows.shape[0] + point.z.shape[0]
+    for r in range(point.rows.shape[0]):
+        total += away.rows[r] * point.rows[r]
+    for i in range(point.z.shape[0]):
+        total += away.low[i] * point.low[i]
+        if point.high[i] > 0:
+            count += 1
+            total += away.high[i] * point.high[i]
+    return total / point.z.dtype.type(count)
+
+
+@kernel
+def moved_by(place: Array, change: Array, share: float) -> Array:
+    """Return what `place` is after `share` of a change."""
+    result = place.copy()
+    for i in range(place.shape[0]):
+        result[i] += share * change[i]
+    return result
+
+
+@kernel
+def after(point: Point, change: Point, share: float) -> Point:
+    """Return the point after `share` of a change."""
+    return Point(
+        moved_by(point.z, change.z, share), moved_by(point.rows, change.rows, share),
+        moved_by(point.low, change.low, share), moved_by(point.high, change.high, share),
+    )  # fmt: skip
+
+
+@kernel
+def newton_step(
+    constant: Structure,
+    U: Array,
+    skyline: NDArray[np.uint64],
+    slope: Array,
+    point: Point,
+    away: Distances,
+    products: Distances,
+    softness: float,
+) -> tuple[Point, Distances]:
+    """Return the Newton step that changes the products by `products`, and how the distances change with it."""
+    dz, of_rows, d_low, d_high = -slope, products.rows.copy(), products.low.copy(), products.high.copy()
+    for r in range(of_rows.shape[0]):
+        of_rows[r] /= away.rows[r] + softness * point.rows[r]
+    add_columns(constant, -of_rows, dz)
+    for i in range(dz.shape[0]):
+        d_low[i] /= away.low[i]
+        dz[i] += d_low[i]
+        if point.high[i] > 0:
+            d_high[i] /= away.high[i]
+            dz[i] -= d_high[i]
+    cholesky_solve(U, skyline, dz)
+    d_away = np.empty_like(of_rows)
+    multiply_rows(constant, dz, d_away)
+    for r in range(of_rows.shape[0]):
+        of_rows[r] += point.rows[r] * d_away[r] / (away.rows[r] + softness * point.rows[r])
+        d_away[r] = softness * of_rows[r] - d_away[r]
+    for i in range(dz.shape[0]):
+        d_low[i] -= point.low[i] * dz[i] / away.low[i]
+        if point.high[i] > 0:
+            d_high[i] += point.high[i] * dz[i] / away.high[i]
+    return Point(dz, of_rows, d_low, d_high), Distances(d_away, dz, -dz)
+
+
+@kernel
+def towards_zero(point: Point, away: Distances) -> Distances:
+    """Return by how much the products are to change to vanish."""
+    rows, low, high = np.empty_like(point.rows), np.empty_like(point.z), np.zeros_like(point.z)
+    for r in range(rows.shape[0]):
+        rows[r] = -(away.rows[r] * point.rows[r])
+    for i in range(low.shape[0]):
+        low[i] = -(away.low[i] * point.low[i])
+        if point.high[i] > 0:
+            high[i] = -(away.high[i] * point.high[i])
+    return Distances(rows, low, high)
+
+
+@kernel
+def correct(products: Distances, mu: float, point: Point, change: Point, moved: Distances) -> None:
+    """Let the products become mu, and make up for what a change adds to them in second order."""
+    for r in range(products.rows.shape[0]):
+        products.rows[r] += mu - moved.rows[r] * change.rows[r]
+    for i in range(products.low.shape[0]):
+        products.low[i] += mu - moved.low[i] * change.low[i]
+        if point.high[i] > 0:
+            products.high[i] += mu - moved.high[i] * change.high[i]
+
+
+@kernel
+def longest(point: Point, away: Distances, change: Point, moved: Distances, share: float) -> float:
+    """Return the longest step up to `share` that crosses nothing."""
+    share = room(away.rows, moved.rows, room(point.rows, change.rows, share))
+    share = room(away.low, moved.low, room(point.low, change.low, share))
+    return room(away.high, moved.high, room(point.high, change.high, share))
+
+
+@kernel
+def gradient(constant: Structure, phi: Array, point: Point) -> Array:
+    """Return the gradient of the Lagrangian, shape (n,)."""
+    slope = phi - point.low + point.high
+    for i in range(slope.shape[0]):
+        for j in range(slope.shape[0]):
+            slope[j] += constant.hessian[i, j] * point.z[i]
+    add_columns(constant, point.rows, slope)
+    return slope
+
+
+@kernel
+def step(
+    constant: Structure, phi: Array, gamma: Array, low: Array, high: Array, point: Point, softness: float, finest: float
+) -> tuple[Point, bool]:
+    """Return the point after one iteration, and whether there was anything to be won."""
+    real = point.z.dtype.type
+    one = real(1.0)
+    away = distances(constant, gamma, low, high, point, softness)
+    mu = mean_product(point, away)
+    if not mu > finest:
+        return point, False
+    slope = gradient(constant, phi, point)
+    U = newton_matrix(constant, point, away, softness)
+    skyline = cholesky(U)
+    products = towards_zero(point, away)
+    change, moved = newton_step(constant, U, skyline, slope, point, away, products, softness)
+    share = longest(point, away, change, moved, one)
+    predicted = after(point, change, share)
+    centring = mean_product(predicted, distances(constant, gamma, low, high, predicted, softness)) / mu
+    correct(products, mu * centring * centring * centring, point, change, moved)
+    change, moved = newton_step(constant, U, skyline, slope, point, away, products, softness)
+    share = min(one, real(SHORT_OF) * longest(point, away, change, moved, one / real(SHORT_OF)))
+    return after(point, change, share), True
+
+
+@solves_by(InteriorPointMethod)
+@kernel
+def solve(
+    c: InteriorPointMethod, qp: QuadraticProblem, guess: Array, counts: NDArray[np.int64], before: Costs  # noqa: ARG001
+) -> Answer:  # fmt: skip
+    """Return the best point after each count of steps, fewer once the products are as small as rounding."""
+    best, rows = np.empty_like(qp.phi), np.empty_like(qp.gamma)
+    guessed, point = begin(c.structure, qp, guess, c.path, best, rows)
+    points, costs = np.empty((counts.shape[0], best.shape[0]), best.dtype), np.empty(counts.shape[0], best.dtype)
+    iterations = np.empty_like(counts)
+    cost, done = guessed, 0
+    for k in range(counts.shape[0]):
+        more, cost, point = descend(c.structure, qp, c.path, point, best, rows, cost, counts[k] - done)
+        done += more
+        points[k], costs[k], iterations[k] = best, cost, done
+    return Answer(guessed, points, costs, iterations, rows)

@@ -1,0 +1,184 @@
+"""The cold box: how the components are piped together, its states, inputs and outputs.
+
+High-pressure helium at 80 K is cooled in NEF34; part of it drives the turbine, the rest goes on through NEF2 and NEF1
+to the Joule-Thomson valve and the bath. The vapour returns through NEF1, meets the turbine's exhaust, and leaves
+through NEF2 and NEF34. To make another refrigerator, write such a module: choose components, order the states, call the
+components in the order in which the streams need each other.
+
+All functions are kernels and take x (28 states, `STATE_NAMES`), u (3 inputs, `INPUT_NAMES`), w (heat load NCR22_HL, W),
+real or complex.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from coldloop.kernels.compiled import inlined, kernel
+from coldloop.process import cold_box
+from coldloop_plant.components.gas_valve import CRITICAL_RATIO, cold_valve_flow
+from coldloop_plant.components.heat_exchanger import HeatExchanger, HighPressureFlow, LowPressureFlow, exchange
+from coldloop_plant.components.phase_separator import (
+    Content,
+    PhaseSeparator,
+    bath_relief,
+    content,
+    level,
+    outflow,
+    separate,
+    thinness,
+)
+from coldloop_plant.components.return_line import ReturnLine, return_flow
+from coldloop_plant.components.turbine import Back, Expansion, Turbine, expand, throttled_flow, turbine_flow
+from coldloop_plant.components.valve import Valve
+from coldloop_plant.helium.properties import Helium, saturation, supply_enthalpy_and_density, vapour_temperature
+from coldloop_plant.numeric import PA_PER_BAR, Array, at_least
+
+LOAD_NAME, LOAD_UNIT = "NCR22_HL", "W"
+OUTPUTS: Final = len(cold_box.OUTPUT_NAMES)
+CELLS = (8, 6, 12)  # of NEF1, NEF2, NEF34; the states are named in coldloop.process.cold_box
+
+
+class ColdBox(NamedTuple):
+    """Components and boundaries of the cold box, in SI units; `coldloop_plant.cold_box.plant_file` has the reference plant's."""
+
+    separator: PhaseSeparator
+    """The bath, NS1."""
+    jt_valve: Valve
+    """CV155."""
+    turbine: Turbine
+    """The turbine with CV156."""
+    nef1: HeatExchanger
+    """The coldest exchanger, between the bath and the mixing point."""
+    nef2: HeatExchanger
+    """The exchanger between the mixing point and the turbine's inlet."""
+    nef34: HeatExchanger
+    """The exchanger from the turbine's inlet up to the nitrogen pre-cooler."""
+    return_line: ReturnLine
+    """The low-pressure side."""
+    P_HP: float
+    """Supply pressure, Pa, 5e5 to 19e5; the reference is that of the isobar's table."""
+    P_LP: float
+    """Suction pressure of the compressor, Pa."""
+    T_in: float
+    """Temperature after the nitrogen pre-cooler, K."""
+
+
+class Streams(NamedTuple):
+    """Flows and pressures that follow from the state at once, before the exchangers are marched."""
+
+    m_jt: float
+    """Through the Joule-Thomson valve, kg/s."""
+    h_jt: float
+    """Enthalpy into the bath, J/kg."""
+    m_v: float
+    """Vapour from the bath, kg/s."""
+    m_t: float
+    """Through the turbine, kg/s."""
+    P_turbine: float
+    """Between CV156 and the nozzle, Pa."""
+    P_mix: float
+    """Where the turbine's exhaust joins the return, Pa."""
+    exhaust: Expansion
+    """What leaves the turbine."""
+
+
+@inlined
+def streams(x: Array, u: Array, box: ColdBox, helium: Helium) -> Streams:
+    """Return the flows at the state `x` under the inputs `u`."""
+    h_jt, rho_jt = supply_enthalpy_and_density(box.P_HP, x[1 + box.nef1.cells], helium)
+    m_jt = cold_valve_flow(box.jt_valve, u[0], x[1 + box.nef1.cells], rho_jt, box.P_HP, x[0])
+    T_turbine = x[1 + box.nef1.cells + box.nef2.cells + box.nef34.cells]
+    h_turbine, rho_turbine = supply_enthalpy_and_density(box.P_HP, T_turbine, helium)
+    m_t, P_turbine = turbine_flow(box.turbine, u[2], box.P_HP, T_turbine, rho_turbine)
+    thin = thinness(box.separator, x[0], x[1], helium)
+    m_v, P_mix = return_flow(box.return_line, x[0], box.P_LP, m_t, thin)
+    if P_mix.real > CRITICAL_RATIO * P_turbine.real:
+        back = Back(box.return_line, x[0], box.P_LP, thin)
+        m_t, P_turbine, m_v, P_mix = throttled_flow(box.turbine, u[2], box.P_HP, T_turbine, rho_turbine, back)
+    exhaust = expand(box.turbine, m_t, h_turbine, P_turbine, P_mix, helium)
+    return Streams(m_jt, h_jt, m_v, m_t, P_turbine, P_mix, exhaust)
+
+
+@inlined
+def mix(vapour: LowPressureFlow, s: Streams, helium: Helium) -> LowPressureFlow:
+    """Return the low-pressure flow after the turbine's exhaust has joined the vapour from NEF1."""
+    flow = s.m_v + s.m_t
+    h = (s.m_v * vapour.h + s.m_t * s.exhaust.h_out) / at_least(flow, 1e-12)
+    return LowPressureFlow(flow, s.P_mix, vapour_temperature(s.P_mix, h, saturation(s.P_mix, helium), helium), h)
+
+
+@kernel
+def evaluate(
+    x: Array, u: Array, w: float, box: ColdBox, helium: Helium, dx: Array, y: Array, is_supply_held: bool = True  # noqa: FBT001, FBT002 compiled
+) -> tuple[Streams, LowPressureFlow, float, Content]:  # fmt: skip
+    """Write the rates of the states into `dx` (28, per second) and the outputs into `y` (22, `OUTPUT_UNITS`).
+
+    If the supply is not held at constant pressure, in the place of the rates of the cells is the heat that they give to
+    the low-pressure gas (W). Returns the flows, what leaves at the warm end of the low-pressure side, what the bath's
+    relief valve blows into the recovery line (kg/s), and what the bath holds.
+    """
+    s = streams(x, u, box, helium)
+    first2 = 2 + box.nef1.cells
+    first34 = first2 + box.nef2.cells
+    sat = saturation(x[0], helium)
+    heat = at_least(u[1], 0.0) + w
+    top = outflow(box.separator, x[0], x[1], sat, helium)
+    relief = bath_relief(box.separator, x[0], top.rho)
+    bath = content(box.separator, x[0], x[1], helium)
+    dx[0], dx[1] = separate(bath, s.m_jt, s.h_jt, s.m_v + relief, top.h, heat)
+
+    vapour = LowPressureFlow(s.m_v, x[0], top.T, top.h)
+    into_nef1 = HighPressureFlow(s.m_jt, x[first34 - 1], box.P_HP)
+    cold = exchange(box.nef1, x[2:first2], into_nef1, vapour, helium, dx[2:first2], is_supply_held)
+    mixed = mix(cold, s, helium)
+    into_nef2 = HighPressureFlow(s.m_jt, x[first34 + box.nef34.cells - 1], box.P_HP)
+    middle = exchange(box.nef2, x[first2:first34], into_nef2, mixed, helium, dx[first2:first34], is_supply_held)
+    into_nef34 = HighPressureFlow(s.m_jt + s.m_t, box.T_in, box.P_HP)
+    warm = exchange(box.nef34, x[first34:], into_nef34, middle, helium, dx[first34:], is_supply_held)
+
+    exhaust_saturation = saturation(s.P_mix, helium)
+    y[0] = level(box.separator, x[1])
+    y[1] = s.exhaust.speed
+    y[2] = top.T
+    y[3] = x[first2 - 1]
+    y[4] = cold.T
+    y[5] = into_nef1.T
+    y[6] = vapour_temperature(s.P_mix, s.exhaust.h_out, exhaust_saturation, helium)
+    y[7] = into_nef2.T
+    y[8] = mixed.T
+    y[9] = middle.T
+    y[10] = box.T_in
+    y[11] = warm.T
+    _write_pressures(x[0], s, box, y[12:])
+    return s, warm, relief, bath
+
+
+@kernel
+def _write_pressures(P_bath: float, s: Streams, box: ColdBox, y: Array) -> None:
+    """Write P1 to P10, in bar."""
+    y[0] = P_bath / PA_PER_BAR
+    y[1] = box.P_HP / PA_PER_BAR
+    y[2] = s.P_mix / PA_PER_BAR
+    y[3] = box.P_HP / PA_PER_BAR
+    y[4] = s.P_mix / PA_PER_BAR
+    y[5] = s.P_turbine / PA_PER_BAR
+    y[6] = s.P_mix / PA_PER_BAR
+    y[7] = s.P_mix / PA_PER_BAR
+    y[8] = box.P_HP / PA_PER_BAR
+    y[9] = box.P_LP / PA_PER_BAR
+
+
+@kernel
+def derivative(x: Array, u: Array, w: float, box: ColdBox, helium: Helium) -> Array:
+    """Return dx/dt, shape (28,), in `STATE_UNITS` per second."""
+    dx = np.empty_like(x)
+    evaluate(x, u, w, box, helium, dx, np.empty(22, dtype=x.dtype))
+    return dx
+
+
+@kernel
+def outputs(x: Array, u: Array, w: float, box: ColdBox, helium: Helium) -> Array:
+    """Return y, shape (22,), in `OUTPUT_UNITS`."""
+    y = np.empty(22, dtype=x.dtype)
+    evaluate(x, u, w, box, helium, np.empty_like(x), y)
+    return y

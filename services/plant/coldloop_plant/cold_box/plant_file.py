@@ -1,0 +1,195 @@
+"""The plant file: the parameters of a cold box and its operating point, as a lab would write them down (TOML).
+
+Every key is optional; the defaults are the reference plant. Numbers of cells are no keys: they name the states.
+"""
+
+from typing import Annotated, Any, Final
+
+from coldloop.process.model_range import SATURATION_BAR, SUPPLY_BAR
+from coldloop_plant.cold_box.physics import CELLS, ColdBox
+from coldloop_plant.components.heat_exchanger import HeatExchanger
+from coldloop_plant.components.phase_separator import PhaseSeparator
+from coldloop_plant.components.return_line import ReturnLine
+from coldloop_plant.components.turbine import Turbine
+from coldloop_plant.components.valve import Valve
+from coldloop_plant.lab_units import Section, within
+
+LISTING: Final = "`coldloop docs your-refrigerator` lists the keys"
+
+HeatTransfer = Annotated[float, within(10, 200_000)]
+Litres = Annotated[float, within(0.1, 2000)]
+Mass = Annotated[float, within(0.1, 20_000)]
+Drop = Annotated[float, within(0.0001, 1)]
+Flow = Annotated[float, within(0.1, 5000)]
+
+OPERATING_INPUTS: Final = (43.0, 75.0, 36.0)  # CV155 %, NCR22_A W, CV156 %; left of the capacity maximum at 50 %
+OPERATING_LEVEL: Final = 60.0  # %
+
+
+class BathSection(Section):
+    """The phase separator NS1."""
+
+    volume_m3: Annotated[float, within(0.005, 10)] = 0.2
+    """Of the vessel; 1 % of level is a hundredth of it."""
+    wall_kg: Annotated[float, within(0.1, 10_000)] = 50.0
+    """Aluminium that warms when the vessel is dry."""
+    relief_pressure_bar: Annotated[float, within(*SATURATION_BAR)] = 1.8
+    """At which its relief valve begins to open."""
+    relief_span_bar: Annotated[float, within(0.01, 2)] = 0.3
+    """Rise above it at which that valve is fully open."""
+    relief_area_mm2: Annotated[float, within(1, 100_000)] = 400.0
+    """Its flow area then."""
+
+
+class JtValveSection(Section):
+    """The Joule-Thomson valve CV155."""
+
+    area_mm2: Annotated[float, within(0.05, 500)] = 3.9
+    """Effective flow area when fully open."""
+
+
+class TurbineSection(Section):
+    """The turbine and its inlet valve CV156."""
+
+    cv156_area_mm2: Annotated[float, within(0.5, 5000)] = 26.0
+    """Effective flow area of CV156 when fully open."""
+    nozzle_g_sqrt_k_per_s_bar: Annotated[float, within(0.5, 5000)] = 22.0
+    """K of the choked nozzle, m = K P / sqrt(T) with m in g/s, P in bar, T in K."""
+    efficiency: Annotated[float, within(0.2, 0.95)] = 0.7
+    """Isentropic."""
+    speed_hz_per_sqrt_j_per_kg: Annotated[float, within(0.1, 100)] = 10.0
+    """Shaft speed over the square root of the isentropic enthalpy drop."""
+    windage_g_per_s: Annotated[float, within(0.1, 1000)] = 15.0
+    """Flow below which windage takes work."""
+
+
+class ExchangerSection(Section):
+    """A counter-flow exchanger."""
+
+    ua_w_per_k: HeatTransfer
+    """Heat transfer coefficient times area."""
+    volume_l: Litres
+    """Of the high-pressure passes."""
+    aluminium_kg: Mass
+    """Of the walls."""
+
+    def component(self, cells: int) -> HeatExchanger:
+        """Return the exchanger in SI units."""
+        conductance, volume, aluminium = self.si
+        return HeatExchanger(conductance, volume, aluminium, cells)
+
+
+class Nef1Section(ExchangerSection):
+    """The coldest exchanger, between the bath and the mixing point."""
+
+    ua_w_per_k: HeatTransfer = 1400.0
+    volume_l: Litres = 6.0
+    aluminium_kg: Mass = 15.0
+
+
+class Nef2Section(ExchangerSection):
+    """The exchanger between the mixing point and the turbine's inlet."""
+
+    ua_w_per_k: HeatTransfer = 2500.0
+    volume_l: Litres = 6.0
+    aluminium_kg: Mass = 15.0
+
+
+class Nef34Section(ExchangerSection):
+    """The exchanger from the turbine's inlet up to the nitrogen pre-cooler."""
+
+    ua_w_per_k: HeatTransfer = 11_000.0
+    volume_l: Litres = 30.0
+    aluminium_kg: Mass = 80.0
+
+
+class ReturnLineSection(Section):
+    """The low-pressure side, by a pressure drop at a flow for each half; drops go with the square of the flow."""
+
+    cold_drop_bar: Drop = 0.05
+    """From the bath to the mixing point,"""
+    cold_flow_g_per_s: Flow = 28.0
+    """with this flow."""
+    warm_drop_bar: Drop = 0.06
+    """From the mixing point to the compressor,"""
+    warm_flow_g_per_s: Flow = 73.0
+    """with this flow."""
+
+
+class BoundariesSection(Section):
+    """What the cold box is given."""
+
+    p_hp_bar: Annotated[float, within(*SUPPLY_BAR)] = 16.0
+    """Supply pressure."""
+    p_lp_bar: Annotated[float, within(SATURATION_BAR[0], 2)] = 1.05
+    """Suction pressure of the compressor."""
+    t_in_k: Annotated[float, within(30, 300)] = 80.0
+    """Temperature after the nitrogen pre-cooler."""
+
+
+class OperatingPointSection(Section):
+    """Where the plant is at rest, and its model linear."""
+
+    cv155_pct: Annotated[float, within(0, 100)] = OPERATING_INPUTS[0]
+    ncr22_a_w: Annotated[float, within(0, 1000)] = OPERATING_INPUTS[1]
+    cv156_pct: Annotated[float, within(0, 100)] = OPERATING_INPUTS[2]
+    level_pct: Annotated[float, within(5, 95)] = OPERATING_LEVEL
+    """L1; the load is what the box then cools beside its heater."""
+
+    @property
+    def inputs(self) -> tuple[float, float, float]:
+        """CV155 %, NCR22_A W, CV156 %."""
+        return (self.cv155_pct, self.ncr22_a_w, self.cv156_pct)
+
+
+class BoxParameters(Section):
+    """The parameters of a cold box."""
+
+    bath: BathSection = BathSection()
+    cv155: JtValveSection = JtValveSection()
+    turbine: TurbineSection = TurbineSection()
+    nef1: Nef1Section = Nef1Section()
+    nef2: Nef2Section = Nef2Section()
+    nef34: Nef34Section = Nef34Section()
+    return_line: ReturnLineSection = ReturnLineSection()
+    boundaries: BoundariesSection = BoundariesSection()
+
+    @property
+    def box(self) -> ColdBox:
+        """The cold box, in SI units."""
+        cv156, *turbine = self.turbine.si
+        cold_drop, cold_flow, warm_drop, warm_flow = self.return_line.si
+        supply, suction, T_in = self.boundaries.si
+        return ColdBox(
+            separator=PhaseSeparator(*self.bath.si),
+            jt_valve=Valve(*self.cv155.si),
+            turbine=Turbine(Valve(cv156), *turbine),
+            nef1=self.nef1.component(CELLS[0]),
+            nef2=self.nef2.component(CELLS[1]),
+            nef34=self.nef34.component(CELLS[2]),
+            return_line=ReturnLine(cold_drop / cold_flow**2, warm_drop / warm_flow**2),
+            P_HP=supply,
+            P_LP=suction,
+            T_in=T_in,
+        )
+
+
+REFERENCE: Final = BoxParameters().box
+
+
+class PlantFile(BoxParameters):
+    """A cold box and its operating point."""
+
+    operating_point: OperatingPointSection = OperatingPointSection()
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """What a model file says of the plant; nothing where it is the reference plant."""
+        return {} if self.box == REFERENCE else self.model_dump(exclude={"operating_point"})
+
+    def scaled(self, key: str, factor: float) -> ColdBox:
+        """Return the cold box with one parameter, such as `nef1.ua_w_per_k`, multiplied by a factor."""
+        section, _, name = key.partition(".")
+        part = getattr(self, section)
+        changed = part.model_copy(update={name: factor * getattr(part, name)})
+        return self.model_copy(update={section: changed}).box

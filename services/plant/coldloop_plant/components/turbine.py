@@ -1,0 +1,161 @@
+"""Expansion turbine: an inlet valve in series with a nozzle, and an expansion of fixed efficiency.
+
+In operation the nozzle is choked and the pressure behind it does not count. Near a standstill it does: the flow follows
+the pressure ratio, never uphill (`throttled_flow`), and windage takes what little work the gas does.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from coldloop.kernels.compiled import inlined, kernel
+from coldloop_plant.components.gas_valve import CHOKED, CRITICAL_RATIO, expansion
+from coldloop_plant.components.return_line import ReturnLine, return_flow
+from coldloop_plant.components.valve import Valve, effective_area
+from coldloop_plant.helium.properties import Helium, enthalpy_after_isentropic_expansion, entropy_before_expansion
+from coldloop_plant.numeric import at_least, at_most
+
+BISECTIONS = 40
+SHUT = 1e-12  # m2, of a valve that passes less than 2e-5 g/s
+SMALL_FLOW, SMALL_PRESSURE = 1e-9, 1.0  # kg/s and Pa, of difference quotients
+
+
+class Turbine(NamedTuple):
+    """A turbine and its inlet valve."""
+
+    inlet_valve: Valve
+    """The valve that throttles the gas before the nozzle."""
+    nozzle: float
+    """Kt of the choked nozzle, m = Kt P / sqrt(T), in kg sqrt(K)/(s Pa)."""
+    efficiency: float
+    """Isentropic efficiency, 0 to 1."""
+    speed_coefficient: float
+    """Shaft speed over the square root of the isentropic enthalpy drop, Hz/sqrt(J/kg)."""
+    windage_flow: float
+    """Flow (kg/s) below which windage takes the work: in proportion less of it reaches the brake."""
+
+
+class Back(NamedTuple):
+    """What the exhaust meets."""
+
+    line: ReturnLine
+    P_bath: float
+    """Pa."""
+    P_suction: float
+    """Pa."""
+    thinness: float
+    """Of the vapour, see `return_flow`."""
+
+
+class Expansion(NamedTuple):
+    """What the turbine makes of the gas."""
+
+    h_out: float
+    """Enthalpy of the exhaust, J/kg."""
+    speed: float
+    """Shaft speed, Hz."""
+
+
+@inlined
+def turbine_flow(turbine: Turbine, opening: float, P_supply: float, T_in: float, density: float) -> tuple[float, float]:
+    """Return the mass flow (kg/s) and the pressure between valve and nozzle (Pa).
+
+    The flow m solves valve and choked nozzle together: m^2 + b m - c P_supply = 0, with c = 2 rho (K u)^2 and
+    b = c sqrt(T)/Kt. `density` (kg/m3) is that of the supply, at `P_supply` (Pa) and `T_in` (K); `opening` in %.
+    A valve that leaves less than the critical share of the supply pressure is choked and passes no more.
+    """
+    area = effective_area(turbine.inlet_valve, opening)
+    root = np.sqrt(T_in) / turbine.nozzle
+    c = 2.0 * density * area * area
+    b = c * root
+    flow = 0.5 * (np.sqrt(b * b + 4.0 * c * P_supply) - b)
+    if (flow * root).real < CRITICAL_RATIO * P_supply.real:
+        flow = np.sqrt((1.0 - CRITICAL_RATIO) * c * P_supply)
+    return flow, flow * root
+
+
+@kernel
+def throttled_flow(
+    turbine: Turbine, opening: float, P_supply: float, T_in: float, density: float, back: Back
+) -> tuple[float, float, float, float]:
+    """Return the flow through a turbine whose nozzle is not choked, and what it makes of the pressures.
+
+    The flow lies between none and what the valve passes when it is choked; it raises the pressure behind the nozzle and
+    lowers that before it. Where the nozzle passes all that a choked valve does, the pressure between them is as low as
+    it needs for that. Bisection, and a last step of Newton's method that carries derivatives.
+
+    Returns:
+        m (kg/s), the pressure between valve and nozzle (Pa), the vapour's flow (kg/s), the mixing pressure (Pa).
+    """
+    area = effective_area(turbine.inlet_valve, opening)
+    none = 0.0 * (P_supply + T_in + density + back.P_bath + back.P_suction + area)
+    c = 2.0 * density * area * area + none
+    if area.real < SHUT:
+        m_v, P_mix = return_flow(back.line, back.P_bath, back.P_suction, none, back.thinness)
+        return none, P_mix + none, m_v + none, P_mix + none
+    choked = np.sqrt((1.0 - CRITICAL_RATIO) * c * P_supply)
+    excess, _, m_v, P_mix = _flow_excess(turbine, c, choked, P_supply, T_in, back)
+    if excess.real < 0.0:
+        P_between = _nozzle_inlet(turbine, choked, P_mix, CRITICAL_RATIO * P_supply, T_in)
+        return choked, P_between, m_v + none, P_mix + none
+    low, high = 0.0, choked.real
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        excess, _, _, _ = _flow_excess(turbine, c, middle + none, P_supply, T_in, back)
+        if excess.real > 0.0:
+            high = middle
+        else:
+            low = middle
+    flow = 0.5 * (low + high) + none
+    excess, _, _, _ = _flow_excess(turbine, c, flow, P_supply, T_in, back)
+    further, _, _, _ = _flow_excess(turbine, c, flow + SMALL_FLOW, P_supply, T_in, back)
+    flow -= excess * SMALL_FLOW / at_least(further.real - excess.real, 1e-3 * SMALL_FLOW)
+    flow = at_most(at_least(flow, 0.0), choked)
+    _, P_between, m_v, P_mix = _flow_excess(turbine, c, flow, P_supply, T_in, back)
+    return flow, P_between + none, m_v + none, P_mix + none
+
+
+@kernel
+def _flow_excess(
+    turbine: Turbine, c: float, flow: float, P_supply: float, T_in: float, back: Back
+) -> tuple[float, float, float, float]:
+    """Return by how much a flow is more than what the nozzle passes (kg/s), and what `throttled_flow` returns."""
+    P_between = at_least(P_supply - flow * flow / c, 0.0)
+    m_v, P_mix = return_flow(back.line, back.P_bath, back.P_suction, flow, back.thinness)
+    return flow - _nozzle_flow(turbine, P_between, P_mix, T_in), P_between, m_v, P_mix
+
+
+@inlined
+def _nozzle_flow(turbine: Turbine, P_in: float, P_out: float, T_in: float) -> float:
+    """Return what the nozzle passes between two pressures (kg/s)."""
+    ratio = at_most(P_out / at_least(P_in, 1.0), 1.0)
+    flow: float = turbine.nozzle * P_in / np.sqrt(T_in) * expansion(ratio) / CHOKED
+    return flow
+
+
+@kernel
+def _nozzle_inlet(turbine: Turbine, flow: float, P_out: float, highest: float, T_in: float) -> float:
+    """Return the pressure (Pa, `highest` or less) with which the nozzle passes a flow (kg/s)."""
+    low, high = P_out.real, highest.real
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        if _nozzle_flow(turbine, middle + 0.0 * P_out, P_out, T_in).real > flow.real:
+            high = middle
+        else:
+            low = middle
+    P_in = 0.5 * (low + high) + 0.0 * (flow + P_out + highest + T_in)
+    passed = _nozzle_flow(turbine, P_in, P_out, T_in)
+    further = _nozzle_flow(turbine, P_in + SMALL_PRESSURE, P_out, T_in)
+    return P_in + (flow - passed) * SMALL_PRESSURE / at_least(further.real - passed.real, 1e-12)
+
+
+@inlined
+def expand(turbine: Turbine, flow: float, h_in: float, P_in: float, P_out: float, helium: Helium) -> Expansion:
+    """Return exhaust and speed for gas at `h_in` (J/kg) that expands from `P_in` to `P_out` (Pa), `flow` in kg/s.
+
+    A turbine whose valve shuts does no work: the drop never falls below zero. With little flow the wheel turns slowly.
+    """
+    h_isentropic = enthalpy_after_isentropic_expansion(P_out, entropy_before_expansion(P_in, h_in, helium), helium)
+    drop = at_least(h_in - h_isentropic, 0.0)
+    share = at_most(flow / turbine.windage_flow, 1.0)
+    return Expansion(h_in - turbine.efficiency * share * drop, turbine.speed_coefficient * np.sqrt(share * drop))

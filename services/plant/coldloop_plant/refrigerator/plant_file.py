@@ -1,0 +1,229 @@
+"""The plant file of a whole refrigerator: the cold box's sections, with those of its pre-cooler and its station.
+
+Every key is optional; the defaults are the reference plant. A plant file with one of these sections is that of a
+refrigerator. `boundaries` are then its pressures at rest, and the temperature from which the search begins.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from coldloop.config import load_configuration
+from coldloop.errors import ConfigurationError
+from coldloop.process.limits import InputLimits
+from coldloop_plant.cold_box.plant_file import LISTING, BoxParameters, ExchangerSection, HeatTransfer, Litres, PlantFile
+from coldloop_plant.components.actuator import Actuator
+from coldloop_plant.components.gas_valve import ReliefValve
+from coldloop_plant.components.gas_volume import GasVolume
+from coldloop_plant.components.nitrogen_bath import NitrogenBath
+from coldloop_plant.components.screw_compressor import ScrewCompressor
+from coldloop_plant.components.valve import Valve
+from coldloop_plant.lab_units import Section, within
+from coldloop_plant.refrigerator.compression_station import CompressionStation
+from coldloop_plant.refrigerator.physics import Refrigerator
+from coldloop_plant.refrigerator.precooler import NEF6_CELLS, Precooler
+
+CubicMetres = Annotated[float, within(0.05, 1000)]
+Area = Annotated[float, within(0.05, 100_000)]
+ReliefPressure = Annotated[float, within(1.01, 50)]
+ReliefSpan = Annotated[float, within(0.01, 10)]
+Lag = Annotated[float, within(0.5, 1000)]
+Speed = Annotated[float, within(0.1, 1000)]
+Share = Annotated[float, within(0.05, 1)]
+
+
+class Nef6Section(ExchangerSection):
+    """The exchanger from ambient temperature to the nitrogen bath."""
+
+    ua_w_per_k: HeatTransfer = 21_500.0
+    volume_l: Litres = 40.0
+    aluminium_kg: Annotated[float, within(0.1, 20_000)] = 150.0
+
+
+class Nef5Section(Section):
+    """The nitrogen bath with its feed valve CV167."""
+
+    ua_w_per_k: Annotated[float, within(1, 100_000)] = 336.44
+    """Of the wetted coil."""
+    volume_l: Litres = 30.0
+    """Of the vessel."""
+    wet_level_pct: Annotated[float, within(1, 100)] = 25.0
+    """Level above which the whole coil is wet."""
+    capacity_kj_per_k: Annotated[float, within(0.1, 10_000)] = 20.0
+    """Of the coil and the helium in it."""
+    cv167_area_mm2: Annotated[float, within(0.01, 1000)] = 1.3
+    """Effective flow area of CV167 when fully open."""
+    cv167_lag_s: Lag = 2.0
+    """Time constant of its drive."""
+    cv167_fastest_pct_per_s: Speed = 10.0
+    """Largest speed of its drive."""
+
+
+class CompressorSection(Section):
+    """A screw compressor with its motor."""
+
+    displacement_l_per_s: Annotated[float, within(0.1, 50_000)] = 380.0
+    """Swept volume at full speed."""
+    filling: Share = 0.92
+    """Volumetric efficiency without a pressure rise."""
+    slip: Annotated[float, within(0, 0.1)] = 0.006
+    """Loss of it per unit of pressure ratio."""
+    isothermal_efficiency: Annotated[float, within(0.2, 1)] = 0.55
+    """At the built-in pressure ratio."""
+    built_in_ratio: Annotated[float, within(1.1, 100)] = 10.0
+    """That the rotors' ports are made for."""
+    mismatch: Annotated[float, within(0, 1)] = 0.05
+    """Loss of isothermal efficiency per squared logarithm of the ratio over the built-in one."""
+    motor_efficiency: Share = 0.95
+
+
+class StationSection(Section):
+    """Volumes, valves and cooler of the compression station."""
+
+    hp_volume_m3: CubicMetres = 2.0
+    """Of the high-pressure line."""
+    lp_volume_m3: CubicMetres = 1.5
+    """Of the low-pressure line."""
+    buffer_volume_m3: CubicMetres = 20.0
+    """Of the medium-pressure vessel."""
+    buffer_bar: Annotated[float, within(1, 20)] = 6.0
+    """Its pressure at rest."""
+    cv956_area_mm2: Area = 34.0
+    """Effective flow area when fully open of the bypass,"""
+    cv952_area_mm2: Area = 20.0
+    """of the valve from the high-pressure line to the buffer,"""
+    cv953_area_mm2: Area = 40.0
+    """and of that from the buffer to the low-pressure line."""
+    valve_lag_s: Lag = 1.0
+    """Time constant of the drives of these three."""
+    valve_fastest_pct_per_s: Speed = 20.0
+    """Largest speed of these drives."""
+    cooler_approach_k: Annotated[float, within(0, 50)] = 5.0
+    """By how much the compressed gas is warmer than the surroundings."""
+    run_up_s: Lag = 6.0
+    """Time constant of a compressor that starts,"""
+    run_down_s: Lag = 1.5
+    """and of one that stops."""
+
+
+class ReliefSection(Section):
+    """A relief valve into the atmosphere."""
+
+    pressure_bar: ReliefPressure
+    """At which it begins to open."""
+    span_bar: ReliefSpan
+    """Rise above it at which it is fully open."""
+    area_mm2: Area
+    """Effective flow area then."""
+
+    @property
+    def component(self) -> ReliefValve:
+        """The valve, in SI units."""
+        pressure, span, area = self.si
+        return ReliefValve(pressure, span, Valve(area))
+
+
+class HpReliefSection(ReliefSection):
+    """That of the high-pressure line."""
+
+    pressure_bar: ReliefPressure = 18.0
+    span_bar: ReliefSpan = 1.0
+    area_mm2: Area = 120.0
+
+
+class LpReliefSection(ReliefSection):
+    """That of the low-pressure line."""
+
+    pressure_bar: ReliefPressure = 1.5
+    span_bar: ReliefSpan = 0.2
+    area_mm2: Area = 2500.0
+
+
+class BufferReliefSection(ReliefSection):
+    """That of the buffer."""
+
+    pressure_bar: ReliefPressure = 13.0
+    span_bar: ReliefSpan = 1.0
+    area_mm2: Area = 100.0
+
+
+class RefrigeratorParameters(BoxParameters):
+    """The parameters of a refrigerator."""
+
+    nef6: Nef6Section = Nef6Section()
+    nef5: Nef5Section = Nef5Section()
+    nc1: CompressorSection = CompressorSection()
+    nc2: CompressorSection = CompressorSection()
+    station: StationSection = StationSection()
+    hp_relief: HpReliefSection = HpReliefSection()
+    lp_relief: LpReliefSection = LpReliefSection()
+    buffer_relief: BufferReliefSection = BufferReliefSection()
+
+    @property
+    def refrigerator(self) -> Refrigerator:
+        """The refrigerator, in SI units."""
+        return Refrigerator(self.box, self._precooler, self._station)
+
+    @property
+    def _precooler(self) -> Precooler:
+        conductance, volume, wet_level, capacity, area, lag, fastest = self.nef5.si
+        bath = NitrogenBath(conductance, volume, wet_level, capacity, Valve(area))
+        return Precooler(self.nef6.component(NEF6_CELLS), bath, Actuator(lag, fastest))
+
+    @property
+    def _station(self) -> CompressionStation:
+        hp, lp, buffer, _, bypass, discharge, charge, lag, fastest, *rest = self.station.si
+        return CompressionStation(
+            GasVolume(hp), GasVolume(lp), GasVolume(buffer),
+            ScrewCompressor(*self.nc1.si), ScrewCompressor(*self.nc2.si),
+            Valve(bypass), Valve(discharge), Valve(charge), Actuator(lag, fastest),
+            self.hp_relief.component, self.lp_relief.component, self.buffer_relief.component, *rest,
+        )  # fmt: skip
+
+
+REFERENCE_REFRIGERATOR: Final = RefrigeratorParameters().refrigerator
+
+
+class RefrigeratorPlantFile(RefrigeratorParameters, PlantFile):
+    """A refrigerator and its operating point."""
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """What a model file says of the plant; nothing where it is the reference plant."""
+        own = self.refrigerator == REFERENCE_REFRIGERATOR
+        return {} if own else self.model_dump(exclude={"operating_point"})
+
+
+WARM_SECTIONS: Final = set(RefrigeratorParameters.model_fields) - set(BoxParameters.model_fields)
+"""Sections that a cold box's file has not."""
+
+
+def read_plant_file(path: Path, limits: InputLimits, *, whole: bool = False) -> PlantFile:
+    """Return what a plant file says: of a refrigerator if it has one of its sections, or if `whole` is set.
+
+    Raises:
+        ConfigurationError: As `read_refrigerator`.
+    """
+    file = read_refrigerator(path, limits)
+    if whole or WARM_SECTIONS & file.model_fields_set:
+        return file
+    return PlantFile.model_validate(file.model_dump(include=set(PlantFile.model_fields)))
+
+
+def read_refrigerator(path: Path, limits: InputLimits) -> RefrigeratorPlantFile:
+    """Return what a plant file says of a refrigerator; what it leaves out is as in the reference plant.
+
+    Raises:
+        ConfigurationError: One line: the file cannot be read, a key is unknown or out of range, or the operating point
+            is outside the limits of the inputs.
+    """
+    file = load_configuration(
+        RefrigeratorPlantFile, file=path, environment={}, option="--plant", listing=LISTING
+    ).settings
+    inputs = file.operating_point.model_dump(exclude={"level_pct"})
+    for (key, value), low, high in zip(inputs.items(), limits.low, limits.high, strict=True):
+        if not low <= value <= high:
+            raise ConfigurationError(
+                f"{path}: operating_point.{key}: {value:g} is outside the limits of this input, {low:g} to {high:g};"
+                " take a value within, or change limits.low and limits.high"
+            )
+    return file
