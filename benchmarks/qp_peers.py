@@ -1,7 +1,7 @@
 """PIQP, ProxQP, Clarabel and QPALM on the controller's problems, cut off after a number of iterations.
 
-All but ProxQP are the outside solvers of these names (`coldloop_optimizer_plc/solvers/outside_libraries.py`). ProxQP, an
-augmented Lagrangian method, gets the same problems with soft rows and begins at the guess; an iteration of it is one
+All but ProxQP are the outside solvers of these names (`coldloop_optimizer_plc/solvers/outside_libraries.py`). ProxQP,
+an augmented Lagrangian method, gets the same problems with soft rows and begins at the guess; an iteration of it is one
 Newton step in one outer iteration. What comes back is projected into the box and judged by J. Optional:
 `pip install -r benchmarks/qp_peers.txt`, and `pip install 'coldloop[qpalm]'`.
 """

@@ -155,10 +155,10 @@ def transfer_functions() -> None:
 def run_modules() -> None:
     """Import what a run needs besides kernels, so that its bytecode is written."""
     for module in (
-        "coldloop_control_plc.runtime", "coldloop_rig.cli", "coldloop_rig.cli.commands.run", "coldloop_rig.runs.running", "coldloop_rig.cosim.networked_run",
-        "coldloop_rig.cosim.one_process", "coldloop_rig.progress", "coldloop_rig.figures.worker", "coldloop_rig.figures.run_plot",
+        "control_plc.runtime", "rig.cli", "rig.cli.commands.run", "rig.runs.running", "rig.cosim.networked_run",
+        "rig.cosim.one_process", "rig.progress", "rig.figures.worker", "rig.figures.run_plot",
     ):  # fmt: skip
-        import_module(module)
+        import_module(f"coldloop_{module}")
 
 
 def all_modules() -> None:

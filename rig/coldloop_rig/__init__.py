@@ -14,4 +14,4 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401 whatever it is
         from coldloop_rig.runs import simulation  # noqa: PLC0415
 
         return getattr(simulation, name)
-    raise AttributeError(f"module 'rig' has no attribute {name!r}")
+    raise AttributeError(f"module '{__name__}' has no attribute {name!r}")

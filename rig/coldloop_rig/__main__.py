@@ -1,4 +1,4 @@
-"""The command `coldloop`, and `python -m coldloop_rig`: interrupts end it in good order also while its modules are imported."""
+"""The command `coldloop`; interrupts end it in good order also while its modules are imported."""
 
 import gc
 import io

@@ -6,6 +6,8 @@ from typing import Final
 
 from coldloop.errors import ColdloopError, ModelFileError, RunInterruptedError
 
+RENAMED: Final = frozenset({"plant", "control_plc", "optimizer_plc", "hmi", "rig"})
+"""Packages that begin with `coldloop_` since version 0.4."""
 MOST_SAID: Final = 2000
 """Characters of what that code says in a message."""
 
@@ -30,6 +32,8 @@ def foreign(
 
 def _text(error: BaseException) -> str:
     try:
-        return str(error)
-    except Exception:  # noqa: BLE001 of others, too
+        said = str(error)
+    except Exception:  # noqa: BLE001 code of others, too
         return ""
+    package = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
+    return f"{said}: its name is coldloop_{package} since version 0.4" if package in RENAMED else said

@@ -44,6 +44,7 @@ class SpeechlessError(Exception):
         (ValueError("\x1b[2J\r"), r"rule: ValueError: \\x1b\[2J"),
         (MemoryError(), "rule: MemoryError"),
         (StopIteration(3), "rule: StopIteration: 3"),
+        (ModuleNotFoundError("No module named 'rig'", name="rig"), ".*: its name is coldloop_rig since version 0.4"),
     ],
     ids=lambda one: type(one).__name__ if isinstance(one, BaseException) else "",
 )

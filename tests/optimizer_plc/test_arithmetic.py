@@ -42,7 +42,7 @@ def test_no_kernel_computes_with_a_double_in_single_precision(processes: Process
     program = f"from tests.optimizer_plc.single_precision import main; main({names})"
     called, faults = json.loads(processes.run_python(program)[0])
     assert not faults
-    assert set(called) >= {f"optimizer_plc.{name}" for name in ON_LINE}
+    assert set(called) >= {f"coldloop_optimizer_plc.{name}" for name in ON_LINE}
     assert called.count("coldloop_optimizer_plc.scheme.solve") == len({solver for solver, _ in cases}), (
         "one method a solver"
     )

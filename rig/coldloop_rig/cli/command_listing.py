@@ -1,4 +1,4 @@
-"""All commands and their options as Markdown; `docs/commands.md` is made of it: `python -m coldloop_rig.cli.command_listing`."""
+"""All commands and their options as Markdown: `python -m coldloop_rig.cli.command_listing` makes `docs/commands.md`."""
 
 import argparse
 import sys

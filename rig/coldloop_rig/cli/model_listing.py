@@ -54,7 +54,7 @@ def describe_model(
         control: Of a refrigerator's pressures; its weights decide the gains.
 
     Raises:
-        coldloop_plant.cold_box.equilibrium.NoEquilibriumError: The plant does not come to rest there; one line that says why.
+        NoEquilibriumError: The plant does not come to rest there; one line that says why.
     """
     helium = load_helium()
     if isinstance(plant, RefrigeratorPlantFile):

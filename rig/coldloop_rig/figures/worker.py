@@ -1,6 +1,6 @@
 """The figure of a run, drawn by a separate process: matplotlib is loaded during the run, on another core.
 
-python -m coldloop_rig.figures.worker < (folder and formats as JSON): an error is one line on standard error, as of any command
+python -m coldloop_rig.figures.worker < (folder and formats as JSON): an error is one line on standard error
 """
 
 import gc

@@ -22,16 +22,17 @@ SLIPS = TOLERANCES.with_name("slips.md")
 TITLE = "Coldloop: the paper, figure by figure"
 QUICK = "**A quick run: ten minutes a run and one draw. Its verdicts say that it works, not more.**"
 READING = (
-    "Tolerances were set before the runs (`rig/coldloop_rig/report/tolerances.toml`): {changed} of these {counted} claims and aims "
-    "were added or changed after a report, and {withdrawn} were withdrawn, which is listed below with date and reason. "
-    "The paper's numbers are computed from the points of its figures by the same formulas as ours. Ours are the mean "
-    "over the draws, its 95 % interval (`rig/coldloop_rig/studies/intervals.py`), and the range of the draws. A claim is reproduced "
-    "if this interval is within the tolerance, or its only value; until 2026-11-23 all draws had to be. "
-    "Weights, loads and operating point are this project's own, for the paper leaves them open: costs are compared as "
-    "ratios. The load of the solver comparison was chosen after the tolerances, by a few hours of several families, so"
-    " that throttled qpOASES predicts violations as large as in the paper (c1) and converged qpOASES pays more for "
-    "violation than for deviation: what depends on that is marked as calibrated. Checks (arithmetic, or fitted to the "
-    "paper's own numbers) and variants (milder forms of a claim) are in a table of their own and do not count."
+    "Tolerances were set before the runs (`rig/coldloop_rig/report/tolerances.toml`): {changed} of these {counted} "
+    "claims and aims were added or changed after a report, and {withdrawn} were withdrawn, which is listed below with "
+    "date and reason. The paper's numbers are computed from the points of its figures by the same formulas as ours. "
+    "Ours are the mean over the draws, its 95 % interval (`rig/coldloop_rig/studies/intervals.py`), and the range of "
+    "the draws. A claim is reproduced if this interval is within the tolerance, or its only value; until 2026-11-23 "
+    "all draws had to be. Weights, loads and operating point are this project's own, for the paper leaves them open: "
+    "costs are compared as ratios. The load of the solver comparison was chosen after the tolerances, by a few hours "
+    "of several families, so that throttled qpOASES predicts violations as large as in the paper (c1) and converged "
+    "qpOASES pays more for violation than for deviation: what depends on that is marked as calibrated. Checks "
+    "(arithmetic, or fitted to the paper's own numbers) and variants (milder forms of a claim) are in a table of their "
+    "own and do not count."
 )
 
 

@@ -1,4 +1,4 @@
-"""A solver and the problems of a converged loop, one after the other: what `coldloop_rig.studies.paper.open_loop` compares."""
+"""A solver and the problems of a converged loop, one after the other, which `studies.paper.open_loop` compares."""
 
 import math
 from typing import Any, Final

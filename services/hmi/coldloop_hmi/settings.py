@@ -55,7 +55,8 @@ class LoginSettings(BaseModel):
     """Who may do what.
 
     Args:
-        users: File with a line `name:role:hash` for each user; `python -m coldloop_hmi.users` writes it. None: no operators.
+        users: File with a line `name:role:hash` for each user; `python -m coldloop_hmi.users` writes it. None: no
+            operators.
         anonymous_view: Everybody who reaches the page may look at it; only commands need a login.
         idle_minutes: A session without a request for so long ends.
         longest_minutes: Every session ends after this time.

@@ -1,6 +1,7 @@
 """Users of the page, their roles and the hashes of their passwords.
 
-`python -m coldloop_hmi.users FILE NAME view|operate` asks for a password, or reads it from standard input, and writes a line.
+`python -m coldloop_hmi.users FILE NAME view|operate` asks for a password, or reads it from standard input, and writes
+a line.
 """
 
 import argparse

@@ -58,8 +58,8 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
     if section.station.control is StationControlKind.LQ and section.station.weights != file.weights:
         raise ConfigurationError(
             "plant.station.weights: the gains of this refrigerator belong to other weights; make a file with"
-            " `python -m coldloop_plant.refrigerator.model FILE` and name it in plant.refrigerator.file, or, with a plant file,"
-            " its model file with `coldloop model --plant` and these weights"
+            " `python -m coldloop_plant.refrigerator.model FILE` and name it in plant.refrigerator.file, or, with a"
+            " plant file, its model file with `coldloop model --plant` and these weights"
         )
     return partial(_make_refrigerator, header, section, plant, file)
 

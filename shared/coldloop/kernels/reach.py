@@ -1,6 +1,7 @@
 """Digests of code by what it reaches: the functions, classes and data that it names, recursively.
 
-Kernels, gains and outcomes of studies are kept under such digests (`coldloop.kernels.compiled`, `coldloop_rig.studies.request`).
+Kernels, gains and outcomes of studies are kept under such digests (`coldloop.kernels.compiled`,
+`coldloop_rig.studies.request`).
 A digest is the same in every process and wherever the files are; it changes with whatever may change what the code
 does, and not with docstrings, comments or code that is not reached. `coldloop.kernels.description` says what counts.
 

@@ -2,7 +2,7 @@
 
 z holds, knot by knot, the inputs (deviations from the operating point over `input_scale`) and then, knot by knot, the
 slacks of the output bands. phi and gamma are affine in the predicted state, the load and the input applied
-before the first knot; Phi and Gamma are constant. There is no factor 1/2 before Phi (`rig/coldloop_rig/report/slips.md`, 11).
+before the first knot; Phi and Gamma are constant. There is no factor 1/2 before Phi (`report/slips.md`, 11).
 """
 
 from typing import Final, NamedTuple

@@ -1,4 +1,4 @@
-"""The model file's maker: `python -m coldloop_plant.cold_box.model FILE` writes the linear model of the reference cold box.
+"""The model file's maker: `python -m coldloop_plant.cold_box.model FILE` writes the model of the reference cold box.
 
 `coldloop model --plant` makes that of another one.
 """

@@ -39,7 +39,7 @@ CELLS = (8, 6, 12)  # of NEF1, NEF2, NEF34; the states are named in coldloop.pro
 
 
 class ColdBox(NamedTuple):
-    """Components and boundaries of the cold box, in SI units; `coldloop_plant.cold_box.plant_file` has the reference plant's."""
+    """Components and boundaries of the cold box, in SI units; `cold_box.plant_file` has the reference plant's."""
 
     separator: PhaseSeparator
     """The bath, NS1."""

@@ -1,7 +1,7 @@
 """The refrigerator's file: its operating point and the gains of its LQ controller, made off line.
 
-`python -m coldloop_plant.refrigerator.model FILE` makes it. Like the model file it is JSON with its own digest, so that every
-run, on any machine, begins with the same bits.
+`python -m coldloop_plant.refrigerator.model FILE` makes it. Like the model file it is JSON with its own digest, so that
+every run, on any machine, begins with the same bits.
 """
 
 import hashlib

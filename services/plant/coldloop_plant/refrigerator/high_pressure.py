@@ -1,7 +1,7 @@
 """The high-pressure side: the line and, at the same pressure, the passes of NEF6, NEF34, NEF2 and NEF1.
 
 Its helium is one state, so what enters and leaves is what it holds, to rounding; the pressure follows from it and from
-the temperatures. `coldloop_plant.components.passes` has the equations of the cells. NEF5's coil lies between NEF6 and NEF34; the
+the temperatures. `components.passes` has the equations of the cells. NEF5's coil lies between NEF6 and NEF34; the
 helium in it belongs to its heat capacity, it has no volume.
 
 The heats of the cold box are those of the flows at the cold ends, towards CV155 and CV156, on which only depends how
@@ -83,7 +83,7 @@ class Held(NamedTuple):
     mass: Array
     """Cubic of the mass in all passes in bar from 16 bar, kg, shape (4,)."""
     cells: Array
-    """Columns of `coldloop_plant.components.passes`, shape (states up to the coil, 12)."""
+    """Columns of `components.passes`, shape (states up to the coil, 12)."""
 
 
 class Filling(NamedTuple):
@@ -105,7 +105,7 @@ class Gains(NamedTuple):
     """What the cells held at the start of a step, and the sums of their weighted gains over its stages."""
 
     start: Array
-    """Columns of `coldloop_plant.components.passes` at the first stage."""
+    """Columns of `components.passes` at the first stage."""
     gained: Array
     """Mass (kg/s) and energy (W) of each cell, shape (states up to the coil, 2)."""
 

@@ -10,7 +10,7 @@ All functions are kernels, of real or complex numbers, and take
 * v: 4 commands of the warm valves, `COMMAND_NAMES`, %;
 * d: 6 disturbances, `DISTURBANCE_NAMES`.
 
-The exchangers' passes take and give helium as the high pressure moves (`coldloop_plant.refrigerator.high_pressure`); lines have
+The exchangers' passes take and give helium as the high pressure moves (`refrigerator.high_pressure`); lines have
 no pressure drop besides that of the cold box's return.
 """
 
@@ -79,7 +79,7 @@ SIGNALS: Final = len(SIGNAL_NAMES)
 
 
 class Refrigerator(NamedTuple):
-    """Components of the refrigerator, in SI units; `coldloop_plant.refrigerator.plant_file` has the reference plant's."""
+    """Components of the refrigerator, in SI units; `refrigerator.plant_file` has the reference plant's."""
 
     box: ColdBox
     """Its boundaries P_HP and P_LP are the pressures at rest; the equations do not read them, nor T_in."""
