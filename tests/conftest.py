@@ -22,6 +22,7 @@ from coldloop_rig import cli
 from coldloop_rig.cosim.ports import ReservedPorts
 from coldloop_rig.figures.worker import FigureProcess
 from tests.harness.budget import BudgetPlugin
+from tests.harness.changed import can_reach, changed_files
 from tests.harness.lanes import USES, Lane, Watch, judge, lane_of, table
 from tests.harness.processes import Processes
 
@@ -73,6 +74,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption(
         "--lanes", action="store_true", help="run nothing: print the table of which tests are in which lane"
     )
+    group.addoption("--changed", metavar="BASE", help="only tests that what differs from this commit can reach")
     group.addoption("--over-budget", metavar="FILE", help="write the folders that are over their budget to a file")
 
 
@@ -114,13 +116,16 @@ def is_named(item: pytest.Item) -> bool:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark each test by what it uses, and leave out what is in other lanes than those asked for."""
     asked, chosen, left_out = asked_lanes(config), list[pytest.Item](), list[pytest.Item]()
+    base = config.getoption("--changed")
+    changed = None if base is None else changed_files(base)
     for item in items:
         fixtures = set(getattr(item, "fixturenames", ()))
         for mark in (mark for mark, names in USES.items() if names & fixtures):
             item.add_marker(mark)
         item.stash[LANES] = lane_of(mark.name for mark in item.iter_markers())
         item.stash[SHARED_BY] = shared = shared_fixture(item)
-        (chosen if item.stash[LANES] in asked or is_named(item) else left_out).append(item)
+        runs = item.stash[LANES] in asked and (changed is None or can_reach(item.path, fixtures, changed))
+        (chosen if runs or is_named(item) else left_out).append(item)
         if shared is not None:
             keep_together(item, f"{shared.baseid}/{shared.argname}")
     if config.getoption("--lanes"):
