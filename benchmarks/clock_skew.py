@@ -17,7 +17,7 @@ from coldloop_plant.load import find_load
 from coldloop_plant.own_model import own_header
 from coldloop_rig.cosim.local_services import LocalServices
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.cosim.session_client import SessionClient
+from coldloop_rig.cosim.session import SessionClient
 from coldloop_rig.cosim.wiring import START_PATIENCE_S
 from coldloop_rig.settings import Settings
 

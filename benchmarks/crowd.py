@@ -28,7 +28,7 @@ from coldloop.registers.safety import WatchdogStatus
 from coldloop_plant.load import find_load
 from coldloop_rig.cosim.local_services import LocalServices
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.cosim.session_client import SessionClient
+from coldloop_rig.cosim.session import SessionClient
 from coldloop_rig.results.recording import LinkStatistics, Recorder
 from coldloop_rig.settings import Settings
 

@@ -16,7 +16,7 @@ from coldloop.config import load_configuration
 from coldloop.process.cold_box import TICK_S
 from coldloop.process.lti_model import load as load_model
 from coldloop_plant.load import HOUR_TICKS, HOURS, concatenated, telegraph
-from coldloop_rig.cosim.job import Job
+from coldloop_rig.cosim.scenario import Job
 from coldloop_rig.figures.worker import FigureProcess
 from coldloop_rig.results.folders import claim_folder
 from coldloop_rig.results.recording import SampleBlock, Sink

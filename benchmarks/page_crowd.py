@@ -22,10 +22,10 @@ from coldloop.process.lti_model import load as load_model
 from coldloop_hmi.settings import HmiSettings
 from coldloop_plant.load import find_load
 from coldloop_rig.cosim.local_services import LocalServices
-from coldloop_rig.cosim.ports import ReservedPorts
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.cosim.session_client import SessionClient
-from coldloop_rig.live.page_process import PageProcess
+from coldloop_rig.cosim.session import SessionClient
+from coldloop_rig.cosim.wiring import ReservedPorts
+from coldloop_rig.live.up import PageProcess
 from coldloop_rig.results.recording import LinkStatistics, Recorder
 from coldloop_rig.settings import Settings
 

@@ -17,8 +17,7 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from coldloop.config import PREFIX, to_environment
-from coldloop_rig.cosim.ports import HOST, ReservedPorts
-from coldloop_rig.cosim.wiring import SERVICES, endpoints_on, wired
+from coldloop_rig.cosim.wiring import HOST, SERVICES, ReservedPorts, endpoints_on, wired
 from coldloop_rig.settings import Settings
 
 READ_MAGIC: Final = bytes((0, 1, 0, 0, 0, 6, 1, 3, 0, 0, 0, 2))

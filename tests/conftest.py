@@ -19,7 +19,7 @@ from hypothesis import settings
 
 from coldloop.config import PREFIX
 from coldloop_rig import cli
-from coldloop_rig.cosim.ports import ReservedPorts
+from coldloop_rig.cosim.wiring import ReservedPorts
 from coldloop_rig.figures.worker import FigureProcess
 from tests.harness.budget import BudgetPlugin
 from tests.harness.changed import can_reach, changed_files

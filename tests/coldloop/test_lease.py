@@ -11,7 +11,7 @@ from coldloop.registers.bank import BusyError, Caller
 from coldloop.registers.declaration import Role
 from coldloop.registers.safety import LeaseState, LeaseStatus
 from coldloop.registers.text import to_words
-from coldloop.safety.lease import LINGER_S, SIMPLE_CLIENT, Lease
+from coldloop.safety.lease import LINGER_S, SIMPLE_CLIENT, WriterLease
 
 SILENCE_S = 5.0
 
@@ -37,17 +37,17 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def lease(clock: Clock) -> Lease:
-    return Lease("the rack", lambda: SILENCE_S, clock)
+def lease(clock: Clock) -> WriterLease:
+    return WriterLease("the rack", lambda: SILENCE_S, now=clock)
 
 
-def writes(lease: Lease, who: Caller, holder: int | None = None) -> bool:
+def writes(lease: WriterLease, who: Caller, holder: int | None = None) -> bool:
     """Write; return whether the lease has a new holder with it."""
     lease.check(who, holder)
     return lease.take(who, holder)
 
 
-def test_the_first_who_writes_has_it_and_a_second_is_refused_and_counted(lease: Lease) -> None:
+def test_the_first_who_writes_has_it_and_a_second_is_refused_and_counted(lease: WriterLease) -> None:
     assert lease.state is LeaseState.FREE
     assert writes(lease, A, 7)
     assert (lease.state, lease.holder) == (LeaseState.HELD, 7)
@@ -59,13 +59,13 @@ def test_the_first_who_writes_has_it_and_a_second_is_refused_and_counted(lease: 
     assert not writes(lease, A, 7)
 
 
-def test_a_look_at_whether_one_may_write_takes_nothing(lease: Lease) -> None:
+def test_a_look_at_whether_one_may_write_takes_nothing(lease: WriterLease) -> None:
     lease.check(A, 7)
     assert lease.state is LeaseState.FREE
     assert writes(lease, B, 8)
 
 
-def test_a_holder_that_is_silent_for_longer_than_it_may_loses_it(lease: Lease, clock: Clock) -> None:
+def test_a_holder_that_is_silent_for_longer_than_it_may_loses_it(lease: WriterLease, clock: Clock) -> None:
     writes(lease, A, 7)
     clock.now += SILENCE_S
     assert lease.state is LeaseState.HELD
@@ -76,13 +76,13 @@ def test_a_holder_that_is_silent_for_longer_than_it_may_loses_it(lease: Lease, c
         lease.check(A, 7)
 
 
-def test_a_holder_that_comes_back_after_its_silence_is_a_new_one(lease: Lease, clock: Clock) -> None:
+def test_a_holder_that_comes_back_after_its_silence_is_a_new_one(lease: WriterLease, clock: Clock) -> None:
     writes(lease, A, 7)
     clock.now += SILENCE_S + 1.0
     assert writes(lease, A, 7)
 
 
-def test_every_write_ends_the_silence(lease: Lease, clock: Clock) -> None:
+def test_every_write_ends_the_silence(lease: WriterLease, clock: Clock) -> None:
     writes(lease, A)
     for _ in range(5):
         clock.now += 0.9 * SILENCE_S
@@ -90,14 +90,14 @@ def test_every_write_ends_the_silence(lease: Lease, clock: Clock) -> None:
 
 
 def test_without_a_limit_a_silent_holder_keeps_it(clock: Clock) -> None:
-    lease = Lease("the rack", lambda: 0.0, clock)
+    lease = WriterLease("the rack", lambda: 0.0, now=clock)
     writes(lease, A)
     clock.now += 1e6
     with pytest.raises(BusyError):
         lease.check(B)
 
 
-def test_when_the_connection_of_a_simple_client_closes_the_next_may_write_at_once(lease: Lease) -> None:
+def test_when_the_connection_of_a_simple_client_closes_the_next_may_write_at_once(lease: WriterLease) -> None:
     writes(lease, A)
     assert not lease.closed(B)
     assert lease.closed(A)
@@ -106,7 +106,7 @@ def test_when_the_connection_of_a_simple_client_closes_the_next_may_write_at_onc
 
 
 def test_when_that_of_a_holder_with_a_number_closes_only_the_same_may_come_back_for_a_moment(
-    lease: Lease, clock: Clock
+    lease: WriterLease, clock: Clock
 ) -> None:
     writes(lease, A, 7)
     assert lease.closed(A)
@@ -119,7 +119,7 @@ def test_when_that_of_a_holder_with_a_number_closes_only_the_same_may_come_back_
     assert lease.state is LeaseState.HELD
 
 
-def test_after_that_moment_it_is_free(lease: Lease, clock: Clock) -> None:
+def test_after_that_moment_it_is_free(lease: WriterLease, clock: Clock) -> None:
     writes(lease, A, 7)
     lease.closed(A)
     clock.now += LINGER_S + 0.001
@@ -127,7 +127,7 @@ def test_after_that_moment_it_is_free(lease: Lease, clock: Clock) -> None:
     assert writes(lease, B, 8)
 
 
-def test_the_same_holder_goes_on_over_a_new_connection_and_its_old_one_closes_later(lease: Lease) -> None:
+def test_the_same_holder_goes_on_over_a_new_connection_and_its_old_one_closes_later(lease: WriterLease) -> None:
     writes(lease, A, 7)
     assert not writes(lease, B, 7)
     assert not lease.closed(A)
@@ -135,13 +135,13 @@ def test_the_same_holder_goes_on_over_a_new_connection_and_its_old_one_closes_la
     assert lease.closed(B)
 
 
-def test_two_simple_clients_are_not_the_same_holder(lease: Lease) -> None:
+def test_two_simple_clients_are_not_the_same_holder(lease: WriterLease) -> None:
     writes(lease, A, SIMPLE_CLIENT)
     with pytest.raises(BusyError):
         lease.check(B, SIMPLE_CLIENT)
 
 
-def test_another_number_over_the_same_connection_is_a_new_holder_and_none_is_the_same(lease: Lease) -> None:
+def test_another_number_over_the_same_connection_is_a_new_holder_and_none_is_the_same(lease: WriterLease) -> None:
     assert writes(lease, A, 7)
     assert not writes(lease, A)
     assert lease.holder == 7
@@ -149,7 +149,7 @@ def test_another_number_over_the_same_connection_is_a_new_holder_and_none_is_the
     assert lease.holder == 9
 
 
-def test_registers_tell_who_has_it(lease: Lease, clock: Clock) -> None:
+def test_registers_tell_who_has_it(lease: WriterLease, clock: Clock) -> None:
     nobody = LeaseStatus(LeaseState.FREE, 0, 0, to_words("", WHO_WORDS))
     assert lease.registers() == nobody
     writes(lease, A, 7)
@@ -191,7 +191,7 @@ def test_another_party_writes_only_after_the_silence_or_the_departure_of_the_one
     story: list[Step],
 ) -> None:
     clock = Clock()
-    lease = Lease("the rack", lambda: SILENCE_S, clock)
+    lease = WriterLease("the rack", lambda: SILENCE_S, now=clock)
     last: tuple[int, float] | None = None  # connection and time of the last write that was taken
     departed: float | None = None
     left: set[int] = set()  # connections that their holder has left for another one

@@ -6,7 +6,7 @@ import pytest
 
 from coldloop.errors import LinkError, PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
-from coldloop.operating.load_stream import LoadStream
+from coldloop.operating.execution import LoadStream
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.maps import maps_of

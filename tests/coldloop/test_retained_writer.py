@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from coldloop.safety.retained import RetainedFile, RetainedStateError
-from coldloop.safety.retained_writer import RetainedStateWriter
+from coldloop.safety.retained import RetainedFile, RetainedStateError, RetainedStateWriter
 
 LONG_S = 120.0
 """Longer than anything here takes."""

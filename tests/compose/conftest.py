@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from coldloop_rig import cli
-from coldloop_rig.cosim.ports import ReservedPorts
+from coldloop_rig.cosim.wiring import ReservedPorts
 
 ROOT = Path(__file__).parents[2]
 SERVICES = ("plant", "control-plc", "optimizer-plc")

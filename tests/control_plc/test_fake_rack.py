@@ -31,7 +31,7 @@ from coldloop.registers.control_plc import (
 from coldloop.registers.declaration import Role
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import LeaseState
-from coldloop.safety.lease import Lease
+from coldloop.safety.lease import WriterLease
 from coldloop.safety.sequence import InputSequence, with_checksum
 from coldloop.service.journal import Journal
 from coldloop.session.time_base import TimeBase
@@ -99,7 +99,7 @@ class FakeRack:
         self.journal = Journal(now=lambda: self.now)
         watchdog = WatchdogSettings(timeout_s=watchdog_s, action=SafeAction.SAFE, safe_state=SAFE_STATE)
         self.rack = Rack(watchdog, HEADER.u0, StillPlant, self.session(1), journal=self.journal)  # type: ignore[arg-type]
-        self.lease = Lease("the outputs", lambda: self.rack.silence_s, now=lambda: self.now)
+        self.lease = WriterLease("the outputs", lambda: self.rack.silence_s, now=lambda: self.now)
         self.fraction = 0.0
         self.own_steps: list[tuple[float, ...]] = []
 

@@ -39,7 +39,7 @@ from coldloop_control_plc.runtime import ControlPlc
 from coldloop_control_plc.sessions import ADOPT_AFTER_S
 from coldloop_control_plc.settings import ControlSettings
 from coldloop_rig.cli.certificates import Authority
-from coldloop_rig.cosim.ports import ReservedPorts
+from coldloop_rig.cosim.wiring import ReservedPorts
 from tests.harness.records import CONTROL_MAP, PLANT_MAP, sealed
 
 WITHIN_S = 60.0

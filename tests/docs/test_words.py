@@ -8,7 +8,7 @@ from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers.common import MAGIC
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.safety import AlarmKind
-from coldloop.service.event_text import alarm_word, word
+from coldloop.service.event_text import alarm_word
 from coldloop_control_plc.alarm_settings import PASSING, AlarmSettings
 from tests.harness.records import CONTROL_MAP
 
@@ -23,13 +23,13 @@ def test_alarms_are_called_what_they_are_called_with_their_priorities() -> None:
     assert told == {(int(settings.rule(kind).priority), alarm_word(kind, COLD_BOX)) for kind in AlarmKind}
     passing = re.search(r"happens at an instant \(([^)]+)\)", page)
     assert passing is not None
-    assert set(re.findall(r"`([^`]+)`", passing[1])) == {word(kind) for kind in PASSING}
+    assert set(re.findall(r"`([^`]+)`", passing[1])) == {kind.word for kind in PASSING}
 
 
 def test_the_verdicts_of_the_link_page_are_those_of_the_registers() -> None:
     page = (DOCS / "link.md").read_text(encoding="utf-8").partition("| verdict |")[2].partition("\n\n")[0]
     rows = [(int(number), name.lower()) for number, name in re.findall(r"^\| (\d+) ([^|]+?) \|", page, re.MULTILINE)]
-    assert rows == [(verdict.value, word(verdict)) for verdict in Verdict if verdict]
+    assert rows == [(verdict.value, verdict.word) for verdict in Verdict if verdict]
 
 
 def test_the_alarms_of_the_scada_page_are_the_whole_block() -> None:

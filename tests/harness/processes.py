@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 from pydantic import BaseModel
 
 from coldloop.config import PREFIX, to_environment
-from coldloop_rig.cosim.ports import ReservedPorts
+from coldloop_rig.cosim.wiring import ReservedPorts
 
 END_S: Final = 60.0
 """A process that is told to end has failed when it takes longer; the machine may be busy with something else."""

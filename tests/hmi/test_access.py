@@ -20,7 +20,12 @@ from coldloop.errors import ConfigurationError, UsageError
 from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.settings import TlsSettings
 from coldloop.process.cold_box import COLD_BOX
-from coldloop_hmi.access import (
+from coldloop_hmi.audit import Audit
+from coldloop_hmi.guard import Connections, Guard, host_of, is_own_origin, port_of, told_in_a_line
+from coldloop_hmi.page_server import PageServer, PageSite
+from coldloop_hmi.process_image import Model
+from coldloop_hmi.settings import HmiSection, LoginSettings
+from coldloop_hmi.users import (
     LOGIN_BURST,
     LOGINS_A_MINUTE,
     PASSWORD_BURST,
@@ -29,19 +34,14 @@ from coldloop_hmi.access import (
     ClientLimit,
     LoginLimit,
     LoginSessions,
-    host_of,
-    is_own_origin,
-    port_of,
+    PageRole,
+    User,
+    Users,
+    hash_password,
+    write_user,
 )
-from coldloop_hmi.audit import Audit
-from coldloop_hmi.connections import Connections
-from coldloop_hmi.guard import Guard, told_in_a_line
-from coldloop_hmi.page_server import PageServer, PageSite
-from coldloop_hmi.process_image import Model
-from coldloop_hmi.settings import HmiSection, LoginSettings
-from coldloop_hmi.users import PageRole, User, Users, hash_password, write_user
-from coldloop_rig.cosim.endpoints import RigEndpoints
-from coldloop_rig.live.page_process import pointed_at
+from coldloop_rig.cosim.wiring import RigEndpoints
+from coldloop_rig.live.up import pointed_at
 from tests.hmi.conftest import OPERATOR, VIEWER, Clock, Site
 
 WHOLE_HASH = hash_password("a long password")

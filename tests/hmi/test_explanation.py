@@ -18,15 +18,14 @@ from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, T5
 from coldloop.registers.codec import blank
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, UpdatingRuleKind, UpdatingRuleStatus
-from coldloop_hmi import explanation, sentences
-from coldloop_hmi.explanation import Branch, Explanation, increments_of
-from coldloop_hmi.sentences import sentence
+from coldloop_hmi import explanation
+from coldloop_hmi.explanation import Branch, Explanation, increments_of, sentence
 from coldloop_optimizer_plc.rules import Algorithm1, Observation, algorithm_1, assess
 from tests.harness.records import MAPS, as_transmitted
 
 getcontext().prec = 40
 explain = partial(explanation.explain, process=COLD_BOX)
-deviation = partial(sentences.deviation, process=COLD_BOX)
+deviation = partial(explanation.deviation, process=COLD_BOX)
 
 RULE = UpdatingRuleStatus(UpdatingRuleKind.ALGORITHM_1, 9, 2, 19, 2, slots=0.25, preparation=0.13, iteration=0.25)
 FIXED = UpdatingRuleStatus(UpdatingRuleKind.FIXED, 9, 9, 9, 0, slots=0.25, preparation=0.13, iteration=0.25)

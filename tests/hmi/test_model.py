@@ -5,11 +5,12 @@ import json
 import shutil
 import subprocess
 from collections.abc import Iterator
+from typing import cast
 
 import pytest
 
 from coldloop.errors import LinkError
-from coldloop.modbus.endpoints import Endpoint
+from coldloop.modbus.client import RegisterClient
 from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, TICK_S
 from coldloop.registers.audit import Event, EventKind, JournalPage
 from coldloop.registers.common import Identity, SessionPace
@@ -17,15 +18,21 @@ from coldloop.registers.control_plc import LadderStatus, Mode, Plan, ProcessNow
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmPriority, AlarmState
 from coldloop.service.metrics import exposition
-from coldloop_hmi.access import Party
-from coldloop_hmi.broadcast import WAITING, Broadcast
-from coldloop_hmi.documents import MOST_MARKS, alarms_document, catalog, encoded, state_document, trend_document
-from coldloop_hmi.page_metrics import page_families
-from coldloop_hmi.polling import Poller
-from coldloop_hmi.process_image import STALE_S, JournalEntry, Model
-from coldloop_hmi.reading import safe_cell
-from coldloop_hmi.signals import signals_of, words_in
-from coldloop_hmi.trends import MOST_ROWS, TrendStore, thin
+from coldloop_hmi.answers import WAITING, Broadcast
+from coldloop_hmi.documents import (
+    MOST_MARKS,
+    alarms_document,
+    catalog,
+    encoded,
+    page_families,
+    state_document,
+    trend_document,
+)
+from coldloop_hmi.page_server import safe_cell
+from coldloop_hmi.process_image import MOST_ROWS, STALE_S, JournalEntry, Model, TrendStore, thin
+from coldloop_hmi.runtime import Poller
+from coldloop_hmi.signals import signals_of
+from coldloop_hmi.users import Party
 from coldloop_rig.process_file.making import made_from
 from tests.harness.process_files import COLUMN
 from tests.harness.records import MAPS
@@ -52,11 +59,12 @@ def process(tick: int, level: float = 60.0) -> ProcessNow:
     return ProcessNow(tick, 400.0, (43.0, 75.0, 36.0), (level, *(0.0,) * 21))
 
 
-def test_descriptions_that_number_their_meanings_become_words_and_others_do_not() -> None:
-    assert words_in("0 auto, 1 classical loops, 2 manual") == {0: "auto", 1: "classical loops", 2: "manual"}
-    assert words_in("0 free, 1 held, 2 lingering: its connection has closed")[2] == "lingering"
-    assert words_in("Tick of the first step; 0 is none") == {}
-    assert words_in("Times that it has expired") == {}
+def test_signals_have_the_texts_of_their_enumerations() -> None:
+    words = {signal.name: signal.words for register_map in MAPS.values() for signal in signals_of(register_map)}
+    assert words["control_plc.operator.mode"] == {0: "auto", 1: "classical loops", 2: "manual"}
+    assert words["plant.lease.state"][2] == "lingering"
+    assert words["plant.pace.realtime"] == {0: "lock-step", 1: "real time"}
+    assert words["plant.load status.last_tick"] == words["plant.watchdog.trips"] == {}
 
 
 def test_every_register_of_a_block_with_one_row_is_a_signal() -> None:
@@ -185,9 +193,8 @@ def test_a_service_that_counts_its_events_anew_loses_none(model: Model, monkeypa
             pass
 
     service = Service()
-    poller = Poller("plant", Endpoint(port=1), model, 0.0)
-    monkeypatch.setattr(poller, "_client", service)
-    monkeypatch.setattr(poller, "_slow", [JournalPage])
+    poller = Poller("plant", cast("RegisterClient", service), model, 0.0)
+    monkeypatch.setattr(poller, "_slow", [])
 
     async def look(*, again: bool = False) -> list[tuple[int, int]]:
         if again:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from coldloop.number_text import axis_labels, number_text
-from coldloop_hmi.assets import STATIC
-from coldloop_hmi.quality import Quality
+from coldloop_hmi.answers import STATIC
+from coldloop_hmi.signals import Quality
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

@@ -16,8 +16,8 @@ from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind
 from coldloop_hmi.explanation import Branch
 from coldloop_hmi.process_image import JournalEntry, Model
-from coldloop_hmi.quality import SOUND
 from coldloop_hmi.replay import Replay
+from coldloop_hmi.signals import SOUND, doubted
 from coldloop_rig.live.recorded_page import RecordedPage
 from coldloop_rig.results.run_folder import RunFolder
 from tests.conftest import Coldloop
@@ -130,7 +130,7 @@ def test_a_recorded_run_has_the_quality_of_its_sensors(recorded_run: Path, monke
         for at, kind, cause in noted
     ]
     monkeypatch.setattr(recorded, "events", events)
-    told = [recorded.frame(tick).doubts.named(COLD_BOX).get("T5") for tick in (4, 5, 8, 9, 13, 15)]
+    told = [doubted(recorded.frame(tick).doubts, COLD_BOX).get("T5") for tick in (4, 5, 8, 9, 13, 15)]
     assert told == [None, "suspect", "suspect", "simulated", "simulated", None]
     assert recorded.frame(recorded.ticks - 1).doubts == SOUND
     assert recorded._bits("L1 T5") == 1 << OUTPUT_NAMES.index("L1") | 1 << t5  # noqa: SLF001

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from coldloop.process.cold_box import COLD_BOX
-from coldloop_hmi.trends import TrendStore
+from coldloop_hmi.process_image import TrendStore
 from tests.harness.processes import Processes
 from tests.harness.waiting import eventually
 from tests.hmi.conftest import RECORDED_S, Served, Site, log_in_by_clicks, opened

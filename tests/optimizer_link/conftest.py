@@ -29,7 +29,7 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.declaration import Block, RegisterMap
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
-from coldloop.safety.lease import Lease
+from coldloop.safety.lease import WriterLease
 from coldloop.safety.sequence import InputSequence, checksum
 from coldloop_optimizer_plc.runtime import OptimizerPlc
 from coldloop_optimizer_plc.settings import OptimizerSettings
@@ -61,7 +61,7 @@ class PlayedControlPlc:
         self._model = model
         self.bank = RegisterBank(register_map)
         self.bank.put(Identity(map_digest=register_map.digest, map_version=register_map.version))
-        self.lease = Lease("the optimiser", lambda: 0.0)
+        self.lease = WriterLease("the optimiser", lambda: 0.0)
         self.session, self.updates = 1, 0
         self.latches_on = True
         """An update follows on each sequence that is accepted."""

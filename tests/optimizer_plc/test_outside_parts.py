@@ -32,9 +32,7 @@ from coldloop_optimizer_plc.rules.outside import OutsideRule
 from coldloop_optimizer_plc.settings import ProgramSettings
 from coldloop_optimizer_plc.solvers.outside import OutsideSolver
 from coldloop_rig.settings import Settings
-from coldloop_rig.testing.conformance import problems_of, requirements
-from coldloop_rig.testing.estimator_conformance import estimator_requirements
-from coldloop_rig.testing.rule_conformance import rule_requirements
+from coldloop_rig.testing.conformance import estimator_requirements, problems_of, requirements, rule_requirements
 from tests.harness.processes import PROGRAM_S, Processes
 
 if TYPE_CHECKING:

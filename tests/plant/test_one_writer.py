@@ -6,9 +6,8 @@ import pytest
 
 from coldloop.registers.audit import EventKind
 from coldloop.registers.plant import OutputVerdict
-from coldloop.registers.safety import LeaseState, LeaseStatus, WatchdogTime
+from coldloop.registers.safety import LeaseEvent, LeaseState, LeaseStatus, WatchdogTime
 from coldloop.registers.text import from_words
-from coldloop.safety.writer_lease import LeaseEvent
 
 if TYPE_CHECKING:
     from tests.plant.conftest import RackOnTheBus

@@ -23,12 +23,10 @@ from coldloop_control_plc.settings import ControlSettings
 from coldloop_optimizer_plc.settings import OptimizerSettings
 from coldloop_plant.load import find_load
 from coldloop_plant.settings import PlantSettings
-from coldloop_rig.cosim.endpoints import RigEndpoints
 from coldloop_rig.cosim.one_process import OneProcessRig
-from coldloop_rig.cosim.ports import ReservedPorts
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.cosim.session_client import SessionClient
-from coldloop_rig.cosim.wiring import SERVICES, endpoints_on, wired
+from coldloop_rig.cosim.session import SessionClient
+from coldloop_rig.cosim.wiring import SERVICES, ReservedPorts, RigEndpoints, endpoints_on, wired
 from coldloop_rig.results.recording import Recorder, Recording
 from coldloop_rig.settings import Settings
 from tests.harness import configurations

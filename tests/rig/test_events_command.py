@@ -16,6 +16,7 @@ import pytest
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
 from coldloop.modbus.settings import AccessSettings, TlsSettings
+from coldloop.operating.observer import JournalReader
 from coldloop.registers.audit import Event, EventKind, JournalQuery
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
@@ -24,7 +25,6 @@ from coldloop.registers.declaration import Block, RegisterMap
 from coldloop.registers.safety import AlarmKind
 from coldloop.service.journal import KEPT, Journal, JournalPublication
 from coldloop_rig.cli.commands.events import COLUMNS
-from coldloop_rig.cosim.journal_reader import JournalReader
 from tests.harness.processes import Processes
 from tests.harness.records import CONTROL_MAP, PLANT_MAP
 

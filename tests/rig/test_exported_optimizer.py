@@ -20,9 +20,9 @@ from coldloop.registers.common import Identity
 from coldloop.registers.safety import LeaseState, LeaseStatus
 from coldloop_rig import cli
 from coldloop_rig.cli.plc_folder import export_plc
-from coldloop_rig.cosim.endpoints import REQUIRED
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.cosim.session_client import SessionClient
+from coldloop_rig.cosim.session import SessionClient
+from coldloop_rig.cosim.wiring import REQUIRED
 from coldloop_rig.plc_export.c import exported_optimizer
 from coldloop_rig.plc_export.kernels.recorded_problems import SINGLE
 from coldloop_rig.settings import Settings

@@ -1,11 +1,12 @@
 """Services of a rig that stays up: what ends is started again after a pause, and given up after five times."""
 
 import asyncio
+from collections.abc import Awaitable, Callable
 
 import pytest
 
 from coldloop.errors import LinkError
-from coldloop_rig.cosim.kept_up import PAUSES_S, end_of, keep_up
+from coldloop_rig.cosim.local_services import PAUSES_S, end_of, keep_up
 
 NONE = (0.0,) * len(PAUSES_S)
 
@@ -30,10 +31,16 @@ class Mortal:
         self.starts += 1
 
 
+async def kept_up(
+    process: Mortal, restarted: Callable[[], Awaitable[None]] | None = None, pauses_s: tuple[float, ...] = NONE
+) -> None:
+    await keep_up(process.name, process.ended, process.restart, restarted, pauses_s)
+
+
 async def test_what_ends_again_and_again_is_given_up_after_five(capsys: pytest.CaptureFixture[str]) -> None:
     process = Mortal()
     with pytest.raises(LinkError, match="was ended by SIGKILL; given up after 5 restarts"):
-        await keep_up(process, pauses_s=NONE)
+        await kept_up(process)
     assert process.starts == 5
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "coldloop: the plant service was ended by SIGKILL: started again in 0 s (1 of 5)"
@@ -41,9 +48,9 @@ async def test_what_ends_again_and_again_is_given_up_after_five(capsys: pytest.C
 
 
 async def test_what_has_run_for_long_begins_to_count_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coldloop_rig.cosim.kept_up.STEADY_S", -1.0)
+    monkeypatch.setattr("coldloop_rig.cosim.local_services.STEADY_S", -1.0)
     process = Mortal(lives=12)
-    keeping = asyncio.create_task(keep_up(process, pauses_s=NONE))
+    keeping = asyncio.create_task(kept_up(process))
     await asyncio.wait_for(process.lives_on.wait(), 60.0)
     keeping.cancel()
     assert process.starts == 12
@@ -52,7 +59,7 @@ async def test_what_has_run_for_long_begins_to_count_anew(monkeypatch: pytest.Mo
 async def test_each_start_is_followed_up() -> None:
     told: asyncio.Queue[int] = asyncio.Queue()
     process = Mortal(lives=2)
-    keeping = asyncio.create_task(keep_up(process, lambda: told.put(process.starts), NONE))
+    keeping = asyncio.create_task(kept_up(process, lambda: told.put(process.starts)))
     assert [await asyncio.wait_for(told.get(), 60.0) for _ in range(2)] == [1, 2]
     keeping.cancel()
 
@@ -69,7 +76,7 @@ async def test_what_ends_again_while_its_start_is_followed_up_is_started_again()
             given_up.append(process.starts)
 
     with pytest.raises(LinkError, match="given up after 5 restarts"):
-        await asyncio.wait_for(keep_up(process, restarted, NONE), 60.0)
+        await asyncio.wait_for(kept_up(process, restarted), 60.0)
     assert given_up == [1, 2, 3, 4, 5]
 
 
@@ -77,8 +84,9 @@ async def test_what_goes_wrong_after_a_start_is_not_lost() -> None:
     async def restarted() -> None:
         raise LinkError("the session could not begin")
 
+    once = Mortal(lives=1)
     with pytest.raises(LinkError, match="could not begin"):
-        await asyncio.wait_for(keep_up(Mortal(lives=1), restarted, NONE), 60.0)
+        await asyncio.wait_for(kept_up(once, restarted), 60.0)
 
 
 def test_the_pauses_grow() -> None:

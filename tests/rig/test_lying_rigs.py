@@ -33,7 +33,7 @@ from coldloop.registers.text import to_words
 from coldloop_plant.own_model import own_header
 from coldloop_rig.cosim.wiring import SERVICES
 from coldloop_rig.settings import Settings
-from coldloop_rig.testing.event_loop import BackgroundLoop
+from coldloop_rig.testing.live_rig import BackgroundLoop
 from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ def ask(
     coldloop: "Coldloop", fake: FakeRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> "Callable[..., Outcome]":
     """A command to the fake rig, which does not move in a run."""
-    monkeypatch.setattr("coldloop_rig.cosim.session_client.QUIET_S", 0.5)
+    monkeypatch.setattr("coldloop_rig.cosim.session.QUIET_S", 0.5)
 
     def asked(*words: object) -> "Outcome":
         if words[0] == "run":
@@ -299,7 +299,7 @@ def test_a_journal_whose_answer_never_advances_is_given_up(fake: FakeRig, ask: "
 
 
 def test_a_rig_that_answers_slowly_is_given_up(ask: "Callable[..., Outcome]", monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coldloop_rig.cosim.answer_time.ANSWER_S", 0.3)
+    monkeypatch.setattr("coldloop_rig.cosim.wiring.ANSWER_S", 0.3)
 
     async def late(*_: object) -> list[bytes]:
         await asyncio.sleep(30)

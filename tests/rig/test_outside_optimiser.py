@@ -25,9 +25,9 @@ from coldloop.registers.common import MAGIC, Identity
 from coldloop.registers.control_plc import LadderStatus, Mode, Status, Verdict
 from coldloop.registers.safety import LeaseState, LeaseStatus
 from coldloop_rig import cli
-from coldloop_rig.cosim.endpoints import REQUIRED
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.cosim.session_client import SessionClient
+from coldloop_rig.cosim.session import SessionClient
+from coldloop_rig.cosim.wiring import REQUIRED
 from coldloop_rig.settings import Settings
 from tests.conftest import Coldloop
 from tests.harness.processes import Process, Processes

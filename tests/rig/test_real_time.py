@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import pytest
 
-import coldloop_rig.cosim.session_client
+import coldloop_rig.cosim.session
 from coldloop.modbus.client import RegisterClient
+from coldloop.operating.observer import SampleReader
 from coldloop.process.limits import InputLimits
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.common import Identity
@@ -18,9 +19,8 @@ from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.optimizer_plc import OptimizerSession
 from coldloop.registers.plant import LoadStep, PlantSession
 from coldloop_control_plc.settings import ControlSection, LadderSettings
-from coldloop_rig.cosim.answer_time import QUIET_S
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.cosim.session_reader import SampleReader
+from coldloop_rig.cosim.wiring import QUIET_S
 from coldloop_rig.settings import Settings
 from tests.harness import processes as harness
 from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
@@ -176,7 +176,7 @@ class ClockOfTicks:
             return self._tick
 
         monkeypatch.setattr(SampleReader, "read", noted)
-        monkeypatch.setattr(coldloop_rig.cosim.session_client, "time", self)
+        monkeypatch.setattr(coldloop_rig.cosim.session, "time", self)
 
     def monotonic(self) -> float:
         return 0.9 * QUIET_S * self._tick
@@ -186,7 +186,7 @@ async def test_a_slow_run_is_not_given_up_while_it_moves(
     load_a: LoadProfile, on_the_bus: "OnTheBus", monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = ClockOfTicks(monkeypatch)
-    monkeypatch.setattr(coldloop_rig.cosim.session_client, "LONGEST_PAUSE_S", 0.002)  # most looks find nothing new
+    monkeypatch.setattr(coldloop_rig.cosim.session, "LONGEST_PAUSE_S", 0.002)  # most looks find nothing new
     async with on_the_bus() as bus:
         recording = await bus.record(Scenario(ticks=80, load=load_a, updating_period_s=0.0, seed=1, realtime=True,
                                               factor=40.0))  # fmt: skip

@@ -15,8 +15,8 @@ from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.control_plc import Operator, OperatorMode
 from coldloop_rig import cli
-from coldloop_rig.live.link_cuts import CUT_FILES, CuttableLinks
 from coldloop_rig.live.started_rigs import running_rig, state_folder
+from coldloop_rig.live.up import CUT_FILES, CuttableLinks
 from tests.conftest import Coldloop
 from tests.harness.processes import Processes
 from tests.harness.records import CONTROL_MAP

@@ -1,11 +1,11 @@
 """What is known of a session before its recording begins: how everything is, from what was noted last."""
 
-from types import SimpleNamespace
 from typing import cast
 
 import pytest
 
 from coldloop.modbus.client import RegisterClient
+from coldloop.operating.observer import UpdateReader
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.common import Identity
@@ -14,11 +14,9 @@ from coldloop.registers.optimizer_plc import HISTORY_ROWS, Optimization
 from coldloop.registers.safety import AlarmState
 from coldloop_hmi.process_image import JournalEntry
 from coldloop_optimizer_plc.publication import NO_UPDATE
-from coldloop_rig.cosim.session_reader import UpdateReader
-from coldloop_rig.cosim.session_recording import Lateness, state_of
+from coldloop_rig.cosim.session import Lateness, state_of
 from coldloop_rig.results.recorded import LinkStatistics
 from coldloop_rig.results.recorded_alarms import alarms_after
-from coldloop_rig.results.recording import Records
 
 NOW = 1000
 """A tick after all that is noted."""
@@ -100,6 +98,6 @@ def done(number: int, tick: int) -> Optimization:
 async def test_an_update_that_was_abandoned_for_a_newer_one_is_not_recorded(*, tolerant: bool) -> None:
     """In real time a busy machine may leave the first update unanswered: its row is empty, and its number is 0."""
     recorded: list[Optimization] = []
-    client, recorder = cast("RegisterClient", History(done(1, 4), done(3, 12))), SimpleNamespace(update=recorded.append)
-    await UpdateReader(client, cast("Records", recorder), session=1, tolerant=tolerant).read()
+    client = cast("RegisterClient", History(done(1, 4), done(3, 12)))
+    await UpdateReader(client, recorded.append, session=1, first=0, tolerant=tolerant).read()
     assert [update.update for update in recorded] == [1, 3]

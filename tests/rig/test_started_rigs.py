@@ -16,19 +16,23 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from coldloop.errors import UsageError
-from coldloop_rig.cosim.endpoints import RigEndpoints
-from coldloop_rig.live.private_folder import base_folder, make_private, new_own, read_own, write_own
-from coldloop_rig.live.process_faults import pause
-from coldloop_rig.live.process_identity import identity_of
+from coldloop_rig.cosim.wiring import RigEndpoints
 from coldloop_rig.live.started_rigs import (
     LOCK_FILE,
     STATE_FILE,
     RigLock,
     RunningRig,
     ServiceProcess,
+    base_folder,
+    identity_of,
+    make_private,
+    new_own,
+    pause,
+    read_own,
     rigs_up,
     running_rig,
     state_folder,
+    write_own,
 )
 from tests.harness.processes import END_S
 

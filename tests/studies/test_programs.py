@@ -137,7 +137,7 @@ def test_the_edit_of_a_docstring_a_comment_or_the_page_is_not(copy: Path) -> Non
     for file, old, new in (
         ("services/optimizer_plc/coldloop_optimizer_plc/settings.py", '"""Configuration', '"""The configuration'),
         ("services/plant/coldloop_plant/helium/properties.py", "# K, below the table", "# K, somewhat below the table"),
-        ("services/hmi/coldloop_hmi/trends.py", "import math\n", "import math\n\nEXTRA = 1\n"),
+        ("services/hmi/coldloop_hmi/process_image.py", "import math\n", "import math\n\nEXTRA = 1\n"),
     ):
         text = (copy / file).read_text()
         assert old in text

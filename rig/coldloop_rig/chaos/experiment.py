@@ -13,9 +13,8 @@ from coldloop_rig.chaos.plan import ChaosPlan
 from coldloop_rig.chaos.runner import conduct
 from coldloop_rig.chaos.sequencer import Progress
 from coldloop_rig.chaos.trace import ChaosTrace
-from coldloop_rig.cosim.job import Job
 from coldloop_rig.cosim.one_process import OneProcessRig
-from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.cosim.scenario import Job, Scenario
 from coldloop_rig.figures.worker import FigureProcess
 from coldloop_rig.results.recording import Recorder, Recording
 from coldloop_rig.results.way import Way

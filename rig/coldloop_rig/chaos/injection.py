@@ -26,7 +26,7 @@ from coldloop_rig.chaos.faults import (
 from coldloop_rig.chaos.models import WRONG_MODEL
 from coldloop_rig.chaos.proxy import LinkProxy
 from coldloop_rig.cosim.local_services import LocalServices
-from coldloop_rig.cosim.session_client import CONTACT_S
+from coldloop_rig.cosim.session import CONTACT_S
 from coldloop_rig.cosim.wiring import SERVICES
 
 T = TypeVar("T")

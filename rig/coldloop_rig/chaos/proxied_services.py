@@ -8,10 +8,8 @@ from typing import Self
 
 from coldloop_rig.chaos.faults import Link
 from coldloop_rig.chaos.proxy import LinkProxy
-from coldloop_rig.cosim.endpoints import RigEndpoints
 from coldloop_rig.cosim.local_services import LocalServices
-from coldloop_rig.cosim.ports import ReservedPorts
-from coldloop_rig.cosim.wiring import Detours, retaining
+from coldloop_rig.cosim.wiring import Detours, ReservedPorts, RigEndpoints, retaining
 from coldloop_rig.settings import Settings
 
 

@@ -14,7 +14,7 @@ from coldloop_rig.chaos.proxied_services import ProxiedServices
 from coldloop_rig.chaos.sequencer import FaultSequencer, Progress
 from coldloop_rig.chaos.trace import ChaosTrace
 from coldloop_rig.cosim.scenario import Scenario, with_copied_load
-from coldloop_rig.cosim.session_client import SessionClient
+from coldloop_rig.cosim.session import SessionClient
 from coldloop_rig.cosim.wiring import START_PATIENCE_S
 from coldloop_rig.results.recording import Recorder
 from coldloop_rig.settings import Settings

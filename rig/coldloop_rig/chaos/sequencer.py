@@ -17,7 +17,7 @@ from coldloop_rig.chaos.resources import log_lines, resident_mb
 from coldloop_rig.chaos.timeline import Moment, Timeline
 from coldloop_rig.chaos.trace import ChaosTrace, Mark, Resources
 from coldloop_rig.cosim.local_services import LocalServices
-from coldloop_rig.cosim.session_client import SessionClient
+from coldloop_rig.cosim.session import SessionClient
 
 Progress = Callable[[int, LadderStatus | None, list[str]], None]
 """Takes the plant's tick, the state of the control PLC (None while it does not answer), and the faults that are on."""

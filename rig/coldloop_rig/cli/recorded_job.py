@@ -10,7 +10,7 @@ from typing import Any, Final
 from coldloop.errors import NOT_FINITE
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import load as load_model
-from coldloop_rig.cosim.job import Job
+from coldloop_rig.cosim.scenario import Job
 from coldloop_rig.figures.worker import FigureProcess
 from coldloop_rig.results.folders import claim_folder, claim_folder_of_now
 from coldloop_rig.results.recording import Sink

@@ -10,7 +10,6 @@ from typing import Final
 from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
 from coldloop.modbus.requests import MAX_READ_WORDS
 from coldloop.registers.declaration import Block, Kind, Register, RegisterMap
-from coldloop.service.event_text import word
 from coldloop_rig.text_tables import aligned, markdown_table
 
 PORTS: Final = {"plant": PLANT_PORT, "control_plc": CONTROL_PORT, "optimizer_plc": OPTIMIZER_PORT}
@@ -50,7 +49,7 @@ def _meanings(register: Register) -> dict[str, str] | None:
     """Return the meaning of an enumeration's numbers."""
     if register.values is None:
         return None
-    return {str(value.value): word(value) for value in register.values}
+    return {str(value.value): value.word for value in register.meanings}
 
 
 def _text(value: str | float | dict[str, str] | None) -> str:

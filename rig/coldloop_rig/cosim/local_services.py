@@ -1,22 +1,25 @@
-"""The services as processes on localhost."""
+"""The services as processes on localhost: started, watched, started again where a rig stays up, and ended.
+
+Services compile kernels before they serve, and write to log files: what they compile is shown on standard error.
+"""
 
 import asyncio
 import contextlib
 import os
 import signal
 import sys
-from collections.abc import Awaitable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Self, TypeVar
+from typing import IO, Any, Final, Self, TypeVar
 
 from coldloop.config import PREFIX, to_environment
 from coldloop.errors import LinkError
-from coldloop_rig.cosim.compiling_services import show_compiling
-from coldloop_rig.cosim.kept_up import end_of
-from coldloop_rig.cosim.ports import ReservedPorts
+from coldloop.kernels.first_use import Kernels, announce
+from coldloop.parsing import parsed_json
+from coldloop.service.start import COMPILING, SERVING
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.cosim.session_client import SessionClient
-from coldloop_rig.cosim.wiring import SERVICES, START_PATIENCE_S, Detours, endpoints_on, wired
+from coldloop_rig.cosim.session import SessionClient
+from coldloop_rig.cosim.wiring import SERVICES, START_PATIENCE_S, Detours, ReservedPorts, endpoints_on, wired
 from coldloop_rig.interpreter import PYTHON
 from coldloop_rig.results.recording import Recorder
 from coldloop_rig.settings import Settings
@@ -24,13 +27,110 @@ from coldloop_rig.settings import Settings
 if sys.platform != "win32":
     import resource
 
+LOOK_S: Final = 0.25
+TOGETHER_S: Final = 1.5
+"""Services that are started at once say within this time that they compile."""
+PAUSES_S: Final = (1.0, 2.0, 4.0, 8.0, 16.0)
+"""Before each further start; after the last one the service is given up."""
+STEADY_S: Final = 60.0
+"""After this time without an exit the pauses start from the first one."""
 T = TypeVar("T")
-
 STOP_GRACE_S = 5.0
 MOST_LOG_BYTES = 2**26
 """Size of a file that a service writes, its log among them: a write beyond it fails."""
 EXIT_S = 2.0
 """How long a process may take to end after it has closed its connections."""
+
+
+async def show_compiling(logs: Sequence[Path]) -> None:
+    """Announce what the services with these logs compile, in one line; return when all of them serve."""
+    while not any(COMPILING in events for events in map(_events, logs)):
+        if all(SERVING in events for events in map(_events, logs)):
+            return
+        await asyncio.sleep(LOOK_S)
+    await asyncio.sleep(TOGETHER_S)
+    compiling = [events[COMPILING] for events in map(_events, logs) if COMPILING in events]
+    announce(*(Kernels(line["kernels"], line["about_s"]) for line in compiling))
+
+
+def _events(log: Path) -> dict[str, dict[str, Any]]:
+    """Return the lines of a log by what happened, of each the last one."""
+    found = {}
+    for text in log.read_text(encoding="utf-8", errors="replace").splitlines():
+        with contextlib.suppress(ValueError):  # the last words of a service, or half a line
+            line = parsed_json(text)
+            if isinstance(line, dict) and "event" in line:
+                found[line["event"]] = line
+    return found
+
+
+async def keep_up(
+    name: str, ended: Callable[[], Awaitable[str]], restart: Callable[[], Awaitable[None]],
+    restarted: Callable[[], Awaitable[None]] | None = None, pauses_s: tuple[float, ...] = PAUSES_S,
+) -> None:  # fmt: skip
+    """Start a process again whenever it has ended, until cancelled.
+
+    Args:
+        name: What it is, in a message.
+        ended: Waits until it has ended; returns how, such as `was ended by SIGKILL`.
+        restart: Starts it where it was before.
+        restarted: Work after each start, given up when the process ends again.
+        pauses_s: Before each start in a row.
+
+    Raises:
+        LinkError: It has ended once more than there are pauses.
+    """
+    loop = asyncio.get_running_loop()
+    restarts, since = 0, loop.time()
+    work: Callable[[], Awaitable[None]] = _nothing
+    while True:
+        how = await _run_until_exit(ended, work)
+        if loop.time() - since > STEADY_S:
+            restarts = 0
+        if restarts == len(pauses_s):
+            raise LinkError(f"{name} {how}; given up after {restarts} restarts")
+        pause = pauses_s[restarts]
+        restarts += 1
+        say(f"{name} {how}: started again in {pause:g} s ({restarts} of {len(pauses_s)})")
+        await asyncio.sleep(pause)
+        since = loop.time()
+        await restart()
+        work = restarted or _nothing
+
+
+async def _nothing() -> None:
+    """Do nothing after a start."""
+
+
+async def _run_until_exit(ended: Callable[[], Awaitable[str]], work: Callable[[], Awaitable[None]]) -> str:
+    """Wait until a process has ended while `work` runs, which is cancelled with it; return how it has ended."""
+    exited, running = asyncio.ensure_future(ended()), asyncio.ensure_future(work())
+    try:
+        await asyncio.wait({exited, running}, return_when=asyncio.FIRST_COMPLETED)
+        if not exited.done():
+            await running
+        return await exited
+    finally:
+        exited.cancel()
+        running.cancel()
+        await asyncio.gather(exited, running, return_exceptions=True)
+
+
+def end_of(code: int, last_words: str) -> str:
+    """Return how a process has ended: by which signal, or with which exit code and last line of its log."""
+    if code < 0:
+        try:
+            return f"was ended by {signal.Signals(-code).name}"
+        except ValueError:
+            return f"was ended by signal {-code}"
+    return f"has ended with exit code {code}: {last_words}"
+
+
+def say(text: str) -> None:
+    """Print a line for the operator or the log; ignore a closed output."""
+    with contextlib.suppress(OSError):  # the disk may be full, the terminal closed
+        sys.stderr.write(f"coldloop: {text}\n")
+        sys.stderr.flush()
 
 
 class LocalServices:
@@ -68,7 +168,8 @@ class LocalServices:
             self._commands["optimizer_plc"] = (*optimizer, *where)
         self._logs = log_folder
         self.services = tuple(services)
-        self._processes: dict[str, asyncio.subprocess.Process] = {}
+        self.processes: dict[str, asyncio.subprocess.Process] = {}
+        """By service, of those that are to run."""
         self._watchers: set[asyncio.Task[None]] = set()
         self._ended: asyncio.Queue[str] = asyncio.Queue()
         self._showing: asyncio.Task[None] | None = None
@@ -88,7 +189,7 @@ class LocalServices:
         if self._showing is not None:
             self._showing.cancel()
             await asyncio.gather(self._showing, return_exceptions=True)
-        processes, self._processes = self._processes, {}
+        processes, self.processes = self.processes, {}
         for process in processes.values():
             terminate(process)
         for process in processes.values():
@@ -106,7 +207,7 @@ class LocalServices:
         """
         with self.log(service).open("ab") as log:
             process = await start_program(self._commands[service], {**self._environment, **(environment or {})}, log)
-        self._processes[service] = process
+        self.processes[service] = process
         if may_end:
             return
         watcher = asyncio.create_task(self._watch(service, process), name=f"watch {service}")
@@ -115,14 +216,14 @@ class LocalServices:
 
     async def stop(self, service: str, number: signal.Signals) -> None:
         """End one of them on purpose, by a signal, and wait until it has ended."""
-        process = self._processes.pop(service)
+        process = self.processes.pop(service)
         with contextlib.suppress(ProcessLookupError):
             process.send_signal(number)
         await wait_for_end(process)
 
     def ended(self, service: str) -> bool:
         """Return whether a service has ended by itself."""
-        return self._processes[service].returncode is not None
+        return self.processes[service].returncode is not None
 
     def pause(self, service: str) -> None:
         """Let a process stand still."""
@@ -134,12 +235,7 @@ class LocalServices:
 
     def _signal(self, service: str, number: signal.Signals) -> None:
         with contextlib.suppress(ProcessLookupError):
-            self._processes[service].send_signal(number)
-
-    @property
-    def processes(self) -> Mapping[str, asyncio.subprocess.Process]:
-        """The processes by service, of those that are to run."""
-        return self._processes
+            self.processes[service].send_signal(number)
 
     async def during(self, work: Awaitable[T]) -> T:
         """Return the result of `work`, unless a service ends before by itself.
@@ -164,36 +260,23 @@ class LocalServices:
 
     async def _watch(self, service: str, process: asyncio.subprocess.Process) -> None:
         await process.wait()
-        if self._processes.get(service) is process:
+        if self.processes.get(service) is process:
             self._ended.put_nowait(service)
 
     def log(self, service: str) -> Path:
         """Return the file that a service logs to."""
         return self._logs / f"{service}.log"
 
+    async def exit_of(self, service: str) -> str:
+        """Wait until a service has ended; return how, and where its log is."""
+        await self.processes[service].wait()
+        return self.end_of(service)
+
     def end_of(self, service: str) -> str:
         """Return how a service has ended, and where its log is."""
-        process = self._processes.get(service)
+        process = self.processes.get(service)
         code = 0 if process is None or process.returncode is None else process.returncode
         return f"{end_of(code, last_line(self.log(service)))} (log: {self.log(service)})"
-
-
-class KeptService:
-    """One of the services, for `coldloop_rig.cosim.kept_up`."""
-
-    def __init__(self, services: LocalServices, service: str) -> None:
-        self.name = f"the {service} service"
-        self._services = services
-        self._service = service
-
-    async def ended(self) -> str:
-        """Wait until it has ended; return how."""
-        await self._services.processes[self._service].wait()
-        return self._services.end_of(self._service)
-
-    async def restart(self) -> None:
-        """Start it where it was before."""
-        await self._services.start(self._service, may_end=True)
 
 
 def _is_link_error(task: "asyncio.Future[T]") -> bool:
@@ -255,13 +338,6 @@ async def run_on_localhost(
         LinkError: A service ended, or one could not be reached.
     """
     async with LocalServices(settings, log_folder, optimizer=optimizer) as services:
-        rig = SessionClient(services.endpoints, settings)
-
-        async def work() -> None:
-            await rig.connect(START_PATIENCE_S)
-            await rig.run(scenario, recorder)
-
-        try:
-            await services.during(work())
-        finally:
-            rig.close()
+        with contextlib.closing(SessionClient(services.endpoints, settings)) as rig:
+            await services.during(rig.connect(START_PATIENCE_S))
+            await services.during(rig.run(scenario, recorder))

@@ -1,27 +1,142 @@
-"""A run over the bus: on services that are started for it, or on a rig that is up."""
+"""A run over the bus: on services that are started for it, or on a rig that is up, with what that really runs."""
 
 import asyncio
-from collections.abc import Awaitable, Coroutine, Sequence
+from collections.abc import Awaitable, Coroutine, Iterator, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
-from coldloop.config import Configuration
+from pydantic import BaseModel
+
+import coldloop_control_plc.settings
+import coldloop_optimizer_plc.settings
+import coldloop_plant.settings
+from coldloop.config import MOST_SHOWN, Configuration, flattened, load_configuration
+from coldloop.errors import LinkError, UsageError
+from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.endpoints import Endpoint
+from coldloop.registers.configuration import ConfigurationDigest, ConfigurationLine, configuration_of, lines_of
 from coldloop.service.start import run_event_loop
-from coldloop_rig.cosim.answer_time import answered_in_time
-from coldloop_rig.cosim.endpoints import RigEndpoints
-from coldloop_rig.cosim.job import Job, StopRequest
 from coldloop_rig.cosim.local_services import run_on_localhost
-from coldloop_rig.cosim.rig_configuration import attached, running_configuration
 from coldloop_rig.cosim.saved_session import restore_session, save_session
-from coldloop_rig.cosim.scenario import Scenario, with_copied_load
-from coldloop_rig.cosim.session_client import SessionClient
-from coldloop_rig.cosim.session_recording import SessionUnderWay, find_session, record_session
+from coldloop_rig.cosim.scenario import Job, Scenario, StopRequest, with_copied_load
+from coldloop_rig.cosim.session import SessionClient, SessionUnderWay, find_session, record_session
+from coldloop_rig.cosim.wiring import RigEndpoints, answered_in_time
 from coldloop_rig.results.recording import Recorder
 from coldloop_rig.results.way import Way
 from coldloop_rig.settings import Settings
 
+SHOWN: Final[Mapping[str, Sequence[str]]] = {
+    "plant": coldloop_plant.settings.SHOWN,
+    "control_plc": coldloop_control_plc.settings.SHOWN,
+    "optimizer_plc": coldloop_optimizer_plc.settings.SHOWN,
+}
+"""What each service shows."""
+OF_SESSION: Final = (
+    "session.mode", "session.factor", "plant.load", "plant.seed", "optimizer_plc.program.updating_period_s",
+)  # fmt: skip
+"""Keys that a rig takes from the client that begins a session."""
+OF_CLIENT: Final = ("model.", "rig.")
+"""Sections that concern the client. The model of a rig is compared with ours when it is connected to."""
+SOURCE: Final = "the rig"
 ATTACH_PATIENCE_S: Final = 5.0
+
+
+def _files(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    """Yield the dotted keys of all files and folders."""
+    for name, field in model.model_fields.items():
+        kinds = get_args(field.annotation) or (field.annotation,)
+        if Path in kinds:
+            yield prefix + name
+        for kind in kinds:
+            if isinstance(kind, type) and issubclass(kind, BaseModel):
+                yield from _files(kind, f"{prefix}{name}.")
+
+
+FILES: Final = frozenset(_files(Settings))
+"""Keys whose value names a file: the rig's values are compared and never opened."""
+
+
+async def read_configuration(client: RegisterClient, shown: Sequence[str]) -> dict[str, Any]:
+    """Return what the registers of a service show of its configuration, by dotted key.
+
+    Args:
+        client: Of the service.
+        shown: Keys and sections that it may show.
+
+    Raises:
+        LinkError: It does not answer, or its text is not whole, or it shows something else.
+    """
+    digest = await client.read(ConfigurationDigest)
+    lines = await client.read_rows(ConfigurationLine, 0, lines_of(digest))
+    try:
+        values = flattened(configuration_of(digest, lines))
+    except ValueError as error:
+        raise LinkError(f"{client.peer}: its configuration cannot be read: {error}") from None
+    for key in values:
+        if not f"{key}.".startswith(tuple(f"{one}." for one in shown)):
+            raise LinkError(f"{client.peer}: its configuration has {_text(key)}, which it has not to show")
+    return values
+
+
+def _text(value: object) -> str:
+    """Return a value of a rig as a message can show it."""
+    text = str(value)
+    return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}..."
+
+
+async def running_configuration(endpoints: RigEndpoints, settings: Settings, patience_s: float) -> dict[str, Any]:
+    """Return what the services of a rig run, by dotted key, without what belongs to a session.
+
+    Raises:
+        LinkError: A service does not answer.
+        ModelFileError: One runs another model than ours.
+        UsageError: Two services run different limits.
+    """
+    running: dict[str, Any] = {}
+    with closing(SessionClient(endpoints, settings)) as client:
+        await client.connect(patience_s)
+        for service, one in client.clients.items():
+            shown = await read_configuration(one, SHOWN[service])
+            for key in running.keys() & shown.keys():
+                if running[key] != shown[key]:
+                    raise UsageError(
+                        f"{one.peer} runs {key} = {_text(shown[key])}, another one {_text(running[key])}: give all "
+                        "of them the same"
+                    )
+            running |= shown
+    return {key: value for key, value in running.items() if key not in OF_SESSION}
+
+
+def attached(effective: Configuration[Settings], running: Mapping[str, Any]) -> Configuration[Settings]:
+    """Return a configuration with what a rig really runs.
+
+    Args:
+        effective: What the user asks for.
+        running: What the rig runs.
+
+    Raises:
+        UsageError: The user asks for something that the rig does not run, and that a client cannot change.
+    """
+    asked = {key: value for key, value, _ in effective.effective()}
+    for given, source in effective.sources.items():
+        covered = [key for key in running if f"{key}.".startswith(f"{given}.")]
+        for key in covered:
+            if asked.get(key) != running[key]:
+                raise UsageError(
+                    f"{source}: the rig runs {key} = {_text(running[key])}, which a client does not change; drop it, "
+                    "or start the rig with it"
+                )
+        if not covered and source.startswith("--") and not given.startswith((*OF_SESSION, *OF_CLIENT)):
+            raise UsageError(f"{source}: a rig that is up has its own {given}, which a client does not change; drop it")
+    for key in FILES & running.keys():
+        if asked.get(key) != running[key]:
+            raise UsageError(
+                f"the rig runs {key} = {_text(running[key])}: name the same file here with --set {key}=FILE"
+            )
+    values = {key: (value, source) for key, value, source in effective.effective() if value is not None}
+    values |= {key: (value, SOURCE) for key, value in running.items() if key not in FILES}
+    return load_configuration(Settings, environment={}, options=values)
 
 
 def as_attached(effective: Configuration[Settings], endpoints: Sequence[Endpoint]) -> Configuration[Settings]:
@@ -53,13 +168,10 @@ def session_under_way(effective: Configuration[Settings], endpoints: Sequence[En
     found: list[SessionUnderWay] = []
 
     async def read() -> int:
-        rig = SessionClient(RigEndpoints(*endpoints), effective.settings)
-        try:
+        with closing(SessionClient(RigEndpoints(*endpoints), effective.settings)) as rig:
             async with answered_in_time("to read what the rig does"):
                 await rig.connect(ATTACH_PATIENCE_S)
                 found.append(await find_session(rig))
-        finally:
-            rig.close()
         return 0
 
     run_event_loop(read)
@@ -105,17 +217,13 @@ async def _stoppable(run: Awaitable[None], stop: StopRequest) -> int:
 
 
 async def _looked_at(endpoints: RigEndpoints, settings: Settings, scenario: Scenario, recorder: Recorder) -> None:
-    rig = SessionClient(endpoints, settings, tolerant=True)
-    try:
+    with closing(SessionClient(endpoints, settings, tolerant=True)) as rig:
         await rig.connect(ATTACH_PATIENCE_S)
         await record_session(rig, scenario, recorder)
-    finally:
-        rig.close()
 
 
 async def _attached(endpoints: RigEndpoints, settings: Settings, scenario: Scenario, recorder: Recorder) -> None:
-    rig = SessionClient(endpoints, settings)
-    try:
+    with closing(SessionClient(endpoints, settings)) as rig:
         await rig.connect(ATTACH_PATIENCE_S)
         async with answered_in_time("to read what the rig does"):
             saved = await save_session(rig)
@@ -123,8 +231,6 @@ async def _attached(endpoints: RigEndpoints, settings: Settings, scenario: Scena
             await rig.run(scenario, recorder)
         finally:
             await _to_its_end(restore_session(rig, saved, rig.session))
-    finally:
-        rig.close()
 
 
 async def _to_its_end(work: Coroutine[Any, Any, None]) -> None:

@@ -4,14 +4,13 @@ import logging
 from typing import NamedTuple
 
 from coldloop.errors import LinkError
-from coldloop.operating.execution import lead_ticks, write_pace
-from coldloop.operating.load_stream import LoadStream
+from coldloop.operating.execution import LoadStream, lead_ticks, write_pace
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Operator, OperatorMode
 from coldloop.registers.plant import LOAD_ROWS, LiveLoad, LoadStatus, LoadStep, PlantSession
 from coldloop.registers.seal import sealed
-from coldloop_rig.cosim.session_client import SessionClient
+from coldloop_rig.cosim.session import SessionClient
 
 log = logging.getLogger("coldloop.rig")
 

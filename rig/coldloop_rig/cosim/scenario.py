@@ -1,13 +1,20 @@
-"""What a run is to do, whichever way it is run."""
+"""A run to be done: its scenario, its configuration, how the programs are connected; and the signal that ends it."""
 
+import signal
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from coldloop.config import Configuration
+from coldloop.errors import RunInterruptedError
+from coldloop.modbus.endpoints import Endpoint
 from coldloop.process.load_profile import LoadProfile
 from coldloop.table import TIME
 from coldloop.whole_file import whole_text
 from coldloop_plant.load import HOUR_TICKS, named_families
+from coldloop_rig.results.recording import Recorder
+from coldloop_rig.results.way import Way
 from coldloop_rig.settings import Settings
 
 INPUTS: Final = "inputs"
@@ -48,3 +55,39 @@ def with_copied_load(settings: Settings, profile: LoadProfile, folder: Path) -> 
     whole_text(folder / LOAD_COPY, f"{TIME},{process.load.column}\n{rows}")
     plant = settings.plant.model_copy(update={"load": str(folder / LOAD_COPY)})
     return settings.model_copy(update={"plant": plant})
+
+
+Conduct = Callable[[Recorder, Path], Awaitable[None]]
+"""Does a run: takes its recorder and the folder of its results."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run to be done."""
+
+    effective: Configuration[Settings]
+    scenario: Scenario
+    way: Way
+    endpoints: tuple[Endpoint, ...] = ()
+    """Of a rig that is up, to attach to."""
+    conduct: Conduct | None = None
+    """How it is done, in a way that the others do not describe."""
+    optimizer: tuple[str, ...] = ()
+    """A program that takes the place of our optimiser, with its options."""
+
+
+class StopRequest:
+    """A signal on its way to the run."""
+
+    def __init__(self) -> None:
+        self.error: RunInterruptedError | None = None
+        self.recorder: Recorder | None = None
+        self.cancel: Callable[[], object] | None = None
+
+    def __call__(self, number: signal.Signals) -> None:
+        """Take a signal (signal handler)."""
+        self.error = RunInterruptedError(number.name, number)
+        if self.recorder is not None:
+            self.recorder.stop(self.error)
+        if self.cancel is not None:
+            self.cancel()

@@ -1,20 +1,90 @@
-"""Where three services on localhost listen, and where their clients are pointed at."""
+"""Where the three services of a rig are, where their clients are pointed at, and how long a rig may take to answer."""
 
-from collections.abc import Sequence
+import asyncio
+import socket
+import sys
+from collections.abc import AsyncIterator, Sequence
+from contextlib import AbstractContextManager, asynccontextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from coldloop.errors import PeerUnreachableError
 from coldloop.modbus.endpoints import PLANT_PORT, Endpoint
 from coldloop.safety.retained import RetainSettings
-from coldloop_rig.cosim.answer_time import QUIET_S
-from coldloop_rig.cosim.endpoints import RigEndpoints
 from coldloop_rig.settings import Settings
 
+REQUIRED: Final = ("plant", "control_plc")
+"""Services of every rig; an optimiser may be somebody else's (`up --without optimizer`)."""
+ANSWER_S: Final = 10.0
+"""How long a rig may take to answer all that a command asks at once."""
+QUIET_S: Final = 20.0
+"""A run gives up a rig on which nothing happens, or a service that does not answer, for this long."""
+HOST: Final = "127.0.0.1"
 SERVICES: Final = ("plant", "control_plc", "optimizer_plc")
 RETAINING: Final = ("plant", "control_plc")
 """Services that resume after a restart, from a state file."""
 START_PATIENCE_S: Final = 600.0
 """Services that need other kernels than before compile them first, on a slow machine for minutes."""
+
+
+class RigEndpoints(NamedTuple):
+    """Where the three servers are."""
+
+    plant: Endpoint
+    control_plc: Endpoint
+    optimizer_plc: Endpoint
+
+
+@asynccontextmanager
+async def answered_in_time(what: str) -> AsyncIterator[None]:
+    """Give up what is done in this context after `ANSWER_S`.
+
+    Raises:
+        PeerUnreachableError: It took longer.
+    """
+    try:
+        async with asyncio.timeout(ANSWER_S):
+            yield
+    except TimeoutError:
+        raise PeerUnreachableError(f"{what} takes longer than {ANSWER_S:g} s: the rig answers too slowly") from None
+
+
+class ReservedPorts(AbstractContextManager["ReservedPorts"]):
+    """Ports reserved until they are released; a context that releases them.
+
+    A socket that never listens is bound to each. Servers may listen there all the same, again and again, as they set
+    SO_REUSEADDR; while none does, connections are refused. Other systems than Linux do not let two sockets have a port
+    in this way: there the sockets are closed at once, and another program may take a port before its server does.
+
+    Args:
+        count: How many.
+        first: Reserve it and those that follow it; 0 is any.
+
+    Raises:
+        OSError: One of them is in use.
+    """
+
+    def __init__(self, count: int, first: int = 0) -> None:
+        self._sockets = [socket.socket() for _ in range(count)]
+        try:
+            for place, one in enumerate(self._sockets):
+                one.bind((HOST, first and first + place))  # alone: only then it lets servers in
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        except (OSError, OverflowError):
+            self.release()
+            raise
+        self.numbers = [int(one.getsockname()[1]) for one in self._sockets]
+        if sys.platform != "linux":
+            self.release()
+
+    def release(self) -> None:
+        """Give the ports back."""
+        for one in self._sockets:
+            one.close()
+
+    def __exit__(self, *_: object) -> None:
+        """Release them."""
+        self.release()
 
 
 class Detours(NamedTuple):
@@ -28,17 +98,12 @@ class Detours(NamedTuple):
 
 def endpoints_on(ports: Sequence[int], settings: Settings) -> RigEndpoints:
     """Return where the services are for the rig, on these ports."""
-    return RigEndpoints(*(_endpoint(settings, service, port) for service, port in zip(SERVICES, ports, strict=True)))
-
-
-def _endpoint(settings: Settings, service: str, port: int) -> Endpoint:
-    section = getattr(settings, service)
-    return Endpoint(
-        port=port,
-        word_order=section.word_order,
-        tls=settings.rig.tls if section.server.tls else None,
-        timeout_s=QUIET_S,
-    )
+    ends, tls = [], settings.rig.tls
+    for service, port in zip(SERVICES, ports, strict=True):
+        one = getattr(settings, service)
+        place = {"port": port, "word_order": one.word_order, "tls": tls if one.server.tls else None}
+        ends.append(Endpoint(**place, timeout_s=QUIET_S))
+    return RigEndpoints(*ends)
 
 
 def retaining(settings: Settings, folder: Path, *, always: bool) -> Settings:

@@ -13,13 +13,13 @@ from coldloop.config import load_configuration
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Mode, ProcessNow
-from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, UpdatingRuleStatus
+from coldloop.registers.optimizer_plc import OperatingLimits, Optimization
 from coldloop.registers.plant import SensorFaultKind, StationSample
 from coldloop.registers.safety import Alarm
-from coldloop.service.event_text import EventText, word
+from coldloop.service.event_text import EventText
 from coldloop_hmi.process_image import JournalEntry
-from coldloop_hmi.quality import Doubts
 from coldloop_hmi.replay import ReplayFrame
+from coldloop_hmi.signals import Doubts
 from coldloop_optimizer_plc.budget import PlcBudget
 from coldloop_optimizer_plc.rules import make_rule
 from coldloop_optimizer_plc.settings import OptimizerSettings
@@ -29,8 +29,8 @@ from coldloop_rig.results.recorded_alarms import alarms_after
 from coldloop_rig.results.run_folder import MOST_IN_MEMORY, MOST_LISTED, RunFolder
 
 SECTIONS: Final = ("limits", "session", "optimizer_plc", "telemetry")
-_MODES: Final = {word(mode): int(mode) for mode in Mode}
-_CAUSES: Final = {word(cause): int(cause) for cause in Cause}
+_MODES: Final = {mode.word: int(mode) for mode in Mode}
+_CAUSES: Final = {cause.word: int(cause) for cause in Cause}
 
 
 class RecordedPage:
@@ -53,13 +53,21 @@ class RecordedPage:
             bits = cache(self._bits)
             self._bad_sensors = [bits(bad or "") for bad in table["bad_sensors"].to_pylist()]
         self._since = _beginnings(self._modes)
-        self._settings = self._read_settings()
         self._station = self._read_station()
-
-    @property
-    def configuration(self) -> Mapping[str, Any]:
-        """Its configuration, by dotted key."""
-        return self._folder.configuration
+        self.ticks = len(self._values)
+        self.configuration: Mapping[str, Any] = folder.configuration
+        with folder.reading("updates.parquet", MOST_LISTED) as file:
+            rows = file.read().to_pylist()
+        self.updates: Sequence[Optimization] = [_optimization(row, self.process.tick_s) for row in rows]
+        entries = (_entry(row) for row in folder.events())
+        self.events: Sequence[JournalEntry] = sorted(entries, key=lambda entry: entry.tick)
+        settings = self._read_settings()
+        program, limits = settings.optimizer_plc.program, settings.limits
+        budget = PlcBudget(program.budget, make_solver(program).tau_1_s)
+        rule, times = make_rule(program, budget, round(program.updating_period_s / self.process.tick_s)), budget.times
+        self.rule = rule.status._replace(slots=times.slots, preparation=times.preparation, iteration=times.iteration)
+        bands = program.design.output_low, program.design.output_high
+        self.limits = OperatingLimits(*bands, limits.low, limits.high, limits.rate)
 
     def _read_station(self) -> NDArray[np.float32] | None:
         """Return signals, mode and alarms of the station, a row a tick; None of a cold box alone."""
@@ -76,37 +84,6 @@ class RecordedPage:
         values["model.file"] = str(self._folder.held(copy)) if copy else "cold-box"
         options: Mapping[str, tuple[object, str]] = {key: (value, "manifest") for key, value in values.items()}
         return load_configuration(OptimizerSettings, environment={}, options=options).settings
-
-    @property
-    def ticks(self) -> int:
-        """Ticks that were recorded."""
-        return len(self._values)
-
-    @cached_property
-    def updates(self) -> list[Optimization]:
-        """Updates whose sequence was played."""
-        with self._folder.reading("updates.parquet", MOST_LISTED) as file:
-            return [_optimization(row, self.process.tick_s) for row in file.read().to_pylist()]
-
-    @cached_property
-    def events(self) -> list[JournalEntry]:
-        """Events of the journals, in the order of their ticks."""
-        return sorted((_entry(row) for row in self._folder.events()), key=lambda entry: entry.tick)
-
-    @cached_property
-    def rule(self) -> UpdatingRuleStatus:
-        """What decided the updating period."""
-        program = self._settings.optimizer_plc.program
-        budget = PlcBudget(program.budget, make_solver(program).tau_1_s)
-        rule = make_rule(program, budget, round(program.updating_period_s / self.process.tick_s))
-        times = budget.times
-        return rule.status._replace(slots=times.slots, preparation=times.preparation, iteration=times.iteration)
-
-    @property
-    def limits(self) -> OperatingLimits:
-        """Bands, bounds and rates."""
-        design, limits = self._settings.optimizer_plc.program.design, self._settings.limits
-        return OperatingLimits(design.output_low, design.output_high, limits.low, limits.high, limits.rate)
 
     def frame(self, tick: int) -> ReplayFrame | None:
         """Return one tick; None if it is missing in the recording."""
@@ -130,10 +107,10 @@ class RecordedPage:
             if subject not in self.process.output_names:
                 continue
             (_, suspect, faulty), bit = found[-1], self._bits(subject)
-            if kind == word(EventKind.SENSOR):
+            if kind == EventKind.SENSOR.word:
                 suspect = suspect & ~bit | bit * (cause == "suspect")
-            elif kind == word(EventKind.SENSOR_FAULT):
-                faulty = faulty & ~bit | bit * (cause != word(SensorFaultKind.NONE))
+            elif kind == EventKind.SENSOR_FAULT.word:
+                faulty = faulty & ~bit | bit * (cause != SensorFaultKind.NONE.word)
             found.append((entry.tick, suspect, faulty))
         return found
 

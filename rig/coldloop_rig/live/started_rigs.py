@@ -1,27 +1,39 @@
-"""Rigs that were started on this machine: where they keep their state, their ports, how they are found and ended."""
+"""Rigs that were started on this machine: where they keep their state, their ports, how they are found and ended.
 
+What others must neither read nor change is in a private folder: `coldloop` in `XDG_RUNTIME_DIR`, if that is a folder
+of this user, or `coldloop-UID` in the folder for temporary files. Folders are used only if they belong to this user and
+are closed to others, and are not links: another user may have made them first where everybody can write. Files are
+opened without following links.
+"""
+
+import asyncio
 import fcntl
 import json
 import os
 import signal
 import socket
+import stat
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Self
+from typing import IO, Annotated, Final, NamedTuple, Self
+
+from pydantic import Field, TypeAdapter, ValidationError
 
 from coldloop.errors import ColdloopError, UsageError
 from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
-from coldloop.parsing import parsed_json
-from coldloop_rig.cosim.endpoints import REQUIRED, RigEndpoints
+from coldloop_rig.cosim.wiring import REQUIRED, RigEndpoints
 from coldloop_rig.interpreter import PYTHON
 from coldloop_rig.interruption import INTERRUPTION
-from coldloop_rig.live.private_folder import base_folder, is_private, make_own_folder, new_own, read_own, write_own
-from coldloop_rig.live.process_identity import identity_of
 
+MOST_BYTES: Final = 65536
+"""Size of a file about a rig, at most."""
+STATE, STARTED = 0, 19
+"""Places in /proc/PID/stat, counted behind the name of the program."""
 DEFAULT_PORTS: Final = (PLANT_PORT, CONTROL_PORT, OPTIMIZER_PORT)
 STATE_FILE: Final = "rig.json"
 """What `coldloop down`, `status` and `set` know of a rig that is up: process, ports, certificates."""
@@ -31,46 +43,165 @@ LOOK_UP_S: Final = 0.05
 """Between two looks at the process of a rig."""
 ANSWER_S: Final = 5.0
 """How long a connection to a port of this machine may take."""
+_HOLDER: Final = "a rig in containers, or another program (ss -ltnp names it): end it, or give another --port-base"
+
+
+def base_folder() -> Path:
+    """Return where the folders of all rigs of this user are; it need not be there."""
+    runtime = Path(os.environ.get("XDG_RUNTIME_DIR", ""))
+    if runtime.is_absolute() and runtime.is_dir() and runtime.stat().st_uid == os.getuid():
+        return runtime / "coldloop"
+    return Path(tempfile.gettempdir()) / f"coldloop-{os.getuid()}"
+
+
+def make_private(folder: Path) -> Path:
+    """Make a folder within one that exists, closed to others; return it.
+
+    Raises:
+        UsageError: It cannot be made, or its place is taken by a file of another user.
+    """
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+    except FileExistsError:
+        pass  # not a folder: said below
+    except OSError as error:
+        raise UsageError(f"{folder}: {error.strerror}; set XDG_RUNTIME_DIR to a folder of your own") from None
+    if not is_private(folder):
+        raise UsageError(
+            f"{folder}: not a folder of this user alone (owner, mode 0700, no link); remove it, or set XDG_RUNTIME_DIR "
+            "to a folder of your own"
+        )
+    return folder
+
+
+def make_own_folder(name: str) -> Path:
+    """Make a private folder of this name in the one of all rigs; return it.
+
+    Raises:
+        UsageError: It cannot be made, or belongs to another user.
+    """
+    return make_private(make_private(base_folder()) / name)
+
+
+def is_private(folder: Path) -> bool:
+    """Return whether something is a folder that belongs to this user and is closed to all others."""
+    try:
+        status = folder.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o077
+
+
+def read_own(file: Path) -> str:
+    """Return the text of a small file in a private folder.
+
+    Raises:
+        OSError: It is not there, or cannot be read.
+        ValueError: It is not a regular file of this user, is too large, or is not UTF-8 text.
+    """
+    with open(file, "rb", opener=_not_following) as content:
+        status = os.fstat(content.fileno())
+        if not stat.S_ISREG(status.st_mode) or status.st_uid != os.getuid():
+            raise ValueError("not a file of this user")
+        data = content.read(MOST_BYTES + 1)
+    if len(data) > MOST_BYTES:
+        raise ValueError("too large")
+    return data.decode("utf-8")
+
+
+def new_own(file: Path) -> IO[bytes]:
+    """Return a new file in a private folder, open for writing; what was there under its name is removed.
+
+    Raises:
+        OSError: It cannot be made.
+    """
+    file.unlink(missing_ok=True)
+    return open(file, "xb", opener=_not_following)
+
+
+def write_own(file: Path, text: str) -> None:
+    """Write a file in a private folder, which appears whole; what was there under its name is replaced.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    draft = file.with_name(f".{file.name}.draft")
+    try:
+        with new_own(draft) as content:
+            content.write(text.encode())
+        draft.replace(file)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(file)) from None
+
+
+def _not_following(path: str, flags: int) -> int:
+    """Open without following a link, and without waiting for a pipe's other end."""
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, mode=0o600)
+
+
+def identity_of(pid: int) -> str | None:
+    """Return what no other process has that ever had or will have this number; None if none runs that has it.
+
+    It is the boot and the time since it at which the process was started; without /proc that time, to the second.
+    """
+    if sys.platform != "linux":
+        shown = subprocess.run(  # noqa: S603
+            ["ps", "-o", "lstart=", "-p", str(pid)],  # noqa: S607 where it is differs
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        return shown.stdout.strip() or None
+    try:
+        status = Path(f"/proc/{pid}/stat").read_bytes()
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    except OSError:
+        return None
+    fields = status.rpartition(b")")[2].split()  # the name before may have anything in it
+    if fields[STATE] in (b"Z", b"X"):  # has ended, and its parent has not noticed
+        return None
+    return f"{boot} {int(fields[STARTED])}"
+
+
+Pid = Annotated[int, Field(gt=1, lt=2**31)]
+Port = Annotated[int, Field(gt=0, lt=0x10000)]
 
 
 class ServiceProcess(NamedTuple):
     """Process of a service."""
 
-    pid: int
+    pid: Pid
     identity: str
-    """See `coldloop_rig.live.process_identity`."""
+    """See `identity_of`."""
 
     @classmethod
     def of(cls, pid: int) -> Self:
         """Return the process that has this number now."""
         return cls(pid, identity_of(pid) or "")
 
-    @classmethod
-    def parsed(cls, content: Any) -> Self:  # noqa: ANN401 any JSON
-        """Return the process that a state file names.
+    @property
+    def runs(self) -> bool:
+        """Whether it is there, and not another one that has its number."""
+        return self.identity == identity_of(self.pid)
 
-        Raises:
-            ValueError: It names none.
-        """
-        process = cls(*content)
-        if type(process.pid) is not int or not 1 < process.pid < 2**31 or not isinstance(process.identity, str):
-            raise ValueError("its process id is invalid")
-        return process
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal, unless the process has ended meanwhile and another one may have its number."""
+        if self.runs:
+            with suppress(ProcessLookupError):
+                os.kill(self.pid, number)
 
 
 class RunningRig(NamedTuple):
     """A rig that was started on this machine."""
 
-    pid: int
+    pid: Pid
     identity: str
-    """Of its process; see `coldloop_rig.live.process_identity`."""
-    ports: tuple[int, ...]
-    tls: str
+    """Of its process; see `identity_of`."""
+    ports: Annotated[tuple[Port, ...], Field(min_length=3, max_length=3)]
+    tls: Annotated[str, Field(pattern=r"\A[^\x00]*\z")]
     """Folder of certificates that it was started with; empty when none."""
     services: dict[str, ServiceProcess]
     """Those that were started: an optimiser may be somebody else's."""
     cuttable: bool
-    """Whether its links can be cut; see `coldloop_rig.live.link_cuts`."""
+    """Whether its links can be cut; see `coldloop_rig.live.up`."""
 
     @classmethod
     def of_this_process(cls, ports: Sequence[int], tls: str, services: Mapping[str, int], *, cuttable: bool) -> Self:
@@ -90,27 +221,17 @@ class RunningRig(NamedTuple):
             ValueError: It was not written by `coldloop up`, or by another version.
         """
         try:
-            content: dict[str, Any] = parsed_json(text)
-            own = ServiceProcess.parsed([content["pid"], content["identity"]])
-            services = {
-                service: ServiceProcess.parsed(content["services"][service])
-                for service in RigEndpoints._fields
-                if service in REQUIRED or service in content["services"]
-            }
-            rig = cls(*own, tuple(content["ports"]), content["tls"], services, content["cuttable"] is True)
-        except (ValueError, KeyError, TypeError):
+            rig = cls(*TypeAdapter(cls).validate_json(text, strict=True))
+        except ValidationError:
             raise ValueError("not what `coldloop up` of this version writes") from None
-        ports_fit = len(rig.ports) == len(DEFAULT_PORTS) and all(
-            type(port) is int and 0 < port < 0x10000 for port in rig.ports
-        )
-        if not ports_fit or not isinstance(rig.tls, str) or "\0" in rig.tls:
-            raise ValueError("a port or a folder in it is invalid")
+        if not set(REQUIRED) <= rig.services.keys() <= set(RigEndpoints._fields):
+            raise ValueError("not what `coldloop up` of this version writes")
         return rig
 
     @property
-    def alive(self) -> bool:
-        """Whether its process is there, and not another one that has its number."""
-        return self.identity == identity_of(self.pid)
+    def process(self) -> ServiceProcess:
+        """Its own process."""
+        return ServiceProcess(self.pid, self.identity)
 
     @property
     def place(self) -> str:
@@ -143,7 +264,7 @@ def running_rig(first_port: int) -> RunningRig | None:
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise UsageError(f"{file}: {reason}; remove it, and end what is left of the rig by its process") from None
-    return rig if rig.alive else None
+    return rig if rig.process.runs else None
 
 
 def rigs_up() -> list[RunningRig]:
@@ -184,10 +305,17 @@ def find_rig(first_port: int | None) -> RunningRig | None:
     return found[0] if found else None
 
 
-def no_rig(first_port: int | None) -> UsageError:
-    """Return the message if `find_rig` finds none."""
-    where = "" if first_port is None else f" on port {first_port}"
-    return UsageError(f"no rig started here is up{where}: `coldloop up` starts one")
+def require_rig(first_port: int | None) -> RunningRig:
+    """Return the rig that was started here on these ports, or, without ports, the only one.
+
+    Raises:
+        UsageError: There is none, there are several, or its record is damaged.
+    """
+    rig = find_rig(first_port)
+    if rig is None:
+        where = "" if first_port is None else f" on port {first_port}"
+        raise UsageError(f"no rig started here is up{where}: `coldloop up` starts one")
+    return rig
 
 
 class RigLock:
@@ -261,9 +389,6 @@ def check_ports(ports: Sequence[int]) -> None:
                 raise UsageError(f"port {port} of the {service}: {error.strerror}; {remedy}") from None
 
 
-_HOLDER: Final = "a rig in containers, or another program (ss -ltnp names it): end it, or give another --port-base"
-
-
 def require_listener(port: int) -> None:
     """Reject a port of this machine without a listener.
 
@@ -279,7 +404,7 @@ def require_listener(port: int) -> None:
         ) from None
 
 
-# -- start and end -----------------------------------------------------------------------------------------------------
+# -- start, end and faults ---------------------------------------------------------------------------------------------
 
 
 def detached(ports: Sequence[int], lock: RigLock) -> int:
@@ -331,15 +456,36 @@ def take_down(first_port: int | None, patience_s: float) -> int:
         UsageError: There is none that was started here.
         ColdloopError: It does not end.
     """
-    rig = find_rig(first_port)
-    if rig is None:
-        raise no_rig(first_port)
-    with suppress(ProcessLookupError):
-        for number in (signal.SIGTERM, signal.SIGCONT):  # one that is stopped could not end
-            os.kill(rig.pid, number)
+    rig = require_rig(first_port)
+    for number in (signal.SIGTERM, signal.SIGCONT):  # one that is stopped could not end
+        rig.process.send(number)
     deadline = time.monotonic() + patience_s
-    while rig.alive:
+    while rig.process.runs:
         if time.monotonic() > deadline:
             raise ColdloopError(f"process {rig.pid} has not ended after {patience_s:g} s")
         time.sleep(LOOK_UP_S)
     return rig.pid
+
+
+def process_of(first_port: int | None, service: str) -> ServiceProcess:
+    """Return the process of a service of the rig on these ports, or of the only one.
+
+    Raises:
+        UsageError: No rig was started here, it has no such service, or that does not run at present.
+    """
+    process = require_rig(first_port).services.get(service)
+    if process is None:
+        raise UsageError(f"the rig was started without an {service} service")
+    if not process.runs:
+        raise UsageError(f"the {service} service does not run: `coldloop up` starts it again, or has given it up")
+    return process
+
+
+async def pause(process: ServiceProcess, seconds: float) -> bool:
+    """Suspend a process for a while; it is resumed in any case. Return whether it runs."""
+    process.send(signal.SIGSTOP)
+    try:
+        await asyncio.sleep(seconds)
+    finally:
+        process.send(signal.SIGCONT)
+    return process.runs

@@ -1,24 +1,46 @@
-"""What a rig that is up is doing, read over Modbus."""
+"""What commands ask of a rig that is up over Modbus: its status, or something with the role of an operator."""
 
 import asyncio
-from collections.abc import Awaitable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator
+from contextlib import AsyncExitStack, nullcontext
 from typing import Any, Final, NamedTuple
 
-from coldloop.errors import LinkError, PeerUnreachableError
+from coldloop.errors import LinkError, PeerUnreachableError, RequestRefusedError
 from coldloop.number_text import value_text
-from coldloop.operating.execution import Clients, CommandClient
-from coldloop.operating.rings import last_update
+from coldloop.operating.execution import Clients, CommandClient, clients_of, connected, reason_of
+from coldloop.operating.observer import last_update, read_alarms
 from coldloop.process.declaration import Process
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode, ProcessNow
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import LoadStatus
-from coldloop.registers.safety import Alarm, AlarmState, alarms_of
-from coldloop.service.event_text import alarm_cause, alarm_word, word_of
-from coldloop_rig.cosim.answer_time import answered_in_time
+from coldloop.registers.safety import AlarmState
+from coldloop.service.event_text import alarm_cause, alarm_word
+from coldloop_rig.cosim.wiring import RigEndpoints, answered_in_time
 from coldloop_rig.terminal import Colour, coloured
 
+Work = Callable[[Clients], Awaitable[str]]
 QUIET: Final = (AlarmState.NORMAL, AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE)
+
+
+async def ask(rig: RigEndpoints, process: Process, services: Iterable[str], work: Work, *, limited: bool = True) -> str:
+    """Connect to the services of a request, carry it out, and return the result.
+
+    With `limited` it may not take longer than a rig takes to answer.
+
+    Raises:
+        LinkError: A service is not there, refuses, or answers too late.
+        UsageError: It is not possible now.
+    """
+    clients = clients_of({service: getattr(rig, service) for service in services}, process)
+    async with AsyncExitStack() as stack:
+        async with answered_in_time("to connect"):
+            await stack.enter_async_context(connected(clients))
+        async with answered_in_time("the command") if limited else nullcontext():
+            try:
+                return await work(clients)
+            except RequestRefusedError as error:
+                raise LinkError(reason_of(error)) from None
 
 
 class PlantStatus(NamedTuple):
@@ -58,9 +80,9 @@ async def read_status(clients: Clients) -> RigStatus:
     Raises:
         LinkError: Neither the plant nor the control PLC answers, or an answer is not possible.
     """
-    readers = {"plant": _plant, "control_plc": _control, "optimizer_plc": _update}
+    readers = {"plant": _plant, "control_plc": _control, "optimizer_plc": last_update}
     names = [name for name in readers if name in clients]
-    answers = await asyncio.gather(*(_answer(readers[name](clients[name])) for name in names))
+    answers = await asyncio.gather(*(_answer(readers[name], clients[name]) for name in names))
     found: dict[str, Any] = dict(zip(names, answers, strict=True))
     absent = [answer for answer in answers if isinstance(answer, LinkError)]
     plant, control, update = (
@@ -71,38 +93,31 @@ async def read_status(clients: Clients) -> RigStatus:
     return RigStatus(clients[names[0]].process, plant, control, update, tuple(map(str, absent)))
 
 
-async def _answer(reading: Awaitable[Any]) -> Any:  # noqa: ANN401 of any service
+async def _answer(read: Callable[[CommandClient], Awaitable[Any]], client: CommandClient) -> Any:  # noqa: ANN401 any
     """Return what is read, or why a service does not answer."""
     try:
         async with answered_in_time("to read the status"):
-            return await reading
+            await client.connect(0.0)
+            return await read(client)
     except PeerUnreachableError as error:
         return error
 
 
 async def _plant(client: CommandClient) -> PlantStatus:
-    await client.connect(0.0)
     return PlantStatus(await client.read(Identity), await client.read(SessionPace), await client.read(LoadStatus))
 
 
 async def _control(client: CommandClient) -> ControlStatus:
-    await client.connect(0.0)
-    rows = await client.read_rows(Alarm, 0, len(alarms_of(client.process)))
-    alarms = tuple(_alarm(kind, row, client.process) for kind, row in enumerate(rows) if row.state not in QUIET)
+    rows, process = await read_alarms(client), client.process
+    causes = [f" ({cause})" if (cause := alarm_cause(i, row.cause, process)) else "" for i, row in enumerate(rows)]
+    alarms = tuple(
+        f"{alarm_word(i, process)}{causes[i]}, {AlarmState.word_of(row.state)}"
+        for i, row in enumerate(rows)
+        if row.state not in QUIET
+    )
     return ControlStatus(
         await client.read(LadderStatus), await client.read(Operator), (await client.read(ProcessNow)).y, alarms
     )
-
-
-async def _update(client: CommandClient) -> Optimization | None:
-    await client.connect(0.0)
-    return await last_update(client, await client.read(Identity))
-
-
-def _alarm(kind: int, row: Alarm, process: Process) -> str:
-    cause = alarm_cause(kind, row.cause, process)
-    state = word_of(AlarmState, row.state)
-    return f"{alarm_word(kind, process)}{f' ({cause})' if cause else ''}, {state}"
 
 
 def _pace(plant: PlantStatus) -> str:
@@ -140,9 +155,9 @@ def _rows(status: RigStatus) -> Iterator[tuple[str, str]]:
     if plant is not None:
         yield "session", f"{plant.identity.session}, {_pace(plant)}, {plant.identity.tick * tick_s:.2f} s"
     if control is not None:
-        mode, cause = word_of(Mode, control.ladder.mode), word_of(Cause, control.ladder.cause)
+        mode, cause = Mode.word_of(control.ladder.mode), Cause.word_of(control.ladder.cause)
         yield "mode", f"{mode} ({cause}) since {control.ladder.since * tick_s:g} s"
-        yield "operator", word_of(OperatorMode, control.operator.mode)
+        yield "operator", OperatorMode.word_of(control.operator.mode)
     if plant is not None and process.has_load:
         load, unit = plant.load, process.load.unit
         then = f", {value_text(load.next_watts, unit)} from {load.next_tick * tick_s:g} s" if load.upcoming else ""
@@ -161,7 +176,7 @@ def line(status: RigStatus) -> str:
     """Return the state as one line."""
     plant, control, process = status.plant, status.control, status.process
     parts = ["no plant  "] if plant is None else [f"{plant.identity.tick * process.tick_s:10.2f} s"]
-    parts.append("no control PLC" if control is None else f"{word_of(Mode, control.ladder.mode):9}")
+    parts.append("no control PLC" if control is None else f"{Mode.word_of(control.ladder.mode):9}")
     if plant is not None and process.has_load:
         parts.append(f"{plant.load.watts:6.1f} {process.load.unit}")
     if control is not None:

@@ -1,40 +1,310 @@
-"""A rig that stays up: services on fixed ports, in real time, until they are ended."""
+"""A rig that stays up: services on fixed ports, in real time, with the operator's page, until they are ended.
+
+`coldloop up --cuttable` has a proxy in each link, in its own process, and cuts it when `coldloop fault cut` leaves a
+file in the rig's private folder, each its own, which that process takes away when it cuts.
+"""
 
 import asyncio
+import json
+import secrets
+import socket
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext, suppress
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final, NamedTuple, Self
 
-from coldloop.errors import LinkError, PeerUnreachableError
+from pydantic import Field, TypeAdapter, ValidationError
+
+from coldloop.config import to_environment
+from coldloop.errors import ColdloopError, LinkError, PeerUnreachableError, UsageError
+from coldloop.modbus.settings import TlsSettings
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus
 from coldloop.registers.maps import maps_of
 from coldloop.registers.plant import Measurement
-from coldloop_rig.cosim.kept_up import keep_up, say
-from coldloop_rig.cosim.local_services import KeptService, LocalServices
+from coldloop_hmi.settings import HmiSection, HmiSettings
+from coldloop_hmi.users import PageRole, write_user
+from coldloop_rig.chaos.faults import Freeze, Link
+from coldloop_rig.chaos.proxied_services import LinkProxies
+from coldloop_rig.cosim.local_services import (
+    LocalServices,
+    end_of,
+    keep_up,
+    last_line,
+    say,
+    start_program,
+    terminate,
+    wait_for_end,
+)
 from coldloop_rig.cosim.scenario import with_copied_load
-from coldloop_rig.cosim.session_client import SessionClient
-from coldloop_rig.cosim.wiring import RETAINING, SERVICES, START_PATIENCE_S, retaining
-from coldloop_rig.live.link_cuts import CuttableLinks
-from coldloop_rig.live.page_process import PageProcess
-from coldloop_rig.live.private_folder import make_own_folder, make_private
-from coldloop_rig.live.started_rigs import DEFAULT_PORTS, STATE_FILE, RunningRig
+from coldloop_rig.cosim.session import SessionClient
+from coldloop_rig.cosim.wiring import RETAINING, SERVICES, START_PATIENCE_S, RigEndpoints, retaining
+from coldloop_rig.interpreter import PYTHON
+from coldloop_rig.live.started_rigs import (
+    DEFAULT_PORTS,
+    STATE_FILE,
+    RunningRig,
+    make_own_folder,
+    make_private,
+    new_own,
+    read_own,
+    require_rig,
+    state_folder,
+    write_own,
+)
 from coldloop_rig.runs.running import make_scenario
 from coldloop_rig.settings import Settings
 
+CUT_FILES: Final = "cut-*.json"
+CUT_LOOK_S: Final = 0.2
+"""Between two looks for a cut that is wanted, and for one that is taken."""
+TAKEN_S: Final = 10.0
+"""A rig takes it within this time."""
+OPERATOR: Final = "operator"
 LOOK_S: Final = 0.5
 """Between two looks at the load that the plant knows of, and at a service that was started again."""
 LOOKING: Final = (PlantLinkState.SEARCHING, PlantLinkState.JOINING)
 """A control PLC without a session is looking for the one that it has retained."""
 
 
+class Cut(NamedTuple):
+    """A link through which nothing passes for a while; its connections stay open, as when a cable is pulled."""
+
+    link: Link
+    seconds: Annotated[float, Field(gt=0, le=3600)]
+    """By the clock."""
+
+    @classmethod
+    def parsed(cls, text: str) -> Self:
+        """Return the cut that a file asks for.
+
+        Raises:
+            ValueError: It asks for none.
+        """
+        try:
+            return cls(*TypeAdapter(cls).validate_json(text))
+        except ValidationError:
+            raise ValueError("not what `coldloop fault cut` writes") from None
+
+
+class CuttableLinks(LinkProxies):
+    """Proxies that pass everything on, but what is cut on request."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__("up")
+        self._folder = folder
+        for file in folder.glob(CUT_FILES):
+            file.unlink(missing_ok=True)
+
+    async def keep(self) -> None:
+        """Cut what is wanted, until cancelled."""
+        cuts: set[asyncio.Task[None]] = set()
+        try:
+            while True:
+                await asyncio.sleep(CUT_LOOK_S)
+                for cut in self._wanted():
+                    task = asyncio.create_task(self._cut(cut))
+                    cuts.add(task)
+                    task.add_done_callback(cuts.discard)
+        finally:
+            for task in cuts:
+                task.cancel()
+
+    def _wanted(self) -> Iterator[Cut]:
+        """Take the cuts that are wanted; one that cannot be read is left, and its command says that it was not cut."""
+        for file in self._folder.glob(CUT_FILES):
+            with suppress(OSError):
+                try:
+                    yield Cut.parsed(read_own(file))
+                except ValueError as error:
+                    say(f"{file}: {error}")
+                file.unlink(missing_ok=True)
+
+    async def _cut(self, cut: Cut) -> None:
+        proxy = self.by_link[cut.link]
+        fault = Freeze(kind="freeze", link=cut.link, at_s=0.0, duration_s=cut.seconds)
+        proxy.begin(fault)
+        say(f"the {cut.link} link is cut for {cut.seconds:g} s")
+        try:
+            await asyncio.sleep(cut.seconds)
+        finally:
+            proxy.end(fault)
+        say(f"the {cut.link} link is restored")
+
+
+async def cut(first_port: int | None, link: Link, seconds: float) -> None:
+    """Cut a link of the rig that was started here on these ports, or of the only one; return when it is cut.
+
+    Raises:
+        UsageError: There is no such rig, or its links cannot be cut.
+        ColdloopError: It does not take it.
+    """
+    rig = require_rig(first_port)
+    if not rig.cuttable:
+        raise UsageError("the links of this rig cannot be cut: start it with `coldloop up --cuttable`")
+    file = state_folder(rig.ports[0]) / CUT_FILES.replace("*", secrets.token_hex(8))
+    write_own(file, json.dumps([link, seconds]))
+    deadline = time.monotonic() + TAKEN_S
+    try:
+        while file.exists():
+            if time.monotonic() > deadline:
+                raise ColdloopError(f"the rig (process {rig.pid}) has not cut the link within {TAKEN_S:g} s")
+            await asyncio.sleep(CUT_LOOK_S)
+    finally:
+        file.unlink(missing_ok=True)
+
+
+def check_page(section: HmiSection) -> None:
+    """Refuse a page that cannot be served, before anything that takes time.
+
+    Raises:
+        UsageError: It has no port, its extra is not installed, or its port is in use.
+    """
+    if not section.port:
+        raise UsageError("the page needs a fixed port: give one with --page-port")
+    if find_spec("aiohttp") is None:
+        raise UsageError("--page needs aiohttp: pip install 'coldloop[hmi]'")
+    with socket.socket(socket.AF_INET6 if ":" in section.host else socket.AF_INET) as one:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            one.bind((section.host, section.port))
+        except OSError as error:
+            raise UsageError(
+                f"port {section.port} of the page: {error.strerror}; give another one with --page-port"
+            ) from None
+
+
+def pointed_at(section: HmiSection, endpoints: RigEndpoints) -> HmiSection:
+    """Return the settings of a page of the services at these endpoints.
+
+    Their certificate is an operator's, for commands; for reading the page uses the reader's next to it, if any.
+    """
+    update: dict[str, object] = {
+        service: getattr(section, service).model_copy(
+            update={"host": end.host, "port": end.port, "word_order": end.word_order, "tls": readers(end.tls)}
+        )
+        for service, end in endpoints._asdict().items()
+    }
+    if endpoints.plant.tls is not None and section.operator_tls is None:
+        update["operator_tls"] = endpoints.plant.tls
+    return section.model_copy(update=update)
+
+
+def readers(tls: TlsSettings | None) -> TlsSettings | None:
+    """Return the reader's certificate next to the given one, as `coldloop certificates` makes it, or the given one."""
+    if tls is None:
+        return None
+    certificate, key = tls.certificate.with_name("reader.crt"), tls.key.with_name("reader.key")
+    if not (certificate.is_file() and key.is_file()):
+        return tls
+    return tls.model_copy(update={"certificate": certificate, "key": key})
+
+
+class FirstLogin(NamedTuple):
+    """The operator of a page whose configuration names no users."""
+
+    file: Path
+    password: str
+
+    @classmethod
+    def made_in(cls, folder: Path) -> Self:
+        """Write a user with a random password into a folder."""
+        login = cls(folder / "page-users", secrets.token_urlsafe(9))
+        login.file.unlink(missing_ok=True)
+        write_user(login.file, OPERATOR, PageRole.OPERATE, login.password)
+        return login
+
+    @property
+    def line(self) -> str:
+        """How to log in."""
+        return f"  to operate     user {OPERATOR}, password {self.password} (of this run)\n"
+
+
+def with_own_files(section: HmiSection, folder: Path) -> tuple[HmiSection, FirstLogin | None]:
+    """Return the settings of a page with users and an audit in a private folder, where they name none."""
+    update: dict[str, object] = {}
+    login = None if section.login.users else FirstLogin.made_in(folder)
+    if login is not None:
+        update["login"] = section.login.model_copy(update={"users": login.file})
+    if section.audit is None:
+        update["audit"] = folder / "page-audit.jsonl"
+    return section.model_copy(update=update), login
+
+
+class PageProcess:
+    """The page; an async context in which it lives.
+
+    Args:
+        settings: Its own, and the process of the rig.
+        endpoints: Where the services are, with the operator's certificate.
+        folder: Where it logs to, and keeps the first login and the audit.
+    """
+
+    def __init__(self, settings: HmiSettings | Settings, endpoints: RigEndpoints, folder: Path) -> None:
+        self._log = folder / "logs" / "hmi.log"
+        self._section, self._login = with_own_files(pointed_at(settings.hmi, endpoints), folder)
+        self._environment = to_environment(HmiSettings(model=settings.model, hmi=self._section))
+        self._process: asyncio.subprocess.Process | None = None
+
+    async def __aenter__(self) -> Self:
+        """Start it."""
+        await self.restart()
+        return self
+
+    async def ended(self) -> str:
+        """Wait until it has ended; return how."""
+        if self._process is None:
+            raise RuntimeError("the page was not started")
+        code = await self._process.wait()
+        return f"{end_of(code, last_line(self._log))} (log: {self._log})"
+
+    async def restart(self) -> None:
+        """Start it, or start it again."""
+        self._log.parent.mkdir(parents=True, exist_ok=True)
+        with new_own(self._log) as log:
+            self._process = await start_program((*PYTHON, "-m", "coldloop_hmi"), self._environment, log)
+
+    async def __aexit__(self, *_: object) -> None:
+        """End it."""
+        if self._process is not None:
+            terminate(self._process)
+            await wait_for_end(self._process)
+
+    async def is_served(self) -> None:
+        """Wait until the page answers.
+
+        Raises:
+            LinkError: It has ended.
+        """
+        while True:
+            if self._process is not None and self._process.returncode is not None:
+                raise LinkError(f"the page {await self.ended()}")
+            try:
+                _, writer = await asyncio.open_connection(self._section.host, self._section.port)
+            except OSError:
+                await asyncio.sleep(0.05)
+                continue
+            writer.close()
+            return
+
+    @property
+    def addresses(self) -> str:
+        """Where it is, and who may operate."""
+        scheme = "https" if self._section.https else "http"
+        text = f"  page           {scheme}://{self._section.host}:{self._section.port}/\n"
+        if self._login is not None:
+            text += self._login.line
+        return text
+
+
 class UpRig:
     """Starts the services, begins a session in real time, and keeps both up until it is cancelled.
 
-    A service or page that ends is started again (`coldloop_rig.cosim.kept_up`), and resumes from its retained state.
+    A service or page that ends is started again (`coldloop_rig.cosim.local_services`), and resumes from its retained state.
     `services` are those that are started; where the optimiser is not one of them, another client takes its place.
     `optimizer` is a program that is started in the place of ours.
     """
@@ -147,7 +417,12 @@ class UpRig:
                         return
                 await asyncio.sleep(LOOK_S)
 
-        await keep_up(KeptService(services, service), restarted)
+        await keep_up(
+            f"the {service} service",
+            lambda: services.exit_of(service),
+            lambda: services.start(service, may_end=True),
+            restarted,
+        )
 
     async def _goes_on(self, service: str, rig: SessionClient) -> bool:
         """Print whether the session was resumed after a restart of a service, or a new one has begun.
@@ -169,7 +444,7 @@ class UpRig:
 async def _keep_page(page: PageProcess) -> None:
     """Keep the page up; the rig keeps running without it once it is given up."""
     try:
-        await keep_up(page)
+        await keep_up("the page", page.ended, page.restart)
     except LinkError as error:
         say(str(error))
 

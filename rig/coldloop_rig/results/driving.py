@@ -13,7 +13,6 @@ from coldloop.process.declaration import Process
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.plant import SensorFaultKind
-from coldloop.service.event_text import word_of
 from coldloop_rig.results.arrow_arrays import number_array, text_array
 
 CONTROL: Final = "control_plc"
@@ -127,7 +126,7 @@ def _texts(state: Driving, output_names: Sequence[str]) -> dict[str, str | None]
     bad = " ".join(output_names[output] for output in sorted(state.bad))
     if state.mode is None:
         return dict(zip(_TEXTS, (None, None, None, bad), strict=True))
-    words = (word_of(Mode, state.mode), word_of(Cause, state.cause), DRIVERS.get(state.mode), bad)
+    words = (Mode.word_of(state.mode), Cause.word_of(state.cause), DRIVERS.get(state.mode), bad)
     return dict(zip(_TEXTS, words, strict=True))
 
 

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import islice
-from typing import Final, Protocol
+from typing import Final
 
 from coldloop.errors import ColdloopError, LinkError
 from coldloop.registers.audit import Event
@@ -18,7 +18,7 @@ from coldloop.registers.plant import PlantSample, StationSample
 from coldloop_rig.results.driving import CONTROL
 from coldloop_rig.results.recorded import LinkStatistics, PendingTicks, Recording, SampleBlock, joined
 
-__all__ = ["LinkStatistics", "MemorySink", "Recorder", "Recording", "Records", "SampleBlock", "Sink"]
+__all__ = ["LinkStatistics", "MemorySink", "Recorder", "Recording", "SampleBlock", "Sink"]
 
 BLOCK_TICKS: Final = 512
 """Samples that are passed on together."""
@@ -78,26 +78,6 @@ class MemorySink(Sink):
         """Return what was kept."""
         block = joined(self._blocks)
         return Recording(block.load, block.u, block.y, block.x, self._updates, link, block.station, self.events)
-
-
-class Records(Protocol):
-    """Takes what is read of a session: a recorder, or what is before one."""
-
-    @property
-    def next_tick(self) -> int:
-        """First tick that is still to come."""
-
-    def sample(self, sample: PlantSample) -> None:
-        """Take a tick."""
-
-    def station(self, sample: StationSample) -> None:
-        """Take what goes with a tick that is about to come."""
-
-    def update(self, update: Optimization) -> None:
-        """Take an update."""
-
-    def event(self, event: Event, service: str = CONTROL) -> None:
-        """Take an event."""
 
 
 class Recorder:

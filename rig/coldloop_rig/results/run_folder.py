@@ -19,7 +19,6 @@ from coldloop.parsing import parsed_json
 from coldloop.process.declaration import Process
 from coldloop.process.model_file import process_in, read_document
 from coldloop.registers.control_plc import Mode
-from coldloop.service.event_text import word
 from coldloop.text_file import held_file, read_text
 from coldloop_rig.durations import LONGEST_TICKS
 from coldloop_rig.results.arrow_arrays import numbers_of
@@ -291,7 +290,7 @@ def _in_force(batch: pa.RecordBatch, names: Sequence[str]) -> Curves:
     """Return columns as numbers; the updating period only where MPC was active, or the mode is not known."""
     series = batch_series(batch.select(names))
     if TAU_U in series:
-        is_mpc = pc.fill_null(pc.equal(batch["mode"], word(Mode.MPC)), fill_value=True)
+        is_mpc = pc.fill_null(pc.equal(batch["mode"], Mode.MPC.word), fill_value=True)
         series[TAU_U] = np.where(is_mpc.to_numpy(zero_copy_only=False), series[TAU_U], np.nan)
     return series
 

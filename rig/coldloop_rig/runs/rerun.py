@@ -14,9 +14,8 @@ from coldloop.errors import UsageError, printable
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import read_document
 from coldloop_plant.load import named_families
-from coldloop_rig.cosim.job import Job
 from coldloop_rig.cosim.one_process import OneProcessRig
-from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.cosim.scenario import Job, Scenario
 from coldloop_rig.figures.worker import FigureProcess
 from coldloop_rig.progress import RunProgress
 from coldloop_rig.results.folders import claim_folder, installed_version

@@ -9,9 +9,8 @@ from coldloop.process.lti_model import load as load_model
 from coldloop.registers.plant import PlantSample
 from coldloop.session.settings import TimeMode
 from coldloop_plant.load import find_load
-from coldloop_rig.cosim.job import Job, StopRequest
 from coldloop_rig.cosim.one_process import OneProcessRig
-from coldloop_rig.cosim.scenario import Scenario, natural_ticks
+from coldloop_rig.cosim.scenario import Job, Scenario, StopRequest, natural_ticks
 from coldloop_rig.figures.worker import FigureProcess
 from coldloop_rig.interruption import INTERRUPTION
 from coldloop_rig.results.recording import Recorder, Sink

@@ -9,8 +9,6 @@ with up(load="a") as rig:
     print(rig.plant.read("measurement.y.T5"))
 """
 
-from coldloop_rig.testing.live_rig import LiveRig, up
-from coldloop_rig.testing.named_registers import NamedRegisters
-from coldloop_rig.testing.rigs import Rigs
+from coldloop_rig.testing.live_rig import LiveRig, NamedRegisters, Rigs, up
 
 __all__ = ["LiveRig", "NamedRegisters", "Rigs", "up"]

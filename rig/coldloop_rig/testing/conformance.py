@@ -3,32 +3,214 @@
 `python -m coldloop_rig.testing.conformance NAME` prints it of a solver, with `rule` or `estimator` behind it of such.
 """
 
+import math
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coldloop.errors import ColdloopError
+from coldloop.process.declaration import REFERENCE_TICK_S, Process
 from coldloop.process.lti_model import load
+from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop_optimizer_plc.computing_settings import DaqpSettings, OutsideSettings
 from coldloop_optimizer_plc.entry_points import Part, made
+from coldloop_optimizer_plc.outside_estimator import Measured, OutsideCorrection, PlantModel, plant_model
 from coldloop_optimizer_plc.qp.costs import augmented_cost
-from coldloop_optimizer_plc.qp.prediction import PredictionModel
+from coldloop_optimizer_plc.qp.prediction import PredictionModel, prediction_of
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
+from coldloop_optimizer_plc.rules import Observation, assess
+from coldloop_optimizer_plc.rules.outside import OutsideDecision
 from coldloop_optimizer_plc.solvers.daqp import DaqpSolver
 from coldloop_optimizer_plc.solvers.outside import OutsideMethod, OutsideSolver
 from coldloop_rig.settings import Settings
-from coldloop_rig.testing.estimator_conformance import estimator_requirements
-from coldloop_rig.testing.requirement import Requirement
-from coldloop_rig.testing.rule_conformance import rule_requirements
 from coldloop_rig.text_tables import aligned
 
+DECISIONS: Final = 200
+"""In each session."""
+LONGEST_TICKS: Final = 20
+"""Of a sampling period, as the cold box has it; a ladder says what periods there are."""
+LADDERS: Final = (
+    tuple(range(SHORTEST_TICKS, LONGEST_TICKS + 1)), (SHORTEST_TICKS, LONGEST_TICKS), (LONGEST_TICKS,),
+)  # fmt: skip
+"""Every period, two, and a single one: on a slow PLC there is no other."""
+SEEDS: Final = range(5)
+PERIODS: Final = 400
+"""Updating periods of a session; of half a sampling period each, as far as ticks go."""
+AHEAD: Final = 60
+"""Periods over which outputs are predicted from an estimate."""
+LEFT: Final = 0.1
+"""Share of the first error of these predictions that may be left at the end."""
+LOST: Final = range(20, 40)
+"""Periods in which readings are lost, the first one alone at first and all of them in the middle one."""
 PROBLEMS: Final = 20
 COUNTS: Final = (0, 1, 2, 5, 20, 100)
 LONGEST: Final = COUNTS[-1]
 NOISE: Final = 1e-9
 """Rise of a cost, relative, that is rounding."""
+
+
+class Requirement(NamedTuple):
+    """A requirement, and in how many cases it was not kept."""
+
+    text: str
+    failures: int
+    cases: int
+
+    @property
+    def outcome(self) -> str:
+        """Yes, or how often not."""
+        return "yes" if not self.failures else f"NO, in {self.failures} of {self.cases}"
+
+
+def rule_requirements(make: Callable[[Sequence[int]], OutsideDecision]) -> list[Requirement]:
+    """Return what the rules that are made keep, in a session with each ladder."""
+    failed = dict.fromkeys(
+        ("begins with the number of a period", "decides numbers of periods, 1 to their count",
+         "has the number of a period after a load step", "decides the same from the same observations",
+         "begins a session as if there had been none before"), 0,
+    )  # fmt: skip
+    begins, decides, steps, same, fresh = failed
+    for ladder in LADDERS:
+        rule, twin = make(ladder), make(ladder)
+        decided = session(rule, ladder)
+        failed[begins] += not is_q(decided[0], ladder)
+        failed[decides] += not all(is_q(q, ladder) for q in decided[1:])
+        failed[steps] += not is_q(getattr(rule, "after_interruption", rule.first)(), ladder)
+        failed[same] += decided != session(twin, ladder)
+        failed[fresh] += decided != session(make(ladder), ladder)
+    return [Requirement(text, failures, len(LADDERS)) for text, failures in failed.items()]
+
+
+def is_q(q: float, ladder: Sequence[int]) -> bool:
+    """Return whether this is the number of a period, which is one of whole ticks."""
+    return float(q).is_integer() and 1 <= q <= len(ladder)
+
+
+def session(rule: OutsideDecision, ladder: Sequence[int]) -> list[float]:
+    """Return what a rule decides in a session of random costs over twelve decades, the first q first.
+
+    A q that it should not have decided is followed by the nearest.
+    """
+    random = np.random.default_rng(1)
+    decided: list[float] = [rule.first()]
+    for _ in range(DECISIONS):
+        q = int(np.clip(np.nan_to_num(decided[-1], nan=1.0), 1, len(ladder)))
+        before, hot_start, delivered, effective = (10.0 ** random.uniform(0.0, 12.0, 4)).tolist()
+        last_but_one = delivered * (1.0 + abs(float(random.normal())))
+        ticks = ladder[q - 1]
+        o = Observation(q, 4 * ticks, ticks * REFERENCE_TICK_S, before, hot_start, last_but_one, delivered, effective)
+        decided.append(rule.decide(o, assess(o)))
+    return decided
+
+
+Array = NDArray[np.float64]
+Made = Callable[[PlantModel], OutsideCorrection]
+Estimate = tuple[Array, float]
+
+
+def estimator_requirements(make: Made, settings: Settings) -> list[Requirement]:
+    """Return what the estimators that are made keep, in a session each of several plants."""
+    program = settings.optimizer_plc.program
+    prediction = prediction_of(load(settings.model.file), program.estimator.disturbed, program.design)
+
+    def model() -> PlantModel:
+        return plant_model(prediction, program.estimator)
+
+    failed = dict.fromkeys(
+        ("returns a finite state of n numbers and a mismatch", "does so where readings are missing",
+         "leaves the prediction and the measurement as they were", "converges on a plant that is its model",
+         "gives the same bits for the same measurements", "begins a session as if there had been none before"), 0,
+    )  # fmt: skip
+    finite, missing, left, converges, same, fresh = failed
+    for seed in SEEDS:
+        world, lossy = (World(model(), settings.process, seed, loses=loses) for loses in (False, True))
+        twin = make(model())
+        first = world.session(make(model()))
+        failed[finite] += not all(is_estimate(one, world.n) for one in first)
+        failed[missing] += not all(is_estimate(one, world.n) for one in lossy.session(make(model())))
+        failed[left] += world.touched
+        failed[converges] += not world.left <= LEFT
+        failed[same] += not equal(first, world.session(twin))
+        failed[fresh] += not equal(first, world.session(make(model())))
+    return [Requirement(text, failures, len(SEEDS)) for text, failures in failed.items()]
+
+
+def is_estimate(estimate: Estimate, n: int) -> bool:
+    """Return whether this is a finite state (n,) and mismatch."""
+    x, mismatch = estimate
+    return np.shape(x) == (n,) and bool(np.isfinite(x).all()) and math.isfinite(mismatch)
+
+
+def equal(some: list[Estimate], others: list[Estimate]) -> bool:
+    """Return whether estimates have the same bits."""
+    return all(np.array_equal(x, y) and v == w for (x, v), (y, w) in zip(some, others, strict=True))
+
+
+class World:
+    """A plant that is the model, and begins elsewhere than the estimator believes; nothing disturbs it.
+
+    Its inputs move; its constant errors are some of its sensors' standard deviations, and a part of its load is unseen.
+    """
+
+    def __init__(self, model: PlantModel, process: Process, seed: int, *, loses: bool) -> None:
+        self._process, self._ticks = process, process.ticks_per_sample // 2
+        self._model, self._seed, self._loses = model, seed, loses
+        self.n = len(model.A)
+        self.touched = False
+        """Whether an estimator has changed what it was given."""
+        self.left = math.inf
+        """Error of the outputs predicted from the last estimate, over that from nothing."""
+
+    def session(self, estimator: OutsideCorrection) -> list[Estimate]:
+        """Return the estimates of a session; what is none is followed by the prediction, as in the program."""
+        m, random = self._model, np.random.default_rng(self._seed)
+        A, B, F = over(m, self._ticks)
+        scale = math.sqrt(self._process.ticks_per_sample) * m.walks
+        x = random.normal(size=self.n) * 10.0 * scale[:-1]
+        unseen = float(random.normal()) * 10.0 * scale[-1] * self._process.has_load
+        size = np.array([0.02 * (one.high - one.low) for one in self._process.inputs])
+        predicted, mismatch, found = np.zeros(self.n), 0.0, []
+        before = self._error(x, unseen, predicted, mismatch)
+        u = np.zeros(len(size))
+        for period in range(PERIODS):
+            y = m.C @ x + m.D @ u + m.G[:, 0] * unseen
+            if self._loses and period in LOST:
+                y[: 1 if period != LOST[len(LOST) // 2] else None] = np.nan
+            measured = Measured(self._ticks, u.copy(), 0.0, y.copy())
+            given = predicted.copy()
+            estimate = estimator.correct(given, mismatch, measured)
+            self.touched |= not (
+                np.array_equal(given, predicted) and np.array_equal(measured.y, y, equal_nan=True)
+                and np.array_equal(measured.u, u)
+            )  # fmt: skip
+            found.append((np.array(estimate[0], np.float64), float(estimate[1])))
+            if is_estimate(found[-1], self.n):
+                predicted, mismatch = found[-1]
+            self.left = self._error(x, unseen, predicted, mismatch) / before
+            u = size * np.sin(0.1 * period + np.arange(len(size)))
+            x = A @ x + B @ u + F[:, 0] * unseen
+            predicted = A @ predicted + B @ u + F[:, 0] * mismatch
+        return found
+
+    def _error(self, x: Array, unseen: float, found: Array, mismatch: float) -> float:
+        """Return the error of outputs predicted from an estimate, over the sensors' noise, root mean square."""
+        m, (A, _, F) = self._model, over(self._model, self._ticks)
+        e, w, errors = x - found, unseen - mismatch, []
+        for _ in range(AHEAD):
+            e = A @ e + F[:, 0] * w
+            errors.append((m.C @ e + m.G[:, 0] * w) / m.noise)
+        return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def over(model: PlantModel, ticks: int) -> tuple[Array, Array, Array]:
+    """Return A, B and F over so many ticks."""
+    A, B, F = np.eye(len(model.A)), np.zeros_like(model.B), np.zeros_like(model.F)
+    for _ in range(ticks):
+        A, B, F = model.A @ A, model.A @ B + model.B, model.A @ F + model.F
+    return A, B, F
 
 
 def requirements(method: OutsideMethod, problems: list[QuadraticProblem]) -> list[Requirement]:

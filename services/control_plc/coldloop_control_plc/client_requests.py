@@ -22,9 +22,9 @@ from coldloop.registers.control_plc import (
     Verdict,
 )
 from coldloop.registers.declaration import Block, Role
-from coldloop.registers.safety import AlarmCommand, AlarmKind, WatchdogTime
+from coldloop.registers.safety import AlarmCommand, AlarmKind, LeaseEvent, WatchdogTime
+from coldloop.safety.lease import WriterLease
 from coldloop.safety.sequence import InputSequence
-from coldloop.safety.writer_lease import LeaseEvent, WriterLease
 from coldloop.session.time_base import TimeBase
 from coldloop_control_plc.program import ControlProgram
 from coldloop_control_plc.publication import ControlPublication

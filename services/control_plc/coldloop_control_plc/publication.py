@@ -8,7 +8,7 @@ from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.control_plc import LadderStatus, PlantLinkStatus, ProcessNow, Status
 from coldloop.registers.safety import AlarmState
-from coldloop.safety.writer_lease import WriterLease
+from coldloop.safety.lease import WriterLease
 from coldloop.service.event_text import alarm_word, log_event
 from coldloop.service.journal import JournalPublication
 from coldloop.session.clock import LatenessRecord

@@ -16,8 +16,7 @@ from coldloop.registers.codec import check_record
 from coldloop.registers.common import SessionPace
 from coldloop.registers.control_plc import SEQUENCE_ROWS, CoolDownStep, Operator, SequenceHeader, control_map
 from coldloop.registers.safety import Alarm, alarms_of
-from coldloop.safety.retained import RetainedFile, RetainedStateError
-from coldloop.safety.retained_writer import RetainedStateWriter
+from coldloop.safety.retained import RetainedFile, RetainedStateError, RetainedStateWriter
 from coldloop.safety.sequence import InputSequence, checksum
 from coldloop.session.time_base import TimeBase
 from coldloop_control_plc.program import ControlProgram

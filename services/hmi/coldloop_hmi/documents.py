@@ -1,12 +1,14 @@
-"""What the page and other programs are sent, as JSON; `docs/operator-page.md` describes every field."""
+"""What the page and other programs are sent: JSON (`docs/operator-page.md` describes every field), and metrics."""
 
 import json
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from itertools import islice, pairwise
 from typing import Any, Final
+
+from prometheus_client.core import Metric
 
 from coldloop import __version__
 from coldloop.process.declaration import Process
@@ -21,31 +23,66 @@ from coldloop.registers.optimizer_plc import (
     Prediction,
     outputs_of,
 )
+from coldloop.registers.plant import StationAlarm, StationMode, StationStatus
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmPriority, AlarmState
-from coldloop.service.event_text import alarm_cause, alarm_word, word, word_of
-from coldloop_hmi.compression_station import plant_document
-from coldloop_hmi.explanation import explain
-from coldloop_hmi.process_image import JournalEntry, Model
-from coldloop_hmi.process_view import process_document
-from coldloop_hmi.quality import qualities
-from coldloop_hmi.sentences import deviation, sentence
-from coldloop_hmi.signals import signals_of
-from coldloop_hmi.trends import Gap, ModeInterval, mode_name, rounded, thin
+from coldloop.service.event_text import alarm_cause, alarm_word, flag_words
+from coldloop.service.metrics import block_families, build_family, gauge
+from coldloop_hmi.explanation import deviation, explain, sentence
+from coldloop_hmi.process_image import Gap, JournalEntry, ModeInterval, Model, rounded, thin
+from coldloop_hmi.signals import RAW, Quality, process_document, qualities, signals_of
 
-Document = dict[str, Any]
-
+KIND: Final = "plant.kind"
+REFRIGERATOR: Final = "refrigerator"
+SIGNALS: Final = "plant.station.signals."
+ALARMS: Final = "plant.station.alarms."
+LIMITS: Final[Mapping[str, tuple[str | None, str | None]]] = {
+    "P12": ("hp_low_bar", "hp_high_bar"),
+    "P11": ("lp_low_bar", "lp_high_bar"),
+    "L_N2": ("nitrogen_low", None),
+    "lost": (None, "helium_lost_kg"),
+}
+"""Where the station's alarms begin, by signal: below, above."""
 MARKED: Final = {
-    word(EventKind.ALARM_RAISED): "alarm",
-    word(EventKind.LIVE_LOAD): "load",
-    word(EventKind.LOAD): "load",
-    word(EventKind.OPERATOR_MODE): "operator",
-    word(EventKind.SETPOINT): "operator",
-    word(EventKind.SENSOR_FAULT): "fault",
+    EventKind.ALARM_RAISED.word: "alarm",
+    EventKind.LIVE_LOAD.word: "load",
+    EventKind.LOAD.word: "load",
+    EventKind.OPERATOR_MODE.word: "operator",
+    EventKind.SETPOINT.word: "operator",
+    EventKind.SENSOR_FAULT.word: "fault",
 }
 """Kinds of events that are marked on the trends, and what as."""
-BEGUN: Final = word(EventKind.SESSION)
+BEGUN: Final = EventKind.SESSION.word
 MOST_MARKS: Final = 1000
 EARLIER_PREDICTIONS: Final = 12
+PERIODS: Final = ("tau_u", "q")
+QUANTITIES: Final[Mapping[str, Callable[[Optimization, float], float]]] = {
+    "tau_u": lambda one, tick_s: one.tau_u * tick_s,
+    "q": lambda one, _: float(one.q),
+    "J": lambda one, _: one.j_effective,
+    "J_predicted": lambda one, _: one.j_delivered,
+}
+
+
+def plant_document(model: Model) -> dict[str, Any]:
+    """Return the kind of the plant as it reports it; of a refrigerator also the state of its station."""
+    kind = model.configuration.get(KIND, "")
+    if kind != REFRIGERATOR:
+        return {"kind": kind}
+    status = model.record("plant", StationStatus) or StationStatus()
+    return {
+        "kind": kind,
+        "mode": StationMode.word_of(status.mode),
+        "alarms": flag_words(StationAlarm(status.alarms)),
+        "bands": {f"{SIGNALS}{name}": _band(model, *keys) for name, keys in LIMITS.items()},
+    }
+
+
+def _band(model: Model, *keys: str | None) -> list[float | None]:
+    values = (model.configuration.get(f"{ALARMS}{key}") if key else None for key in keys)
+    return [float(value) if isinstance(value, int | float) else None for value in values]
+
+
+Document = dict[str, Any]
 
 
 def encoded(document: Document) -> bytes:
@@ -91,7 +128,8 @@ def catalog(model: Model, *, training: bool, replay: bool) -> Document:
         "trended": [name for name in model.trends.names if name != "load" or process.has_load],
         "process": process_document(process),
         "outputs": list(process.output_names),
-        "alarm_actions": {word(action): int(action) for action in AlarmAction},
+        "alarm_actions": {action.word: int(action) for action in AlarmAction},
+        "alarm_states": {state.word: state.text for state in AlarmState},
         "tick_s": process.tick_s,
     }  # fmt: skip
 
@@ -101,11 +139,11 @@ def alarm_document(kind: int, alarm: Alarm, process: Process) -> Document:
     return {
         "number": int(kind),
         "name": alarm_word(kind, process),
-        "state": word_of(AlarmState, alarm.state),
+        "state": AlarmState.word_of(alarm.state),
         "active": bool(alarm.active),
         "cause": alarm_cause(kind, alarm.cause, process) if alarm.times else "",
         "priority": int(alarm.priority),
-        "priority_word": word_of(AlarmPriority, alarm.priority),
+        "priority_word": AlarmPriority.word_of(alarm.priority),
         "times": alarm.times,
         "raised_s": alarm.raised * process.tick_s,
         "returned_s": alarm.returned * process.tick_s,
@@ -116,7 +154,9 @@ def alarm_document(kind: int, alarm: Alarm, process: Process) -> Document:
 def alarms_document(model: Model) -> list[Document]:
     """Return all alarms: those that are active first, of these the unacknowledged ones, then by priority and age."""
     rank: dict[int, int] = {AlarmState.UNACKNOWLEDGED: 0, AlarmState.ACKNOWLEDGED: 1, AlarmState.RETURNED: 2}
-    rows = sorted(model.alarm_rows(), key=lambda row: (rank.get(row[1].state, 3), -row[1].priority, -row[1].raised))
+    rows = sorted(
+        enumerate(model.alarms), key=lambda row: (rank.get(row[1].state, 3), -row[1].priority, -row[1].raised)
+    )
     return [alarm_document(kind, alarm, model.process) for kind, alarm in rows]
 
 
@@ -230,6 +270,7 @@ def trend_document(
         start - 2 * process.ticks_per_sample, end
     )  # with the update that the window begins with
     shown = [one for one in model.predictions if one.tick >= start and not is_brief]
+    every = max(1, -(-len(shown) // EARLIER_PREDICTIONS))  # the newest, and of the earlier ones some
     quantities = ("tau_u",) if is_brief else tuple(QUANTITIES)
     limits = model.limits
     return {
@@ -237,10 +278,10 @@ def trend_document(
         "time": times,
         "series": series,
         "updates": updates_document(model.updates, in_force, gaps, points, quantities, tick_s),
-        "modes": [{"from": one.start, "to": one.end, "mode": mode_name(one.mode)} for one in modes],
+        "modes": [{"from": one.start, "to": one.end, "mode": Mode.word_of(one.mode)} for one in modes],
         "doubtful": {name: found for name, found in model.trends.doubtful(start, end).items() if name in names},
         **_marks(model, start, end),
-        "predictions": [prediction_document(one, process) for one in _some(shown)],
+        "predictions": [prediction_document(one, process) for one in shown[::-1][::every][::-1]],
         "planned": model.is_planned,
         "gaps": [[max(gap.start, start) * tick_s, min(gap.end, end) * tick_s] for gap in gaps],
         "bands": _ranges([one.name for one in process.banded], limits.output_low, limits.output_high),
@@ -275,15 +316,6 @@ def updates_document(
     return found
 
 
-PERIODS: Final = ("tau_u", "q")
-QUANTITIES: Final[Mapping[str, Callable[[Optimization, float], float]]] = {
-    "tau_u": lambda one, tick_s: one.tau_u * tick_s,
-    "q": lambda one, _: float(one.q),
-    "J": lambda one, _: one.j_effective,
-    "J_predicted": lambda one, _: one.j_delivered,
-}
-
-
 def _lost_updates(updates: Sequence[Optimization], gaps: Sequence[Gap]) -> list[int]:
     """Return the ticks of the updates before which some are missing because nothing could be read."""
     return [
@@ -297,18 +329,12 @@ def _ranges(names: Sequence[str], low: Sequence[float], high: Sequence[float]) -
     return {name: list(ends) for name, *ends in zip(names, low, high, strict=True)}
 
 
-def _some(predictions: list[Prediction]) -> list[Prediction]:
-    """Return the newest prediction and some of the earlier ones, evenly spaced."""
-    every = max(1, -(-len(predictions) // EARLIER_PREDICTIONS))
-    return predictions[::-1][::every][::-1]
-
-
 def _marks(model: Model, start: int, end: int) -> Document:
     """Return the marks between two ticks, and since when they are all, s; None if there are no earlier ones."""
     tick_s = model.process.tick_s
     begun = max((e.utc for e in model.events if e.service == "plant" and e.text.kind == BEGUN), default="")
     known = [entry for entry in model.events if entry.utc >= begun]  # not of a session before
-    marked = MARKED.keys() - ({word(EventKind.LOAD)} if not model.process.has_load else ())
+    marked = MARKED.keys() - ({EventKind.LOAD.word} if not model.process.has_load else ())
     found = [entry for entry in known if entry.text.kind in marked and start <= entry.tick <= end]
     is_cut = len(found) > MOST_MARKS or (len(known) == model.events.maxlen and known[0].tick > start)
     since_s = (found[-MOST_MARKS:] or known)[0].tick * tick_s if is_cut else None
@@ -317,3 +343,54 @@ def _marks(model: Model, start: int, end: int) -> Document:
         for entry in found[-MOST_MARKS:]
     ]
     return {"marks": marks, "marks_since_s": since_s}
+
+
+def page_families(model: Model, browsers: int) -> Iterator[Metric]:
+    """Yield everything; of a service that is silent only that it is."""
+    yield build_family()
+    live = [service for service in model.maps if model.is_live(service)]
+    up = {service: service in live for service in model.maps}
+    yield gauge("coldloop_up", "1 while a service answers the page", up, label="service")
+    ages = {service: age for service in model.maps if (age := model.age_s(service)) is not None}
+    yield gauge("coldloop_age_seconds", "Time since the last answer of a service", ages, label="service")
+    yield gauge("coldloop_page_browsers", "Streams to browsers", browsers)
+    for service in live:
+        for block in model.maps[service].blocks:
+            record = model.sources[service].records.get(block.name)
+            if record is not None and block.writer is None:
+                yield from block_families(service, block, record)
+    yield _qualities(model, live)
+    if "control_plc" in live:
+        yield from _alarms(model)
+    if "optimizer_plc" in live and model.updates:
+        fields = model.maps["optimizer_plc"].block_of(Optimization).fields
+        for (name, field), value in zip(fields.items(), model.updates[-1], strict=True):
+            unit = f" ({field.unit})" if field.unit else ""
+            yield gauge(f"coldloop_update_{name}", f"Last update: {field.description}{unit}", value)
+
+
+def _qualities(model: Model, live: list[str]) -> Metric:
+    """Return the quality of the outputs, wherever they are read, and of the last update, as page and API have them."""
+    found, places = qualities(model.doubts, model.stale_prefixes(), model.process), ("control_plc.process.y.", *RAW)
+    names = [
+        f"{place}{name}" for place in places if place.partition(".")[0] in live for name in model.process.output_names
+    ]
+    if "optimizer_plc" in live and model.updates:
+        names.append("update")
+    worst = dict.fromkeys(names, 0)
+    for entry, quality in found.items():  # the worst is the last
+        concerned = [name for name in names if name == entry or (entry[-1] == "." and name.startswith(entry))]
+        worst.update(dict.fromkeys(concerned, list(Quality).index(quality)))
+    description = ", ".join(f"{number} {quality}" for number, quality in enumerate(Quality))
+    return gauge("coldloop_quality", f"Quality of a value: {description}", worst, label="signal")
+
+
+def _alarms(model: Model) -> Iterator[Metric]:
+    rows = [(alarm_word(kind, model.process), alarm) for kind, alarm in enumerate(model.alarms)]
+    for name, description, values in (
+        ("coldloop_alarm_active", "1 while the condition of an alarm holds", [row.active for _, row in rows]),
+        ("coldloop_alarm_state", ", ".join(f"{state.value} {state.text}" for state in AlarmState),
+         [row.state for _, row in rows]),
+        ("coldloop_alarm_raised", "Times that an alarm was raised", [row.times for _, row in rows]),
+    ):  # fmt: skip
+        yield gauge(name, description, dict(zip([alarm for alarm, _ in rows], values, strict=True)), label="alarm")

@@ -1,4 +1,4 @@
-"""Explains an updating period: from the record of an update to the branch that decided it.
+"""Explains an updating period: from the record of an update to the branch that decided it, and to a sentence.
 
 A pure function of registers: it works on a running rig and on a recorded run alike. Symbols are those of Algorithm 1
 (`coldloop_optimizer_plc/rules/`): the quantities of update i were found at t_i, of the period that ended there.
@@ -7,17 +7,28 @@ A pure function of registers: it works on a running rig and on a recorded run al
 import math
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cache
 from typing import Final, NamedTuple
 
+from coldloop.number_text import number_text
 from coldloop.process.declaration import Process
 from coldloop.process.updating_periods import ComputingTimes
 from coldloop.registers.control_plc import Verdict
-from coldloop.registers.optimizer_plc import Optimization, UpdatingRuleKind, UpdatingRuleStatus
+from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, UpdatingRuleKind, UpdatingRuleStatus
 
 RESOLUTION: Final = 2.0**-22
 """A change of E that is smaller is lost in the single precision of the registers."""
 STEEPEST: Final = 0.1
 """Slope of K, 1/iteration, that is not reached where K is 1."""
+AT_REST: Final = 1e-9
+"""A Gamma that is smaller is rounding: the cost is at its floor."""
+NOTABLE_SHARE: Final = 0.01
+"""A plant that differs from its model by less than this share of the range of an input is not worth a word, ..."""
+NOTABLE_NOISE: Final = 5.0
+"""... nor by less than so many times the noise of an output, where the process does not declare what is notable."""
+MOST_DEVIATIONS: Final = 4
+SURPRISING: Final = 3.0
+"""A reading that is so many times further from its prediction than the filter expects is worth a word."""
 
 
 class Branch(StrEnum):
@@ -123,15 +134,7 @@ def explain(
     update: Optimization, before: Optimization | None, after: Optimization | None, rule: UpdatingRuleStatus,
     process: Process,
 ) -> Explanation:  # fmt: skip
-    """Explain the updating period that begins with `update`.
-
-    Args:
-        update: The update.
-        before: The one recorded before it.
-        after: The one recorded after it.
-        rule: What decides the updating period.
-        process: Whose ticks they are.
-    """
+    """Explain the updating period that begins with `update`, recorded between two others."""
     tick_s = process.tick_s
     if before is not None and before.update + 1 != update.update:
         before = None
@@ -238,3 +241,114 @@ def _alternatives(
         response = -n * times.iteration / math.log(K) if 0.0 < K < 1.0 else None
         found.append(Alternative(q, n, period * times.tick_s, K, response))
     return tuple(found)
+
+
+@cache
+def _notable(process: Process) -> tuple[float, ...]:
+    """Return what is worth a word, by input and output."""
+    usual = [(one.unit, NOTABLE_SHARE * (one.high - one.low)) for one in process.inputs]
+    usual += [(one.unit, NOTABLE_NOISE * one.noise) for one in process.outputs]
+    return tuple(process.notable.get(unit, value) for unit, value in usual)
+
+
+def deviation(found: ModelDeviation, process: Process, suspects: int = 0) -> str:
+    """Return how the plant differs from its model, without the load, the most notable first; empty where it agrees.
+
+    Last come the reading that is furthest from what is predicted, if it is surprising: the model, or its sensor, is
+    not what the filter takes it for; and those that are not used for that reason (bit i is output i); and inputs
+    that have no effect (the bits after those).
+    """
+    names = process.output_names
+    parts = [
+        (value, f"needs {number_text(abs(value), 3)} {unit} {'less' if value > 0 else 'more'} of {name}")
+        for name, unit, value in zip(process.input_names, process.input_units, found.u, strict=True)
+    ]
+    parts += [
+        (value, f"{name} {'+' if value > 0 else ''}{number_text(value, 3)} {unit}")
+        for name, unit, value in zip(names, process.output_units, found.y, strict=True)
+    ]
+    notable = [
+        (abs(value) / least, text)
+        for (value, text), least in zip(parts, _notable(process), strict=True)
+        if abs(value) >= least
+    ]
+    texts = [text for _, text in sorted(notable, reverse=True)[:MOST_DEVIATIONS]]
+    surprise, name = max(zip(found.surprise, names, strict=True))
+    if surprise >= SURPRISING:
+        texts.append(f"{name} {number_text(surprise, 2)} times further from its prediction than expected")
+    texts += [f"{name} is not used: it contradicts the others" for i, name in enumerate(names) if suspects >> i & 1]
+    inputs = enumerate(process.input_names, len(names))
+    texts += [f"{name} is left where it is: it has no effect" for i, name in inputs if suspects >> i & 1]
+    return ", ".join(texts)
+
+
+def sentence(found: Explanation, rule: UpdatingRuleStatus) -> str:
+    """Return the explanation of the period in one or two sentences."""
+    text = f"{_because(found, rule)}."
+    if found.spare_s:
+        text += f" The period is {found.spare_s:g} s longer than that of q = {found.q}, as answers have been late."
+    return text
+
+
+def _because(found: Explanation, rule: UpdatingRuleStatus) -> str:
+    period = f"tau_u is {found.period_s:g} s"
+    match found.branch:
+        case Branch.FIXED:
+            done = f"{found.update.iterations} iterations were done in it"
+            return f"{period} because the session has a fixed updating period; {done}"
+        case Branch.FIRST:
+            return f"{period} because this is the first update: q starts at {rule.q_first}"
+        case Branch.UNKNOWN:
+            return (
+                f"{period}; the update before was not played or is not recorded, so there was nothing to learn from "
+                "(a load step that interrupts, a late sequence, or a restart)"
+            )
+    then = found.period_before_s
+    if then is not None and then == found.period_s:
+        period = f"tau_u stays at {then:g} s"
+    elif then is not None:
+        period = f"tau_u {'rises' if found.period_s > then else 'falls'} from {then:g} s to {found.period_s:g} s"
+    return f"{period} because {_cause(found, rule)}"
+
+
+def _cause(found: Explanation, rule: UpdatingRuleStatus) -> str:
+    q, verdict = found.q, found.before.verdict if found.before else Verdict.NONE
+    match found.branch:
+        case Branch.BEGUN_AGAIN:
+            why = "a restart, or another client moved the inputs"
+            if verdict == Verdict.NO_ANSWER:
+                why = "the update before has no answer: what was computed is not finite"
+            return f"the optimiser had to start over ({why}): q starts at {rule.q_first}"
+        case Branch.INTERRUPTED:
+            ended = f"a load step ended the period before after {found.elapsed_s:g} s of {found.period_before_s:g} s"
+            return f"{ended}: what was learned is discarded and q starts at {rule.q_first}"
+        case Branch.LATE:
+            said = f"the sequence before did not take effect at its instant (verdict: {Verdict.word_of(verdict)})"
+            return f"{said}: there was nothing to learn from, and q stays at {q}"
+        case Branch.CONTRACTION:
+            K, gamma = number_text(found.update.contraction, 4), number_text(found.update.gamma, 3)
+            why = f"K = {K} is within its noise, or Gamma = {gamma} asks for no longer period"
+            if found.q_before is not None and (q > found.q_before or q == found.q_before == rule.q_max > rule.q_min):
+                why = f"K = {K} is beyond its noise and Gamma = {gamma} < 0 asks for a longer period"
+            return f"{why}: the contraction rule has q = {q}, at rest {rule.q_min}"
+        case Branch.OUTSIDE:
+            return f"the rule that is installed beside Coldloop decided so: q = {q}"
+    return _by_algorithm_1(found)
+
+
+def _by_algorithm_1(found: Explanation) -> str:
+    K, gamma, q = found.update.contraction, found.update.gamma, found.q
+    if is_rounded_to_one(found.update):
+        looks = "K is 1 to the precision of the registers (the cost does not change), and Gamma"
+    elif K >= 1.0:
+        looks = f"K = {number_text(K, 6)} is not below 1 (the cost does not fall), so K itself is to fall: dK/dn"
+    else:
+        looks = f"K = {number_text(K, 6)} is below 1 (the cost falls), so the response time is to fall: dt_r/dn"
+    if found.branch is Branch.LEVEL:
+        return f"{looks} = 0 says that the number of iterations makes no difference"
+    sign, wanted, end, further = (">", "shorter", "min", "less") if gamma > 0 else ("<", "longer", "max", "more")
+    rest = " (at rest: the cost is at its floor, and rounding decides)" if abs(gamma) < AT_REST else ""
+    step = f"q becomes {q}" if found.q_before is None else f"q goes from {found.q_before} to {q}"
+    if q == found.q_before:
+        step = f"q stays at {q}, as q_{end} allows no {further}"
+    return f"{looks} = {number_text(gamma)} {sign} 0 asks for a {wanted} period{rest}; {step}"

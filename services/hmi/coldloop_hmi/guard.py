@@ -1,17 +1,21 @@
-"""What every request passes: whose it is, where it comes from, how often, and the headers of every answer."""
+"""What every request passes: its connection, whose it is, where it comes from, how often, and the answer's headers."""
 
 import asyncio
 import logging
 import re
 import time
-from collections.abc import Awaitable, Callable
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Final
 
 from aiohttp import hdrs, web
 from aiohttp.http_exceptions import HttpProcessingError
 
-from coldloop_hmi.access import (
-    LOCAL_NAMES,
+from coldloop_hmi.audit import Audit
+from coldloop_hmi.settings import HmiSection
+from coldloop_hmi.users import (
     REQUEST_BURST,
     REQUESTS_A_BROWSER,
     ClientLimit,
@@ -19,15 +23,12 @@ from coldloop_hmi.access import (
     LoginSession,
     LoginSessions,
     Party,
-    host_of,
-    is_own_origin,
-    port_of,
+    User,
+    Users,
 )
-from coldloop_hmi.audit import Audit
-from coldloop_hmi.connections import Connections
-from coldloop_hmi.settings import HmiSection
-from coldloop_hmi.users import User, Users
 
+REQUEST_S: Final = 10.0
+"""A request that takes longer, because its client is slow to read the answer, keeps no place; a stream does."""
 HEADERS: Final = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
     "connect-src 'self'; frame-src 'self'; frame-ancestors 'self'; base-uri 'none'; form-action 'self'",
@@ -36,6 +37,9 @@ HEADERS: Final = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
+LOCAL_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
+_HOST: Final = re.compile(r"(?:\[(?P<v6>[0-9a-fA-F:.]+)\]|(?P<name>[A-Za-z0-9._-]+))(?::(?P<port>[0-9]{1,5}))?")
+"""A Host header: a name or an address, and nothing before or after it but a port."""
 SAFE: Final = frozenset({hdrs.METH_GET, hdrs.METH_HEAD})
 BY_ITSELF: Final = frozenset(
     {"/api/stream", "/api/trend", "/api/events", "/api/audit", "/api/me", "/api/explanation", "/api/replay"}
@@ -53,8 +57,87 @@ BODY_S: Final = 5.0
 """Within this time a request is here as a whole."""
 PASSWORDS_AT_ONCE: Final = 2
 """Passwords that are checked at a time: each takes a core and 16 MB."""
-
 _RUN: Final = re.compile(r"\A/run/\d+/")
+
+
+@dataclass
+class Use:
+    """What a connection is used for."""
+
+    since: float
+    """When its last request began or ended; without one, when it was seen first. Monotonic clock, s."""
+    is_busy: bool = False
+    is_stream: bool = False
+    has_session: bool = False
+    """Its last request had a login."""
+
+    def rank(self, now: float) -> int | None:
+        """Return how soon it gives way, 0 first; None keeps its place."""
+        if self.is_busy and (self.is_stream or now - self.since < REQUEST_S):
+            return None
+        return 2 * self.has_session + self.is_busy
+
+
+class Connections:
+    """Connections of one server, at most so many.
+
+    A newcomer takes the place of a connection that only waits: strangers' first, and of these one from the address
+    that has most of them. So idle connections or incomplete requests lock out no user.
+
+    Args:
+        most: Connections at a time.
+        now: Monotonic clock, s.
+    """
+
+    def __init__(self, most: int, now: Callable[[], float]) -> None:
+        self._most = most
+        self._now = now
+        self._uses: dict[web.RequestHandler, Use] = {}  # in the order of their arrival
+
+    def newcomer(self, server: web.Server) -> asyncio.Protocol:
+        """Return what serves a new connection of the server: its handler, or a refusal where none gives way."""
+        now = self._now()
+        connected = [one for one in server.connections if one.transport is not None]
+        self._uses = {one: self._uses.get(one) or Use(now) for one in connected}
+        if len(connected) >= self._most and not self._make_room(now):
+            return _Refused()
+        return server()
+
+    def _make_room(self, now: float) -> bool:
+        crowd = Counter(map(_address, self._uses))
+        ranks = {one: rank for one, use in self._uses.items() if (rank := use.rank(now)) is not None}
+        if not ranks:
+            return False
+        first = min(ranks, key=lambda one: (ranks[one], -crowd[_address(one)], self._uses[one].since))
+        transport = first.transport
+        if transport is not None:
+            transport.abort()  # do not wait for unread data
+        first.force_close()
+        return True
+
+    @contextmanager
+    def serving(self, request: web.Request, *, is_stream: bool, has_session: bool) -> Iterator[None]:
+        """Keep the place of a connection while its request, received as a whole, is answered."""
+        use = self._uses.setdefault(request.protocol, Use(self._now()))
+        use.since, use.is_busy, use.is_stream, use.has_session = self._now(), True, is_stream, has_session
+        try:
+            yield
+        finally:
+            use.since, use.is_busy = self._now(), False
+
+
+def _address(handler: web.RequestHandler) -> str:
+    peer = handler.peername
+    return str(peer[0]) if isinstance(peer, tuple) else ""
+
+
+class _Refused(asyncio.Protocol):
+    """Ends a connection for which there is no room."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """End it."""
+        if isinstance(transport, asyncio.WriteTransport):
+            transport.abort()
 
 
 def told_in_a_line(record: logging.LogRecord) -> bool:
@@ -89,15 +172,28 @@ def path_in_site(request: web.Request) -> str:
     return _RUN.sub("/", request.path, count=1)
 
 
-class Guard:
-    """Judges requests before anything is done.
+def host_of(header: str) -> str:
+    """Return the name in a Host header, without its port; empty when it is not one."""
+    found = _HOST.fullmatch(header)
+    return (found["v6"] or found["name"]).lower() if found else ""
 
-    Args:
-        settings: Of the page.
-        audit: Where refusals are noted.
-        users: Who may log in.
-        connections: Informed of requests under way.
+
+def port_of(header: str) -> int | None:
+    """Return the port in a Host header; None when there is none."""
+    found = _HOST.fullmatch(header)
+    return int(found["port"]) if found and found["port"] else None
+
+
+def is_own_origin(origin: str | None, host: str) -> bool:
+    """Return whether a request that changes something comes from the page itself: `Origin` names the address asked for.
+
+    A request without `Origin` is not: browsers send it with every POST. A proxy in front may add HTTPS.
     """
+    return origin in {f"http://{host}", f"https://{host}"}
+
+
+class Guard:
+    """Judges requests before anything is done."""
 
     def __init__(self, settings: HmiSection, audit: Audit, users: Users, connections: Connections) -> None:
         self._settings = settings

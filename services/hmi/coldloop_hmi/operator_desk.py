@@ -1,41 +1,97 @@
-"""Carries out commands: two steps, a connection with the operator's role only meanwhile, and a read-back."""
+"""Commands of users, and their logins: two steps, the operator's role only meanwhile, and a read-back.
+
+A command is confirmed against its premises: what it would change, read from the registers, as others may change it.
+"""
 
 import asyncio
 import secrets
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
+
+from aiohttp import web
 
 from coldloop.errors import LinkError, UsageError
 from coldloop.modbus.endpoints import Endpoint
+from coldloop.number_text import value_text
 from coldloop.operating.commands import (
     Command,
     FaultSensor,
     PlayLoad,
+    SetFactor,
     SetLoad,
+    SetMode,
+    SetPaused,
     SetSetpoint,
     TreatAlarm,
     clock_text,
     duration_text,
+    read_command,
 )
 from coldloop.operating.execution import (
     WORK,
+    Clients,
     CommandClient,
     NotTakenError,
     check_bounds,
+    check_manual,
     clients_of,
     connected,
     reason_of,
 )
-from coldloop.registers.common import SessionPace
+from coldloop.parsing import parsed_json
+from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.control_plc import LadderStatus, Mode, Operator, OperatorMode
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import AlarmAction
-from coldloop_hmi.premises import Premises, differences, read_premises
+from coldloop_hmi.answers import compressed_answer
+from coldloop_hmi.audit import Audit
+from coldloop_hmi.documents import encoded
+from coldloop_hmi.guard import Guard, cookie_name, refusal
 from coldloop_hmi.process_image import Model
+from coldloop_hmi.settings import HmiSection
+from coldloop_hmi.users import LoginSession, Users
 
+Premises = dict[str, str]
+"""Present values by what they are of, in words."""
 CONFIRM_WITHIN_S: Final = 60.0
 MOST_PREPARED: Final = 100
 TIMEOUT_S: Final = 3.0
+LONGEST_REQUEST: Final = 2_000_000
+"""Bytes of a request: a load file fits."""
+
+
+async def read_premises(clients: Clients, command: Command) -> Premises:
+    """Read the premises of a command: of all the session, of one about an alarm or a sensor no more than that.
+
+    Raises:
+        LinkError: A service does not answer.
+        UsageError: A setpoint, and another mode than manual.
+    """
+    found = {"session": str((await next(iter(clients.values())).read(Identity)).session)}
+    match command:
+        case SetMode():
+            mode = (await clients["control_plc"].read(LadderStatus)).mode
+            found["operator's mode"] = OperatorMode.word_of((await clients["control_plc"].read(Operator)).mode)
+            found["active"] = Mode.word_of(Mode.MPC if mode == Mode.REST else mode)  # between two sequences
+        case SetSetpoint():
+            operator = await check_manual(clients["control_plc"])
+            found[f"setpoint of {command.input}"] = value_text(operator.u[command.place], command.unit)
+        case SetLoad() | PlayLoad():
+            load, process = await clients["plant"].read(LoadStatus), command.process
+            until = f"changing until {clock_text(load.last_tick * process.tick_s)}"  # by itself
+            found[process.load.title] = until if load.upcoming else value_text(load.watts, process.load.unit)
+        case SetFactor() | SetPaused():
+            pace = await clients["plant"].read(SessionPace)
+            running = f"{'paused, ' if pace.paused else ''}factor {value_text(pace.factor)}"
+            found["plant time"] = running if pace.realtime else "lock-step"
+    return found
+
+
+def differences(before: Premises, now: Premises) -> str:
+    """Return what has changed, in words; empty if nothing has."""
+    names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
+    return "; ".join(f"{name}: {before.get(name, 'not known')}, now {now.get(name, 'not known')}" for name in names)
 
 
 class Preview(NamedTuple):
@@ -197,3 +253,136 @@ class OperatorDesk:
     def _clients(self, services: Iterable[str]) -> dict[str, CommandClient]:
         ends = {service: self._endpoints[service].model_copy(update={"timeout_s": TIMEOUT_S}) for service in services}
         return clients_of(ends, self.process)
+
+
+class Commanding:
+    """Answers requests that change something. Without a desk there are no commands, as in a replay."""
+
+    def __init__(
+        self, settings: HmiSection, guard: Guard, users: Users, desk: OperatorDesk | None, audit: Audit
+    ) -> None:
+        self._settings = settings
+        self._guard = guard
+        self._users = users
+        self._desk = desk
+        self._audit = audit
+
+    def routes(self) -> list[web.AbstractRouteDef]:
+        """Return what is served."""
+        return [
+            web.get("/api/me", self.me),
+            web.post("/api/login", self.login),
+            web.post("/api/logout", self.logout),
+            web.get("/api/audit", self.audit),
+            web.post("/api/commands", self.prepare),
+            web.post("/api/commands/{token}", self.confirm),
+        ]
+
+    async def me(self, request: web.Request) -> web.Response:
+        """Answer with who is asking."""
+        session = self._guard.session(request)
+        return web.json_response(
+            {
+                "user": session.user.name if session else "",
+                "role": session.user.role.value if session else ("view" if self._settings.login.anonymous_view else ""),
+                "operates": bool(session and session.may_operate and self._desk),
+                "can_log_in": len(self._users) > 0,
+            }
+        )
+
+    async def login(self, request: web.Request) -> web.Response:
+        """Begin a session."""
+        asked = await _document(request)
+        name, password = asked.get("user"), asked.get("password")
+        if not isinstance(name, str) or not isinstance(password, str):
+            return refusal(400, "user and password must be text")
+        address = request.remote or ""
+        user = await self._guard.log_in(name, password, address, self._guard.logins)
+        if isinstance(user, web.Response):
+            return user
+        self._guard.sessions.end(request.cookies.get(cookie_name(request)))
+        answer = web.json_response({"user": user.name, "role": user.role.value})
+        answer.set_cookie(
+            cookie_name(request), self._guard.sessions.begin(user), httponly=True, samesite="Strict", path="/",
+            secure=self._settings.https is not None,
+        )  # fmt: skip
+        self._audit.note("login", who=user.name, address=address, outcome="done", detail=user.role.value)
+        return answer
+
+    async def logout(self, request: web.Request) -> web.Response:
+        """End the session."""
+        who = self._guard.who(request)
+        if who:
+            self._audit.note("logout", who=who, address=request.remote or "", outcome="done")
+        self._guard.sessions.end(request.cookies.get(cookie_name(request)))
+        answer = web.json_response({})
+        answer.del_cookie(cookie_name(request), path="/")
+        return answer
+
+    async def audit(self, request: web.Request) -> web.Response:
+        """Answer with the last entries of the audit, for operators."""
+        operator = self._operator(request)
+        if isinstance(operator, web.Response):
+            return operator
+        return compressed_answer(request, encoded({"entries": self._audit.entries[::-1]}))
+
+    async def prepare(self, request: web.Request) -> web.Response:
+        """Take a command: answer with what it would do and the token that confirms it."""
+        operator = self._operator(request)
+        if isinstance(operator, web.Response) or self._desk is None:
+            return operator if isinstance(operator, web.Response) else refusal(409, "a recorded run takes no commands")
+        try:
+            command = read_command(await _document(request), self._desk.process)
+            preview = await self._desk.prepare(command, operator.user.name)
+        except (UsageError, LinkError) as error:
+            self._refuse(request, str(error))
+            return refusal(422, str(error))
+        return web.json_response(preview._asdict())
+
+    async def confirm(self, request: web.Request) -> web.Response:
+        """Carry out a prepared command; answer with the command and its result."""
+        operator = self._operator(request)
+        if isinstance(operator, web.Response) or self._desk is None:
+            return operator if isinstance(operator, web.Response) else refusal(409, "a recorded run takes no commands")
+        try:
+            outcome = await self._desk.confirm(request.match_info["token"], operator.user.name)
+        except (UsageError, LinkError) as error:
+            self._refuse(request, str(error))
+            preview = error.preview._asdict() if isinstance(error, PremisesChangedError) else {}
+            return web.json_response({"error": str(error), **preview}, status=409)
+        word = "refused" if outcome.refused_because else "uncertain" if outcome.uncertain_because else "done"
+        detail = f"{outcome.asked}: {' '.join(filter(None, outcome[1:]))}"
+        self._audit.note(  # by name: the login may have ended meanwhile
+            "command", who=operator.user.name, address=request.remote or "", outcome=word, detail=detail
+        )
+        return compressed_answer(request, encoded(outcome._asdict()))
+
+    def _operator(self, request: web.Request) -> LoginSession | web.Response:
+        """Return the session of an operator, or the refusal."""
+        session = self._guard.session(request)
+        if session is None:
+            self._refuse(request, "not logged in, or the session has ended")
+            return refusal(401, "log in first: the session has ended, or there was none")
+        if not session.may_operate:
+            self._refuse(request, "the user may only view")
+            return refusal(403, f"{session.user.name} may view, but not operate")
+        return session
+
+    def _refuse(self, request: web.Request, reason: str) -> None:
+        who = self._guard.who(request)
+        self._audit.refuse("command", who=who, address=request.remote or "", reason=reason, has_session=bool(who))
+
+
+async def _document(request: web.Request) -> dict[str, Any]:
+    """Return the JSON object of a request.
+
+    Raises:
+        HTTPBadRequest: It has none.
+    """
+    try:
+        document = await request.json(loads=parsed_json)
+    except (ValueError, LookupError):  # no JSON, or no such character set
+        document = None
+    if not isinstance(document, dict):
+        raise web.HTTPBadRequest(reason="the request is not a JSON object")
+    return document

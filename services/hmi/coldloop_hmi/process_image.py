@@ -1,15 +1,19 @@
-"""What the page knows: the newest record of each block, trends, updates, predictions and events.
+"""What the page knows: the newest record of each block, trends (thinned), updates, predictions and events.
 
 Readers of a rig or of a recorded run write into it; the pages are made from it. No sockets here.
 """
 
 import math
+from array import array
+from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, Final, NamedTuple, TypeVar, cast
 
 from coldloop.process.declaration import Process
+from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.audit import Event
 from coldloop.registers.codec import blank
 from coldloop.registers.common import Identity, SessionPace
@@ -19,17 +23,231 @@ from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Pred
 from coldloop.registers.plant import StationStatus
 from coldloop.registers.safety import Alarm
 from coldloop.service.event_text import EventText, describe, utc_text
-from coldloop_hmi.quality import Doubts
-from coldloop_hmi.signals import values_of
-from coldloop_hmi.trends import TrendStore
+from coldloop_hmi.signals import SOUND, Doubts, Quality, doubted, values_of
 
+STATION_NAMES: Final = ("P12", "P11")
+"""Signals of a refrigerator's station that are kept: high and low pressure."""
+MOST_ROWS: Final = 65_536
+SPARE_ROWS: Final = 4096
+"""Rows that are removed at a time, so that removing costs little."""
 R = TypeVar("R", bound=tuple[Any, ...])
-
 UPDATES_KEPT: Final = 20_000
 PREDICTIONS_KEPT: Final = 1000
 EVENTS_KEPT: Final = 10_000
 STALE_S: Final = 1.5
 """A value whose source has been silent for this long is crossed out."""
+STEP_BACK: Final = 20
+"""A tick that goes back by more than this many begins another stretch of time."""
+
+
+class ModeInterval(NamedTuple):
+    """A stretch of plant time with one mode."""
+
+    start: float
+    end: float
+    mode: int
+
+
+class Doubtful(NamedTuple):
+    """A stretch of plant time in which the reading of an output is in doubt."""
+
+    start: float
+    end: float
+    quality: Quality
+
+
+class Gap(NamedTuple):
+    """A stretch in which nothing was read: the ticks of the samples before and after it."""
+
+    start: int
+    end: int
+
+
+Columns = dict[str, list[float | None]]
+"""Values by signal; None where nothing was read."""
+
+
+class TrendStore:
+    """Samples of the process in the order of their ticks, at most `kept_s` of plant time of them."""
+
+    def __init__(self, process: Process, kept_s: float) -> None:
+        self._process = process
+        self._kept_ticks = round(kept_s / process.tick_s)
+        self.station_names = STATION_NAMES if process.has_station else ()
+        self.names = ("load", *process.input_names, *process.output_names, "mode", *self.station_names)
+        """Of its columns; `mode` is that of the fail-safe ladder."""
+        self._places = tuple(map(STATION_SIGNAL_NAMES.index, self.station_names))
+        self._no_station = [math.nan] * len(self._places)
+        self.ticks = array("q")
+        self._columns: dict[str, array[float]] = {name: array("f") for name in self.names}
+        self._doubts: list[Doubts] = []
+        self._gaps: list[Gap] = []
+
+    def __len__(self) -> int:
+        return len(self.ticks)
+
+    @property
+    def last_tick(self) -> int:
+        """Tick of the newest sample; -1 when there is none."""
+        return self.ticks[-1] if self.ticks else -1
+
+    def clear(self) -> None:
+        """Forget everything."""
+        del self.ticks[:], self._doubts[:], self._gaps[:]
+        for column in self._columns.values():
+            del column[:]
+
+    def add(
+        self, process: ProcessNow, mode: int, doubts: Doubts = SOUND, station: Sequence[float] = (), *,
+        is_after_gap: bool = False,
+    ) -> None:  # fmt: skip
+        """Add a sample; one that is not newer than the last one is left out.
+
+        Args:
+            process: The sample.
+            mode: Of the fail-safe ladder.
+            doubts: Outputs whose readings are in doubt.
+            station: Signals of a refrigerator's station; empty, or all 0, of a plant without.
+            is_after_gap: Between the last sample and this one nothing could be read.
+        """
+        if process.tick <= self.last_tick:
+            return
+        if is_after_gap and process.tick - self.last_tick > 1 and self.ticks:
+            self._gaps.append(Gap(self.last_tick, process.tick))
+        self.ticks.append(process.tick)
+        self._doubts.append(doubts)
+        kept = [station[place] for place in self._places] if any(station) else self._no_station
+        values = (process.load, *process.u, *process.y, float(mode), *kept)
+        for name, value in zip(self.names, values, strict=True):
+            self._columns[name].append(value)
+        self._trim()
+
+    def _trim(self) -> None:
+        excess = max(len(self.ticks) - MOST_ROWS, 0)
+        oldest = bisect_left(self.ticks, self.ticks[-1] - self._kept_ticks)
+        drop = max(excess, oldest)
+        if drop >= SPARE_ROWS or (drop and 2 * drop >= len(self.ticks)):
+            del self.ticks[:drop], self._doubts[:drop]
+            for column in self._columns.values():
+                del column[:drop]
+            self._gaps = [gap for gap in self._gaps if gap.start >= self.ticks[0]]
+
+    def between(self, start: int, end: int) -> range:
+        """Return the rows from tick `start` to tick `end`."""
+        return range(bisect_left(self.ticks, start), bisect_right(self.ticks, end))
+
+    def column(self, name: str, rows: range) -> "array[float]":
+        """Return values of a column."""
+        return self._columns[name][rows.start : rows.stop]
+
+    def gaps(self, start: int, end: int) -> list[Gap]:
+        """Return the stretches in which nothing was read that reach into those from tick `start` to `end`."""
+        return [gap for gap in self._gaps if gap.end > start and gap.start < end]
+
+    def thinned(self, names: Sequence[str], start: int, end: int, points: int) -> tuple[list[float], Columns]:
+        """Return times (s) and columns from tick `start` to `end`, of about `points` points.
+
+        A longer stretch is reduced to the least and the largest value of each of `points / 2` intervals. Where a gap
+        begins all columns have None.
+        """
+        rows, tick_s = self.between(start, end), self._process.tick_s
+        times = [tick * tick_s for tick in self.ticks[rows.start : rows.stop]]
+        columns = {name: self.column(name, rows) for name in names}
+        return thin(times, columns, points, tick_s, [gap.end * tick_s for gap in self.gaps(start, end)])
+
+    def modes(self, start: int, end: int) -> list[ModeInterval]:
+        """Return the modes between two ticks, stretch by stretch."""
+        rows, tick_s = self.between(start, end), self._process.tick_s
+        after_gap = {gap.end * tick_s for gap in self.gaps(start, end)}
+        found: list[ModeInterval] = []
+        for tick, value in zip(self.ticks[rows.start : rows.stop], self.column("mode", rows), strict=True):
+            time, mode = tick * tick_s, int(value)
+            if found and time not in after_gap:
+                found[-1] = found[-1]._replace(end=time)
+            if not found or found[-1].mode != mode or time in after_gap:
+                found.append(ModeInterval(time, time, mode))
+        return found
+
+    def doubtful(self, start: int, end: int) -> dict[str, list[Doubtful]]:
+        """Return the intervals in which readings of outputs are in doubt between two ticks, by name.
+
+        Each lasts until the first sample of another quality, or a gap.
+        """
+        rows, tick_s = self.between(start, end), self._process.tick_s
+        after_gap = {gap.end for gap in self.gaps(start, end)}
+        found: dict[str, list[Doubtful]] = {}
+        before: dict[str, Quality] = {}
+        last = 0
+        for tick, doubts in zip(self.ticks[rows.start : rows.stop], self._doubts[rows.start : rows.stop], strict=True):
+            if doubts != SOUND or before:
+                reach, now = (last + 1 if tick in after_gap else tick) * tick_s, doubted(doubts, self._process)
+                for name in before:
+                    found[name][-1] = found[name][-1]._replace(end=reach)
+                for name, quality in now.items():
+                    if before.get(name) != quality or tick in after_gap:
+                        found.setdefault(name, []).append(Doubtful(tick * tick_s, tick * tick_s, quality))
+                before = now
+            last = tick
+        for name in before:
+            found[name][-1] = found[name][-1]._replace(end=(last + 1) * tick_s)
+        return found
+
+    def doubts_at(self, row: int) -> dict[str, Quality]:
+        """Return the outputs whose readings are in doubt, and how."""
+        return doubted(self._doubts[row], self._process)
+
+
+def thin(
+    times: Sequence[float], columns: Mapping[str, Sequence[float]], points: int, tick_s: float,
+    edges: Sequence[float] = (),
+) -> tuple[list[float], Columns]:  # fmt: skip
+    """Reduce columns to the least and the largest value of each of `points / 2` intervals, if they are longer.
+
+    No interval reaches across one of the times `edges`, in order, that end a gap; a tick after it begins there is None.
+    """
+    cuts = [0, *(bisect_left(times, edge) for edge in edges), len(times)]
+    found: list[float] = []
+    reduced: Columns = {name: [] for name in columns}
+    for first, end in pairwise(cuts):
+        if first == end:
+            continue
+        if found:
+            found.append(found[-1] + tick_s)
+            for values in reduced.values():
+                values.append(None)
+        share = max(2, points * (end - first) // len(times))
+        piece_times, piece = _thin_piece(times[first:end], {n: c[first:end] for n, c in columns.items()}, share)
+        found += piece_times
+        for name in reduced:
+            reduced[name] += piece[name]
+    return found, reduced
+
+
+def _thin_piece(
+    times: Sequence[float], columns: Mapping[str, Sequence[float]], points: int
+) -> tuple[list[float], dict[str, list[float]]]:
+    count = len(times)
+    if count <= points:
+        return list(times), {name: [rounded(value) for value in column] for name, column in columns.items()}
+    every = -(-count // max(1, points // 2))
+    starts = range(0, count, every)
+    thinned_times: list[float] = []
+    for first in starts:
+        thinned_times += [times[first], times[min(first + every, count) - 1]]
+    thinned: dict[str, list[float]] = {}
+    for name, column in columns.items():
+        values: list[float] = []
+        for first in starts:
+            part = column[first : first + every]
+            least, largest = rounded(min(part)), rounded(max(part))
+            values += [least, largest] if part[0] <= part[-1] else [largest, least]
+        thinned[name] = values
+    return thinned_times, thinned
+
+
+def rounded(value: float) -> float:
+    """Return a single-precision number with the digits that it has."""
+    return float(f"{value:.7g}")
 
 
 class JournalEntry(NamedTuple):
@@ -97,7 +315,8 @@ class Model:
         """Names of signals, `alarms`, `updates`, `prediction`: what changed since it was last looked at."""
         self.configuration: Mapping[str, Any] = {}
         """The plant's configuration from its registers, by dotted key."""
-        self._values: dict[str, float | int | str] = {}
+        self.values: dict[str, float | int | str] = {}
+        """All values by the names of their signals."""
         self._session = 0
         self.faulty_sensors = 0
         """Outputs that a fault was put into for training, a bit for each."""
@@ -119,8 +338,8 @@ class Model:
             return
         source.records[block.name] = record
         for name, value in values_of(service, block, record).items():
-            if not _same(self._values.get(name), value):
-                self._values[name] = value
+            if not _same(self.values.get(name), value):
+                self.values[name] = value
                 self.changed.add(name)
         if isinstance(record, Identity):
             self._identity(service, record)
@@ -132,7 +351,9 @@ class Model:
             signals = station.signals if station else ()
             self.trends.add(record, self.mode, self.doubts, signals, is_after_gap=is_after_gap)
         elif isinstance(record, Prediction):
-            self._predicted(record)
+            if record.tick and (not self.predictions or self.predictions[-1].update != record.update):
+                self.predictions.append(record)
+                self.changed.add("prediction")
         elif isinstance(record, SessionPace):  # from now on ticks follow another clock
             for each in self.sources.values():
                 each.moved = self.now()
@@ -142,25 +363,15 @@ class Model:
         if service == "control_plc" and identity.session:  # one that was started again looks for its session first
             if identity.session != self._session or identity.tick + STEP_BACK < self.trends.last_tick:
                 self._session = identity.session
-                self._begin()
+                for drawn in (self.trends, self.updates, self.predictions):
+                    drawn.clear()  # nothing that was drawn belongs to another session
+                self.changed |= {"updates", "prediction"}
         elif service == "plant":
             self._moved(source, identity.tick)
-
-    def _begin(self) -> None:
-        """Another session: nothing that was drawn belongs to it."""
-        self.trends.clear()
-        self.updates.clear()
-        self.predictions.clear()
-        self.changed |= {"updates", "prediction"}
 
     def _moved(self, source: Source, tick: int) -> None:
         if tick != source.tick:
             source.tick, source.moved = tick, self.now()
-
-    def _predicted(self, prediction: Prediction) -> None:
-        if prediction.tick and (not self.predictions or self.predictions[-1].update != prediction.update):
-            self.predictions.append(prediction)
-            self.changed.add("prediction")
 
     def put_alarms(self, rows: list[Alarm]) -> None:
         """Take the rows of the alarms."""
@@ -203,11 +414,6 @@ class Model:
     def record(self, service: str, kind: type[R]) -> R | None:
         """Return the newest record of a kind; None when none has been read."""
         return cast("R | None", self.sources[service].records.get(self.maps[service].block_of(kind).name))
-
-    @property
-    def values(self) -> Mapping[str, float | int | str]:
-        """All values by the names of their signals."""
-        return self._values
 
     @property
     def mode(self) -> int:
@@ -278,11 +484,3 @@ class Model:
     def is_planned(self) -> bool:
         """Whether the newest prediction is played: the optimiser is heard, and its sequence drives the outputs."""
         return self.mode == Mode.MPC and self.is_live("control_plc") and self.is_live("optimizer_plc")
-
-    def alarm_rows(self) -> list[tuple[int, Alarm]]:
-        """Return the alarms with their kinds."""
-        return list(enumerate(self.alarms))
-
-
-STEP_BACK: Final = 20
-"""A tick that goes back by more than this many begins another stretch of time."""

@@ -20,8 +20,8 @@ from coldloop.registers.safety import Alarm
 from coldloop_hmi.guard import refusal
 from coldloop_hmi.page_server import PageServer, PageSite
 from coldloop_hmi.process_image import JournalEntry, Model
-from coldloop_hmi.quality import SOUND, Doubts
 from coldloop_hmi.settings import HmiSection
+from coldloop_hmi.signals import SOUND, Doubts
 
 STEP_S: Final = 0.1
 MOST_AT_ONCE: Final = 400
@@ -45,37 +45,18 @@ class ReplayFrame(NamedTuple):
 class RecordedRun(Protocol):
     """What a replay needs of a run."""
 
-    @property
-    def name(self) -> str:
-        """Its name."""
-
-    @property
-    def process(self) -> Process:
-        """Its process."""
-
-    @property
-    def ticks(self) -> int:
-        """Ticks that were recorded, from 0 on."""
-
-    @property
-    def updates(self) -> Sequence[Optimization]:
-        """Updates in their order."""
-
-    @property
-    def events(self) -> Sequence[JournalEntry]:
-        """Events in the order of their ticks."""
-
-    @property
-    def rule(self) -> UpdatingRuleStatus:
-        """What decided the updating period."""
-
-    @property
-    def limits(self) -> OperatingLimits:
-        """Bands, bounds and rates."""
-
-    @property
-    def configuration(self) -> Mapping[str, Any]:
-        """Its configuration, by dotted key."""
+    name: str
+    process: Process
+    ticks: int
+    """Ticks that were recorded, from 0 on."""
+    updates: Sequence[Optimization]
+    events: Sequence[JournalEntry]
+    """In the order of their ticks."""
+    rule: UpdatingRuleStatus
+    """What decided the updating period."""
+    limits: OperatingLimits
+    configuration: Mapping[str, Any]
+    """By dotted key."""
 
     def frame(self, tick: int) -> ReplayFrame | None:
         """Return one tick; None if it is missing in the recording."""
@@ -95,13 +76,7 @@ class ReplayRequest(BaseModel):
 
 
 class Replay:
-    """Plays a run.
-
-    Args:
-        run: What is played.
-        model: What it is shown in.
-        kept_s: How much of it the trends have, s.
-    """
+    """Plays a run into a model, whose trends have `kept_s` of it."""
 
     def __init__(self, run: RecordedRun, model: Model, kept_s: float) -> None:
         self._run = run
@@ -112,7 +87,10 @@ class Replay:
         self._tick = -1
         self._in_gap = False
         """What was read last is missing in the recording."""
-        self._begin()
+        model.put("control_plc", Identity(session=1))
+        model.configuration = run.configuration
+        model.put("optimizer_plc", run.rule)
+        model.put("optimizer_plc", run.limits)
         self.go_to(0)
 
     def routes(self) -> tuple[web.AbstractRouteDef, ...]:
@@ -158,13 +136,6 @@ class Replay:
 
     # -- updates of the model ------------------------------------------------------------------------------------------
 
-    def _begin(self) -> None:
-        model = self._model
-        model.put("control_plc", Identity(session=1))
-        model.configuration = self._run.configuration
-        model.put("optimizer_plc", self._run.rule)
-        model.put("optimizer_plc", self._run.limits)
-
     def go_to(self, tick: int) -> None:
         """Show the run up to a tick as if it had just been played until there."""
         model = self._model
@@ -208,8 +179,9 @@ class Replay:
         model.recorded_doubts = frame.doubts
         model.put("control_plc", process)
         model.put("plant", LoadStatus(watts=process.load))
-        if frame.station is not None:  # what its controller asked for is not recorded
-            model.put("plant", StationStatus(*_of_status(frame.station), (math.nan,) * len(STATION_VALVE_NAMES)))
+        if (one := frame.station) is not None:  # what its controller asked for is not recorded
+            unknown = (math.nan,) * len(STATION_VALVE_NAMES)
+            model.put("plant", StationStatus(one.tick, one.mode, one.alarms, one.signals, unknown))
 
     def _show(self) -> None:
         for service in self._model.maps:
@@ -220,10 +192,6 @@ class Replay:
             "name": self._run.name, "playing": self._playing, "speed": self._speed, "tick": self._tick,
             "last_tick": self._run.ticks - 1,
         }  # fmt: skip
-
-
-def _of_status(sample: StationSample) -> tuple[int, int, int, tuple[float, ...]]:
-    return sample.tick, sample.mode, sample.alarms, sample.signals
 
 
 async def serve_replays(runs: Sequence[RecordedRun], settings: HmiSection, announce: Callable[[str], None]) -> None:

@@ -115,7 +115,10 @@ class HmiSection(BaseModel):
     @property
     def is_local(self) -> bool:
         """Whether only this machine reaches the page."""
-        return self.host == "localhost" or _is_loopback(self.host)
+        try:
+            return self.host == "localhost" or ip_address(self.host).is_loopback
+        except ValueError:
+            return False
 
     @model_validator(mode="after")
     def _passwords_are_not_readable(self) -> Self:
@@ -125,13 +128,6 @@ class HmiSection(BaseModel):
                 "give https.certificate and https.key, or insecure = true"
             )
         return self
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 class HmiSettings(RootSettings):

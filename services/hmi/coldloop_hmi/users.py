@@ -1,7 +1,8 @@
-"""Users of the page, their roles and the hashes of their passwords.
+"""Users of the page: roles and hashes of passwords, sessions, and how often requests and passwords are allowed.
 
-`python -m coldloop_hmi.users FILE NAME view|operate` asks for a password, or reads it from standard input, and writes
-a line.
+No sockets; the clock is given.
+`python -m coldloop_hmi.users FILE NAME view|operate` asks for a password, or reads it from standard input, and
+writes a line.
 """
 
 import argparse
@@ -12,6 +13,9 @@ import hmac
 import secrets
 import stat
 import sys
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -21,15 +25,25 @@ from coldloop.text_file import read_text
 
 COST: Final = 2**14
 BLOCK_SIZE: Final = 8
-SALT_BYTES: Final = 16
 DIGEST_BYTES: Final = 32
 SHORTEST_PASSWORD: Final = 8
-HASH_FIELDS: Final = 5
 MOST_MEMORY: Final = 64 * 1024 * 1024
 COSTS: Final = range(10, 17)
 BLOCK_SIZES: Final = range(1, 17)
 """Of hashes: cost as a power of 2, and block size. The largest take the memory above and half a second."""
 COMMENT: Final = "#"
+MOST_SESSIONS: Final = 200
+MOST_ADDRESSES: Final = 1000
+LOGINS_A_MINUTE: Final = 6.0
+LOGIN_BURST: Final = 6.0
+"""Wrong passwords for one name from one address."""
+PASSWORDS_A_SECOND: Final = 4.0
+PASSWORD_BURST: Final = 12.0
+"""Passwords that are checked for all names of one address together, but for those that have logged in from there: each
+takes a twentieth of a second of a core."""
+REQUESTS_A_BROWSER: Final = 3.0
+"""In a second. Behind a proxy all browsers have one address, and each asks for two trends a second."""
+REQUEST_BURST: Final = 150.0
 
 
 class PageRole(StrEnum):
@@ -49,9 +63,9 @@ class User(NamedTuple):
 
 def hash_password(password: str) -> str:
     """Return `scrypt$cost$block size$salt$hash` of a password."""
-    salt = secrets.token_bytes(SALT_BYTES)
+    salt = secrets.token_bytes(16)
     digest = _scrypt(password, salt, COST, BLOCK_SIZE)
-    return f"scrypt${COST}${BLOCK_SIZE}${_text(salt)}${_text(digest)}"
+    return f"scrypt${COST}${BLOCK_SIZE}$" + "$".join(base64.b64encode(one).decode("ascii") for one in (salt, digest))
 
 
 def is_password(password: str, stored: str) -> bool:
@@ -62,19 +76,8 @@ def is_password(password: str, stored: str) -> bool:
 
 
 def _scrypt(password: str, salt: bytes, cost: int, block_size: int) -> bytes:
-    return hashlib.scrypt(
-        password.encode(errors="surrogatepass"),
-        salt=salt,
-        n=cost,
-        r=block_size,
-        p=1,
-        maxmem=MOST_MEMORY,
-        dklen=DIGEST_BYTES,
-    )
-
-
-def _text(raw: bytes) -> str:
-    return base64.b64encode(raw).decode("ascii")
+    encoded = password.encode(errors="surrogatepass")
+    return hashlib.scrypt(encoded, salt=salt, n=cost, r=block_size, p=1, maxmem=MOST_MEMORY, dklen=DIGEST_BYTES)
 
 
 NOBODYS_HASH: Final = hash_password(secrets.token_urlsafe())
@@ -136,13 +139,13 @@ def _user(line: str, place: str) -> User:
 
 def _is_hash(stored: str) -> bool:
     """Return whether a password can be compared with this hash: it is whole, and of a usual cost."""
-    fields = stored.split("$")
-    if len(fields) != HASH_FIELDS or fields[0] != "scrypt" or not (fields[1] + fields[2]).isdecimal():
-        return False
     try:
-        salt, digest = (base64.b64decode(field, validate=True) for field in fields[3:])
-        cost, block_size = int(fields[1]), int(fields[2])
+        name, *numbers, first, second = stored.split("$")
+        cost, block_size = map(int, numbers)
+        salt, digest = (base64.b64decode(field, validate=True) for field in (first, second))
     except ValueError:
+        return False
+    if name != "scrypt" or not "".join(numbers).isdecimal():
         return False
     costs = [2**power for power in COSTS if 128 * 2**power * block_size < MOST_MEMORY]
     return cost in costs and block_size in BLOCK_SIZES and len(salt) > 0 and len(digest) == DIGEST_BYTES
@@ -166,6 +169,145 @@ def write_user(file: Path, name: str, role: PageRole, password: str) -> None:
         file.write_text("\n".join([*kept, f"{name}:{role.value}:{hash_password(password)}"]) + "\n", encoding="utf-8")
     except OSError as error:
         raise UsageError(f"{file}: {error.strerror}") from None
+
+
+class Party(NamedTuple):
+    """Who shares a bound: a user who has logged in, or all strangers of one address."""
+
+    name: str
+    has_session: bool
+
+
+@dataclass
+class LoginSession:
+    """A user who has logged in."""
+
+    user: User
+    began: float
+    seen: float
+
+    @property
+    def may_operate(self) -> bool:
+        """Whether commands are allowed."""
+        return self.user.role is PageRole.OPERATE
+
+
+class LoginSessions:
+    """LoginSessions by their tokens, of which only digests are kept.
+
+    Args:
+        now: Monotonic clock, s.
+        idle_s: A session without a request for so long ends.
+        longest_s: Every session ends after this time.
+    """
+
+    def __init__(self, now: Callable[[], float], idle_s: float, longest_s: float) -> None:
+        self._now = now
+        self._idle_s = idle_s
+        self._longest_s = longest_s
+        self._sessions: OrderedDict[str, LoginSession] = OrderedDict()
+
+    def begin(self, user: User) -> str:
+        """Begin a session; return its token. The oldest session ends when there are too many."""
+        token = secrets.token_urlsafe(32)
+        now = self._now()
+        self._sessions[_digest(token)] = LoginSession(user, now, now)
+        while len(self._sessions) > MOST_SESSIONS:
+            self._sessions.popitem(last=False)
+        return token
+
+    def find(self, token: str | None, *, is_use: bool = True) -> LoginSession | None:
+        """Return the session of a token; None when there is none, or it has ended.
+
+        Args:
+            token: What the browser sent.
+            is_use: The request counts as a sign of life; what a page asks for by itself does not.
+        """
+        key = _digest(token) if token else ""
+        session = self._sessions.get(key)
+        if session is None:
+            return None
+        now = self._now()
+        if now - session.seen > self._idle_s or now - session.began > self._longest_s:
+            del self._sessions[key]
+            return None
+        if is_use:
+            session.seen = now
+        return session
+
+    def end(self, token: str | None) -> None:
+        """End a session."""
+        if token:
+            self._sessions.pop(_digest(token), None)
+
+
+def _digest(token: str) -> str:
+    return hashlib.sha256(token.encode(errors="surrogatepass")).hexdigest()
+
+
+class ClientLimit:
+    """A bucket of requests for each address or party.
+
+    Args:
+        now: Monotonic clock, s.
+        per_second: Rate at which it fills.
+        burst: Its capacity.
+    """
+
+    def __init__(self, now: Callable[[], float], per_second: float, burst: float) -> None:
+        self._now = now
+        self._per_second = per_second
+        self._burst = burst
+        self._buckets: OrderedDict[str | Party, tuple[float, float]] = OrderedDict()
+
+    def allows(self, address: str | Party) -> bool:
+        """Take a request of an address or a party, or refuse it."""
+        now = self._now()
+        level, since = self._buckets.pop(address, (self._burst, now))
+        level = min(self._burst, level + (now - since) * self._per_second)
+        allowed = level >= 1.0
+        self._buckets[address] = (level - 1.0 if allowed else level, now)
+        while len(self._buckets) > MOST_ADDRESSES:
+            self._buckets.popitem(last=False)
+        return allowed
+
+    def give_back(self, address: str | Party) -> None:
+        """Give a request back that shall not count."""
+        if address in self._buckets:
+            level, since = self._buckets[address]
+            self._buckets[address] = (min(self._burst, level + 1.0), since)
+
+
+class LoginLimit:
+    """Which attempts to log in are looked at: by address and name, and by address.
+
+    Who has logged in from an address before comes first there: others who try from it, behind a proxy perhaps, do not
+    keep such users out. Nothing here depends on whether a name exists.
+
+    Args:
+        now: Monotonic clock, s.
+    """
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._of_names = ClientLimit(now, LOGINS_A_MINUTE / 60, LOGIN_BURST)
+        self._of_addresses = ClientLimit(now, PASSWORDS_A_SECOND, PASSWORD_BURST)
+        self._known: OrderedDict[str, None] = OrderedDict()
+
+    def allows(self, address: str, name: str) -> bool:
+        """Return whether a password is checked for this name from this address."""
+        both = f"{address} {name}"
+        return (both in self._known or self._of_addresses.allows(address)) and self._of_names.allows(both)
+
+    def succeeded(self, address: str, name: str) -> None:
+        """Note that the password was right."""
+        both = f"{address} {name}"
+        self._of_names.give_back(both)
+        if both not in self._known:
+            self._of_addresses.give_back(address)
+        self._known[both] = None
+        self._known.move_to_end(both)
+        while len(self._known) > MOST_ADDRESSES:
+            self._known.popitem(last=False)
 
 
 def main() -> int:

@@ -11,7 +11,7 @@ from coldloop.process.load_profile import LoadProfile, load_profile_of
 from coldloop.process.settings import ProcessSettings, one_of, settings_of, settings_process, within
 from coldloop.registers.plant import SensorFaultKind
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, alarms_of
-from coldloop.service.event_text import alarm_word, word
+from coldloop.service.event_text import alarm_word
 
 LONGEST_FILE: Final = 1_000_000
 """Characters of a load file."""
@@ -170,7 +170,7 @@ class TreatAlarm(_Command):
         """The command in words."""
         name = "all alarms" if self.alarm == ALL_ALARMS else f"alarm {alarm_word(self.alarm, self.process)}"
         time = f" for {duration_text(self.time_s)}" if self.action == AlarmAction.SHELVE and self.time_s else ""
-        return f"{word(AlarmAction(self.action)).capitalize()}: {name}{time}"
+        return f"{AlarmAction(self.action).word.capitalize()}: {name}{time}"
 
 
 class FaultSensor(_Command):
@@ -185,7 +185,7 @@ class FaultSensor(_Command):
     def text(self) -> str:
         """The command in words."""
         value = f" ({value_text(self.value)})" if self.fault == SensorFaultKind.VALUE else ""
-        return f"Training: sensor of {self.output}: {word(SensorFaultKind(self.fault))}{value}"
+        return f"Training: sensor of {self.output}: {SensorFaultKind(self.fault).word}{value}"
 
 
 Command = SetMode | SetSetpoint | SetLoad | PlayLoad | SetFactor | SetPaused | TreatAlarm | FaultSensor

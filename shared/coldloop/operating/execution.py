@@ -1,12 +1,13 @@
-"""Commands carried out: what is written for each, and what is read back of it. Connections are given."""
+"""Commands carried out: what is written for each, loads of any length among them, and what is read back of it."""
 
 import asyncio
 import math
+from bisect import bisect_right
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from typing import Any, Final
 
-from coldloop.errors import BUSY, LinkError, RequestRefusedError, UsageError
+from coldloop.errors import BUSY, LinkError, PeerUnreachableError, RequestRefusedError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.endpoints import Endpoint
 from coldloop.number_text import value_text
@@ -22,17 +23,29 @@ from coldloop.operating.commands import (
     TreatAlarm,
     clock_text,
 )
-from coldloop.operating.load_stream import LoadStream
+from coldloop.operating.observer import read_alarms
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
 from coldloop.registers.maps import Maps, maps_of
-from coldloop.registers.plant import LiveLoad, LoadStatus, SensorFault, SensorFaultKind
+from coldloop.registers.plant import (
+    AHEAD_STEPS,
+    LOAD_ROWS,
+    LiveLoad,
+    LoadAhead,
+    LoadStatus,
+    LoadStep,
+    SensorFault,
+    SensorFaultKind,
+)
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmState, alarms_of
 from coldloop.registers.seal import sealed
-from coldloop.service.event_text import alarm_word, word
+from coldloop.service.event_text import alarm_word
 
+LAST_TICK: Final = 2**32 - 1
+KEPT_AHEAD: Final = LOAD_ROWS
+"""Steps that the plant is to know in advance; it keeps twice as many."""
 EFFECT_S: Final = 2.0
 """How long the effect of a command is waited for."""
 LOOK_S: Final = 0.1
@@ -48,6 +61,114 @@ HINTS: Final = {
     3: "the value is not possible now",
     BUSY: "another client is its writer",
 }
+ALL_SERVICES: Final = Maps._fields
+
+
+class LoadStream:
+    """Keeps the plant supplied with the steps of a load.
+
+    Args:
+        plant: Client of the plant.
+        session: Whose load it is.
+        load: All of it.
+        sent: Steps that the plant has already.
+        begin: Tick of the session at which the load begins.
+
+    Raises:
+        UsageError: A step is beyond the last tick of a session.
+    """
+
+    def __init__(
+        self, plant: RegisterClient, session: int, load: LoadProfile, *, sent: int = 0, begin: int = 0
+    ) -> None:
+        self._plant = plant
+        self._session = session
+        self._times = [begin + tick for tick in load.times]
+        if self._times[-1] > LAST_TICK:
+            raise UsageError(f"a load with a step at tick {self._times[-1]}: the last tick of a session is {LAST_TICK}")
+        self._watts = load.watts
+        self._sent = sent
+        self._unanswered = 0
+        """Steps behind those of which it is not known whether the plant has them."""
+
+    @property
+    def steps(self) -> int:
+        """Steps of the load."""
+        return len(self._times)
+
+    @property
+    def done(self) -> bool:
+        """Whether the plant has all steps."""
+        return self._sent >= len(self._times)
+
+    @property
+    def known_until(self) -> int | None:
+        """First tick whose load the plant does not know yet; None when it knows all of it."""
+        return None if self.done else self._times[self._sent]
+
+    async def feed(self, tick: int) -> None:
+        """Write what the plant should know at `tick`.
+
+        Raises:
+            LinkError: The plant does not answer; or it refuses steps, because they come too late or the session is
+                another one.
+        """
+        while not self.done and self._sent - bisect_right(self._times, tick) < KEPT_AHEAD:
+            await self._send()
+
+    async def fill(self) -> int:
+        """Write as much as the plant has room for; return how many steps it has by now.
+
+        The first steps replace what it knew from there on, and so make room for themselves.
+
+        Raises:
+            LinkError: As `feed`.
+        """
+        if not self._sent:
+            await self._send()
+        free = (await self._plant.read(LoadStatus)).free
+        while not self.done and free >= AHEAD_STEPS:
+            free -= await self._send()
+        return self._sent
+
+    async def _send(self) -> int:
+        """Write the next steps; return how many."""
+        some = slice(self._sent, self._sent + AHEAD_STEPS)
+        record = LoadAhead.first_of(self._session, self._times[some], self._watts[some])
+        self._unanswered = record.length
+        try:
+            await self._plant.write(sealed(record, self._plant.map))
+        except LinkError as error:
+            if not self._sent:
+                raise
+            kind = PeerUnreachableError if isinstance(error, PeerUnreachableError) else LinkError
+            unit, since_s = self._plant.process.load.unit, self._times[self._sent - 1] * self._plant.process.tick_s
+            raise kind(
+                f"{error}; of {self.steps} steps the plant has taken at least the first {self._sent}, and holds "
+                f"{self._watts[self._sent - 1]:g} {unit} from {since_s:g} s on"
+            ) from None
+        self._sent, self._unanswered = self._sent + record.length, 0
+        return record.length
+
+    async def was_replaced(self) -> bool:
+        """Return whether another client has written the load since: the last step known is not the last one sent."""
+        status = await self._plant.read(LoadStatus)
+        if self._unanswered and status.last_tick == self._times[self._sent + self._unanswered - 1]:
+            self._sent += self._unanswered  # the answer was lost, the request was not
+        self._unanswered = 0
+        last = self._times[self._sent - 1] if self._sent else 0
+        return status.last_tick != last
+
+
+async def write_table(plant: RegisterClient, load: LoadProfile) -> int:
+    """Write the load table of a session that is to begin; return the steps that are in it.
+
+    Raises:
+        LinkError: The plant does not answer, or refuses.
+    """
+    steps = [LoadStep(*step) for step in zip(load.times[:LOAD_ROWS], load.watts[:LOAD_ROWS], strict=True)]
+    await plant.write_rows(steps)
+    return len(steps)
 
 
 class NotTakenError(UsageError):
@@ -117,9 +238,7 @@ async def set_mode(clients: Clients, command: SetMode) -> str:
         await asyncio.sleep(LOOK_S)
         ladder = await client.read(LadderStatus)
     back = OperatorMode((await client.read(Operator)).mode)
-    return (
-        f"operator's mode {word(back)}; the control PLC is in {word(Mode(ladder.mode))} ({word(Cause(ladder.cause))})"
-    )
+    return f"operator's mode {back.word}; the control PLC is in {Mode(ladder.mode).word} ({Cause(ladder.cause).word})"
 
 
 def check_bounds(command: SetSetpoint, low: float, high: float) -> None:
@@ -252,10 +371,9 @@ def lead_ticks(pace: SessionPace, tick_s: float) -> int:
 async def treat_alarm(clients: Clients, command: TreatAlarm) -> str:
     """Write what is done with alarms; wait until their states say that it was."""
     client, action = clients["control_plc"], AlarmAction(command.action)
-    every = alarms_of(command.process)
-    kinds = list(every) if command.alarm == ALL_ALARMS else [command.alarm]
+    kinds = list(alarms_of(command.process)) if command.alarm == ALL_ALARMS else [command.alarm]
     raised_again: list[int] = []
-    before = await client.read_rows(Alarm, 0, len(every))
+    before = await read_alarms(client)
     if command.seen is None:
         await client.write(AlarmCommand(command.alarm, action, command.time_s))
         if action is AlarmAction.ACKNOWLEDGE:
@@ -266,12 +384,12 @@ async def treat_alarm(clients: Clients, command: TreatAlarm) -> str:
         kinds, raised_again = _seen(before, kinds, command)
         for kind in kinds:
             await client.write(AlarmCommand(kind, action, command.time_s))
-    rows = await client.read_rows(Alarm, 0, len(every))
+    rows = await read_alarms(client)
     for _ in range(round(EFFECT_S / LOOK_S)):
         if all(_is_done(action, rows[kind].state) for kind in kinds):
             break
         await asyncio.sleep(LOOK_S)
-        rows = await client.read_rows(Alarm, 0, len(every))
+        rows = await read_alarms(client)
     return _treated(command, rows, kinds, raised_again)
 
 
@@ -309,20 +427,20 @@ def _treated(command: TreatAlarm, rows: Sequence[Alarm], kinds: Sequence[int], r
     action, process = AlarmAction(command.action), command.process
     left = [kind for kind in kinds if not _is_done(action, rows[kind].state)]
     if len(left) == len(kinds):
-        states = ", ".join(sorted({word(AlarmState(rows[kind].state)) for kind in left}))
+        states = ", ".join(sorted({AlarmState(rows[kind].state).word for kind in left}))
         raise NotTakenError(f"{_names(left, process)}: {states}; the control PLC did not take it")
     done = [kind for kind in kinds if kind not in left]
     if len(kinds) == 1:
         row = rows[kinds[0]]
         until = f" until {clock_text(row.shelved_until * process.tick_s)}" if row.state == AlarmState.SHELVED else ""
         over = action is AlarmAction.ACKNOWLEDGE and row.state == AlarmState.NORMAL
-        state = word(AlarmState(row.state))
+        state = AlarmState(row.state).word
         text = f"alarm {alarm_word(kinds[0], process)}: {'acknowledged, now ' if over else ''}{state}{until}"
     elif len(kinds) <= MOST_NAMES:
-        states = "; ".join(f"now {word(state)}: {_names(each, process)}" for state, each in _by_state(rows, done))
+        states = "; ".join(f"now {state.word}: {_names(each, process)}" for state, each in _by_state(rows, done))
         text = f"acknowledged; {states}" if action is AlarmAction.ACKNOWLEDGE else states
     else:
-        counted = ", ".join(f"{len(each)} {word(state)}" for state, each in _by_state(rows, done))
+        counted = ", ".join(f"{len(each)} {state.word}" for state, each in _by_state(rows, done))
         text = f"of {len(kinds)} alarms {counted}"
     if left:
         text += f"; not {_names(left, process)}"
@@ -346,24 +464,17 @@ async def fault_sensor(clients: Clients, command: FaultSensor) -> str:
     client, row = clients["plant"], command.process.output_names.index(command.output)
     await client.write_rows([SensorFault(command.fault, command.value)], row)
     (back,) = await client.read_rows(SensorFault, row, 1)
-    return f"sensor of {command.output}: {word(SensorFaultKind(back.kind))}"
+    return f"sensor of {command.output}: {SensorFaultKind(back.kind).word}"
 
 
-async def set_factor(clients: Clients, command: SetFactor) -> str:
-    """Write how fast plant time goes."""
-    return await _set_pace(clients, lambda pace: pace._replace(realtime=1, factor=command.factor))
-
-
-async def set_paused(clients: Clients, command: SetPaused) -> str:
-    """Pause or resume plant time."""
-    return await _set_pace(clients, lambda pace: pace._replace(paused=int(command.paused)))
-
-
-async def _set_pace(clients: Clients, change: Callable[[SessionPace], SessionPace]) -> str:
-    """Write the time base of the session under way."""
+async def set_pace(clients: Clients, command: SetFactor | SetPaused) -> str:
+    """Write how fast plant time goes, pause or resume it."""
     plant = clients["plant"]
-    present = await plant.read(SessionPace)
-    pace = change(present)
+    pace = await plant.read(SessionPace)
+    if isinstance(command, SetFactor):
+        pace = pace._replace(realtime=1, factor=command.factor)
+    else:
+        pace = pace._replace(paused=int(command.paused))
     if not pace.realtime:
         raise UsageError("the session is in lock-step: time advances as it is granted")
     await write_pace(clients, pace)
@@ -394,7 +505,6 @@ async def write_pace(clients: Mapping[str, RegisterClient], pace: SessionPace) -
 
 
 Work = Callable[[Clients, Any], Awaitable[str]]
-ALL_SERVICES: Final = Maps._fields
 WORK: Final[Mapping[type[Command], tuple[tuple[str, ...], Work]]] = {
     SetMode: (("control_plc",), set_mode),
     SetSetpoint: (("control_plc",), set_setpoint),
@@ -402,7 +512,7 @@ WORK: Final[Mapping[type[Command], tuple[tuple[str, ...], Work]]] = {
     PlayLoad: (("plant",), play_load),
     TreatAlarm: (("control_plc",), treat_alarm),
     FaultSensor: (("plant",), fault_sensor),
-    SetFactor: (ALL_SERVICES, set_factor),
-    SetPaused: (ALL_SERVICES, set_paused),
+    SetFactor: (ALL_SERVICES, set_pace),
+    SetPaused: (ALL_SERVICES, set_pace),
 }
 """Who is written to, and how; in the case of a time base the plant first."""

@@ -1,9 +1,8 @@
 """Records of the journal: what happened, when, and who did it. Every service has one."""
 
-from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
-from coldloop.registers.declaration import f32, text, u16, u32
+from coldloop.registers.declaration import Worded, f32, text, u16, u32
 
 EVENT_ROWS: Final = 256
 QUERY_ROWS: Final = 3
@@ -12,7 +11,7 @@ WHO_WORDS: Final = 24
 NOBODY: Final = (0,) * WHO_WORDS
 
 
-class EventKind(IntEnum):
+class EventKind(Worded):
     """Kind of an event: `subject`, `cause` and `value` depend on it."""
 
     NONE = 0
@@ -78,16 +77,7 @@ class Event(NamedTuple):
     tick: Annotated[int, u32("Tick of plant time")] = 0
     utc: Annotated[int, u32("UTC, seconds since 1970", unit="s")] = 0
     milliseconds: Annotated[int, u16("Milliseconds of that time", unit="ms", high=999)] = 0
-    kind: Annotated[
-        int,
-        u16(
-            "1 mode, 2 alarm raised, 3 returned, 4 acknowledged, 5 shelved, 6 unshelved, 7 out of service, 8 in "
-            "service, 9 boot, 10 session, 11 operator mode, 12 setpoint, 13 watchdog time, 14 watchdog expired, "
-            "15 plant link, 16 lease, 17 sensor fault, 18 load, 19 certificate, 20 lost, 21 control link, "
-            "22 sensor, 23 pace, 24 live load, 25 station alarm, 26 station mode, 27 surroundings, 28 model range",
-            values=EventKind,
-        ),
-    ] = 0
+    kind: Annotated[int, u16("{}", values=EventKind)] = 0
     subject: Annotated[int, u16("The mode, the alarm, ...: depends on the kind")] = 0
     cause: Annotated[int, u16("Why: depends on the kind")] = 0
     value: Annotated[float, f32("A value: depends on the kind")] = 0.0

@@ -1,19 +1,34 @@
 """The corner below address 100 that is the same in every map."""
 
-from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
-from coldloop.registers.declaration import Block, f32, in_ticks, u16, u32
+from coldloop.registers.declaration import Block, Worded, f32, in_ticks, u16, u32
 from coldloop.session.time_base import TimeBase
 
 MAGIC: Final = 123.456
 
 
-class ServiceState(IntEnum):
+class ServiceState(Worded):
     """What a service is doing, in `Identity.state`."""
 
     READY = 0
     RUNNING = 1
+
+
+class TimeBaseKind(Worded):
+    """How the plant time of a session advances."""
+
+    LOCK_STEP = 0, "lock-step"
+    REAL_TIME = 1
+    PAUSED = 2
+    """In real time, and stopped."""
+
+
+class PaceCommand(Worded):
+    """What is written to pause or to resume."""
+
+    PAUSE = 1
+    RESUME = 0
 
 
 class Identity(NamedTuple):
@@ -22,7 +37,7 @@ class Identity(NamedTuple):
     magic: Annotated[float, f32("Always 123.456: reads correctly only with the right word order")] = MAGIC
     map_digest: Annotated[int, u32("Digest of this register map")] = 0
     map_version: Annotated[int, u16("Version of this register map")] = 0
-    state: Annotated[int, u16("0 ready, 1 running", values=ServiceState)] = ServiceState.READY
+    state: Annotated[int, u16("{}", values=ServiceState)] = ServiceState.READY
     model_digest: Annotated[int, u32("First 32 bits of the digest of the prediction model in use")] = 0
     session: Annotated[int, u32("Present session")] = 0
     tick: Annotated[int, in_ticks(u32("Present tick of plant time, counted from the start of the session"))] = 0
@@ -36,9 +51,9 @@ class SessionPace(NamedTuple):
     """
 
     session: Annotated[int, u32("Session of the command; 0 is the present one")] = 0
-    realtime: Annotated[int, u16("0 lock-step, 1 real time", high=1)] = 0
+    realtime: Annotated[int, u16("{}", high=1, values=TimeBaseKind)] = 0
     factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)] = 1.0
-    paused: Annotated[int, u16("1 pause, 0 resume; in real time only", high=1)] = 0
+    paused: Annotated[int, u16("{}; in real time only", values=PaceCommand)] = 0
 
     def of(self, session: int) -> TimeBase:
         """Return the requested time base.
@@ -60,9 +75,9 @@ class SessionPace(NamedTuple):
         return cls(session, int(pace.realtime), pace.factor, int(pace.paused))
 
 
-def pace_subject(pace: TimeBase) -> int:
-    """Return the subject of the event PACE: 0 lock-step, 1 real time, 2 paused."""
-    return 2 if pace.paused else int(pace.realtime)
+def pace_subject(pace: TimeBase) -> TimeBaseKind:
+    """Return the subject of the event PACE."""
+    return TimeBaseKind.PAUSED if pace.paused else TimeBaseKind(pace.realtime)
 
 
 class ServerStatistics(NamedTuple):

@@ -1,16 +1,16 @@
 """Register map of the control PLC: the optimiser's side of the link, and what operators see."""
 
-from enum import IntEnum
 from functools import cache
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.process.declaration import LAST_NUMBER, LAST_TICK, Process
-from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
+from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace, TimeBaseKind
 from coldloop.registers.configuration import LAST_BLOCKS
 from coldloop.registers.declaration import (
     Block,
     RegisterMap,
     Role,
+    Worded,
     each_input,
     f32,
     in_ticks,
@@ -28,22 +28,22 @@ from coldloop.registers.safety import Alarm, AlarmCommand, LeaseStatus, Watchdog
 SEQUENCE_ROWS: Final = 240
 
 
-class Mode(IntEnum):
+class Mode(Worded):
     """Who decides the outputs: the rungs of the fail-safe ladder (MPC, REST, HOLD, CLASSICAL), or an operator."""
 
     HOLD = 0
     """The last value, for a set time."""
-    MPC = 1
+    MPC = 1, "MPC"
     """A sequence, within the updating period that it was sent for."""
-    CLASSICAL = 2
+    CLASSICAL = 2, "classical loops"
     """Two PI loops; CV155 is fixed."""
-    REST = 3
+    REST = 3, "rest of a sequence"
     """The rest of a sequence: the next one is late."""
     MANUAL = 4
     """Setpoints that an operator writes."""
 
 
-class Cause(IntEnum):
+class Cause(Worded):
     """Cause of the mode."""
 
     NONE = 0
@@ -59,7 +59,7 @@ class Cause(IntEnum):
     """The plant began warm, and the optimiser's model does not hold."""
 
 
-class CoolDownStep(IntEnum):
+class CoolDownStep(Worded):
     """How far the cool-down of a cold box has come."""
 
     FINISHED = 0
@@ -74,16 +74,16 @@ class CoolDownStep(IntEnum):
     """The bath is filled; both loops are closed until L1 and T5 have stayed in their bands."""
 
 
-class OperatorMode(IntEnum):
+class OperatorMode(Worded):
     """What an operator wants."""
 
     AUTO = 0
     """MPC, and the ladder when MPC is unavailable."""
-    CLASSICAL = 1
+    CLASSICAL = 1, "classical loops"
     MANUAL = 2
 
 
-class Verdict(IntEnum):
+class Verdict(Worded):
     """Judgement of a sequence by the control PLC."""
 
     NONE = 0
@@ -93,7 +93,7 @@ class Verdict(IntEnum):
     WRONG_TICK = 4
     WRONG_LENGTH = 5
     WRONG_MODEL = 6
-    BAD_CRC = 7
+    BAD_CRC = 7, "bad CRC"
     OUT_OF_RANGE = 8
     RATE_EXCEEDED = 9
     REPEATED = 10
@@ -105,7 +105,7 @@ class Verdict(IntEnum):
     """It has no rows: the optimiser has no answer to the update."""
 
 
-class PlantLinkState(IntEnum):
+class PlantLinkState(Worded):
     """State of the control PLC's link to the rack."""
 
     IDLE = 0
@@ -124,7 +124,7 @@ class PlantLinkState(IntEnum):
     """It answers, and its clock does not move."""
 
 
-class LinkCause(IntEnum):
+class LinkCause(Worded):
     """Why the link to the rack is in its state."""
 
     NONE = 0
@@ -166,7 +166,7 @@ class ProcessNow(NamedTuple):
 class Status(NamedTuple):
     """State of the sequence player and of the scan cycle."""
 
-    mode: Annotated[int, u16("0 hold, 1 MPC, 2 classical loops, 3 rest of a sequence, 4 manual", values=Mode)]
+    mode: Annotated[int, u16("{}", values=Mode)]
     update: Annotated[int, u32("Last update latched")]
     next_update_tick: Annotated[
         int, u32("Tick of the next updating instant; the latest possible one until it is planned")
@@ -184,15 +184,8 @@ class Status(NamedTuple):
 class LadderStatus(NamedTuple):
     """Step of the fail-safe ladder, and the state of its inputs."""
 
-    mode: Annotated[int, u16("0 hold, 1 MPC, 2 classical loops, 3 rest of a sequence, 4 manual", values=Mode)]
-    cause: Annotated[
-        int,
-        u16(
-            "0 none, 1 session started, 2 sequence began, 3 sequence late, 4 sequence exhausted, 5 hold expired, "
-            "6 operator, 7 sensor bad, 8 restarted, 9 cool down",
-            values=Cause,
-        ),
-    ]
+    mode: Annotated[int, u16("{}", values=Mode)]
+    cause: Annotated[int, u16("{}", values=Cause)]
     since: Annotated[int, u32("Tick at which this mode began")]
     optimizer: Annotated[int, u16("1 while the optimiser is alive", high=1)]
     bad_sensors: Annotated[int, u32("Outputs whose measurement is substituted: bit i is output i")]
@@ -258,14 +251,7 @@ class Acknowledgement(NamedTuple):
     """Answer to the last sequence committed."""
 
     number: Annotated[int, u32("Number of the sequence")]
-    verdict: Annotated[
-        int,
-        u16(
-            "0 none, 1 accepted, 2 late, 3 wrong update, 4 wrong tick, 5 wrong length, 6 wrong model, 7 bad CRC, "
-            "8 out of range, 9 rate exceeded, 10 repeated, 11 not invited, 12 plant lost, 13 no answer",
-            values=Verdict,
-        ),
-    ]
+    verdict: Annotated[int, u16("{}", values=Verdict)]
     crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
 
 
@@ -290,7 +276,7 @@ class LatchedUpdate(NamedTuple):
 class Operator(NamedTuple):
     """What an operator wants. Setpoints count in manual mode; they are clamped and rate-limited."""
 
-    mode: Annotated[int, u16("0 auto, 1 classical loops, 2 manual", high=2, values=OperatorMode)]
+    mode: Annotated[int, u16("{}", values=OperatorMode)]
     u: Annotated[tuple[float, ...], each_input("Setpoint: {}")]
 
 
@@ -318,22 +304,8 @@ class SequenceRow(NamedTuple):
 class PlantLinkStatus(NamedTuple):
     """The link to the rack: whether outputs are written, and how far the clocks agree."""
 
-    state: Annotated[
-        int,
-        u16(
-            "0 idle, 1 searching, 2 joining, 3 synchronised, 4 rejected, 5 other master, 6 frozen",
-            high=6,
-            values=PlantLinkState,
-        ),
-    ] = PlantLinkState.IDLE
-    cause: Annotated[
-        int,
-        u16(
-            "0 none, 1 no answer, 2 damaged, 3 implausible, 4 wrong session, 5 stale, 6 changed, 7 second master, "
-            "8 refused, 9 missed scans, 10 time jump, 11 stopped, 12 started, 13 time base, 14 limited",
-            values=LinkCause,
-        ),
-    ] = LinkCause.NONE
+    state: Annotated[int, u16("{}", values=PlantLinkState)] = PlantLinkState.IDLE
+    cause: Annotated[int, u16("{}", values=LinkCause)] = LinkCause.NONE
     since: Annotated[int, u32("Tick at which this state began")] = 0
     breaks: Annotated[int, u32("Times that the link has lost synchronisation")] = 0
     holder: Annotated[int, u32("Number chosen by this control PLC")] = 0
@@ -349,7 +321,7 @@ class ControlSession(NamedTuple):
     """Starts a session when written."""
 
     session: Annotated[int, u32("Number of the session; the control PLC restarts from tick 0", low=1)]
-    realtime: Annotated[int, u16("0 lock-step, 1 real time", high=1)]
+    realtime: Annotated[int, u16("{}", high=1, values=TimeBaseKind)]
     factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
 
 

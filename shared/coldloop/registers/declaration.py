@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, StrEnum
 from functools import cache, cached_property
-from typing import NamedTuple, TypeAlias, cast, get_type_hints
+from typing import NamedTuple, Self, TypeAlias, cast, get_type_hints
 
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
@@ -40,6 +40,37 @@ class Role(StrEnum):
     OPERATOR = "operator"
 
 
+class Worded(IntEnum):
+    """An enumeration of registers, whose members carry their texts: `MPC = 1, "MPC"`; without one, it is the word."""
+
+    text: str
+    """What registers, page and documentation call it."""
+
+    def __new__(cls, value: int, _text: str = "") -> Self:
+        """Make a member of its number."""
+        member = int.__new__(cls, value)
+        member._value_ = value
+        return member
+
+    def __init__(self, _value: int, text: str = "") -> None:
+        self.text = text or self.word
+
+    @property
+    def word(self) -> str:
+        """Its name in plain words, by which records and commands know it: ALARM_RAISED is "alarm raised"."""
+        return self.name.lower().replace("_", " ")
+
+    @classmethod
+    def within(cls, low: float, high: float) -> list[Self]:
+        """Return the members from one number to another."""
+        return [one for one in cls if low <= one <= high]
+
+    @classmethod
+    def word_of(cls, number: int) -> str:
+        """Return the word for a number of a peer; a newer one may have numbers without a word here."""
+        return cls(number).word if number in cls._value2member_map_ else str(number)
+
+
 @dataclass(frozen=True, slots=True)
 class Field:
     """What the bus knows of one field of a record: type, unit, range and meaning.
@@ -55,7 +86,7 @@ class Field:
     high: float | None = None
     elements: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
-    values: type[IntEnum] | None = None
+    values: type[Worded] | None = None
     """Meaning of the numbers of an enumeration."""
     is_text: bool = False
     """The elements are the words of a text (`registers.text`)."""
@@ -85,13 +116,17 @@ def u16(
     unit: str = "",
     low: int | None = None,
     high: int | None = None,
-    values: type[IntEnum] | None = None,
+    values: type[Worded] | None = None,
 ) -> Field:
-    """Declare an unsigned 16-bit register; `values` gives an enumeration's numbers their meaning, and their range."""
+    """Declare an unsigned 16-bit register.
+
+    `values` gives an enumeration's numbers their meaning, and their range; `{}` in the description lists them.
+    """
     lowest, highest = (0, 0xFFFF) if values is None else (min(values), max(values))
-    return Field(
-        Kind.U16, description, unit, lowest if low is None else low, highest if high is None else high, values=values
-    )
+    least, most = lowest if low is None else low, highest if high is None else high
+    if values is not None:
+        description = description.format(", ".join(f"{one.value} {one.text}" for one in values.within(least, most)))
+    return Field(Kind.U16, description, unit, least, most, values=values)
 
 
 def u32(description: str, *, unit: str = "", low: int | None = None, high: int | None = None) -> Field:
@@ -233,8 +268,13 @@ class Register(NamedTuple):
     high: float | None
     writer: Role | None
     description: str
-    values: type[IntEnum] | None = None
-    """Meaning of the numbers of an enumeration."""
+    values: type[Worded] | None = None
+    """Enumeration of its numbers."""
+
+    @property
+    def meanings(self) -> list[Worded]:
+        """The members of its enumeration that are within its range; of other registers none."""
+        return self.values.within(self.low or 0, self.high or 0) if self.values else []
 
 
 @dataclass(frozen=True)

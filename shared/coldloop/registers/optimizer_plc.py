@@ -1,11 +1,10 @@
 """Register map of the optimiser PLC: the results of each update, and the settings of a session."""
 
-from enum import IntEnum
 from functools import cache
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.process.declaration import Process
-from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
+from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace, TimeBaseKind
 from coldloop.registers.configuration import LAST_BLOCKS
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.declaration import (
@@ -14,6 +13,7 @@ from coldloop.registers.declaration import (
     Kind,
     RegisterMap,
     Role,
+    Worded,
     f32,
     f32_array,
     in_ticks,
@@ -58,7 +58,7 @@ class OptimizerSession(NamedTuple):
     """Settings of a session, taken when its first update arrives."""
 
     session: Annotated[int, u32("Number of the session", low=1)]
-    realtime: Annotated[int, u16("0 lock-step, 1 real time: answers are delayed as by the PLC", high=1)]
+    realtime: Annotated[int, u16("{}: answers are delayed as by the PLC", high=1, values=TimeBaseKind)]
     factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
     updating_period: Annotated[
         int,
@@ -68,7 +68,7 @@ class OptimizerSession(NamedTuple):
     ]
 
 
-class ControlLinkState(IntEnum):
+class ControlLinkState(Worded):
     """State of the optimiser's link to the control PLC."""
 
     SEARCHING = 0
@@ -88,14 +88,7 @@ class ControlLinkState(IntEnum):
 class ControlLinkStatus(NamedTuple):
     """The optimiser's link to the control PLC."""
 
-    state: Annotated[
-        int,
-        u16(
-            "0 searching, 1 introducing, 2 waiting, 3 computing, 4 delivering, 5 other master, 6 wrong model",
-            high=6,
-            values=ControlLinkState,
-        ),
-    ] = ControlLinkState.SEARCHING
+    state: Annotated[int, u16("{}", values=ControlLinkState)] = ControlLinkState.SEARCHING
     holder: Annotated[int, u32("Number chosen by this optimiser")] = 0
     breaks: Annotated[int, u32("Times that the link was lost")] = 0
     damaged: Annotated[int, u32("Answers with a broken seal")] = 0
@@ -130,25 +123,23 @@ class Optimization(NamedTuple):
     load_mismatch: Annotated[float, of_load("Estimated load mismatch", finite=False)]
 
 
-class UpdatingRuleKind(IntEnum):
+class UpdatingRuleKind(Worded):
     """What decides the updating period."""
 
-    FIXED = 0
+    FIXED = 0, "fixed period"
     """It is always the same."""
-    ALGORITHM_1 = 1
+    ALGORITHM_1 = 1, "Algorithm 1"
     """The rule of the paper."""
-    CONTRACTION = 2
+    CONTRACTION = 2, "contraction rule"
     """The rule of this project."""
-    OUTSIDE = 3
+    OUTSIDE = 3, "other"
     """Somebody else's."""
 
 
 class UpdatingRuleStatus(NamedTuple):
     """The rule that decides the updating period in this session, and the time that the computation takes."""
 
-    rule: Annotated[int, u16("0 fixed period, 1 Algorithm 1, 2 contraction rule, 3 other", values=UpdatingRuleKind)] = (
-        UpdatingRuleKind.FIXED
-    )
+    rule: Annotated[int, u16("{}", values=UpdatingRuleKind)] = UpdatingRuleKind.FIXED
     q_first: Annotated[int, u16("q of the first period, and of one that follows an interruption")] = 0
     q_min: Annotated[int, u16("Least q that the rule chooses")] = 0
     q_max: Annotated[int, u16("Largest q that the rule chooses")] = 0

@@ -1,20 +1,21 @@
 """Register map of the plant: a remote I/O rack, and the controls of a simulation."""
 
 from collections.abc import Sequence
-from enum import IntEnum, IntFlag
+from enum import IntFlag
 from functools import cache
 from itertools import accumulate, pairwise
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.process.declaration import LAST_TICK, Process
 from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, STATION_VALVE_NAMES
-from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
+from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace, TimeBaseKind
 from coldloop.registers.configuration import LAST_BLOCKS
 from coldloop.registers.declaration import (
     Block,
     Field,
     RegisterMap,
     Role,
+    Worded,
     each_input,
     f32,
     f32_array,
@@ -43,7 +44,7 @@ LONGEST_AHEAD_TICKS: Final = 0xFFFF
 """Ticks that one request can say that a step lasts."""
 
 
-class OutputVerdict(IntEnum):
+class OutputVerdict(Worded):
     """Judgement of the last outputs by the rack."""
 
     NONE = 0
@@ -52,9 +53,9 @@ class OutputVerdict(IntEnum):
     WRONG_SESSION = 2
     STALE = 3
     """For another tick than the present one; in real time, too old."""
-    CHANGED = 4
+    CHANGED = 4, "changed since they were read back"
     """The outputs have changed since they were read back: read them back again."""
-    LIMITED = 5
+    LIMITED = 5, "limited to the rate in a tick"
     """Applied as far as the rate of one tick allows: read them back again."""
 
 
@@ -91,11 +92,7 @@ class Measurement(NamedTuple):
     ] = 1
     verdict: Annotated[
         int,
-        u16(
-            "Outputs sent last: 0 none, 1 accepted, 2 wrong session, 3 stale, 4 changed since they were read back, "
-            "5 limited to the rate in a tick",
-            values=OutputVerdict,
-        ),
+        u16("Outputs sent last: {}", values=OutputVerdict),
     ] = OutputVerdict.NONE
     refused: Annotated[int, u16("Writes of others that were refused so far; wraps")] = 0
     age: Annotated[
@@ -104,22 +101,19 @@ class Measurement(NamedTuple):
     crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
 
 
-class SensorFaultKind(IntEnum):
+class SensorFaultKind(Worded):
     """What is wrong with a sensor, on purpose."""
 
     NONE = 0
     NOT_A_NUMBER = 1
-    FROZEN = 2
-    VALUE = 3
+    FROZEN = 2, "frozen at its present value"
+    VALUE = 3, "the value below"
 
 
 class SensorFault(NamedTuple):
     """A fault put into one output of the simulation. Row i is output i; the history keeps the true value."""
 
-    kind: Annotated[
-        int,
-        u16("0 none, 1 not a number, 2 frozen at its present value, 3 the value below", high=3, values=SensorFaultKind),
-    ]
+    kind: Annotated[int, u16("{}", values=SensorFaultKind)]
     value: Annotated[float, f32("Value that the sensor shows with fault 3")]
 
 
@@ -127,7 +121,7 @@ class PlantSession(NamedTuple):
     """Starts a simulation session when written."""
 
     session: Annotated[int, u32("Number of the session; the simulation restarts from tick 0", low=1)]
-    realtime: Annotated[int, u16("0 lock-step, 1 real time", high=1)]
+    realtime: Annotated[int, u16("{}", high=1, values=TimeBaseKind)]
     factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
     seed: Annotated[int, u32("Seed of the sensor noise")]
     load_steps: Annotated[int, u16("Rows of the load table that are in use", low=1, high=LOAD_ROWS)]
@@ -222,21 +216,21 @@ class PlantSample(NamedTuple):
     x: Annotated[tuple[float, ...], of_states("Simulated state", finite=False)]
 
 
-class StationMode(IntEnum):
+class StationMode(Worded):
     """What the controller of the compression station can do about the pressures."""
 
     AUTOMATIC = 0
     """All valves are within their ranges."""
-    LIMITED = 1
+    LIMITED = 1, "a valve at its end"
     """A valve is at the end of its range: a pressure may leave its set point."""
-    CHARGE_STOPPED = 2
+    CHARGE_STOPPED = 2, "charging stopped"
     """The low pressure is so high that helium is no longer let in from the buffer."""
     ONE_COMPRESSOR = 3
     STOPPED = 4
     """No compressor runs: total trip. The cold box is isolated, the high-pressure line empties into the buffer."""
     STARTING = 5
     """The first compressor idles or is being loaded, with the bypass open; the cold box is isolated until it is."""
-    OVERRIDE = 6
+    OVERRIDE = 6, "a pressure beyond its limit moves the buffer's valves"
     """A pressure is beyond a limit: it moves the buffer's valves, whatever the controller asks for."""
 
 
@@ -273,10 +267,7 @@ class StationSample(NamedTuple):
     ]
     mode: Annotated[
         int,
-        u16(
-            "Pressure control: 0 automatic, 1 a valve at its end, 2 charging stopped, 3 one compressor, 4 stopped, "
-            "5 starting, 6 a pressure beyond its limit moves the buffer's valves"
-        ),
+        u16("Pressure control: {}", high=0xFFFF, values=StationMode),
     ] = StationMode.AUTOMATIC
     alarms: Annotated[
         int,

@@ -1,14 +1,13 @@
 """Records that the fail-safe side of both PLCs and the rack shares: watchdog, lease, alarms."""
 
-from enum import IntEnum
 from typing import Annotated, Final, NamedTuple, Self
 
 from coldloop.process.declaration import Process
 from coldloop.registers.audit import NOBODY, WHO_WORDS
-from coldloop.registers.declaration import in_ticks, text, u16, u32
+from coldloop.registers.declaration import Worded, in_ticks, text, u16, u32
 
 
-class WatchdogState(IntEnum):
+class WatchdogState(Worded):
     """What a watchdog is doing."""
 
     OFF = 0
@@ -20,7 +19,7 @@ class WatchdogStatus(NamedTuple):
     """A watchdog, in the manner of the WAGO 750's block of watchdog registers."""
 
     time: Annotated[int, in_ticks(u16("Time-out in use; 0 is off"))] = 0
-    state: Annotated[int, u16("0 off, 1 running, 2 expired", values=WatchdogState)] = WatchdogState.OFF
+    state: Annotated[int, u16("{}", values=WatchdogState)] = WatchdogState.OFF
     remaining: Annotated[int, in_ticks(u16("Time until it expires"))] = 0
     lowest: Annotated[int, in_ticks(u16("Shortest remaining time since it was set"))] = 0
     trips: Annotated[int, u16("Times that it has expired")] = 0
@@ -32,7 +31,7 @@ class WatchdogTime(NamedTuple):
     time: Annotated[int, in_ticks(u16("Time-out; 0 switches the watchdog off, a new value restarts it"))]
 
 
-class LeaseState(IntEnum):
+class LeaseState(Worded):
     """State of the lease of a role."""
 
     FREE = 0
@@ -41,18 +40,24 @@ class LeaseState(IntEnum):
     """Its connection has closed: for a moment only the same holder may take it."""
 
 
+class LeaseEvent(Worded):
+    """Subject of an event of the kind `EventKind.LEASE`."""
+
+    ENDED = 0
+    GRANTED = 1
+    REFUSED = 2, "a second writer was refused"
+
+
 class LeaseStatus(NamedTuple):
     """The lease of a role: only one connection at a time writes in it."""
 
-    state: Annotated[int, u16("0 free, 1 held, 2 lingering: its connection has closed", values=LeaseState)] = (
-        LeaseState.FREE
-    )
+    state: Annotated[int, u16("{}: its connection has closed", values=LeaseState)] = LeaseState.FREE
     holder: Annotated[int, u32("Number chosen by the holder; 0 is a simple client")] = 0
     refused: Annotated[int, u32("Writes of others that were refused with exception 06")] = 0
     who: Annotated[tuple[int, ...], text("Address, role and certificate of the holder", WHO_WORDS)] = NOBODY
 
 
-class AlarmKind(IntEnum):
+class AlarmKind(Worded):
     """The alarms of the control PLC; the number is the row in their block. Further bands have rows behind these."""
 
     MODE = 0
@@ -110,12 +115,12 @@ def alarm_key(alarm: int, process: Process) -> str:
     )
 
 
-class CapacityCause(IntEnum):
+class CapacityCause(Worded):
     """Why a load is not held."""
 
     NONE = 0
-    TOO_MUCH = 1
-    TOO_LITTLE = 2
+    TOO_MUCH = 1, "too much load: reduce it, or the bath will run dry"
+    TOO_LITTLE = 2, "too little load: raise it, or the turbine gets too cold and the bath floods"
 
     @classmethod
     def of(cls, shortage: float) -> Self:
@@ -123,18 +128,18 @@ class CapacityCause(IntEnum):
         return cls(cls.TOO_MUCH if shortage > 0.0 else cls.TOO_LITTLE if shortage < 0.0 else cls.NONE)
 
 
-class AlarmState(IntEnum):
+class AlarmState(Worded):
     """States of ANSI/ISA-18.2."""
 
     NORMAL = 0
     UNACKNOWLEDGED = 1
     ACKNOWLEDGED = 2
-    RETURNED = 3
+    RETURNED = 3, "returned unacknowledged"
     SHELVED = 4
     OUT_OF_SERVICE = 5
 
 
-class AlarmPriority(IntEnum):
+class AlarmPriority(Worded):
     """How soon an operator has to act."""
 
     LOW = 1
@@ -143,27 +148,20 @@ class AlarmPriority(IntEnum):
     CRITICAL = 4
 
 
-class AlarmAction(IntEnum):
+class AlarmAction(Worded):
     """What an operator does with an alarm."""
 
     ACKNOWLEDGE = 1
     SHELVE = 2
     UNSHELVE = 3
     OUT_OF_SERVICE = 4
-    IN_SERVICE = 5
+    IN_SERVICE = 5, "in service again"
 
 
 class Alarm(NamedTuple):
     """One alarm."""
 
-    state: Annotated[
-        int,
-        u16(
-            "0 normal, 1 unacknowledged, 2 acknowledged, 3 returned unacknowledged, 4 shelved, 5 out of service",
-            high=5,
-            values=AlarmState,
-        ),
-    ] = 0
+    state: Annotated[int, u16("{}", values=AlarmState)] = 0
     active: Annotated[int, u16("1 while the condition holds, whatever the state", high=1)] = 0
     cause: Annotated[
         int, u16("Cause: of a mode its ladder cause, of a sensor its output, of a sequence its verdict")
@@ -171,9 +169,7 @@ class Alarm(NamedTuple):
     times: Annotated[int, u16("Times that it was raised")] = 0
     raised: Annotated[int, u32("Tick at which it was last raised")] = 0
     returned: Annotated[int, u32("Tick at which the condition last ended")] = 0
-    priority: Annotated[int, u16("1 low, 2 medium, 3 high, 4 critical", high=4, values=AlarmPriority)] = (
-        AlarmPriority.LOW
-    )
+    priority: Annotated[int, u16("{}", values=AlarmPriority)] = AlarmPriority.LOW
     shelved_until: Annotated[int, u32("Tick at which shelving ends; 0 is not shelved")] = 0
 
 
@@ -181,15 +177,7 @@ class AlarmCommand(NamedTuple):
     """What an operator wants done with an alarm; done when written."""
 
     alarm: Annotated[int, u16("Number of the alarm; 65535 is all")]
-    action: Annotated[
-        int,
-        u16(
-            "1 acknowledge, 2 shelve, 3 unshelve, 4 out of service, 5 in service again",
-            low=1,
-            high=5,
-            values=AlarmAction,
-        ),
-    ]
+    action: Annotated[int, u16("{}", values=AlarmAction)]
     time: Annotated[int, u16("How long to shelve it; 0 is the time of the configuration", unit="s")] = 0
 
 

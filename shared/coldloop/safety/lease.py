@@ -1,4 +1,4 @@
-"""One writer at a time: the lease of a role.
+"""The one client that writes in a role: its lease, and the events of the lease.
 
 A lease is granted to a connection with its first write, and refused to all others while it is held. It ends with
 silence, or by hand-over: when the connection of a simple client closes, at once; when that of a holder with a number
@@ -14,7 +14,7 @@ from typing import Final
 
 from coldloop.registers.audit import WHO_WORDS
 from coldloop.registers.bank import BusyError, Caller
-from coldloop.registers.safety import LeaseState, LeaseStatus
+from coldloop.registers.safety import LeaseEvent, LeaseState, LeaseStatus
 from coldloop.registers.text import to_words
 
 LINGER_S: Final = 1.0
@@ -22,26 +22,34 @@ LINGER_S: Final = 1.0
 
 SIMPLE_CLIENT: Final = 0
 """Number of a holder that has given itself none."""
+REPEATED_AFTER_S: Final = 10.0
+"""A second writer that keeps trying is an event again after this time."""
 
 
-class Lease:
-    """Who may write in a role.
+class WriterLease:
+    """Who may write in a role; notes who gets the lease, who is refused, and when it ends.
 
     Args:
         what: What the lease is of, for messages.
         silence_s: Returns how long, in real time, a holder may be silent; 0 is for ever.
+        note: Takes the events, with the name of the client.
         now: A clock, s.
         shared: Whether a holder with a number may write over several connections in turn.
     """
 
     def __init__(
-        self, what: str, silence_s: Callable[[], float], now: Callable[[], float] = time.monotonic, *,
-        shared: bool = False,
+        self, what: str, silence_s: Callable[[], float], note: Callable[[LeaseEvent, str], None] = lambda *_: None,
+        now: Callable[[], float] = time.monotonic, *, shared: bool = False,
     ) -> None:  # fmt: skip
         self._what = what
         self._shared = shared
         self._silence_s = silence_s
+        self._note = note
         self._now = now
+        self._name: str | None = None
+        """Of the holder, until the end of its lease has been noted."""
+        self._refused_at: dict[int, float] = {}
+        """When each connection was last noted as a second writer."""
         self._caller: Caller | None = None
         self._holder = SIMPLE_CLIENT
         self._heard_at = 0.0
@@ -49,6 +57,7 @@ class Lease:
         self._others: dict[int, Caller] = {}
         """Open connections that the holder had before the present one; it has left them, unless the lease is shared."""
         self.refused = 0
+        """Writes of others so far."""
 
     @property
     def holder(self) -> int:
@@ -80,10 +89,14 @@ class Lease:
         if self._shared if caller.connection in self._others else known:
             return
         self.refused += 1
+        now, before = self._now(), self._refused_at.get(caller.connection)
+        if before is None or now - before >= REPEATED_AFTER_S:
+            self._refused_at[caller.connection] = now
+            self._note(LeaseEvent.REFUSED, caller.name)
         raise BusyError(f"{held.name} holds the lease of {self._what}")
 
     def take(self, caller: Caller, holder: int | None = None) -> bool:
-        """Note a write that `check` has let pass; return whether the lease has a new holder with it."""
+        """Give the lease to a client that `check` has let pass, or renew it; return whether it has a new holder."""
         held, state = self._caller, self.state
         same = held is not None and caller.connection in {held.connection, *self._others}
         number = self._holder if holder is None and same else holder or SIMPLE_CLIENT
@@ -98,10 +111,16 @@ class Lease:
         self._others.pop(caller.connection, None)
         self._caller, self._holder = caller, number
         self._heard_at, self._closed_at = self._now(), None
+        if new:
+            if self._name is not None:  # it has lapsed, or the same connection has given itself another number
+                self._note(LeaseEvent.ENDED, self._name)
+            self._note(LeaseEvent.GRANTED, caller.name)
+        self._name = caller.name
         return new
 
     def closed(self, caller: Caller) -> bool:
-        """Note that a connection has closed; return whether it held the lease."""
+        """Note that a connection has closed; return whether it held the lease, which a simple client gives up."""
+        self._refused_at.pop(caller.connection, None)
         self._others.pop(caller.connection, None)
         gone = self._caller is None or self._caller.connection != caller.connection
         if gone or self._closed_at is not None:
@@ -112,7 +131,14 @@ class Lease:
         self._closed_at = self._now()
         if self._holder == SIMPLE_CLIENT:
             self._caller = None
+        self.note_end()
         return True
+
+    def note_end(self) -> None:
+        """Note the end of the lease, when it has ended since the last call."""
+        if self._name is not None and self.state is LeaseState.FREE:
+            self._note(LeaseEvent.ENDED, self._name)
+            self._name = None
 
     def registers(self) -> LeaseStatus:
         """Return what its registers show."""

@@ -7,13 +7,14 @@ say it in words. A number without a word stays a number: a newer peer may have m
 import logging
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
-from enum import Enum, IntEnum
+from enum import IntFlag
 from functools import cache
 from typing import Final, NamedTuple
 
 from coldloop.process.declaration import Process
 from coldloop.process.range_bits import ModelRange
 from coldloop.registers.audit import Event, EventKind
+from coldloop.registers.common import TimeBaseKind
 from coldloop.registers.control_plc import (
     Cause,
     CoolDownStep,
@@ -23,37 +24,32 @@ from coldloop.registers.control_plc import (
     PlantLinkState,
     Verdict,
 )
+from coldloop.registers.declaration import Worded
 from coldloop.registers.plant import SensorFaultKind, StationAlarm, StationMode, Surroundings
-from coldloop.registers.safety import AlarmKind, band_alarms
+from coldloop.registers.safety import AlarmKind, CapacityCause, LeaseEvent, band_alarms
 from coldloop.registers.text import from_words
 
 Words = Callable[[int], str]
 """Returns the word for a number."""
 
 
-def word(member: Enum) -> str:
-    """Return the name of a member in plain words: ALARM_RAISED is "alarm raised"."""
-    return str(member.name).lower().replace("_", " ")
-
-
-def word_of(kind: type[IntEnum], number: int) -> str:
-    """Return the word for a peer's number; a newer peer may have numbers without a word here."""
-    return _members(kind)(number)
+def flag_words(flags: type[IntFlag] | IntFlag) -> list[str]:
+    """Return the names of flags in plain words: HP_HIGH is "hp high"."""
+    return [str(one.name).lower().replace("_", " ") for one in flags]
 
 
 def _listed(words: Sequence[str]) -> Words:
     return lambda number: words[number] if number < len(words) else str(number)
 
 
-def _members(kind: type[IntEnum]) -> Words:
-    words = {member.value: word(member) for member in kind}
-    return lambda number: words.get(number, str(number))
-
-
-def _causes(kind: type[IntEnum]) -> Words:
+def _causes(kind: type[Worded]) -> Words:
     """Return the words for causes, of which 0 is none."""
-    words = _members(kind)
-    return lambda number: words(number) if number else ""
+    return lambda number: kind.word_of(number) if number else ""
+
+
+def _texts(kind: type[Worded], first: int = 0) -> Words:
+    """Return the texts of the members from this number on; those before mean nothing."""
+    return _listed(["" if one < first else one.text for one in kind])
 
 
 def _nothing(number: int) -> str:
@@ -84,20 +80,12 @@ class _Wording(NamedTuple):
     """Of the value; None when the kind has none."""
 
 
-SHORTAGE: Final = (
-    "",
-    "too much load: reduce it, or the bath will run dry",
-    "too little load: raise it, or the turbine gets too cold and the bath floods",
-)
-"""Of a plant with a bath: of others it is not known."""
-
-
 class _Words:
     """How events of a process are put into words."""
 
     def __init__(self, process: Process) -> None:
         self.process = process
-        self.alarms = {kind.value: word(kind) for kind in AlarmKind} | {
+        self.alarms = {kind.value: kind.word for kind in AlarmKind} | {
             number: one.alarm_word or f"{one.name} outside its band"
             for number, one in zip(band_alarms(process), process.banded, strict=True)
         }
@@ -125,32 +113,28 @@ class _Words:
         inputs, outputs = _listed(self.process.input_names), _listed(self.process.output_names)
         unit = self.process.load.unit
         return {
-            EventKind.MODE: _Wording(_members(Mode), _causes(Cause)),
+            EventKind.MODE: _Wording(Mode.word_of, _causes(Cause)),
             EventKind.BOOT: _Wording(
                 _listed(("fresh", "with a retained state")), _listed(("", "the previous state was set aside"))
             ),
-            EventKind.SESSION: _Wording(_listed(("lock-step", "real time")), unit="x real time"),
-            EventKind.OPERATOR_MODE: _Wording(_members(OperatorMode)),
+            EventKind.SESSION: _Wording(_texts(TimeBaseKind), unit="x real time"),
+            EventKind.OPERATOR_MODE: _Wording(OperatorMode.word_of),
             EventKind.SETPOINT: _Wording(inputs, unit=""),
             EventKind.WATCHDOG_TIME: _Wording(self._time_out, lambda ticks: f"was {self._time_out(ticks)}"),
-            EventKind.PLANT_LINK: _Wording(_members(PlantLinkState), _causes(LinkCause)),
-            EventKind.LEASE: _Wording(_listed(("ended", "granted", "a second writer was refused"))),
-            EventKind.SENSOR_FAULT: _Wording(outputs, _members(SensorFaultKind)),
+            EventKind.PLANT_LINK: _Wording(PlantLinkState.word_of, _causes(LinkCause)),
+            EventKind.LEASE: _Wording(_texts(LeaseEvent)),
+            EventKind.SENSOR_FAULT: _Wording(outputs, SensorFaultKind.word_of),
             EventKind.LOAD: _Wording(_row, unit=unit),
             EventKind.CERTIFICATE: _Wording(_listed(("", "expires soon", "has expired")), unit="days left"),
             EventKind.LOST: _Wording(unit="events or lines"),
             EventKind.SENSOR: _Wording(outputs, _listed(("good again", "bad", "suspect"))),
             EventKind.LIVE_LOAD: _Wording(_listed(("from one tick on", "steps ahead")), unit=unit),
-            EventKind.STATION_ALARM: _Wording(
-                _listed([word(alarm) for alarm in StationAlarm]), _listed(("returned", "raised"))
-            ),
-            EventKind.STATION_MODE: _Wording(_members(StationMode)),
+            EventKind.STATION_ALARM: _Wording(_listed(flag_words(StationAlarm)), _listed(("returned", "raised"))),
+            EventKind.STATION_MODE: _Wording(StationMode.word_of),
             EventKind.SURROUNDINGS: _Wording(_listed(Surroundings._fields), unit=""),
-            EventKind.MODEL_RANGE: _Wording(
-                _listed([word(part) for part in ModelRange]), _listed(("returned", "left"))
-            ),
-            EventKind.COOL_DOWN: _Wording(_members(CoolDownStep)),
-            EventKind.PACE: _Wording(_listed(("lock-step", "real time", "paused")), unit="x real time"),
+            EventKind.MODEL_RANGE: _Wording(_listed(flag_words(ModelRange)), _listed(("returned", "left"))),
+            EventKind.COOL_DOWN: _Wording(CoolDownStep.word_of),
+            EventKind.PACE: _Wording(_texts(TimeBaseKind), unit="x real time"),
         }
 
     def _alarm_causes(self) -> dict[int, Words]:
@@ -161,7 +145,7 @@ class _Words:
             AlarmKind.SENSOR_BAD: outputs,
             AlarmKind.SENSOR_SUSPECT: outputs,
             AlarmKind.INPUT_WITHOUT_EFFECT: inputs,
-            AlarmKind.CAPACITY: _listed(SHORTAGE),
+            AlarmKind.CAPACITY: _texts(CapacityCause, CapacityCause.TOO_MUCH),
             AlarmKind.SEQUENCE_REJECTED: _causes(Verdict),
             AlarmKind.PLANT_LOST: _causes(LinkCause),
             AlarmKind.PLANT_OTHER_MASTER: _causes(LinkCause),
@@ -173,10 +157,6 @@ class _Words:
 
 
 _words_of: Final = cache(_Words)
-
-
-kind_word: Final = _members(EventKind)
-"""Returns the word for a kind of event."""
 
 
 class EventText(NamedTuple):
@@ -218,7 +198,7 @@ def describe(event: Event, process: Process) -> EventText:
     elif event.kind == EventKind.ALARM_RAISED and event.subject == AlarmKind.CAPACITY:
         unit = process.load.unit
     return EventText(
-        kind=kind_word(event.kind),
+        kind=EventKind.word_of(event.kind),
         subject=wording.subject(event.subject),
         cause=alarm_cause(event.subject, event.cause, process)
         if event.kind in OF_ALARMS

@@ -16,9 +16,9 @@ from coldloop_rig.cli.commands.options import add_rig_options, endpoint, operato
 
 if TYPE_CHECKING:
     from coldloop.modbus.endpoints import Endpoint
+    from coldloop.operating.observer import JournalReader
     from coldloop.process.declaration import Process
     from coldloop.registers.audit import Event
-    from coldloop_rig.cosim.journal_reader import JournalReader
 
 COLUMNS: Final = ("number", "boot", "utc", "tick", "plant_time_s", "kind", "subject", "cause", "value", "who")
 INTERRUPTED: Final = 130
@@ -83,8 +83,8 @@ def execute(options: argparse.Namespace) -> int:
 
 async def _show(options: argparse.Namespace) -> None:
     from coldloop.modbus.client import RegisterClient
+    from coldloop.operating.observer import JournalReader
     from coldloop.registers.maps import maps_of
-    from coldloop_rig.cosim.journal_reader import JournalReader
 
     process, place = _place(options)
     client = RegisterClient.at(maps_of(process).by_service[options.service], place)

@@ -4,6 +4,7 @@ A service that is killed is started again by `coldloop up`. More can happen to l
 """
 
 import argparse
+import signal
 import sys
 from typing import Final
 
@@ -64,14 +65,14 @@ def execute(options: argparse.Namespace) -> int:
 
 
 async def _kill(options: argparse.Namespace) -> None:
-    from coldloop_rig.live.process_faults import kill, process_of
+    from coldloop_rig.live.started_rigs import process_of
 
-    kill(process_of(first_port_here(options), options.service))
+    process_of(first_port_here(options), options.service).send(signal.SIGKILL)
     sys.stdout.write(f"killed the {options.service} service; `coldloop up` restarts it\n")
 
 
 async def _pause(options: argparse.Namespace) -> None:
-    from coldloop_rig.live.process_faults import pause, process_of
+    from coldloop_rig.live.started_rigs import pause, process_of
 
     process = process_of(first_port_here(options), options.service)
     tell(f"the {options.service} service is suspended for {options.seconds:g} s (Ctrl-C resumes it)")
@@ -81,7 +82,7 @@ async def _pause(options: argparse.Namespace) -> None:
 
 async def _cut(options: argparse.Namespace) -> None:
     from coldloop_rig.chaos.faults import Link
-    from coldloop_rig.live.link_cuts import cut
+    from coldloop_rig.live.up import cut
 
     await cut(first_port_here(options), Link(options.link), options.seconds)
     sys.stdout.write(f"the {options.link} link is cut for {options.seconds:g} s\n")
@@ -90,7 +91,7 @@ async def _cut(options: argparse.Namespace) -> None:
 async def _sensor(options: argparse.Namespace) -> None:
     from coldloop.operating.commands import read_command
     from coldloop.operating.execution import WORK
-    from coldloop_rig.live.operator_request import ask
+    from coldloop_rig.live.status import ask
 
     settings = operator_settings(options)
     process = settings.process

@@ -15,7 +15,7 @@ from coldloop_rig.cli.process_option import process_setting
 
 if TYPE_CHECKING:
     from coldloop.config import Configuration
-    from coldloop_rig.cosim.endpoints import RigEndpoints
+    from coldloop_rig.cosim.wiring import RigEndpoints
     from coldloop_rig.operator_settings import OperatorSettings
     from coldloop_rig.settings import Settings
 
@@ -180,7 +180,7 @@ def rig_endpoints(options: argparse.Namespace, settings: "OperatorSettings | Set
     """
     from coldloop.modbus.endpoints import Endpoint
     from coldloop.modbus.settings import TlsSettings
-    from coldloop_rig.cosim.endpoints import RigEndpoints
+    from coldloop_rig.cosim.wiring import RigEndpoints
     from coldloop_rig.live.started_rigs import find_rig, ports_from, require_listener
 
     _refuse_two_places(options)
@@ -207,7 +207,7 @@ def rig_services(options: argparse.Namespace) -> tuple[str, ...]:
     Raises:
         UsageError: Several are up, or its record is damaged.
     """
-    from coldloop_rig.cosim.endpoints import RigEndpoints
+    from coldloop_rig.cosim.wiring import RigEndpoints
     from coldloop_rig.live.started_rigs import find_rig
 
     known = None if options.rig else find_rig(options.port_base)

@@ -26,7 +26,7 @@ def execute(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C."""
     if len(options.runs) > MOST_RUNS:
         raise UsageError(f"{len(options.runs)} runs: one is replayed, or two side by side")
-    from coldloop_rig.live.page_process import check_page
+    from coldloop_rig.live.up import check_page
 
     effective = configuration(options).settings
     check_page(effective.hmi)
@@ -48,8 +48,8 @@ async def _replay(folders: list[Path], settings: "Settings") -> None:
 async def _watch(options: argparse.Namespace, settings: "Settings") -> None:
     from coldloop_hmi.runtime import serve
     from coldloop_hmi.settings import HmiSettings
-    from coldloop_rig.live.page_process import pointed_at, with_own_files
-    from coldloop_rig.live.private_folder import make_own_folder
+    from coldloop_rig.live.started_rigs import make_own_folder
+    from coldloop_rig.live.up import pointed_at, with_own_files
 
     pointed = pointed_at(settings.hmi, rig_endpoints(options, settings))
     section, login = with_own_files(pointed, make_own_folder(f"page-{pointed.port}"))

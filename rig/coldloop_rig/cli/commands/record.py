@@ -10,7 +10,7 @@ from coldloop_rig.cli.commands.options import add_result_options, add_rig_option
 from coldloop_rig.durations import duration
 
 if TYPE_CHECKING:
-    from coldloop_rig.cosim.job import Job
+    from coldloop_rig.cosim.scenario import Job
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -32,8 +32,8 @@ def execute(options: argparse.Namespace) -> int:
 
 def _job(options: argparse.Namespace) -> "Job":
     """Return the recording that the options ask for."""
-    from coldloop_rig.cosim.job import Job
     from coldloop_rig.cosim.networked_run import as_attached, session_under_way
+    from coldloop_rig.cosim.scenario import Job
     from coldloop_rig.results.way import Way
 
     effective = configuration(options)

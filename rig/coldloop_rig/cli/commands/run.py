@@ -20,7 +20,7 @@ from coldloop_rig.cli.commands.options import (
 from coldloop_rig.durations import duration
 
 if TYPE_CHECKING:
-    from coldloop_rig.cosim.job import Job
+    from coldloop_rig.cosim.scenario import Job
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -58,7 +58,7 @@ def execute(options: argparse.Namespace) -> int:
 def _job(options: argparse.Namespace) -> "Job":
     """Return the run that the options and the configuration ask for."""
     from coldloop.modbus.endpoints import Endpoint
-    from coldloop_rig.cosim.job import Job
+    from coldloop_rig.cosim.scenario import Job
     from coldloop_rig.results.way import Way
     from coldloop_rig.runs.running import check_certificates, make_scenario
 
@@ -73,8 +73,8 @@ def _job(options: argparse.Namespace) -> "Job":
     ticks = options.duration.ticks(settings.process.tick_s) if options.duration else None
     scenario = make_scenario(settings, ticks)
     if options.attach:
-        from coldloop_rig.cosim.answer_time import QUIET_S
         from coldloop_rig.cosim.networked_run import as_attached
+        from coldloop_rig.cosim.wiring import QUIET_S
 
         ends = [
             Endpoint(host=end.host, port=end.port, tls=settings.rig.tls, timeout_s=QUIET_S) for end in options.attach

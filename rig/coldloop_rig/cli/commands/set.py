@@ -22,7 +22,7 @@ from coldloop_rig.durations import LONGEST_TICKS
 if TYPE_CHECKING:
     from coldloop.process.declaration import Process
     from coldloop.process.limits import InputLimits
-    from coldloop_rig.live.operator_request import Work
+    from coldloop_rig.live.status import Work
 
 MODES: Final = ("auto", "classical", "manual")
 
@@ -88,7 +88,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 async def _do(options: argparse.Namespace) -> None:
-    from coldloop_rig.live.operator_request import ask
+    from coldloop_rig.live.status import ask
 
     settings = operator_settings(options)
     services, work = _stream(options, settings.process) if _is_stream(options) else _command(options, settings.limits)

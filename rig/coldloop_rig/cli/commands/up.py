@@ -51,13 +51,12 @@ def execute(options: argparse.Namespace) -> int:
     check_ports(ports)
     page = options.page or options.page_port is not None
     if page:
-        from coldloop_rig.live.page_process import check_page
+        from coldloop_rig.live.up import check_page
 
         check_page(effective.settings.hmi)
     if options.detach and options.locked is None:
         return detached(ports, lock)
-    from coldloop_rig.cosim.endpoints import REQUIRED
-    from coldloop_rig.cosim.wiring import SERVICES
+    from coldloop_rig.cosim.wiring import REQUIRED, SERVICES
     from coldloop_rig.live.up import UpRig
     from coldloop_rig.until_interrupted import run_until_interrupted
 

@@ -7,7 +7,7 @@ from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.plant import StationAlarm, StationMode
-from coldloop.service.event_text import alarm_word, word_of
+from coldloop.service.event_text import alarm_word
 from coldloop_rig.results.driving import CONTROL
 from coldloop_rig.studies.beyond.coupling import REFRIGERATOR, TRACE_TICKS
 from coldloop_rig.studies.drawing import over_time
@@ -122,7 +122,7 @@ def _measures(run: Outcome) -> tuple[str | float, ...]:
 def _ladder(run: Outcome) -> str:
     """Return the control PLC's modes in order, each with the second in which it began."""
     began = [(one.tick, one.subject) for one in _of_control_plc(run, EventKind.MODE)]
-    return ", ".join(f"{word_of(Mode, mode)} {tick * TICK_S:.0f} s" for tick, mode in began)
+    return ", ".join(f"{Mode.word_of(mode)} {tick * TICK_S:.0f} s" for tick, mode in began)
 
 
 def _alarms(run: Outcome) -> list[str]:

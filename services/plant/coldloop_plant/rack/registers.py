@@ -31,9 +31,9 @@ from coldloop.registers.plant import (
     Surroundings,
     plant_map,
 )
-from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
+from coldloop.registers.safety import LeaseEvent, LeaseStatus, WatchdogStatus, WatchdogTime
 from coldloop.registers.text import from_words
-from coldloop.safety.writer_lease import LeaseEvent, WriterLease
+from coldloop.safety.lease import WriterLease
 from coldloop.service.journal import Journal, JournalPublication
 from coldloop.session.settings import TimeMode
 from coldloop.session.time_base import TimeBase

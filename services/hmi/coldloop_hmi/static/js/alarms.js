@@ -5,7 +5,6 @@ import { command } from "./commands.js";
 
 const LETTERS = { 4: "C", 3: "H", 2: "M", 1: "L" };
 const WAITING = ["unacknowledged", "returned"];
-const STATES = { returned: "returned unacknowledged", acknowledged: "acknowledged", unacknowledged: "unacknowledged" };
 const byId = (id) => document.getElementById(id);
 
 function badge(alarm) {
@@ -47,7 +46,7 @@ function actions(alarm) {
 function row(one) {
   return element("tr", { class: WAITING.includes(one.state) ? "unacknowledged" : "", "data-alarm": one.name },
     element("td", {}, badge(one), ` ${one.priority_word}`), element("td", { text: one.name }),
-    element("td", { class: "alarm-state", text: `${STATES[one.state] || one.state}${one.active ? ", active" : ""}${one.state === "shelved" ? ` until ${timeText(one.shelved_until_s)}` : ""}` }),
+    element("td", { class: "alarm-state", text: `${state.catalog.alarm_states[one.state] || one.state}${one.active ? ", active" : ""}${one.state === "shelved" ? ` until ${timeText(one.shelved_until_s)}` : ""}` }),
     element("td", { text: one.cause }), element("td", { class: "number", text: one.times ? timeText(one.raised_s) : "" }), element("td", { class: "number", text: one.times }),
     element("td", {}, state.me.operates ? actions(one) : ""));
 }

@@ -1,4 +1,4 @@
-// The quality of a value: one word, the worst that applies, as `coldloop_hmi/quality.py` has it; and how it is shown everywhere.
+// The quality of a value: one word, the worst that applies, as `coldloop_hmi/signals.py` has it; and how it is shown everywhere.
 export const QUALITIES = ["good", "suspect", "held", "bad", "stale", "simulated"]; // the worst last
 export const LETTERS = { good: "", suspect: "?", held: "H", bad: "B", stale: "", simulated: "S" };
 export const TEXTS = {

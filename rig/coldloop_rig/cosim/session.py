@@ -1,31 +1,33 @@
 """Client of a rig on the bus, for one session at a time: begins it, grants ticks, records what happens, follows it.
 
 `coldloop run`, `up`, `chaos` and networked studies use it; what is recorded goes to the sinks of a `Recorder`.
+`record_session` records a session under way without changing it, from now on.
 """
 
 import asyncio
 import contextlib
 import time
-from collections.abc import Awaitable, Sequence
-from typing import Final, TypeVar
+from collections.abc import Awaitable, Iterable, Mapping, Sequence
+from functools import partial
+from itertools import chain
+from typing import Final, NamedTuple, TypeVar
 
-from coldloop.errors import LinkError, ModelFileError, PeerUnreachableError
+from coldloop.errors import LinkError, ModelFileError, PeerUnreachableError, UsageError
 from coldloop.modbus.client import RegisterClient
-from coldloop.operating.load_stream import LoadStream, write_table
-from coldloop.registers.common import Identity
+from coldloop.operating.execution import LoadStream, write_table
+from coldloop.operating.observer import BATCH, JournalReader, SampleReader, Subscriber, UpdateReader, last_update
+from coldloop.process.load_profile import LoadProfile
+from coldloop.registers.audit import Event, EventKind, JournalPage
+from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import ControlSession, Grant, LadderStatus, Mode, Status
 from coldloop.registers.maps import maps_of
-from coldloop.registers.optimizer_plc import OptimizerSession
-from coldloop.registers.plant import HISTORY_ROWS, STATION_ROWS, PlantSession
+from coldloop.registers.optimizer_plc import Optimization, OptimizerSession
+from coldloop.registers.plant import HISTORY_ROWS, STATION_ROWS, LoadStatus, PlantSample, PlantSession, StationSample
 from coldloop_plant.own_model import own_header
-from coldloop_rig.cosim.answer_time import QUIET_S
-from coldloop_rig.cosim.endpoints import RigEndpoints
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.cosim.session_events import SessionEvents
-from coldloop_rig.cosim.session_reader import BATCH, SampleReader, UpdateReader
-from coldloop_rig.cosim.wiring import SERVICES
+from coldloop_rig.cosim.wiring import QUIET_S, SERVICES, RigEndpoints
 from coldloop_rig.results.driving import CONTROL, PLANT
-from coldloop_rig.results.recording import LinkStatistics, Recorder
+from coldloop_rig.results.recording import SETTLED_TICKS, LinkStatistics, Recorder
 from coldloop_rig.settings import Settings
 
 T = TypeVar("T")
@@ -38,10 +40,22 @@ SHORTEST_PAUSE_S: Final = 0.001
 LONGEST_PAUSE_S: Final = 0.2
 LONGEST_LOCKSTEP_PAUSE_S: Final = 0.01
 """A rig that does not move is looked at so often."""
+EVENTS_S: Final = 0.25
+"""Real time between two looks at the journals."""
 LAST_LOOK_S: Final = 2.0
 """How long the events of a run that has ended are waited for."""
 CONTACT_S: Final = 1.0
 """With `tolerant`: how long an answer may take. A stopped process must not hold up the rest for long."""
+PASSING: Final = frozenset({EventKind.ALARM_RAISED, EventKind.ALARM_RETURNED, EventKind.ALARM_ACKNOWLEDGED})
+"""Of these, what has happened to an alarm since it was raised last says how it is."""
+HELD: Final = (
+    frozenset({EventKind.MODE}),
+    frozenset({EventKind.ALARM_SHELVED, EventKind.ALARM_UNSHELVED}),
+    frozenset({EventKind.ALARM_OUT_OF_SERVICE, EventKind.ALARM_IN_SERVICE}),
+    frozenset({EventKind.SENSOR}),
+    frozenset({EventKind.SENSOR_FAULT}),
+)
+"""Kinds of events of which the last says how something is from then on: the ladder, an alarm, a sensor."""
 
 
 def next_session(present: Sequence[int]) -> int:
@@ -50,6 +64,40 @@ def next_session(present: Sequence[int]) -> int:
     while session in present:
         session += 1
     return session
+
+
+class SessionEvents:
+    """Passes what control PLC and plant note from now on to a recorder."""
+
+    def __init__(self, readers: Mapping[str, JournalReader], recorder: Subscriber) -> None:
+        self._readers = readers
+        self._recorder = recorder
+        self._looked_at = 0.0
+        self._tick = 0
+
+    async def look(self, *services: str) -> None:
+        """Read new events of these services, if the last look was long ago.
+
+        Raises:
+            LinkError: One of them does not answer.
+        """
+        ticks = self._recorder.next_tick
+        if time.monotonic() - self._looked_at < EVENTS_S and ticks - self._tick < SETTLED_TICKS // 2:
+            return  # the recorder waits for events no longer than `SETTLED_TICKS`
+        self._looked_at, self._tick = time.monotonic(), ticks
+        for service in services:
+            await self.read(service)
+
+    async def read(self, service: str) -> int:
+        """Read new events of a service; return how many there were.
+
+        Raises:
+            LinkError: It does not answer.
+        """
+        events = await self._readers[service].read_on()
+        for event in events:
+            self._recorder.event(event, service)
+        return len(events)
 
 
 class SessionClient:
@@ -64,12 +112,7 @@ class SessionClient:
     """
 
     def __init__(
-        self,
-        endpoints: RigEndpoints,
-        settings: Settings,
-        *,
-        tolerant: bool = False,
-        services: Sequence[str] = SERVICES,
+        self, endpoints: RigEndpoints, settings: Settings, *, tolerant: bool = False, services: Sequence[str] = SERVICES
     ) -> None:
         self._settings = settings
         self._tolerant = tolerant
@@ -84,7 +127,7 @@ class SessionClient:
         self.lost_contacts = 0
         """Requests that were not answered, with `tolerant`."""
         self._noted_events = -1
-        self._background: asyncio.Task[None] | None = None
+        self._background: asyncio.Future[int | None] | None = None
 
     async def connect(self, patience_s: float) -> None:
         """Connect to all of them, and make sure that they run the model of our configuration.
@@ -127,13 +170,19 @@ class SessionClient:
 
     async def begin(self, scenario: Scenario, recorder: Recorder) -> None:
         """Start a session for the scenario, recorded from now on."""
-        self._events = await SessionEvents.after_now(self.control, self.plant, recorder)
+        self._events = SessionEvents(
+            {
+                service: JournalReader(client, (await client.read(JournalPage)).newest + 1)
+                for service, client in ((CONTROL, self.control), (PLANT, self.plant))
+            },
+            recorder,
+        )
         session = await self.start(scenario)
         self._scenario, self._recorder = scenario, recorder
         self._samples = SampleReader(
             self.plant, recorder, session, scenario.ticks, realtime=scenario.realtime, tolerant=self._tolerant
         )
-        self._updates = UpdateReader(self.optimizer, recorder, session, tolerant=self._tolerant)
+        self._updates = UpdateReader(self.optimizer, recorder.update, session, first=0, tolerant=self._tolerant)
         recorder.begin()
 
     async def start(self, scenario: Scenario) -> int:
@@ -228,9 +277,15 @@ class SessionClient:
                     f"{self.plant.peer} has been at tick {done} for {now - quiet_since:.0f} s: "
                     "see the logs of the control PLC and of the optimiser"
                 )
-            if not scenario.realtime:
-                pause_s = _pause_for_a_batch(pause_s, recorder.next_tick - done)
-            await asyncio.sleep(max(pause_s, SHORTEST_PAUSE_S))
+            ticks = recorder.next_tick - done
+            if scenario.realtime:
+                pass
+            elif ticks > 2 * BATCH:  # the rig must not come to the end of its grant, ...
+                pause_s /= 2
+            elif ticks < BATCH:  # ... and each look asks all three services, so it is worth some ticks
+                pause_s = min(pause_s * 1.5, LONGEST_LOCKSTEP_PAUSE_S)
+            pause_s = max(pause_s, SHORTEST_PAUSE_S)
+            await asyncio.sleep(pause_s)
 
     async def grant(self, until: int) -> None:
         """Advance the rig to a tick, limited by the known load and by the length of the plant's history."""
@@ -259,14 +314,11 @@ class SessionClient:
         if self._background is None or self._background.done():
             if self._background is not None:
                 self._background.result()  # raises what is wrong with more than the contact
-            self._background = asyncio.create_task(self._read_updates(), name="updates")
+            read = self.contact(self._updates.read())  # a silent optimiser must not hold up the rest
+            self._background = asyncio.ensure_future(read)
         if tick is not None:
             await self.contact(self._events.look(PLANT))
         return tick
-
-    async def _read_updates(self) -> None:
-        """Read updates in the background: a silent optimiser must not hold up the rest."""
-        await self.contact(self._updates.read())
 
     async def ladder(self) -> LadderStatus | None:
         """Return the state of the fail-safe ladder, and record the events of the control PLC when there are new ones.
@@ -293,11 +345,149 @@ class SessionClient:
             return None
 
 
-def _pause_for_a_batch(pause_s: float, ticks: int) -> float:
-    """Return the next pause between two looks at a rig in lock-step, after one in which so many ticks were recorded.
+class SessionUnderWay(NamedTuple):
+    """What is found at a rig."""
 
-    Each look asks all three services, so it is worth some ticks; but the rig must not come to the end of its grant.
+    identity: Identity
+    pace: SessionPace
+    load: float
+    """At present, W."""
+
+    def scenario(self, ticks: int) -> Scenario:
+        """Return what is recorded of it in so many ticks; what its load will be is not known."""
+        load = LoadProfile((0,), (self.load,))
+        return Scenario(ticks, load, updating_period_s=0.0, seed=0, realtime=bool(self.pace.realtime),
+                        factor=self.pace.factor)  # fmt: skip
+
+
+async def find_session(rig: SessionClient) -> SessionUnderWay:
+    """Return the session of a rig.
+
+    Raises:
+        UsageError: It has none.
+        LinkError: The plant does not answer.
     """
-    if ticks > 2 * BATCH:
-        return max(pause_s / 2, SHORTEST_PAUSE_S)
-    return min(pause_s * 1.5, LONGEST_LOCKSTEP_PAUSE_S) if ticks < BATCH else pause_s
+    identity, pace = await rig.plant.read(Identity), await rig.plant.read(SessionPace)
+    if not identity.session:
+        raise UsageError(f"{rig.plant.peer} has no session: there is nothing to record")
+    return SessionUnderWay(identity, pace, (await rig.plant.read(LoadStatus)).watts)
+
+
+class _FromNow:
+    """Passes on to a recorder what is read, with ticks and updates counted from now on."""
+
+    def __init__(self, recorder: Recorder, first_tick: int, first_update: int) -> None:
+        self._recorder, self._tick, self._update = recorder, first_tick, first_update
+
+    @property
+    def next_tick(self) -> int:
+        return self._tick + self._recorder.next_tick
+
+    def sample(self, sample: PlantSample) -> None:
+        self._recorder.sample(sample._replace(tick=sample.tick - self._tick))
+
+    def station(self, sample: StationSample) -> None:
+        self._recorder.station(sample._replace(tick=sample.tick - self._tick))
+
+    def update(self, update: Optimization) -> None:
+        if update.tick >= self._tick and update.update >= self._update:
+            self._recorder.update(update._replace(tick=update.tick - self._tick, update=update.update - self._update))
+
+    def event(self, event: Event, service: str = CONTROL) -> None:
+        self._recorder.event(event._replace(tick=max(0, event.tick - self._tick)), service)
+
+
+async def record_session(rig: SessionClient, scenario: Scenario, recorder: Recorder) -> None:
+    """Record a session from now on.
+
+    Args:
+        rig: Connected, and tolerant: services may come and go meanwhile.
+        scenario: What is recorded.
+        recorder: Takes it; its first tick is the present one.
+
+    Raises:
+        UsageError: The rig has no session.
+        LinkError: The plant does not answer for long, or is in another session.
+    """
+    session = await find_session(rig)
+    last = await last_update(rig.optimizer)
+    first_update = 0 if last is None else last.update + 1
+    from_now = _FromNow(recorder, session.identity.tick, first_update)
+    readers = {service: JournalReader(rig.clients[service]) for service in (CONTROL, PLANT)}
+    for service, reader in readers.items():
+        for event in state_of(await reader.read_on(), session.identity.tick):
+            from_now.event(event, service)
+    events = SessionEvents(readers, from_now)
+    number, end = session.identity.session, session.identity.tick + scenario.ticks
+    samples = SampleReader(
+        rig.plant, from_now, number, end, first=session.identity.tick, tolerant=True, realtime=scenario.realtime
+    )
+    updates = UpdateReader(rig.optimizer, from_now.update, number, first=first_update, tolerant=True)
+    late = Lateness(await rig.control.read(Status))
+    recorder.begin()
+    heard_at = time.monotonic()
+    try:
+        while from_now.next_tick < end:
+            if await rig.contact(samples.read()) is not None:
+                heard_at = time.monotonic()
+            elif time.monotonic() - heard_at > QUIET_S:
+                raise LinkError(f"{rig.plant.peer} has not answered for {QUIET_S:g} s")
+            await rig.contact(updates.read())
+            await rig.contact(events.look(CONTROL, PLANT))
+            recorder.link = late.after(await rig.contact(rig.control.read(Status)))
+            pause_s = rig.plant.process.tick_s / scenario.factor if scenario.realtime else 0.0
+            await asyncio.sleep(min(max(pause_s, 2 * SHORTEST_PAUSE_S), LONGEST_PAUSE_S))
+    finally:  # what ended the recording is reported, not that the last of it cannot be read
+        for read in (updates.read, partial(events.read, CONTROL), partial(events.read, PLANT)):
+            with contextlib.suppress(LinkError):
+                await rig.contact(read())
+        with contextlib.suppress(LinkError):
+            recorder.link = late.after(await rig.contact(rig.control.read(Status)))
+
+
+def state_of(events: Iterable[Event], tick: int) -> list[Event]:
+    """Return, of what has been noted in a session so far, the events that say how everything is at a tick.
+
+    And all of later ticks: a session goes on while it is asked.
+    """
+    last: dict[tuple[int, int], Event] = {}
+    alarms: dict[int, list[Event]] = {}
+    later: list[Event] = []
+    for event in events:
+        if event.kind == EventKind.SESSION:
+            last.clear()
+            alarms.clear()
+            later.clear()
+        if event.tick > tick:
+            later.append(event)
+            continue
+        if event.kind in PASSING:
+            before = [] if event.kind == EventKind.ALARM_RAISED else alarms.get(event.subject, [])
+            alarms[event.subject] = [*before, event]
+        for group, kinds in enumerate(HELD):
+            if event.kind in kinds:
+                last[group, event.subject if group else 0] = event
+    return [*sorted([*last.values(), *chain.from_iterable(alarms.values())]), *later]
+
+
+class Lateness:
+    """Counts what was late since a first look, also where the control PLC was restarted and counts from 0."""
+
+    def __init__(self, first: Status) -> None:
+        self._before = first
+        self._late = LinkStatistics(0, 0, first.lateness_max, first.lateness_p99)
+
+    def after(self, status: Status | None) -> LinkStatistics:
+        """Return what was late up to a look, None where there was no answer; the largest lateness is of the session."""
+        if status is not None:
+            before, self._before, late = self._before, status, self._late
+            self._late = LinkStatistics(
+                late.deadline_misses + _gained(before.deadline_misses, status.deadline_misses),
+                late.overruns + _gained(before.overruns, status.overruns),
+                max(late.lateness_max_ms, status.lateness_max), status.lateness_p99,
+            )  # fmt: skip
+        return self._late
+
+
+def _gained(before: int, now: int) -> int:
+    return now - before if now >= before else now
