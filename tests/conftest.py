@@ -274,12 +274,6 @@ def install(*packages: str) -> None:
         pytest.skip(f"needs {' '.join(packages)}: {done.stderr.strip()}")
 
 
-def install_libmodbus() -> None:
-    """Install what an exported optimiser is compiled with for the bus, or skip the test."""
-    if not Path("/usr/include/modbus/modbus.h").exists():
-        install("libmodbus-dev")
-
-
 @pytest.fixture(scope="session")
 def mbpoll() -> str:
     if shutil.which("mbpoll") is None:

@@ -16,7 +16,7 @@ from coldloop.registers.declaration import Block, RegisterMap, f32
 from coldloop.table import TIME, read_table
 from coldloop.text_file import held_file, read_text
 from coldloop_rig.cli.tag_exports import exported
-from coldloop_rig.plc_export.structured_text.names import LONGEST, Names
+from coldloop_rig.plc_export.st_printer import LONGEST, Names
 
 one_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 ENCODINGS: Final = {

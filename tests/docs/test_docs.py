@@ -15,7 +15,7 @@ from coldloop_rig.cli.command_listing import command_listing
 from coldloop_rig.cli.commands.docs import anchor, headings
 from coldloop_rig.cli.key_listing import key_listing
 from coldloop_rig.cli.register_listing import FORMATS
-from coldloop_rig.plc_sizing.profile import PlcProfile
+from coldloop_rig.plc_sizing.plc import PlcProfile
 from coldloop_rig.settings import Settings
 from tests.harness.path_options import path_table
 from tests.harness.records import MAPS

@@ -16,16 +16,8 @@ from coldloop_optimizer_plc.settings import SolverName
 from coldloop_optimizer_plc.solvers import fast_gradient, interior_point, ode
 from coldloop_optimizer_plc.solvers.ode import flow_in
 from coldloop_rig.plc_sizing import operations
-from coldloop_rig.plc_sizing.reference_plc import (
-    ACTIVE_ROWS,
-    QPOASES_ON_LAPTOP_S,
-    cholesky_times,
-    reference_curve,
-    residuals,
-    slow_down,
-)
-from coldloop_rig.plc_sizing.sizes import Pattern, QpSizes, dense_sizes, sizes_without_zeros
-from coldloop_rig.plc_sizing.solver_counts import SOLVERS
+from coldloop_rig.plc_sizing.operations import ACTIVE_ROWS, SOLVERS, Pattern, QpSizes, dense_sizes, sizes_without_zeros
+from coldloop_rig.plc_sizing.plc import QPOASES_ON_LAPTOP_S, cholesky_times, reference_curve, residuals, slow_down
 
 
 class Counted:

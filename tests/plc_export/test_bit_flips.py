@@ -8,13 +8,10 @@ import pytest
 
 from coldloop.errors import UsageError
 from coldloop.process.limits import InputLimits
-from coldloop_rig.plc_export.c.bit_flips import flipped
-from coldloop_rig.plc_export.c.guard_files import GuardExport
-from coldloop_rig.plc_export.c.optimizer_files import OptimizerExport
-from coldloop_rig.plc_export.c.solver_files import OdeExport
-from coldloop_rig.plc_export.kernels.golden_calls import golden_calls
-from coldloop_rig.plc_export.kernels.guard_program import GuardKernels
-from coldloop_rig.plc_export.kernels.recorded_problems import ITERATIONS, GoldenVectors
+from coldloop_rig.plc_export.bit_flips import flipped
+from coldloop_rig.plc_export.c_files import GuardExport, OdeExport, OptimizerExport
+from coldloop_rig.plc_export.golden import ITERATIONS, GoldenVectors, golden_calls
+from coldloop_rig.plc_export.kernels import GuardKernels
 from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, write
 from tests.plc_export.recorded_optimizers import OPTIMISERS, recorded_updates, recorder
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop_rig import cli
-from coldloop_rig.cli import plc_folder
+from coldloop_rig.plc_export import folder as plc_folder
 from tests.harness.processes import Processes
 from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, compiled, output
 from tests.plc_export.st_interpreter import Machine
@@ -26,10 +26,7 @@ SOLVER_TEXTS = ["types.st", "functions.st", "kernels.st", "golden.st", "self_tes
 GUARD_TEXTS = ["types.st", "functions.st", "kernels.st", "output_guard.st", "self_test.st", "configuration.st"]
 DESCRIBED = ["README.md", "manifest.json"]
 OF_SOLVER = "kernels.h kernels.c problem.h problem.c tables.h tables.c golden.h golden.c self_test.c"
-OF_OPTIMIZER = (
-    "kernels.h kernels.c constants.h constants.c golden.h golden.c optimizer.h optimizer.c self_test.c bus/main.c"
-    " bus/control_plc.c bus/control_plc.h bus/diagnostics.c bus/diagnostics.h bus/words.c bus/words.h bus/registers.h"
-)
+OF_OPTIMIZER = "kernels.h kernels.c constants.h constants.c golden.h golden.c optimizer.h optimizer.c self_test.c"
 OF_GUARD = "kernels.h kernels.c limits.h limits.c golden.h golden.c output_guard.h output_guard.c self_test.c README.md"
 FILES = {
     "c": [

@@ -13,16 +13,14 @@ from coldloop.config import load_configuration
 from coldloop_optimizer_plc.computing_settings import OdeSettings
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.ode import ode_solver
-from coldloop_rig.plc_export.kernels.counted import Counter, counted_iterations, counted_updates, counter_of
-from coldloop_rig.plc_export.kernels.ode_program import OdeProgram
-from coldloop_rig.plc_export.kernels.recorded_problems import ITERATIONS, SINGLE, GoldenVectors
-from coldloop_rig.plc_export.tree.counting import CountedProgram
+from coldloop_rig.plc_export.counting import CountedProgram, Counter, counted_iterations, counted_updates, counter_of
+from coldloop_rig.plc_export.golden import ITERATIONS, SINGLE, GoldenVectors
+from coldloop_rig.plc_export.kernels import OdeProgram
 from coldloop_rig.plc_sizing import operations
-from coldloop_rig.plc_sizing.budget_tables import problem_of
+from coldloop_rig.plc_sizing.budget import problem_of
 from coldloop_rig.plc_sizing.exported import cost_text, misfits, read_cost
-from coldloop_rig.plc_sizing.operations import Operations
-from coldloop_rig.plc_sizing.profile import PlcProfile, find_profile
-from coldloop_rig.plc_sizing.sizes import dense_sizes
+from coldloop_rig.plc_sizing.operations import Operations, dense_sizes
+from coldloop_rig.plc_sizing.plc import PlcProfile, find_profile
 from coldloop_rig.settings import Settings
 from tests.plc_export.recorded_optimizers import recorded_updates, recorder
 

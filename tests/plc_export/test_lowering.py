@@ -12,14 +12,12 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop_rig.plc_export.kernels.ode_program import leaves
-from coldloop_rig.plc_export.structured_text.lowering import Lowering
-from coldloop_rig.plc_export.structured_text.places import Record
-from coldloop_rig.plc_export.structured_text.printer import StructuredTextPrinter, block_name, memory
-from coldloop_rig.plc_export.structured_text.slicing import one_iteration_a_call
-from coldloop_rig.plc_export.tree.nodes import RecordType
-from coldloop_rig.plc_export.tree.reading import Program
-from coldloop_rig.plc_export.tree.subset import UnfitKernelError, type_of
+from coldloop_rig.plc_export.kernels import leaves
+from coldloop_rig.plc_export.st_lowering import Lowering, Record
+from coldloop_rig.plc_export.st_pausing import one_iteration_a_call
+from coldloop_rig.plc_export.st_printer import StructuredTextPrinter, block_name, memory
+from coldloop_rig.plc_export.statements import Program
+from coldloop_rig.plc_export.tree import RecordType, UnfitKernelError, type_of
 from tests.plc_export.st_interpreter import Machine
 
 Array = NDArray[np.float32]

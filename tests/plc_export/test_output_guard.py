@@ -18,11 +18,11 @@ from coldloop.process.limits import InputLimits, RateReference
 from coldloop.registers.control_plc import Verdict
 from coldloop_control_plc.guard import OutputGuard
 from coldloop_control_plc.output_limits import begin
-from coldloop_rig.plc_export.c.guard_files import GuardExport
-from coldloop_rig.plc_export.kernels.counted import counted_guard, counted_longest
-from coldloop_rig.plc_export.kernels.golden_calls import Call, GoldenCall, Judgement, golden_calls
-from coldloop_rig.plc_export.kernels.guard_program import GuardKernels
-from coldloop_rig.plc_export.structured_text.guard_files import GuardText
+from coldloop_rig.plc_export.c_files import GuardExport
+from coldloop_rig.plc_export.counting import counted_guard, counted_longest
+from coldloop_rig.plc_export.golden import Call, GoldenCall, Judgement, golden_calls
+from coldloop_rig.plc_export.kernels import GuardKernels
+from coldloop_rig.plc_export.st_files import GuardText
 from tests.harness.records import Row
 from tests.plc_export import matiec
 from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, SANITIZED, STRICT, compiled, output, write

@@ -7,16 +7,14 @@ from hypothesis import strategies as st
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
-from coldloop_rig.plc_export.kernels.recorded_problems import GoldenVector, GoldenVectors, answered
-from coldloop_rig.plc_export.structured_text import pausing
-from coldloop_rig.plc_export.structured_text.lowering import GIVEN, Lowering
-from coldloop_rig.plc_export.structured_text.optimizer_files import OptimizerText
-from coldloop_rig.plc_export.structured_text.pausing import BUSY, PIECE, Pausing
-from coldloop_rig.plc_export.structured_text.printer import StructuredTextPrinter, block_name, interface_names
-from coldloop_rig.plc_export.structured_text.solver_files import WORK, StructuredTextExport
-from coldloop_rig.plc_export.templates import template
-from coldloop_rig.plc_export.tree.reading import Program
-from coldloop_rig.plc_export.tree.subset import UnfitKernelError, type_of
+from coldloop_rig.plc_export import st_pausing
+from coldloop_rig.plc_export.golden import GoldenVector, GoldenVectors, answered
+from coldloop_rig.plc_export.st_files import WORK, OptimizerText, StructuredTextExport
+from coldloop_rig.plc_export.st_lowering import GIVEN, Lowering
+from coldloop_rig.plc_export.st_pausing import BUSY, PIECE, Pausing
+from coldloop_rig.plc_export.st_printer import StructuredTextPrinter, block_name, interface_names
+from coldloop_rig.plc_export.statements import Program
+from coldloop_rig.plc_export.tree import UnfitKernelError, template, type_of
 from tests.plc_export.paused_kernels import KERNELS, S, Z, five_hundred
 from tests.plc_export.recorded_optimizers import recorded_updates, recorder
 from tests.plc_export.st_interpreter import Machine
@@ -100,7 +98,7 @@ def test_whatever_calls_are_given_bits_are_those_of_the_kernel(paused: Paused, m
 
 
 def test_a_statement_of_more_than_a_piece_is_refused_with_file_and_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pausing, "PIECE", 0)
+    monkeypatch.setattr(st_pausing, "PIECE", 0)
     with pytest.raises(UnfitKernelError, match=r"paused_kernels\.py:\d+: a statement of more than 0 operations"):
         Paused(five_hundred, Z, S)  # type: ignore[arg-type]
 

@@ -8,12 +8,10 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from coldloop.process.limits import InputLimits
-from coldloop_rig.plc_export.kernels.golden_calls import golden_calls
-from coldloop_rig.plc_export.kernels.guard_program import GuardKernels
-from coldloop_rig.plc_export.kernels.recorded_problems import GoldenVectors
-from coldloop_rig.plc_export.structured_text.guard_files import GuardText
-from coldloop_rig.plc_export.structured_text.plcopen import NAMESPACE, POUS, SECTIONS, XHTML, plcopen_xml
-from coldloop_rig.plc_export.structured_text.solver_files import StructuredTextExport
+from coldloop_rig.plc_export.golden import GoldenVectors, golden_calls
+from coldloop_rig.plc_export.kernels import GuardKernels
+from coldloop_rig.plc_export.plcopen import NAMESPACE, POUS, SECTIONS, XHTML, plcopen_xml
+from coldloop_rig.plc_export.st_files import GuardText, StructuredTextExport
 from tests.plc_export.st_parser import parsed
 
 pytestmark = pytest.mark.usefixtures("compiles")

@@ -5,9 +5,9 @@ import re
 import numpy as np
 
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop_rig.plc_export.kernels.recorded_problems import paper_settings
-from coldloop_rig.plc_export.problem_layout import problem_layout
-from coldloop_rig.plc_sizing.budget_tables import problem_of
+from coldloop_rig.plc_export.folder import problem_layout
+from coldloop_rig.plc_export.golden import paper_settings
+from coldloop_rig.plc_sizing.budget import problem_of
 
 PROBLEM, PREDICTION = problem_of(paper_settings(DEFAULT_MODEL_FILE))
 TEXT = problem_layout(PROBLEM, PREDICTION)

@@ -10,9 +10,9 @@ import pytest
 from coldloop.process.cold_box import TICK_S
 from coldloop.process.limits import InputLimits
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop_rig.plc_export.c.guard_files import GuardExport
-from coldloop_rig.plc_export.kernels.golden_calls import golden_calls
-from coldloop_rig.plc_export.kernels.guard_program import GuardKernels
+from coldloop_rig.plc_export.c_files import GuardExport
+from coldloop_rig.plc_export.golden import golden_calls
+from coldloop_rig.plc_export.kernels import GuardKernels
 from coldloop_rig.process_file.making import made_from
 from tests.plc_export import problems_file
 from tests.plc_export.c_programs import STRICT, write

@@ -14,15 +14,20 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop_rig.plc_export.structured_text import constants
-from coldloop_rig.plc_export.structured_text.constants import Constants, configuration, in_pieces, types_in
-from coldloop_rig.plc_export.structured_text.lowering import Lowering
-from coldloop_rig.plc_export.structured_text.optimizer_files import state_types
-from coldloop_rig.plc_export.structured_text.places import Record
-from coldloop_rig.plc_export.structured_text.printer import StructuredTextPrinter, global_name, section
-from coldloop_rig.plc_export.templates import template
-from coldloop_rig.plc_export.tree.reading import Program
-from coldloop_rig.plc_export.tree.subset import UnfitKernelError, type_of
+from coldloop_rig.plc_export import st_printer
+from coldloop_rig.plc_export.st_files import state_types
+from coldloop_rig.plc_export.st_lowering import Lowering, Record
+from coldloop_rig.plc_export.st_printer import (
+    Constants,
+    StructuredTextPrinter,
+    configuration,
+    global_name,
+    in_pieces,
+    section,
+    types_in,
+)
+from coldloop_rig.plc_export.statements import Program
+from coldloop_rig.plc_export.tree import UnfitKernelError, template, type_of
 from tests.plc_export.st_interpreter import Machine
 
 Array = NDArray[np.float32]
@@ -207,7 +212,7 @@ class InText:
 @pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("largest_list", [64 * 1024, 4 * N * 2], ids=["whole", "in pieces"])
 def test_a_state_goes_the_same_way_in_structured_text(monkeypatch: pytest.MonkeyPatch, largest_list: int) -> None:
-    monkeypatch.setattr(constants, "LARGEST_LIST", largest_list)
+    monkeypatch.setattr(st_printer, "LARGEST_LIST", largest_list)
     text = InText()
     monkeypatch.undo()
 

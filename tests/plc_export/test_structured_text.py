@@ -9,13 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop_rig.plc_export.kernels.ode_program import PER_PROBLEM
-from coldloop_rig.plc_export.kernels.recorded_problems import ITERATIONS, GoldenVector, GoldenVectors
-from coldloop_rig.plc_export.structured_text import constants
-from coldloop_rig.plc_export.structured_text.names import LONGEST, Names, identifier
-from coldloop_rig.plc_export.structured_text.printer import StructuredTextPrinter
-from coldloop_rig.plc_export.structured_text.solver_files import WORK, StructuredTextExport, sum_of
-from coldloop_rig.plc_export.tree.subset import UnfitKernelError
+from coldloop_rig.plc_export import st_printer
+from coldloop_rig.plc_export.golden import ITERATIONS, GoldenVector, GoldenVectors
+from coldloop_rig.plc_export.kernels import PER_PROBLEM
+from coldloop_rig.plc_export.st_files import WORK, StructuredTextExport, sum_of
+from coldloop_rig.plc_export.st_printer import LONGEST, Names, StructuredTextPrinter, identifier
+from coldloop_rig.plc_export.tree import UnfitKernelError
 from tests.plc_export.st_interpreter import Machine
 
 NUMBER = re.compile(r"(REAL#|-)\d\.\d{9}E[+-]\d\d")
@@ -217,11 +216,11 @@ def test_what_has_no_literal_is_the_largest_number(value: float, largest: str) -
 
 def test_constants_are_in_lists_that_tools_take(export: StructuredTextExport, monkeypatch: pytest.MonkeyPatch) -> None:
     sizes = {"cl_phi": 4 * 49 * 49, "cl_gamma": 4 * 94 * 49}
-    monkeypatch.setattr(constants, "LARGEST_LIST", sizes["cl_gamma"])
+    monkeypatch.setattr(st_printer, "LARGEST_LIST", sizes["cl_gamma"])
     lists = export.files()["configuration.st"].split("VAR_GLOBAL\n")[1:]
     assert len(lists) > 4
     assert not any("cl_phi :" in each and "cl_gamma :" in each for each in lists)
-    monkeypatch.setattr(constants, "LARGEST_LIST", sizes["cl_gamma"] - 1)
+    monkeypatch.setattr(st_printer, "LARGEST_LIST", sizes["cl_gamma"] - 1)
     with pytest.raises(UnfitKernelError, match="cl_gamma: 18424 bytes, and a list of constants has at most 18423"):
         export.files()
 

@@ -14,9 +14,8 @@ from coldloop.errors import UsageError
 from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, Update
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_rig.plc_export.c.optimizer_files import OptimizerExport
-from coldloop_rig.plc_export.kernels.recorded_problems import SINGLE
-from coldloop_rig.plc_export.kernels.recorded_updates import UpdateRecorder
+from coldloop_rig.plc_export.c_files import OptimizerExport
+from coldloop_rig.plc_export.golden import SINGLE, UpdateRecorder
 from coldloop_rig.settings import Settings
 from tests.harness.records import as_transmitted
 from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, SANITIZED, compiled, output, write

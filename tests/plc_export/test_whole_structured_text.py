@@ -9,15 +9,11 @@ import pytest
 
 from coldloop.process.limits import InputLimits
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_rig.plc_export.kernels.golden_calls import golden_calls
-from coldloop_rig.plc_export.kernels.guard_program import GuardKernels
-from coldloop_rig.plc_export.kernels.recorded_updates import integers_of
-from coldloop_rig.plc_export.structured_text.constants import LARGEST_LIST
-from coldloop_rig.plc_export.structured_text.guard_files import GuardText
-from coldloop_rig.plc_export.structured_text.optimizer_files import OptimizerText
-from coldloop_rig.plc_export.structured_text.plcopen import plcopen_xml
-from coldloop_rig.plc_export.structured_text.printer import StructuredTextPrinter
-from coldloop_rig.plc_export.structured_text.register_table import register_table
+from coldloop_rig.plc_export.golden import golden_calls, integers_of
+from coldloop_rig.plc_export.kernels import GuardKernels
+from coldloop_rig.plc_export.plcopen import plcopen_xml
+from coldloop_rig.plc_export.st_files import GuardText, OptimizerText, register_table
+from coldloop_rig.plc_export.st_printer import LARGEST_LIST, StructuredTextPrinter
 from tests.harness.records import CONTROL_MAP
 from tests.plc_export.matiec import NEEDS_MATIEC, joined, self_test
 from tests.plc_export.recorded_optimizers import OPTIMISERS, disturbed_updates, recorded_updates, recorder
@@ -214,8 +210,8 @@ def test_no_list_of_constants_is_larger_than_tools_take(assignments: tuple[str, 
     lists = made.files()["configuration.st"].split("VAR_GLOBAL\n")[1:]
     assert len(lists) > 4
     assert all(4 * len(NUMBER.findall(each)) <= LARGEST_LIST for each in lists)
-    assert made.sizes().constants > 4 * LARGEST_LIST
-    assert made.sizes().blocks < LARGEST_LIST * 2
+    assert made.sizes()["constants"] > 4 * LARGEST_LIST
+    assert made.sizes()["instances of the four blocks"] < LARGEST_LIST * 2
 
 
 def test_the_plcopen_xml_has_all_of_it(texts: dict[str, str]) -> None:

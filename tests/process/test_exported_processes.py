@@ -5,7 +5,6 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from tests.conftest import install_libmodbus
 from tests.harness.processes import Processes
 from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, compiled, output
 from tests.plc_export.st_interpreter import Machine
@@ -37,7 +36,6 @@ PROCESSES = ["quadruple_tank", *(pytest.param(name, marks=pytest.mark.night) for
 def test_in_c_its_self_test_passes_and_on_the_bus_it_leaves_the_trace_and_the_updates_of_ours(
     processes: Processes, tmp_path: Path, name: str
 ) -> None:
-    install_libmodbus()
     file = process_file(name, tmp_path)
     out = exported(processes, file, "c", tmp_path / "out", 600)
     for folder in (out, out / "optimizer", out / "output_guard"):

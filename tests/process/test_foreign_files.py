@@ -19,7 +19,7 @@ from coldloop_hmi.users import PageRole, Users, write_user
 from coldloop_plant.own.maker import _fmu_of, file_digest
 from coldloop_rig.chaos.plan import find_plan
 from coldloop_rig.cli.commands.options import _tls_site
-from coldloop_rig.plc_sizing.profile import find_profile
+from coldloop_rig.plc_sizing.plc import find_profile
 from coldloop_rig.process_file.judgement import described
 from coldloop_rig.process_file.making import made_from
 from coldloop_rig.process_file.reading import read_process_file

@@ -5,13 +5,14 @@ import hashlib
 import json
 import re
 import shutil
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pyarrow.parquet as pq
 import pytest
 
-from coldloop.config import load_configuration
+from coldloop.config import load_configuration, to_environment
 from coldloop.errors import LinkError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.load_profile import LoadProfile
@@ -19,15 +20,20 @@ from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity
 from coldloop.registers.safety import LeaseState, LeaseStatus
 from coldloop_rig import cli
-from coldloop_rig.cli.plc_folder import export_plc
+from coldloop_rig.plc_export.folder import export_plc
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.cosim.session import SessionClient
 from coldloop_rig.cosim.wiring import REQUIRED
-from coldloop_rig.plc_export.c import exported_optimizer
-from coldloop_rig.plc_export.kernels.recorded_problems import SINGLE
+from coldloop_rig.plc_export.exported_optimizer import exported_optimizer
+from coldloop_rig.plc_export.golden import SINGLE
+from coldloop_rig.cosim.wiring import REQUIRED
+from coldloop_rig.cosim.session import SessionClient
+from coldloop_rig.plc_export import exported_optimizer
+from coldloop_rig.plc_export.folder import export_plc
+from coldloop_rig.plc_export.golden import SINGLE
 from coldloop_rig.settings import Settings
-from tests.conftest import Coldloop, install_libmodbus
-from tests.harness.processes import Processes
+from tests.conftest import Coldloop
+from tests.harness.processes import Processes, environment
 from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP
 from tests.rig.conftest import until_accepted
 
@@ -56,15 +62,14 @@ def export(folder: Path) -> Path:
     """The same, compiled."""
     if shutil.which("cc") is None:
         pytest.skip("no C compiler: cc is not installed")
-    install_libmodbus()
     exported_optimizer.exported_optimizer(f"export:{folder}", settings())
     return folder
 
 
 @pytest.fixture
-def program(export: Path) -> Path:
-    """Its program."""
-    return Path(exported_optimizer.exported_optimizer(f"export:{export}", settings())[0])
+def program(export: Path) -> tuple[str, ...]:
+    """The command of its service, without the interpreter."""
+    return exported_optimizer.exported_optimizer(f"export:{export}", settings())[1:]
 
 
 def assert_same(coldloop: Coldloop, export: Path, tmp_path: Path, *scenario: str) -> None:
@@ -96,23 +101,23 @@ def test_so_have_two_hours(coldloop: Coldloop, export: Path, tmp_path: Path, per
 @pytest.mark.usefixtures("realtime")
 @pytest.mark.parametrize("order", list(WordOrder))
 async def test_it_drives_in_either_word_order_and_drives_again_after_a_restart(
-    order: WordOrder, load_a: LoadProfile, on_the_bus: "OnTheBus", processes: Processes, program: Path
+    order: WordOrder, load_a: LoadProfile, on_the_bus: "OnTheBus", processes: Processes, program: tuple[str, ...]
 ) -> None:
     own = processes.free_port()
-    async with on_the_bus(order=order, services=REQUIRED) as bus:
-        where = ("--port", str(bus.endpoints.control_plc.port), "--listen", str(own))
+    async with on_the_bus(settings(), order=order, services=REQUIRED) as bus:
+        told = {**to_environment(bus.settings), "COLDLOOP__OPTIMIZER_PLC__SERVER__PORT": str(own)}
         rig = SessionClient(bus.endpoints, bus.settings, services=REQUIRED)
-        shown = RegisterClient(OPTIMIZER_MAP, host="127.0.0.1", port=own, timeout_s=PATIENCE_S)
+        shown = RegisterClient(OPTIMIZER_MAP, host="127.0.0.1", port=own, order=order, timeout_s=PATIENCE_S)
         try:
             await rig.connect(PATIENCE_S)
             await rig.start(Scenario(14400, load_a, 0.0, 1, realtime=True, factor=5.0))
-            first = processes.script(program, *where)
+            first = processes.python(*program, more=told)
             await until_accepted(rig.control, 3)
             assert (await rig.control.read(LeaseStatus)).state == LeaseState.HELD
             assert (await shown.read(Identity)).session == rig.session
             first.kill()
             shown.close()
-            second = processes.script(program, *where)
+            second = processes.python(*program, more=told)
             await until_accepted(rig.control, 3)
             assert second.alive
         finally:
@@ -154,9 +159,10 @@ def test_it_is_kept_up_and_finds_a_control_plc_that_was_killed(
         assert cli.main(["down", "--port-base", str(base)]) == 0
 
 
-async def test_it_ends_with_the_program_that_has_started_it(processes: Processes, program: Path) -> None:
+async def test_it_ends_with_the_program_that_has_started_it(processes: Processes, program: tuple[str, ...]) -> None:
+    told = environment(settings(f"optimizer_plc.server.port={processes.free_port()}"))
     started = await asyncio.create_subprocess_exec(
-        program, "--listen", str(processes.free_port()), "--with-parent", stdin=asyncio.subprocess.PIPE
+        sys.executable, *program, "--with-parent", stdin=asyncio.subprocess.PIPE, env=told
     )
     assert started.stdin
     started.stdin.close()
@@ -191,7 +197,7 @@ def test_an_export_for_other_settings_is_refused(folder: Path) -> None:
 def test_an_updating_period_is_the_sessions(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exported_optimizer, "_compiled", lambda *_: Path("program"))
     fixed = settings("optimizer_plc.program.updating_period_s=2.5")
-    assert exported_optimizer.exported_optimizer(f"export:{folder}", fixed) == ("program",)
+    assert exported_optimizer.exported_optimizer(f"export:{folder}", fixed)[-1] == "program"
 
 
 def changed_manifest(copy: Path, **fields: object) -> None:
@@ -230,7 +236,7 @@ def test_a_source_that_was_changed_is_refused(copy: Path) -> None:
 
 
 @pytest.mark.usefixtures("compiles")
-@pytest.mark.parametrize("name", ["/dev/zero", "../kernels.c", "bus"])
+@pytest.mark.parametrize("name", ["/dev/zero", "../kernels.c", "."])
 def test_files_are_those_of_the_export(name: str, copy: Path) -> None:
     (copy / "optimizer" / "optimizer.c").write_bytes(b"")
     changed_manifest(copy, files={"optimizer.c": hashlib.sha256(b"").hexdigest(), name: "ab" * 32})
@@ -238,29 +244,24 @@ def test_files_are_those_of_the_export(name: str, copy: Path) -> None:
 
 
 @pytest.mark.usefixtures("compiles")
-def test_a_program_that_lies_in_an_export_is_not_executed(
+def test_a_library_that_lies_in_an_export_is_not_loaded(
     copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    planted = copy / "optimizer" / "bus" / "optimizer"
-    planted.write_text("#!/bin/sh\n")
-    planted.chmod(0o755)
+    (copy / "optimizer" / exported_optimizer.LIBRARY).write_text("planted")
     monkeypatch.setenv("COLDLOOP_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(exported_optimizer, "_make", lambda _, __, made: (made / "program").write_text("ours"))
+    monkeypatch.setattr(exported_optimizer, "_make", lambda _, __, made: (made / "library.so").write_text("ours"))
     monkeypatch.setattr(shutil, "which", lambda _: "cc")
-    (program,) = exported_optimizer.exported_optimizer(f"export:{copy}", settings())
-    assert Path(program).read_text() == "ours"
-    assert Path(program).parent == tmp_path / "cache" / "exports"
-    assert Path(program).parent.stat().st_mode & 0o777 == 0o700
+    library = Path(exported_optimizer.exported_optimizer(f"export:{copy}", settings())[-1])
+    assert library.read_text() == "ours"
+    assert library.parent == tmp_path / "cache" / "exports"
+    assert library.parent.stat().st_mode & 0o777 == 0o700
 
 
 @pytest.mark.usefixtures("compiles")
-def test_without_a_compiler_or_libmodbus_one_line_says_what_to_install(
+def test_without_a_compiler_one_line_says_what_to_install(
     copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLDLOOP_CACHE_DIR", str(tmp_path / "nothing compiled"))
-    if shutil.which("cc"):
-        monkeypatch.setattr(exported_optimizer, "LIBRARY", "#include <modbus/there_is_no_such_header.h>\n")
-        assert "libmodbus is not installed: on Debian, install libmodbus-dev" in refusal(copy)
     monkeypatch.setenv("PATH", str(copy))
     assert "there is no C compiler (cc) to compile it: on Debian, install gcc" in refusal(copy)
 
@@ -268,7 +269,7 @@ def test_without_a_compiler_or_libmodbus_one_line_says_what_to_install(
 @pytest.mark.usefixtures("compiles")
 @pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler: cc is not installed")
 def test_a_compiler_that_gives_other_bits_is_refused(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(exported_optimizer, "FLAGS", ("-std=c99", "-O3", "-ffast-math"))
+    monkeypatch.setattr(exported_optimizer, "FLAGS", ("-std=c99", "-O3", "-ffast-math", "-fPIC"))
     assert "its self-test fails: " in refusal(copy)
 
 

@@ -13,7 +13,7 @@ from coldloop_rig.figures.worker import FigureProcess
 from tests.conftest import draw_nothing
 
 if TYPE_CHECKING:
-    from tests.rig.conftest import Coldloop
+    from tests.conftest import Coldloop
 
 
 pytestmark = pytest.mark.usefixtures("processes")

@@ -10,9 +10,8 @@ import pytest
 from coldloop.errors import ColdloopError
 from coldloop_optimizer_plc.budget import BudgetSettings, PlcBudget
 from coldloop_rig import simulate
-from coldloop_rig.plc_sizing.memory import Footprint
-from coldloop_rig.plc_sizing.profile import find_profile, shipped_profiles
-from coldloop_rig.plc_sizing.verdict import capacity, power_of
+from coldloop_rig.plc_sizing.budget import Footprint, capacity, power_of
+from coldloop_rig.plc_sizing.plc import find_profile, shipped_profiles
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop

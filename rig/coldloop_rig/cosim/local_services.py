@@ -142,7 +142,7 @@ class LocalServices:
         detours: Where something is between clients and servers.
         ports: Where they listen; by default on free ports.
         services: Which ones are started; the others are somebody else's.
-        optimizer: A program that takes the place of our optimiser, with its options.
+        optimizer: The command of a service that takes the place of our optimiser.
     """
 
     def __init__(
@@ -163,9 +163,7 @@ class LocalServices:
             service: (*PYTHON, "-m", f"coldloop_{service}") for service in services
         }
         if optimizer:
-            control, server = placed.optimizer_plc.control_plc, placed.optimizer_plc.server
-            where = ("--host", control.host, "--port", str(control.port), "--listen", str(server.port))
-            self._commands["optimizer_plc"] = (*optimizer, *where)
+            self._commands["optimizer_plc"] = tuple(optimizer)
         self._logs = log_folder
         self.services = tuple(services)
         self.processes: dict[str, asyncio.subprocess.Process] = {}

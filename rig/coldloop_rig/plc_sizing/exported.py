@@ -1,14 +1,14 @@
 """What an export for a PLC costs there, from its manifest: operations of its calls, bytes, times."""
 
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Final
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError
 
 from coldloop.errors import UsageError
 from coldloop.parsing import parsed_json
 from coldloop.text_file import held_file, read_bytes
-from coldloop_rig.plc_sizing.profile import PlcProfile
+from coldloop_rig.plc_sizing.plc import PlcProfile
 from coldloop_rig.text_tables import markdown_table
 
 MANIFEST: Final = "manifest.json"
@@ -37,18 +37,6 @@ class CallCost(BaseModel):
         return self.worst or self.most
 
 
-class Cut(NamedTuple):
-    """How calls are cut."""
-
-    work: int
-    """Operations that a call is given to do; 0 where each call does all of its kind."""
-    piece: int
-    """What it does beyond them at most."""
-
-
-WHOLE: Final = Cut(0, 0)
-
-
 class ExportCost(BaseModel):
     """What an export needs."""
 
@@ -61,9 +49,10 @@ class ExportCost(BaseModel):
     """By what takes them."""
     self_test: dict[str, int] = {}
     """Iterations and operations of the solver in the self-test."""
-    work: Annotated[int, Field(ge=0)] = WHOLE.work
-    piece: Annotated[int, Field(ge=0)] = WHOLE.piece
-    """Of `Cut`."""
+    work: Annotated[int, Field(ge=0)] = 0
+    """Operations that a call is given to do; 0 where each call does all of its kind."""
+    piece: Annotated[int, Field(ge=0)] = 0
+    """What it does beyond them at most."""
     longest_period_s: PositiveFloat = 5.0
     """Longest updating period; exports that do not say it are of the cold box."""
 
@@ -129,10 +118,8 @@ def misfits(cost: ExportCost, profile: PlcProfile) -> list[str]:
         if profile.cycle_s is not None and longest_s > profile.cycle_s:
             found.append(f"{profile.name}: a {call} takes up to {longest_s:.3g} s, and its cycle monitoring"
                          f" stops a program after {profile.cycle_s:g} s: {remedy}")  # fmt: skip
-    once_s, longest_s = (
-        cost.seconds(sum(call.bound for call in cost.operations.values()), profile),
-        cost.longest_period_s,
-    )
+    once_s = cost.seconds(sum(call.bound for call in cost.operations.values()), profile)
+    longest_s = cost.longest_period_s
     if once_s > longest_s:
         found.append(f"{profile.name}: time: with one iteration it takes up to {once_s:.3g} s, and the longest updating"
                      f" period is {longest_s:g} s")  # fmt: skip

@@ -6,17 +6,101 @@ indices are none. Bytes are single-precision matrix elements read or written, pa
 The sizes say which elements count: all, or those that can be non-zero. Active rows are mean ones.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop_rig.plc_sizing.sizes import QpSizes
+from coldloop_optimizer_plc.settings import SolverName
 
 Array = NDArray[np.float64] | NDArray[np.int64]
+Pattern = NDArray[np.bool_]
+
+
+class QpSizes(NamedTuple):
+    """What the operations of an iteration depend on."""
+
+    n: int
+    """Variables."""
+    m: int
+    """Rows of Gamma."""
+    bounded: int
+    """Variables with an upper bound; all have a lower one."""
+    Phi: int
+    """Elements of Phi."""
+    Gamma: int
+    """Elements of Gamma."""
+    outer: int
+    """Elements on and above the diagonal of g g', summed over the rows g' of Gamma."""
+    factor: NDArray[np.int64]
+    """Elements right of the diagonal, row by row, of the Cholesky factor of Phi + Gamma' Gamma, shape (n,)."""
+    transformed: int
+    """Elements of (I; Gamma) R^-1, where R is the Cholesky factor of Phi."""
+
+    @property
+    def triangle(self) -> float:
+        """Elements on and above the diagonal of Phi."""
+        return (self.Phi + self.n) / 2
+
+    @property
+    def row(self) -> float:
+        """Elements of a mean row of Gamma."""
+        return self.Gamma / self.m
+
+
+def sizes_without_zeros(Phi: Array, Gamma: Array, bounded: Pattern) -> QpSizes:
+    """Return the sizes with the zeros of Phi and Gamma left out; `bounded` (n,) are variables with an upper bound."""
+    order = np.argsort(bounded, kind="stable")
+    quadratic, rows = (Phi != 0)[np.ix_(order, order)], (Gamma != 0)[:, order]
+    lengths = rows.sum(axis=1)
+    inverse = inverse_pattern(factor_pattern(quadratic))
+    return QpSizes(
+        n=len(Phi), m=len(Gamma), bounded=int(bounded.sum()),
+        Phi=int(quadratic.sum()), Gamma=int(rows.sum()), outer=int((lengths * (lengths + 1)).sum()) // 2,
+        factor=factor_pattern(quadratic | (rows.T @ rows)).sum(axis=1) - 1,
+        transformed=int(inverse.sum() + (rows @ inverse).sum()),
+    )  # fmt: skip
+
+
+def dense_sizes(n: int, m: int, bounded: int) -> QpSizes:
+    """Return the sizes of a problem without zeros."""
+    return sizes_without_zeros(np.ones((n, n)), np.ones((m, n)), np.arange(n) >= n - bounded)
+
+
+def factor_pattern(pattern: Pattern) -> Pattern:
+    """Return where the Cholesky factor U, U' U = A, of a matrix with this pattern (n, n) can be non-zero."""
+    filled = pattern.copy()
+    for k in range(len(filled)):
+        row = k + np.flatnonzero(filled[k, k:])
+        filled[np.ix_(row, row)] = True
+    upper: Pattern = np.triu(filled)
+    return upper
+
+
+def inverse_pattern(upper: Pattern) -> Pattern:
+    """Return where the inverse of an upper triangular matrix with this pattern (n, n) can be non-zero."""
+    inverse = np.eye(len(upper), dtype=bool)
+    for i in reversed(range(len(upper))):
+        inverse[i] |= inverse[upper[i]].any(axis=0)
+    return inverse
+
 
 WORD = 4
 """Bytes of a number."""
+
+
+class ActiveRows(NamedTuple):
+    """Rows of Gamma in the ODE solver's stage matrix."""
+
+    mean: float
+    worst: float
+
+
+ACTIVE_ROWS = ActiveRows(mean=2.5, worst=31.0)
+"""Measured in the closed loop over hours a to f, tau_u = 5 s; the hourly means are 0.7 to 4.4 (`docs/budget.md`)."""
+WORKING_SET = 25.0
+"""Constraints assumed in the working set of the active-set methods: half of the variables."""
 
 
 class Operations(NamedTuple):
@@ -79,7 +163,7 @@ def stage_matrix(s: QpSizes, active: float) -> Operations:
     return Operations(3 + s.triangle + s.n, 2 * WORD * s.triangle).plus(row.times(active))
 
 
-def ode(s: QpSizes, active: float) -> Operations:
+def ode(s: QpSizes, active: float = ACTIVE_ROWS.mean) -> Operations:
     """Return those of one step of TR-BDF2 that is accepted, with the same rows active at its three points."""
     velocity = gradient(s, active).plus(Operations(s.n))
     vectors = Operations(18 * s.n + 5)  # two stages 11n + 2, error 7n, next step size 3
@@ -95,7 +179,7 @@ def ode_kept(s: QpSizes, active: float) -> Operations:
     return ode(s, active).plus(known.times(-1))
 
 
-def qpoases(s: QpSizes, active: float) -> Operations:
+def qpoases(s: QpSizes, active: float = WORKING_SET) -> Operations:
     """Return those of one working-set change of a null-space active-set method with `active` constraints fixed.
 
     After Ferreau et al., qpOASES: a parametric active-set algorithm (Math. Prog. Comp. 6, 2014), and Gill et al.,
@@ -121,12 +205,12 @@ def osqp(s: QpSizes) -> Operations:
     return Operations(4 * elements + (s.n + rows), 2 * WORD * elements).plus(Operations(5 * s.n + 14 * rows))
 
 
-def fast_gradient(s: QpSizes, active: float) -> Operations:
+def fast_gradient(s: QpSizes, active: float = ACTIVE_ROWS.mean) -> Operations:
     """Return those of one gradient step of the augmented cost with momentum; its projection only compares."""
     return gradient(s, active).plus(Operations(9 * s.n + 8))
 
 
-def interior_point(s: QpSizes, active: float) -> Operations:
+def interior_point(s: QpSizes, active: float = ACTIVE_ROWS.mean) -> Operations:
     """Return those of one predictor and corrector step, and of the augmented cost after it."""
     n, m = s.n, s.m
     bounds = n + s.bounded
@@ -144,7 +228,7 @@ def interior_point(s: QpSizes, active: float) -> Operations:
     )
 
 
-def daqp(s: QpSizes, active: float) -> Operations:
+def daqp(s: QpSizes, active: float = WORKING_SET) -> Operations:
     """Return those of one working-set change of a dual active-set method with an LDL' factor of size `active`.
 
     After Arnstroem, Bemporad, Axehill, A dual active-set solver for embedded quadratic programming using recursive
@@ -218,3 +302,62 @@ def target(inputs: int) -> Operations:
 def _response(results: int, sizes: PreparationSizes) -> Operations:
     """Return those of A x + B u + F w."""
     return product(results * (sizes.states + sizes.inputs)).plus(Operations(results, WORD * results))
+
+
+class SolverCount(NamedTuple):
+    """An iteration of a solver, with the usual number of active rows or of constraints held."""
+
+    operations: Callable[[QpSizes], Operations]
+    default: str
+    """What the default of `tau_1_s` follows."""
+    paper_s: float | None = None
+    """Its time in the paper."""
+
+
+SOLVERS: Final = {
+    SolverName.ODE: SolverCount(ode, "paper", 0.25),
+    SolverName.QPOASES: SolverCount(qpoases, "paper", 0.48),
+    SolverName.OSQP: SolverCount(osqp, "dense"),
+    SolverName.FAST_GRADIENT: SolverCount(fast_gradient, "dense"),
+    SolverName.INTERIOR_POINT: SolverCount(interior_point, "our code"),
+    SolverName.HYBRID: SolverCount(lambda sizes: max(ode(sizes), interior_point(sizes)), "the longer one"),
+    SolverName.DAQP: SolverCount(daqp, "one solve in 5 s"),
+}
+
+
+class ProblemSizes(NamedTuple):
+    """What the sizes of a problem follow from."""
+
+    knots: int
+    inputs: int
+    outputs: int
+    bands: int
+    constraints: int
+    """Constraint instants."""
+    states: int
+    """With those of the estimated constants and of the load."""
+
+
+COLD_BOX_SIZES: Final = ProblemSizes(knots=7, inputs=3, outputs=22, bands=2, constraints=14, states=49)
+
+
+def iteration_shares(sizes: ProblemSizes) -> dict[str, float]:
+    """Return the time of each solver's iteration, and of the preparation, over those of the cold box's problem.
+
+    Dense operations are counted in both, with the cold box's number of active rows.
+    """
+    here, there = (_operations(each) for each in (sizes, COLD_BOX_SIZES))
+    return {name: here[name] / there[name] for name in here}
+
+
+def _operations(sizes: ProblemSizes) -> dict[str, float]:
+    n_inputs, rate_rows = sizes.knots * sizes.inputs, 2 * sizes.knots * sizes.inputs
+    rows = 2 * sizes.bands * sizes.constraints + rate_rows
+    problem = dense_sizes(n_inputs + 2 * sizes.bands * sizes.knots, rows, n_inputs)
+    once = PreparationSizes(
+        problem=problem, rate_rows=rate_rows, knots=sizes.knots, states=sizes.states, inputs=sizes.inputs,
+        outputs=sizes.outputs, segments=1, samples=1, targets=False, limited=False,
+    )  # fmt: skip
+    counts = {str(name): each.operations(problem).flops for name, each in SOLVERS.items()
+              if name is not SolverName.HYBRID}  # fmt: skip
+    return {**counts, "preparation": preparation(once, ACTIVE_ROWS.mean).flops}

@@ -15,7 +15,7 @@ from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel, discretise
 from coldloop.process.sections import Output, State
 from coldloop_plant.own.maker import file_digest
-from coldloop_rig.plc_sizing.problem_sizes import ProblemSizes, iteration_shares
+from coldloop_rig.plc_sizing.operations import ProblemSizes, iteration_shares
 from coldloop_rig.process_file.bath import check_bath
 from coldloop_rig.process_file.courses import courses_of, forecasts_of
 from coldloop_rig.process_file.fmu_model import with_units

@@ -13,7 +13,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, model_validator
 
 from coldloop.parsing import parsed_toml
 from coldloop_rig.plc_sizing.operations import dense_cholesky
-from coldloop_rig.plc_sizing.reference_plc import cholesky_times
+from coldloop_rig.plc_sizing.plc import cholesky_times
 from coldloop_rig.studies import published as paper
 from coldloop_rig.studies.intervals import Interval, geometric_mean, interval_of_mean
 from coldloop_rig.studies.paper.cholesky import SLOW_DOWN, SPEED

@@ -13,9 +13,8 @@ import numpy as np
 from coldloop_optimizer_plc.budget import PlcBudget
 from coldloop_optimizer_plc.qp.design import ControlDesign
 from coldloop_rig.cosim.ideal_loop import run_ideal_loop
-from coldloop_rig.plc_sizing.budget_tables import counted_sizes, problem_of
-from coldloop_rig.plc_sizing.memory import estimator_memory, footprint
-from coldloop_rig.plc_sizing.solver_counts import SOLVERS
+from coldloop_rig.plc_sizing.budget import counted_sizes, estimator_memory, footprint, problem_of
+from coldloop_rig.plc_sizing.operations import SOLVERS
 from coldloop_rig.settings import Settings
 from coldloop_rig.studies.intervals import geometric_mean
 from coldloop_rig.studies.loop_cost import ADAPTIVE, loop_cost, require_costs

@@ -8,7 +8,8 @@ import asyncio
 import logging
 import secrets
 import time
-from typing import Final, NamedTuple
+from collections.abc import Callable
+from typing import Final, NamedTuple, TypeAlias
 
 from coldloop import __version__
 from coldloop.config import selected
@@ -21,7 +22,8 @@ from coldloop.errors import (
     UnfitValueError,
 )
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
-from coldloop.process.lti_model import load
+from coldloop.process.limits import InputLimits
+from coldloop.process.lti_model import LtiModel, load
 from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.control_plc import AwaitUpdate, Update, Verdict
 from coldloop.registers.maps import maps_of
@@ -35,9 +37,10 @@ from coldloop.session.time_base import TimeBase
 from coldloop_optimizer_plc.control_client import ControlClient
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.publication import OptimizerPublication
-from coldloop_optimizer_plc.settings import SHOWN, OptimizerSettings
+from coldloop_optimizer_plc.settings import SHOWN, OptimizerSettings, ProgramSettings
 
 log = logging.getLogger("coldloop.optimizer_plc")
+MakeProgram: TypeAlias = Callable[[LtiModel, ProgramSettings, InputLimits], OptimizerProgram]
 
 LOOK_OUT_TICKS: Final = 1 / 8
 """Plant time between two looks for a load step in real time: the new computation begins so much later."""
@@ -71,17 +74,18 @@ class OptimizerPlc:
 
     Args:
         settings: Of this service.
+        program: Makes the program.
 
     Raises:
         ConfigurationError: The files for TLS cannot be used.
         ModelFileError: The model file cannot be used.
     """
 
-    def __init__(self, settings: OptimizerSettings) -> None:
+    def __init__(self, settings: OptimizerSettings, program: MakeProgram = OptimizerProgram) -> None:
         section = settings.optimizer_plc
         self._settings, self._tick_s = settings, settings.process.tick_s
         maps = maps_of(settings.process)
-        self._program = OptimizerProgram(load(settings.model.file), section.program, settings.limits)
+        self._program = program(load(settings.model.file), section.program, settings.limits)
         digest, holder = self._program.model_digest, 1 + secrets.randbelow(0xFFFFFFFF)
         self.publication = OptimizerPublication(
             maps.optimizer_plc, section.word_order, self._program.budget, self._program.operating_limits, digest, holder
@@ -266,9 +270,9 @@ class OptimizerPlc:
         return newest.session != update.session or newest.update > update.update
 
 
-async def serve(settings: OptimizerSettings) -> None:
+async def serve(settings: OptimizerSettings, program: MakeProgram = OptimizerProgram) -> None:
     """Serve and optimise until cancelled."""
-    plc = OptimizerPlc(settings)
+    plc = OptimizerPlc(settings, program)
     shown = plc.publication
     identity = DeviceIdentity(product="Coldloop optimiser PLC", revision=__version__)
     server = ModbusServer(

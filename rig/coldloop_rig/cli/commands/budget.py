@@ -82,51 +82,36 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _shown(options: argparse.Namespace) -> str:
+    from coldloop_rig.plc_sizing.plc import PlcProfile, find_profile, shipped_profiles
+
     if options.list:
-        return _listing()
+        from coldloop_rig.text_tables import aligned
+
+        return aligned([(name, find_profile(name).name) for name in shipped_profiles()])
     if options.keys:
-        return _keys()
+        from coldloop_rig.cli.key_listing import key_listing
+
+        return key_listing(PlcProfile)
     if options.export:
-        return _exported(options)
-    return _certified(options) if options.certify else _tables(options)
+        from coldloop_rig.plc_sizing.exported import cost_text, profile_of, read_cost
 
+        cost = read_cost(options.export)
+        if options.took:
+            return profile_of(cost, options.took)
+        return cost_text(cost, find_profile(options.plc) if options.plc else None)
+    if options.certify:
+        from coldloop_rig.plc_sizing.certification import certification_table
 
-def _listing() -> str:
-    from coldloop_rig.plc_sizing.profile import find_profile, shipped_profiles
-    from coldloop_rig.text_tables import aligned
-
-    return aligned([(name, find_profile(name).name) for name in shipped_profiles()])
-
-
-def _keys() -> str:
-    from coldloop_rig.cli.key_listing import key_listing
-    from coldloop_rig.plc_sizing.profile import PlcProfile
-
-    return key_listing(PlcProfile)
-
-
-def _exported(options: argparse.Namespace) -> str:
-    from coldloop_rig.plc_sizing.exported import cost_text, profile_of, read_cost
-    from coldloop_rig.plc_sizing.profile import find_profile
-
-    cost = read_cost(options.export)
-    if options.took:
-        return profile_of(cost, options.took)
-    return cost_text(cost, find_profile(options.plc) if options.plc else None)
-
-
-def _certified(options: argparse.Namespace) -> str:
-    from coldloop_rig.plc_sizing.certification_table import certification_table
-
-    if any(value is not None for value in (options.power, options.plc, options.period)):
-        raise UsageError("--certify: uses the configured PLC; leave out --power, --plc and --updating-period")
-    settings = configuration(options).settings
-    return certification_table(settings, options.certify, options.tolerance, options.confidence)
+        if any(value is not None for value in (options.power, options.plc, options.period)):
+            raise UsageError("--certify: uses the configured PLC; leave out --power, --plc and --updating-period")
+        settings = configuration(options).settings
+        return certification_table(settings, options.certify, options.tolerance, options.confidence)
+    return _tables(options)
 
 
 def _tables(options: argparse.Namespace) -> str:
-    from coldloop_rig.plc_sizing.budget_tables import budget_tables, plc_tables, with_power
-    from coldloop_rig.plc_sizing.profile import find_profile
+    from coldloop_rig.plc_sizing.budget import budget_tables, plc_tables, with_power
+    from coldloop_rig.plc_sizing.plc import find_profile
     from coldloop_rig.runs.remarks import certificate
 
     if len(set(options.loads)) < len(options.loads):
@@ -146,7 +131,7 @@ def _tables(options: argparse.Namespace) -> str:
 
 
 def _executed(problem: "PredictiveProblem", program: "ProgramSettings") -> str:
-    from coldloop_rig.plc_export.kernels.counted import counter_of
+    from coldloop_rig.plc_export.counting import counter_of
 
     counter = counter_of(problem, program)
     return (

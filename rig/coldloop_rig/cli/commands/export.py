@@ -59,8 +59,8 @@ def _recorded_run(options: argparse.Namespace) -> list[Path]:
 
 def _solver(options: argparse.Namespace) -> list[Path]:
     from coldloop.errors import UsageError
-    from coldloop_rig.cli.plc_folder import export_plc
-    from coldloop_rig.plc_sizing.profile import find_profile
+    from coldloop_rig.plc_export.folder import export_plc
+    from coldloop_rig.plc_sizing.plc import find_profile
 
     if options.run != PLC:
         raise UsageError(f"{options.run}: has no target; coldloop export plc --target {options.target} --out FOLDER")
@@ -76,7 +76,7 @@ def _settings(options: argparse.Namespace) -> "Settings":
     """Return the settings of the optimiser: those of the paper's PLC, unless the user says otherwise."""
     from coldloop.config import load_configuration
     from coldloop_rig.cli.process_option import process_setting
-    from coldloop_rig.plc_export.kernels.recorded_problems import SINGLE
+    from coldloop_rig.plc_export.golden import SINGLE
     from coldloop_rig.settings import Settings
 
     assignments = [*SINGLE, *options.assignments]

@@ -159,7 +159,7 @@ def exported(given: str | None, settings: "Settings") -> tuple[str, ...]:
     """
     if given is None:
         return ()
-    from coldloop_rig.plc_export.c.exported_optimizer import exported_optimizer
+    from coldloop_rig.plc_export.exported_optimizer import exported_optimizer
 
     return exported_optimizer(given, settings)
 

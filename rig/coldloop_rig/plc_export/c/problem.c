@@ -1,4 +1,4 @@
-@GENERATED
+@GENERATED@
 #include <math.h>
 #include <string.h>
 

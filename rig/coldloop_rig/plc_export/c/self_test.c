@@ -1,4 +1,4 @@
-@GENERATED
+@GENERATED@
 #include <float.h>
 #include <stdio.h>
 #include <string.h>

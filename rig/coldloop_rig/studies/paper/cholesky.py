@@ -23,19 +23,17 @@ from coldloop_optimizer_plc.qp.problem import PredictiveProblem
 from coldloop_optimizer_plc.settings import SolverName
 from coldloop_rig.figures.plot import COLOURS
 from coldloop_rig.plc_sizing import operations
-from coldloop_rig.plc_sizing.memory import Footprint, estimator_memory, footprint
-from coldloop_rig.plc_sizing.reference_plc import (
-    ACTIVE_ROWS,
+from coldloop_rig.plc_sizing.budget import Footprint, estimator_memory, footprint
+from coldloop_rig.plc_sizing.operations import ACTIVE_ROWS, WORKING_SET, dense_sizes
+from coldloop_rig.plc_sizing.plc import (
     MEMORY_BYTES,
     QPOASES_ON_LAPTOP_S,
-    WORKING_SET,
     SpeedCurve,
     cholesky_times,
     reference_curve,
     residuals,
     slow_down,
 )
-from coldloop_rig.plc_sizing.sizes import dense_sizes
 from coldloop_rig.studies.drawing import panels, paper
 from coldloop_rig.studies.request import RunRequest, Series
 from coldloop_rig.studies.study import Outcomes, StudyOptions, StudyResult

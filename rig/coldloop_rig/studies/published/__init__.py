@@ -1,6 +1,6 @@
 """The points of the paper's figures, as far as its source holds them.
 
-Those of the PLC's speed are in `coldloop_rig.plc_sizing.reference_plc`.
+Those of the PLC's speed are in `coldloop_rig.plc_sizing.plc`.
 """
 
 import csv

@@ -1,1 +1,0 @@
-"""The tree as C99: the solver, the whole optimiser, and its place on the bus."""

@@ -1,0 +1,385 @@
+"""What a PLC can do in an updating period, and whether its memory holds the problem, as tables and in a sentence."""
+
+from collections.abc import Callable, Sequence
+from math import floor
+from typing import NamedTuple
+
+import numpy as np
+
+from coldloop.process.lti_model import load
+from coldloop.registers.control_plc import SEQUENCE_ROWS
+from coldloop_optimizer_plc.budget import PlcBudget
+from coldloop_optimizer_plc.computing_settings import Arithmetic, EstimatorKind, EstimatorSettings
+from coldloop_optimizer_plc.estimator import check_detectability, stationary_gains
+from coldloop_optimizer_plc.plausibility import watched_output
+from coldloop_optimizer_plc.qp.arithmetic import real_of
+from coldloop_optimizer_plc.qp.design import ControlDesign, Target, trivial_design
+from coldloop_optimizer_plc.qp.prediction import PredictionModel, prediction_of
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem
+from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
+from coldloop_rig.plc_sizing import operations
+from coldloop_rig.plc_sizing.operations import (
+    ACTIVE_ROWS,
+    SOLVERS,
+    WORD,
+    Operations,
+    QpSizes,
+    dense_sizes,
+    sizes_without_zeros,
+)
+from coldloop_rig.plc_sizing.plc import MEMORY_BYTES, PlcProfile, cholesky_times, reference_curve, residuals, slow_down
+from coldloop_rig.settings import Settings
+from coldloop_rig.text_tables import aligned
+
+
+class Workspace(NamedTuple):
+    """What a solver holds at a time besides the problem, in numbers of single precision; zeros are stored.
+
+    Our own solvers as in their code, without copies of Phi and Gamma in another order; the others as their papers have
+    them.
+    """
+
+    matrices: int
+    """Elements of matrices."""
+    by_variable: int
+    """Vectors with an element for each variable."""
+    by_row: int
+    """Vectors with an element for each row of Gamma."""
+
+
+def workspaces(n: int, m: int) -> dict[SolverName, int]:
+    """Return the bytes of each solver's workspace for n variables and m rows."""
+    triangle = n * (n + 1) // 2
+    held = {
+        # stage matrix; three points, four velocities, variables held; excess and three sets of active rows
+        SolverName.ODE: Workspace(n * n, 8, 4),
+        # Q, R, T; z, multipliers and data (gradient, bounds) with their steps, two products
+        SolverName.QPOASES: Workspace(3 * n * n, 12, 6),
+        # L; z and z~ with scaling, five vectors of the rows of Gamma and of the n bounds, D of L D L'
+        SolverName.OSQP: Workspace(n * m + triangle, 10, 6),
+        # z, the extrapolated point, gradient, change, step sizes; excess and active rows
+        SolverName.FAST_GRADIENT: Workspace(0, 5, 2),
+        # Newton matrix; point, step, predicted point (z and two multipliers each), distances of both points, products,
+        # gradient, best point
+        SolverName.INTERIOR_POINT: Workspace(n * n, 17, 8),
+        # M, R^-1, L; nine vectors of variables, three of rows and bounds
+        SolverName.DAQP: Workspace(n * m + 2 * triangle + n + 1, 12, 3),
+    }
+    sizes = {name: WORD * (one.matrices + one.by_variable * n + one.by_row * m) for name, one in held.items()}
+    return {**sizes, SolverName.HYBRID: max(sizes[SolverName.ODE], sizes[SolverName.INTERIOR_POINT])}
+
+
+class Footprint(NamedTuple):
+    """Bytes in single precision; what is needed for one part of the program each."""
+
+    hessian: int
+    """Phi alone."""
+    problem: int
+    """Gamma, the maps to phi, gamma, the bounds and the constant."""
+    shift: int
+    """One shift of the profile; its other shifts are computed when they are needed."""
+    solver: int
+    """Its workspace."""
+    estimator: int
+    """Transitions, Kalman gains and inverse covariances of every updating period, output matrices, states beside."""
+    sequence: int
+    """Two buffers of the longest sequence: the one being played, the one being written."""
+
+    @property
+    def total(self) -> int:
+        """All of it."""
+        return sum(self)
+
+
+def estimator_memory(prediction: PredictionModel, settings: EstimatorSettings, apart: int = 0) -> int:
+    """Return the bytes of the estimator, with so many predictions beside the filter's."""
+    real = real_of(Arithmetic.FLOAT32)
+    single = prediction.rounded(real)
+    gains = (array.astype(real) for array in stationary_gains(prediction, settings))
+    transitions = (M for step in single.transitions.values() for M in step)
+    states = WORD * apart * (2 * prediction.n_states + 1)
+    return states + sum(M.nbytes for M in (*gains, *transitions, single.C, single.D, single.G))
+
+
+def footprint(problem: PredictiveProblem, estimator: int, solver: SolverName) -> Footprint:
+    """Return what a problem made in single precision needs with a solver and an estimator of so many bytes."""
+    if problem.Phi.dtype != np.float32:
+        raise ValueError("the PLC computes in single precision")
+    return Footprint(
+        hessian=problem.Phi.nbytes,
+        problem=problem.memory() - problem.Phi.nbytes,
+        shift=problem.Phi.nbytes,
+        solver=workspaces(problem.size, len(problem.Gamma))[solver],
+        estimator=estimator,
+        sequence=2 * SEQUENCE_ROWS * problem.design.n_inputs * WORD,
+    )
+
+
+ROUNDING = 1e-9
+MANY = 1000
+"""Variables from which on their number is not said."""
+
+
+class Capacity(NamedTuple):
+    """Up to how many variables a PLC has memory and time, where all else grows with them."""
+
+    by_memory: float
+    by_time: float
+    """For one iteration in the longest updating period."""
+
+
+def power_of(profile: PlcProfile, size: int) -> float:
+    """Return P, the speed of a PLC over the reference PLC's, in loops as long as a problem has variables."""
+    return profile.flops_per_s(size) / reference_curve().flops_per_s(size)
+
+
+def capacity(size: int, needed: Footprint, memory_bytes: int, budget: PlcBudget) -> Capacity:
+    """Return what a PLC has room and time for.
+
+    Matrices grow with the square of the variables and the time of an iteration with their third power, as rows grow
+    with them; the estimator, the sequences and the preparation stay.
+
+    Args:
+        size: Variables of the problem.
+        needed: What it takes in memory.
+        memory_bytes: The PLC's.
+        budget: Of the PLC and the solver.
+    """
+    fixed = needed.estimator + needed.sequence
+    room = max(memory_bytes - fixed, 0)
+    time_s = max(budget.longest_ticks * budget.times.tick_s - budget.times.slots, 0.0)
+    return Capacity(
+        size * (room / (needed.total - fixed)) ** (1 / 2), size * (time_s / budget.times.iteration) ** (1 / 3)
+    )
+
+
+def fits(profile: PlcProfile, program: ProgramSettings, problem: PredictiveProblem, needed: Footprint) -> bool:
+    """Return whether a PLC has memory and time for a problem; as `verdict`."""
+    budget = PlcBudget(program.budget, program.iteration_s)
+    return min(capacity(problem.size, needed, profile.memory_bytes, budget)) + ROUNDING >= problem.size
+
+
+def verdict(profile: PlcProfile, program: ProgramSettings, problem: PredictiveProblem, needed: Footprint) -> str:
+    """Return what a PLC can do with a problem; `program` has the power of this PLC.
+
+    Args:
+        profile: The PLC.
+        program: Solver and budget.
+        problem: The problem in single precision.
+        needed: What it takes in memory.
+    """
+    budget = PlcBudget(program.budget, program.iteration_s)
+    limits = capacity(problem.size, needed, profile.memory_bytes, budget)
+    problem_text = f"the problem ({problem.size} variables, {len(problem.Gamma)} rows) with {program.solver_name}"
+    if not fits(profile, program, problem, needed):
+        lacks = []
+        if limits.by_memory < problem.size:
+            lacks.append(f"it takes {needed.total:,} of {profile.memory_bytes:,} bytes")
+        if limits.by_time < problem.size:
+            lacks.append(budget.too_slow())
+        return f"{profile.name}: {problem_text} does not fit: {', and '.join(lacks)}."
+    memory = f"{needed.total / 1e3:,.0f} of {profile.memory_bytes / 1e3:,.0f} kB"
+    ends = budget.ladder[0], budget.ladder[-1]
+    first, then = sorted((("memory", limits.by_memory), ("time", limits.by_time)), key=lambda one: one[1])
+    shortest_s, longest_s = (ticks * budget.times.tick_s for ticks in ends)
+    soonest, most = (f"{count} iteration{'s' * (count != 1)}" for count in map(budget.iterations, ends))
+    variables = [MANY if count >= MANY else floor(count + ROUNDING) for _, count in (first, then)]
+    return (
+        f"{profile.name}: {problem_text} fits, in {memory}; it updates every {shortest_s:g} s at the "
+        f"soonest ({soonest}), {most} in {longest_s:g} s; {first[0]} gives way first, with more than {variables[0]} "
+        f"variables ({then[0]} with more than {variables[1]}){_calls(profile, budget)}."
+    )
+
+
+def _calls(profile: PlcProfile, budget: PlcBudget) -> str:
+    longest_s, what = max((budget.times.iteration, "an iteration"), (budget.times.preparation, "the preparation"))
+    if profile.cycle_s is None or longest_s <= profile.cycle_s:
+        return ""
+    calls = -int(-longest_s // profile.cycle_s)
+    return (
+        f"; {what} takes {longest_s:.3g} s and its cycle monitoring stops a program after "
+        f"{profile.cycle_s:g} s: divide it over {calls} calls, or set that higher"
+    )
+
+
+class CountedSizes(NamedTuple):
+    """The sizes of a problem, counted in both ways."""
+
+    dense: QpSizes
+    without_zeros: QpSizes
+
+
+def budget_tables(settings: Settings, period_s: float | None, executed: Callable[[PredictiveProblem], str]) -> str:
+    """Return the tables as text, for the configured power and one updating period or several.
+
+    Args:
+        settings: Of the optimiser.
+        period_s: One updating period, or None for several.
+        executed: Returns what an iteration as exported takes.
+    """
+    problem, prediction = problem_of(settings)
+    program = settings.optimizer_plc.program
+    limited, apart = program.cold_end.approach_k > 0.0, predicted_apart(program, prediction)
+    return "\n".join([
+        _speed(problem.size),
+        _operations(problem, prediction, apart, limited=limited) + executed(problem),
+        _iterations(program, problem, period_s),
+        _memory(settings, problem, prediction, MEMORY_BYTES),
+    ])  # fmt: skip
+
+
+def plc_tables(
+    settings: Settings, period_s: float | None, profile: PlcProfile, costs: Callable[[Settings], str]
+) -> str:
+    """Return what a PLC can do as text: a sentence, what updating periods cost there, and the tables that differ.
+
+    Args:
+        settings: With any power: it becomes this PLC's.
+        period_s: One updating period, or None for several.
+        profile: The PLC.
+        costs: Returns a sentence or nothing; it is asked where the controller runs there.
+    """
+    problem, prediction = problem_of(settings)
+    settings = with_power(settings, power_of(profile, problem.size))
+    program = settings.optimizer_plc.program
+    apart = predicted_apart(program, prediction)
+    needed = footprint(problem, estimator_memory(prediction, program.estimator, apart), program.solver)
+    sentences = [verdict(profile, program, problem, needed)]
+    if fits(profile, program, problem, needed):
+        sentences += [costs(settings)]
+    speed = (
+        f"\nP = {program.budget.power:.3g}, {profile.flops_per_s(problem.size) / 1e6:.3g} Mflop/s in loops of length "
+        f"{problem.size}: {profile.source}\n"
+        f"for a run there: --set optimizer_plc.program.budget.power={program.budget.power:.4g}\n"
+    )
+    return "\n".join([
+        *filter(None, sentences),
+        speed,
+        _iterations(program, problem, period_s),
+        _memory(settings, problem, prediction, profile.memory_bytes),
+    ])  # fmt: skip
+
+
+def problem_of(settings: Settings) -> tuple[PredictiveProblem, PredictionModel]:
+    """Return the configured problem in single precision, and the model it is made from."""
+    program = settings.optimizer_plc.program
+    prediction = prediction_of(load(settings.model.file), program.estimator.disturbed, program.design)
+    check_detectability(prediction)
+    return _problem(settings, prediction, program.design), prediction
+
+
+def _problem(settings: Settings, prediction: PredictionModel, design: ControlDesign) -> PredictiveProblem:
+    penalties = settings.optimizer_plc.program.penalties
+    return PredictiveProblem(prediction, design, settings.limits, real_of(Arithmetic.FLOAT32), penalties)
+
+
+def with_power(settings: Settings, power: float) -> Settings:
+    """Return the settings for a PLC of this power."""
+    return settings.with_program(budget=settings.optimizer_plc.program.budget.model_copy(update={"power": power}))
+
+
+def counted_sizes(problem: PredictiveProblem) -> CountedSizes:
+    """Return the sizes of a problem, counted in both ways."""
+    return CountedSizes(
+        dense_sizes(problem.size, len(problem.Gamma), problem.n_inputs),
+        sizes_without_zeros(problem.Phi, problem.Gamma, np.isfinite(problem.maps.high)),
+    )
+
+
+def _speed(size: int) -> str:
+    curve, times = reference_curve(), cholesky_times()
+    return (
+        f"Cholesky factorisation on the PLC: {curve.c1 * 1e6:.3g} n + {curve.c2 * 1e6:.3g} n^2 "
+        f"+ {curve.c3 * 1e6:.3g} n^3 us, within {100 * np.abs(residuals(curve, times)).max():.2f} % of 25 times\n"
+        f"speed in loops of length {size}: {curve.flops_per_s(size) / 1e6:.3f} Mflop/s; "
+        f"slow-down against the laptop: {slow_down(times, size):.0f}\n"
+    )
+
+
+def predicted_apart(program: ProgramSettings, prediction: PredictionModel) -> int:
+    """Return how many predictions there are beside the filter's, without the watched reading."""
+    kalman = program.estimator.kind is EstimatorKind.KALMAN
+    return 2 * (kalman and watched_output(program.plausibility, prediction) >= 0)
+
+
+def _operations(problem: PredictiveProblem, prediction: PredictionModel, apart: int, *, limited: bool) -> str:
+    dense, without_zeros = counted_sizes(problem)
+    m, mean = dense.m, ACTIVE_ROWS.mean
+    variants: dict[str, Callable[[QpSizes], Operations]] = {
+        "ode, no row active": lambda sizes: operations.ode(sizes, 0),
+        f"ode, {mean:g} rows active (mean)": lambda sizes: operations.ode(sizes, mean),
+        f"ode, {mean:g} rows active (mean), velocity kept": lambda sizes: operations.ode_kept(sizes, mean),
+        f"ode, {ACTIVE_ROWS.worst:g} rows active (worst seen)": lambda sizes: operations.ode(sizes, ACTIVE_ROWS.worst),
+        f"ode, all {m} rows active": lambda sizes: operations.ode(sizes, m),
+        f"qpoases, {operations.WORKING_SET:g} constraints held": SOLVERS[SolverName.QPOASES].operations,
+        "osqp": SOLVERS[SolverName.OSQP].operations,
+        f"fast-gradient, {mean:g} rows active": SOLVERS[SolverName.FAST_GRADIENT].operations,
+        "interior-point": SOLVERS[SolverName.INTERIOR_POINT].operations,
+        f"daqp, {operations.WORKING_SET:g} constraints held": SOLVERS[SolverName.DAQP].operations,
+    }
+    rows: list[tuple[str, ...]] = [("one iteration", "operations", "without zeros", "kB moved", "without zeros")]
+    for name, count in variants.items():
+        both = count(dense), count(without_zeros)
+        rows.append((name, *(f"{one.flops:,.0f}" for one in both), *(f"{one.bytes / 1e3:.1f}" for one in both)))
+    sizes = operations.PreparationSizes(
+        dense, m - 4 * len(problem.design.constraint_instants), problem.n_knots, prediction.n_states,
+        prediction.D.shape[1], prediction.D.shape[0], segments=1, samples=1,
+        targets=problem.design.target is not Target.OPERATING_POINT, limited=limited, apart=apart,
+    )  # fmt: skip
+    once = operations.preparation(sizes, mean)
+    rows.append(("preparation, once an updating period", f"{once.flops:,.0f}", "", f"{once.bytes / 1e3:.1f}", ""))
+    return aligned(rows, numbers=True)
+
+
+def solver_table(
+    program: ProgramSettings, problem: PredictiveProblem, periods_s: Sequence[float]
+) -> list[tuple[str, ...]]:  # fmt: skip
+    """Return, solver by solver, times of an iteration at P = 1, periods of the ladder, iterations in some, and memory.
+
+    The first row is the header.
+    """
+    sizes, speed = counted_sizes(problem), reference_curve().flops_per_s(problem.size)
+    memory = workspaces(problem.size, len(problem.Gamma))
+    columns = ("solver", "paper s", "dense s", "without zeros s", "tau_1_s", "default follows")
+    rows: list[tuple[str, ...]] = [(*columns, "periods", *(f"in {period:g} s" for period in periods_s), "kB")]
+    for name, solver in SOLVERS.items():
+        tau_1_s = _tau_1_s(program, name)
+        plc = PlcBudget(program.budget, tau_1_s)
+        rows.append((
+            name, "" if solver.paper_s is None else f"{solver.paper_s:.2f}",
+            *(f"{solver.operations(one).flops / speed:.3f}" for one in sizes), f"{tau_1_s:g}", solver.default,
+            str(len(plc.ladder)), *(str(plc.iterations(round(period / plc.times.tick_s))) for period in periods_s),
+            f"{memory[name] / 1e3:.1f}",
+        ))  # fmt: skip
+    return rows
+
+
+def _tau_1_s(program: ProgramSettings, name: SolverName) -> float:
+    if name is SolverName.HYBRID:
+        return max(program.ode.tau_1_s, program.interior_point.tau_1_s)
+    return float(getattr(program, name.replace("-", "_")).tau_1_s)
+
+
+def _iterations(program: ProgramSettings, problem: PredictiveProblem, period_s: float | None) -> str:
+    longest_s = program.process.sampling_period_s
+    periods_s = [share * longest_s for share in (0.2, 0.5, 1.0)] if period_s is None else [period_s]
+    table = solver_table(program, problem, periods_s)
+    return f"seconds at P = 1, iterations done at P = {program.budget.power:.3g}\n{aligned(table, numbers=True)}"
+
+
+def _memory(
+    settings: Settings, problem: PredictiveProblem, prediction: PredictionModel, memory_bytes: int
+) -> str:  # fmt: skip
+    program = settings.optimizer_plc.program
+    estimator = estimator_memory(prediction, program.estimator, predicted_apart(program, prediction))
+    problems = (problem, _problem(settings, prediction, trivial_design(program.design)))
+    footprints = [footprint(one, estimator, program.solver) for one in problems]
+    names = {"hessian": "Phi", "problem": "Gamma and maps", "shift": "shift of the profile", "solver": "solver",
+             "estimator": "estimator", "sequence": "sequence buffers"}  # fmt: skip
+    rows = [("bytes in single precision", *(f"n = {one.size}" for one in problems))]
+    rows += [(text, *(f"{getattr(one, name):,}" for one in footprints)) for name, text in names.items()]
+    rows.append(("total", *(f"{one.total:,}" for one in footprints)))
+    rows.append((
+        f"share of {memory_bytes / 1e6:g} MB", *(f"{100 * one.total / memory_bytes:.1f} %" for one in footprints)
+    ))  # fmt: skip
+    return aligned(rows, numbers=True)

@@ -1,0 +1,186 @@
+"""PLCs: the reference one, from the times of the Cholesky factorisation in the paper, and others by profiles.
+
+A profile is a TOML file with memory, speed and where the figures are from (`docs/budget.md`).
+"""
+
+import math
+import os
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Annotated, Final, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from scipy.optimize import nnls
+
+from coldloop.config import load_configuration
+from coldloop.errors import ConfigurationError, UsageError
+from coldloop.table import read_table
+from coldloop_rig.plc_sizing.operations import dense_cholesky
+
+Array = NDArray[np.float64]
+
+MEMORY_BYTES = 2_000_000
+"""The memory card, shared by code and variables: the paper's 2 Mb, which 4 * 700^2 bytes just fit."""
+QPOASES_ON_LAPTOP_S = 120e-6
+"""One iteration of qpOASES on the paper's laptop."""
+
+
+class CholeskyTimes(NamedTuple):
+    """Measured times; shape (25,) each."""
+
+    size: Array
+    plc_s: Array
+    laptop_s: Array
+
+
+class SpeedCurve(NamedTuple):
+    """Time of a factorisation, c1 n + c2 n^2 + c3 n^3 in seconds: the work at the start of loops, and within them."""
+
+    c1: float
+    c2: float
+    c3: float
+
+    def time_s(self, n: float) -> float:
+        """Return the time of a Cholesky factorisation of size n, in seconds."""
+        return n * (self.c1 + n * (self.c2 + n * self.c3))
+
+    def flops_per_s(self, length: float) -> float:
+        """Return the speed in loops as long as those of a factorisation of size `length`."""
+        return dense_cholesky(length).flops / self.time_s(length)
+
+
+def cholesky_times() -> CholeskyTimes:
+    """Read the paper's table."""
+    table = np.loadtxt(Path(__file__).parent / "data" / "cholesky_times.csv", delimiter=",", skiprows=4)
+    return CholeskyTimes(table[:, 0], table[:, 1] * 1e-3, table[:, 2] * 1e-6)
+
+
+def fitted(size: Array, plc_s: Array) -> SpeedCurve:
+    """Return the curve without negative coefficients that has the least sum of squared relative errors."""
+    powers = np.stack([size, size**2, size**3], axis=1) / plc_s[:, None]
+    coefficients, _ = nnls(powers, np.ones(len(size)))
+    return SpeedCurve(*coefficients.tolist())
+
+
+def reference_curve() -> SpeedCurve:
+    """Return the curve of the paper's table."""
+    times = cholesky_times()
+    return fitted(times.size, times.plc_s)
+
+
+def residuals(curve: SpeedCurve, times: CholeskyTimes) -> Array:
+    """Return the relative errors of the curve, shape (25,)."""
+    modelled = np.array([curve.time_s(n) for n in times.size.tolist()])
+    errors: Array = modelled / times.plc_s - 1.0
+    return errors
+
+
+def slow_down(times: CholeskyTimes, size: float) -> float:
+    """Return how many times longer than the laptop the PLC takes, between the sizes of the table."""
+    return float(np.interp(size, times.size, times.plc_s / times.laptop_s))
+
+
+LISTING: Final = "`coldloop docs keys` lists the keys"
+SHIPPED: Final = files("coldloop_rig.plc_sizing") / "profiles"
+FEWEST_SIZES: Final = 3
+"""Of a factorisation, for a curve of three coefficients."""
+TIMES_HEADER: Final = ("size", "plc_ms")
+"""First columns of a file of factorisation times."""
+
+LARGEST_SIZE: Final = 10_000
+SHORTEST_MS, LONGEST_MS = 1e-6, 1e9
+
+
+class PlcProfile(BaseModel):
+    """What decides whether a controller runs on a PLC."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    name: Annotated[str, Field(min_length=1, max_length=80)]
+    """As sentences and tables have it."""
+    source: Annotated[str, Field(min_length=1)]
+    """Where the figures are from."""
+    memory_bytes: Annotated[int, Field(strict=True, ge=1, le=10**15)]
+    """For the data of the optimiser; numbers are of single precision."""
+    cycle_s: Annotated[float, Field(strict=True, ge=1e-4, le=1e3)] | None = None
+    """Time after which its cycle monitoring stops a program."""
+    factorisations: Path | None = None
+    """CSV of measured times of the Cholesky factorisation: size, plc_ms; beside the profile."""
+    operation_ns: Annotated[float, Field(strict=True, ge=1e-3, le=1e9)] | None = None
+    """Time of a floating-point operation by its data sheet, if no factorisation has been timed."""
+    overhead: Annotated[float, Field(strict=True, ge=1.0, le=1000.0)] = 1.0
+    """Times as long as that which an operation takes in a program: indices, loops, loads and stores."""
+
+    @field_validator("name", "source")
+    @classmethod
+    def _on_one_line(cls, value: str) -> str:
+        if not value.isprintable():
+            raise ValueError("has a line end or a control character; write it on one line")
+        return value
+
+    @model_validator(mode="after")
+    def _one_speed(self) -> Self:
+        if (self.factorisations is None) == (self.operation_ns is None):
+            raise ValueError("give either factorisations or operation_ns: the speed is one of them")
+        if self.factorisations is not None and "overhead" in self.model_fields_set:
+            raise ValueError("overhead belongs to operation_ns; measured factorisations have theirs in them")
+        return self
+
+    def flops_per_s(self, length: float) -> float:
+        """Return its speed in loops of this length.
+
+        Raises:
+            ConfigurationError: The file of the factorisations cannot be read.
+        """
+        if self.factorisations is not None:
+            return fitted(*_times(self.factorisations)).flops_per_s(length)
+        return 1e9 / self.overhead / (self.operation_ns or math.inf)  # one of both is given
+
+
+def shipped_profiles() -> list[str]:
+    """Return the names of the profiles that come with Coldloop."""
+    return sorted(entry.name.removesuffix(".toml") for entry in SHIPPED.iterdir() if entry.name.endswith(".toml"))
+
+
+def find_profile(name: str) -> PlcProfile:
+    """Return a shipped profile, or that of a file.
+
+    Raises:
+        UsageError: There is none of this name, or something in it is wrong; one line that says what.
+    """
+    if name in shipped_profiles():
+        with as_file(SHIPPED) as folder:
+            return _read(folder / f"{name}.toml")
+    if not os.path.exists(name):  # noqa: PTH110 a path raises an error where a name is too long
+        raise UsageError(f"--plc {name}: neither a file nor one of {', '.join(shipped_profiles())}")
+    return _read(Path(name))
+
+
+def _read(path: Path) -> PlcProfile:
+    profile = load_configuration(PlcProfile, file=path, environment={}, option="--plc", listing=LISTING).settings
+    if profile.factorisations is None:
+        return profile
+    return profile.model_copy(update={"factorisations": path.parent / profile.factorisations})
+
+
+def _times(path: Path) -> tuple[Array, Array]:
+    """Return sizes, in rising order, and times in seconds."""
+    table = read_table(path, TIMES_HEADER, "name a CSV file with `factorisations`", ConfigurationError)
+    found: dict[float, float] = {}
+    for (number, _), size, plc_ms in zip(table.rows, *table.columns(TIMES_HEADER), strict=True):
+        if not (1.0 <= size <= LARGEST_SIZE and SHORTEST_MS <= plc_ms <= LONGEST_MS):
+            raise ConfigurationError(
+                f"{path}: line {number}: sizes are from 1 to {LARGEST_SIZE}, times from {SHORTEST_MS:g} to "
+                f"{LONGEST_MS:g} ms"
+            )
+        if size in found:
+            raise ConfigurationError(f"{path}: line {number}: the size {size:g} is there twice; leave one time of it")
+        found[size] = plc_ms * 1e-3
+    if len(found) < FEWEST_SIZES:
+        raise ConfigurationError(f"{path}: {len(found)} sizes; the curve needs {FEWEST_SIZES} or more")
+    sizes, times = np.array(sorted(found)), np.array([found[size] for size in sorted(found)])
+    if (np.diff(times) <= 0.0).any():
+        raise ConfigurationError(f"{path}: a larger size takes no longer than a smaller one; times have to rise")
+    return sizes, times
