@@ -13,8 +13,8 @@ from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus, Status
 from coldloop.registers.maps import maps_of
 from coldloop.service.start import run_event_loop
+from coldloop_plant.kinds import own_header
 from coldloop_plant.load import find_load
-from coldloop_plant.own_model import own_header
 from coldloop_rig.cosim.local_services import LocalServices
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.cosim.session import SessionClient

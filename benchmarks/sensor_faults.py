@@ -18,9 +18,8 @@ from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.maps import maps_of
 from coldloop_optimizer_plc.qp.design import ControlDesign
-from coldloop_plant.kinds import plant_maker
+from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.load import find_load
-from coldloop_plant.own_model import own_header
 from coldloop_plant.program import PlantProgram
 from coldloop_plant.settings import MismatchSettings
 from coldloop_rig.cosim.one_process import OneProcessRig, Programs, load_table

@@ -7,7 +7,7 @@ from typing import Literal
 
 from coldloop.config import Configuration, flattened, load_configuration
 from coldloop.errors import UsageError
-from coldloop_rig.process_file.model_of import model_file_of
+from coldloop_rig.process_file.reading import model_file_of
 from coldloop_rig.settings import Settings
 
 Period = float | Literal["adaptive"]

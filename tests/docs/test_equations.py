@@ -65,7 +65,7 @@ def parameters(value: Any, path: str) -> Iterator[str]:  # noqa: ANN401 - any ne
 def value_of(path: str) -> float:
     first, *rest = path.split(".")
     value: Any = getattr(REFERENCE_REFRIGERATOR, first, None)
-    if value is None:
+    if not hasattr(value, rest[0]):
         value = import_module(next(f"{each}.{first}" for each in PACKAGES if find_spec(f"{each}.{first}")))
     for name in rest:
         value = getattr(value, name)

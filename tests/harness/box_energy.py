@@ -7,8 +7,7 @@ import numpy as np
 
 from coldloop.kernels.compiled import kernel
 from coldloop_plant.cold_box.physics import ColdBox, evaluate
-from coldloop_plant.components.cell_account import heat_capacity
-from coldloop_plant.components.heat_exchanger import HeatExchanger
+from coldloop_plant.components.heat_exchanger import HeatExchanger, heat_capacity
 from coldloop_plant.components.phase_separator import content, outflow
 from coldloop_plant.helium.properties import Helium, saturation, supply_cell
 from coldloop_plant.numeric import Array, RealArray, at_least

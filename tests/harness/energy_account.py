@@ -8,12 +8,10 @@ from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
 from coldloop.kernels.named import named
 from coldloop.process.cold_box import OUTPUT_NAMES
-from coldloop_plant.components.passes import MASS
 from coldloop_plant.components.phase_separator import start_account
 from coldloop_plant.helium.properties import Helium, supply_cell
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.refrigerator.equipment import EquipmentLaw, act
-from coldloop_plant.refrigerator.high_pressure import FIRST
+from coldloop_plant.refrigerator.high_pressure import FIRST, MASS
 from coldloop_plant.refrigerator.physics import (
     COIL,
     SIGNAL_NAMES,
@@ -21,6 +19,8 @@ from coldloop_plant.refrigerator.physics import (
     advance_refrigerator,
     evaluate_refrigerator,
 )
+from coldloop_plant.refrigerator.station_control import EquipmentLaw
+from coldloop_plant.refrigerator.tick import act
 from tests.harness.refrigerator_energy import refrigerator_energy_rates
 
 CROSSED, SIZE, TO_BATH, WORST = range(4)

@@ -6,11 +6,23 @@ is isothermal.
 
 from coldloop.kernels.compiled import kernel
 from coldloop_plant.components.heat_exchanger import TRICKLE
-from coldloop_plant.components.passes import CAPACITY, COMPRESSION, ENERGY, EXPANSION, WORK, H, supply_at
 from coldloop_plant.components.phase_separator import content, outflow
 from coldloop_plant.helium.properties import WARM_CP, Helium, saturation, supply_cell
 from coldloop_plant.numeric import RealArray, at_least
-from coldloop_plant.refrigerator.high_pressure import FIRST, hold_passes, piped, read_passes, side_pressure
+from coldloop_plant.refrigerator.high_pressure import (
+    CAPACITY,
+    COMPRESSION,
+    ENERGY,
+    EXPANSION,
+    FIRST,
+    WORK,
+    H,
+    hold_passes,
+    piped,
+    read_passes,
+    side_pressure,
+    supply_at,
+)
 from coldloop_plant.refrigerator.physics import BOX_STATES, STATION, Crossing, Refrigerator
 
 

@@ -18,10 +18,9 @@ from coldloop.registers.codec import codec_of
 from coldloop.registers.declaration import Role
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.registers.seal import Seal, seal_of
-from coldloop_plant.cold_box.physics import ColdBox, derivative, outputs
+from coldloop_plant.cold_box.physics import ColdBox, advance, derivative, outputs
 from coldloop_plant.cold_box.plant_file import REFERENCE
 from coldloop_plant.helium.properties import Helium, load_helium
-from coldloop_plant.integrator import advance
 from coldloop_plant.kinds import plant_maker
 from coldloop_plant.numeric import RealArray
 from coldloop_plant.rack.registers import RackRegisters

@@ -9,13 +9,9 @@ from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop_plant.cold_box.physics import OUTPUTS, evaluate
 from coldloop_plant.cold_box.plant_file import REFERENCE
-from coldloop_plant.components.gas_valve import CHOKED, cold_valve_flow, gas_valve_flow
-from coldloop_plant.components.gas_volume import SECOND_VIRIAL, GasVolume, gas_mass, gas_pressure
-from coldloop_plant.components.nitrogen_bath import BOILING_POINT, LATENT_HEAT, LIQUID_DENSITY, boil, nitrogen_level
 from coldloop_plant.components.phase_separator import content, separate
 from coldloop_plant.components.turbine import expand
-from coldloop_plant.components.valve import Valve
-from coldloop_plant.helium.entropy import entropy, supply_entropy
+from coldloop_plant.components.valve import CHOKED, Valve, cold_valve_flow, gas_valve_flow
 from coldloop_plant.helium.properties import (
     GAS_CONSTANT,
     WARM_CP,
@@ -25,7 +21,10 @@ from coldloop_plant.helium.properties import (
     supply_enthalpy_and_density,
 )
 from coldloop_plant.numeric import RealArray
+from coldloop_plant.refrigerator.exergy import entropy, supply_entropy
 from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_plant.refrigerator.precooler import BOILING_POINT, LATENT_HEAT, LIQUID_DENSITY, boil, nitrogen_level
+from coldloop_plant.refrigerator.station import SECOND_VIRIAL, GasVolume, gas_mass, gas_pressure
 
 HELIUM = load_helium()
 BATH = REFERENCE.separator

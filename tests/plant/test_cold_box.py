@@ -7,12 +7,17 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 import pytest
 
-from coldloop_plant.cold_box.equilibrium import NoEquilibriumError, find_equilibrium
-from coldloop_plant.cold_box.linearisation import linearisation_error, state_scales
-from coldloop_plant.cold_box.model import build_model, parameters_digest
+from coldloop_plant.cold_box.model import (
+    build_model,
+    find_equilibrium,
+    linearisation_error,
+    parameters_digest,
+    state_scales,
+)
 from coldloop_plant.cold_box.physics import streams
 from coldloop_plant.cold_box.plant_file import REFERENCE
 from coldloop_plant.components.heat_exchanger import HeatExchanger
+from coldloop_plant.equilibrium import NoEquilibriumError
 from coldloop_plant.helium.properties import (
     saturation,
     supply_enthalpy_and_density,

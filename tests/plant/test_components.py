@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop_plant.cold_box.plant_file import REFERENCE
-from coldloop_plant.components.gas_valve import CRITICAL_RATIO
 from coldloop_plant.components.heat_exchanger import (
     HighPressureFlow,
     LowPressureFlow,
@@ -15,9 +14,8 @@ from coldloop_plant.components.heat_exchanger import (
     take_up,
 )
 from coldloop_plant.components.phase_separator import content, level, separate
-from coldloop_plant.components.return_line import return_flow
-from coldloop_plant.components.turbine import expand, turbine_flow
-from coldloop_plant.components.valve import valve_mass_flow
+from coldloop_plant.components.turbine import expand, return_flow, turbine_flow
+from coldloop_plant.components.valve import CRITICAL_RATIO, valve_mass_flow
 from coldloop_plant.helium.properties import (
     load_helium,
     saturation,

@@ -8,7 +8,11 @@ import pytest
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.plant import StationAlarm, StationMode, Surroundings
-from coldloop_plant.refrigerator.equipment import (
+from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_plant.refrigerator.program import SHIPPED, RefrigeratorProgram, read_refrigerator_file
+from coldloop_plant.refrigerator.settings import EventSchedule, RefrigeratorEvent, StationSettings
+from coldloop_plant.refrigerator.station_control import station_law
+from coldloop_plant.refrigerator.tick import (
     ADMISSION,
     BLOCKED,
     GIVEN_NAMES,
@@ -20,12 +24,6 @@ from coldloop_plant.refrigerator.equipment import (
     start_compressors,
     throttled,
 )
-from coldloop_plant.refrigerator.events import EventSchedule, RefrigeratorEvent
-from coldloop_plant.refrigerator.file import SHIPPED, read_refrigerator_file
-from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.program import RefrigeratorProgram
-from coldloop_plant.refrigerator.station_control import station_law
-from coldloop_plant.refrigerator.station_settings import StationSettings
 
 FILE = read_refrigerator_file(SHIPPED)
 V1, T3 = OUTPUT_NAMES.index("V1"), OUTPUT_NAMES.index("T3")
@@ -67,7 +65,7 @@ def given(**changed: float) -> np.ndarray:
 
 def test_with_all_in_order_what_is_asked_acts_to_the_bit() -> None:
     memory, u, d = resting_equipment(np.array(FILE.u0)), np.array([41.3, 77.7, 35.1]), given(T_ambient=300.0)
-    law = station_law(StationSettings(), FILE.reference, REFERENCE_REFRIGERATOR.station).equipment
+    law = station_law(StationSettings(), FILE.gains, FILE.v0, REFERENCE_REFRIGERATOR.station).equipment
     acting = act(law, memory, u, d, 1.05, 0.9, 2400.0, REFERENCE_REFRIGERATOR)
     assert acting.u.tolist() == u.tolist()
     assert acting.d.tolist() == d.tolist()
@@ -94,7 +92,7 @@ def test_compressors_start_one_after_the_other_idle_first_with_the_cold_box_isol
 
 
 def test_a_low_suction_pressure_stops_one_compressor_then_the_other_until_they_are_switched_off() -> None:
-    law = station_law(StationSettings(), FILE.reference, REFERENCE_REFRIGERATOR.station).equipment
+    law = station_law(StationSettings(), FILE.gains, FILE.v0, REFERENCE_REFRIGERATOR.station).equipment
     memory = resting_equipment(np.array(FILE.u0))
     for lp, state in ((0.81, (1.0, 1.0)), (0.79, (1.0, -1.0)), (0.74, (-1.0, -1.0)), (1.05, (-1.0, -1.0))):
         d = given()

@@ -10,15 +10,20 @@ from hypothesis import strategies as st
 from coldloop.process.cold_box import L1, OUTPUT_NAMES, T5
 from coldloop.process.limits import InputLimits
 from coldloop.process.station import STATION_SIGNAL_NAMES
-from coldloop_plant.helium.entropy import entropy, supply_entropy
 from coldloop_plant.helium.properties import GAS_CONSTANT, load_helium
-from coldloop_plant.refrigerator.diagnosis import refrigerator_operating_point
-from coldloop_plant.refrigerator.equilibrium import Rest
-from coldloop_plant.refrigerator.exergy import LIQUID_NITROGEN, NITROGEN_VAPOUR, ExergyBalance, exergy_balance
-from coldloop_plant.refrigerator.file import SHIPPED, read_refrigerator_file
+from coldloop_plant.refrigerator.exergy import (
+    LIQUID_NITROGEN,
+    NITROGEN_VAPOUR,
+    ExergyBalance,
+    entropy,
+    exergy_balance,
+    supply_entropy,
+)
+from coldloop_plant.refrigerator.model import Rest, refrigerator_operating_point
 from coldloop_plant.refrigerator.physics import read
 from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR, read_refrigerator
-from coldloop_plant.refrigerator.station_settings import LqWeights
+from coldloop_plant.refrigerator.program import SHIPPED, read_refrigerator_file
+from coldloop_plant.refrigerator.settings import LqWeights
 
 HELIUM = load_helium()
 EFFICIENT = read_refrigerator(Path(__file__).parents[2] / "examples" / "efficient_refrigerator.toml", InputLimits())

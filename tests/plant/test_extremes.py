@@ -15,7 +15,7 @@ from coldloop.registers.plant import StationAlarm, StationMode
 from coldloop_plant.cold_box.physics import ColdBox, streams
 from coldloop_plant.cold_box.plant_file import REFERENCE
 from coldloop_plant.components.phase_separator import SUPERHEAT, content, holding, outflow, separate, thinness
-from coldloop_plant.components.return_line import LAMINAR, ReturnLine, return_flow
+from coldloop_plant.components.turbine import LAMINAR, ReturnLine, return_flow
 from coldloop_plant.helium.properties import (
     HIGHEST_SATURATION,
     LOWEST_SATURATION,
@@ -24,16 +24,13 @@ from coldloop_plant.helium.properties import (
     saturation,
     supply_enthalpy_and_density,
 )
-from coldloop_plant.kinds import plant_maker
+from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.own_model import own_header
-from coldloop_plant.refrigerator.equipment import act
-from coldloop_plant.refrigerator.file import SHIPPED, read_refrigerator_file
-from coldloop_plant.refrigerator.linearisation import jacobian, rate_scales
+from coldloop_plant.refrigerator.model import jacobian, rate_scales
 from coldloop_plant.refrigerator.physics import DISTURBANCE_NAMES, STATE_NAMES, advance_refrigerator
 from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.program import RefrigeratorProgram
-from coldloop_plant.refrigerator.tick import COMPRESSED, LEAST_FLOW, LP, TO_BOX, V1, control_tick, read_tick
+from coldloop_plant.refrigerator.program import SHIPPED, RefrigeratorProgram, read_refrigerator_file
+from coldloop_plant.refrigerator.tick import COMPRESSED, LEAST_FLOW, LP, TO_BOX, V1, act, control_tick, read_tick
 from coldloop_plant.settings import PlantSettings
 
 HELIUM = load_helium()

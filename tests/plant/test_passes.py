@@ -6,31 +6,34 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coldloop_plant.cold_box.physics import OUTPUTS
-from coldloop_plant.components.gas_volume import gas_mass
 from coldloop_plant.components.heat_exchanger import HeatExchanger
-from coldloop_plant.components.passes import (
+from coldloop_plant.helium.properties import load_helium, supply_cell, supply_enthalpy_and_density
+from coldloop_plant.numeric import Array, RealArray
+from coldloop_plant.refrigerator.high_pressure import (
     CAPACITY,
     COLUMNS,
     CUBICS,
     ENERGY,
+    FIRST,
     GAIN,
     INFLOW,
     M_IN,
     M_IN_P,
     MASS,
+    Filling,
     H,
     Passing,
     hold_cells,
+    hold_passes,
     march_flows,
     pass_rates,
+    piped,
     read_cells,
+    read_passes,
+    side_pressure,
     supply_at,
 )
-from coldloop_plant.helium.properties import load_helium, supply_cell, supply_enthalpy_and_density
-from coldloop_plant.numeric import Array, RealArray
-from coldloop_plant.refrigerator.file import SHIPPED, read_refrigerator_file
-from coldloop_plant.refrigerator.high_pressure import FIRST, Filling, hold_passes, piped, read_passes, side_pressure
-from coldloop_plant.refrigerator.linearisation import jacobian
+from coldloop_plant.refrigerator.model import jacobian
 from coldloop_plant.refrigerator.physics import (
     BOX_STATES,
     SIGNALS,
@@ -42,6 +45,8 @@ from coldloop_plant.refrigerator.physics import (
     rates,
 )
 from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_plant.refrigerator.program import SHIPPED, read_refrigerator_file
+from coldloop_plant.refrigerator.station import gas_mass
 
 pytestmark = pytest.mark.usefixtures("compiles")
 

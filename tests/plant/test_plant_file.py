@@ -16,13 +16,11 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load
 from coldloop.process.model_file import read_document, read_header, write_document
 from coldloop.process.settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
-from coldloop_plant.cold_box.diagnosis import operating_point
-from coldloop_plant.cold_box.model import build_model, model_at, parameters_digest
+from coldloop_plant.cold_box.model import build_model, model_at, operating_point, parameters_digest
 from coldloop_plant.cold_box.plant_file import REFERENCE, BoxParameters, PlantFile
 from coldloop_plant.helium.properties import load_helium
-from coldloop_plant.kinds import plant_maker
+from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.load import find_load
-from coldloop_plant.own_model import own_header
 from coldloop_plant.refrigerator.plant_file import (
     REFERENCE_REFRIGERATOR,
     WARM_SECTIONS,

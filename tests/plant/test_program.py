@@ -131,9 +131,9 @@ def test_wrong_noise_is_refused(model: LtiModel, deviations: tuple[float, ...]) 
         program(model, noise=MeasurementNoise(deviations, 1))
 
 
-@pytest.mark.parametrize("wrong", [{"x0": [1.0]}, {"u0": [43.0, float("nan"), 36.0]}, {"tick_s": 0.0}, {"tick_s": 0.6}])
+@pytest.mark.parametrize("wrong", [{"x0": [1.0]}, {"u0": [43.0, float("nan"), 36.0]}])
 def test_a_program_checks_its_arguments(model: LtiModel, wrong: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"finite|tick"):
+    with pytest.raises(ValueError, match="finite"):
         program(model, **wrong)
 
 

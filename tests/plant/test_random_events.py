@@ -11,15 +11,12 @@ from coldloop.kernels.named import named, plain_tuples
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.model_range import model_range
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop_plant.cold_box.physics import OUTPUTS, ColdBox, derivative
+from coldloop_plant.cold_box.physics import OUTPUTS, ColdBox, advance, derivative
 from coldloop_plant.cold_box.plant_file import REFERENCE
 from coldloop_plant.components.phase_separator import content
 from coldloop_plant.helium.properties import Helium, load_helium, supply_enthalpy_and_density
-from coldloop_plant.integrator import advance
+from coldloop_plant.kinds import own_header
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.own_model import own_header
-from coldloop_plant.refrigerator.equipment import ACTING, DEVIATING, EquipmentLaw, resting_equipment
-from coldloop_plant.refrigerator.file import SHIPPED, read_refrigerator_file
 from coldloop_plant.refrigerator.high_pressure import FIRST
 from coldloop_plant.refrigerator.physics import (
     BOX_STATES,
@@ -31,8 +28,10 @@ from coldloop_plant.refrigerator.physics import (
     inventory,
 )
 from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.station_control import station_law
-from coldloop_plant.refrigerator.station_settings import StationSettings
+from coldloop_plant.refrigerator.program import SHIPPED, read_refrigerator_file
+from coldloop_plant.refrigerator.settings import StationSettings
+from coldloop_plant.refrigerator.station_control import EquipmentLaw, station_law
+from coldloop_plant.refrigerator.tick import ACTING, DEVIATING, resting_equipment
 from tests.harness.box_energy import energy_gained, energy_rates
 from tests.harness.energy_account import AHEAD, CROSSED, SIZE, TO_BATH, WEIGHTS, WORST, accounted_tick
 from tests.harness.refrigerator_energy import stored_energy
@@ -45,7 +44,7 @@ BATH = REFERENCE.separator
 HEADER = own_header(DEFAULT_MODEL_FILE)
 FILE = read_refrigerator_file(SHIPPED)
 M_LOST = STATE_NAMES.index("M_lost")
-LAW = station_law(StationSettings(), FILE.reference, PLANT.station).equipment
+LAW = station_law(StationSettings(), FILE.gains, FILE.v0, PLANT.station).equipment
 HP, LP = (SIGNAL_NAMES.index(name) for name in ("P12", "P11"))
 PLAIN, TABLES = plain_tuples(PLANT), plain_tuples(HELIUM)
 
@@ -57,7 +56,7 @@ happenings = st.tuples(
     st.floats(0.0, 6000.0), st.floats(275.0, 320.0), st.floats(0.0, 0.01), switch, switch, switch, exact, exact,
     switch, switch, switch, st.sampled_from([1.0, 1.0, 0.0, 2.0]), *[blocking] * 4,
 )  # fmt: skip
-"""In the order of `coldloop_plant.refrigerator.equipment.GIVEN_NAMES`."""
+"""In the order of `coldloop_plant.refrigerator.tick.GIVEN_NAMES`."""
 pieces = st.tuples(st.integers(40, 1200), inputs, st.tuples(percent, percent, percent, percent), happenings)
 
 

@@ -9,17 +9,14 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from coldloop.process.cold_box import OUTPUT_NAMES
-from coldloop_plant.cold_box.equilibrium import Equilibrium
-from coldloop_plant.cold_box.model import build_model
+from coldloop_plant.cold_box.model import Equilibrium, build_model
+from coldloop_plant.cold_box.physics import advance
 from coldloop_plant.helium.properties import (
     WARM_CP,
     load_helium,
 )
-from coldloop_plant.integrator import advance
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.refrigerator.equilibrium import Rest, find_refrigerator_equilibrium
-from coldloop_plant.refrigerator.file import SHIPPED, read_refrigerator_file, refrigerator_digest
-from coldloop_plant.refrigerator.linearisation import jacobian, rate_scales
+from coldloop_plant.refrigerator.model import Rest, find_refrigerator_equilibrium, jacobian, lq_gains, rate_scales
 from coldloop_plant.refrigerator.physics import (
     COMMAND_NAMES,
     DISTURBANCE_NAMES,
@@ -30,7 +27,7 @@ from coldloop_plant.refrigerator.physics import (
     read,
 )
 from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.station_design import line_model, lq_gains
+from coldloop_plant.refrigerator.program import SHIPPED, read_refrigerator_file, refrigerator_digest
 
 HELIUM = load_helium()
 PLANT = REFERENCE_REFRIGERATOR
@@ -94,8 +91,7 @@ def test_the_shipped_file_is_that_of_the_reference_refrigerator(rest: Point) -> 
     cold = Equilibrium(model.x0, model.u0, model.w0, model.y0, 0.0)
     found: Rest = find_refrigerator_equilibrium(cold, PLANT, HELIUM)
     assert found.x == pytest.approx(rest.x, rel=1e-6, abs=1e-9)
-    lines = line_model(jacobian(*found[:4], PLANT, HELIUM))
-    gains = lq_gains(lines, PLANT.station.actuator.lag, FILE.weights)
+    gains = lq_gains(jacobian(*found[:4], PLANT, HELIUM), PLANT.station.actuator.lag, FILE.weights)
     assert gains == pytest.approx(np.array(FILE.gains), rel=1e-6)
 
 

@@ -9,11 +9,9 @@ from coldloop.process.lti_model import load
 from coldloop.process.settings import SHIPPED_MODELS, ModelSettings
 from coldloop_optimizer_plc.qp.design import ControlDesign
 from coldloop_optimizer_plc.qp.prediction import state_weights
-from coldloop_plant.refrigerator.events import EventSchedule
-from coldloop_plant.refrigerator.file import SHIPPED, read_refrigerator_file
-from coldloop_plant.refrigerator.prediction import prediction_model
-from coldloop_plant.refrigerator.program import RefrigeratorProgram
-from coldloop_plant.refrigerator.station_settings import StationSettings
+from coldloop_plant.refrigerator.model import prediction_model
+from coldloop_plant.refrigerator.program import SHIPPED, RefrigeratorProgram, read_refrigerator_file
+from coldloop_plant.refrigerator.settings import EventSchedule, StationSettings
 
 MODEL = load(SHIPPED_MODELS["refrigerator"])
 FILE = read_refrigerator_file(SHIPPED)

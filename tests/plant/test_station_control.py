@@ -12,13 +12,20 @@ from coldloop.process.settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.plant import StationAlarm, StationMode, Surroundings
 from coldloop_plant.kinds import plant_maker
-from coldloop_plant.refrigerator.events import EventSchedule, RefrigeratorEvent
-from coldloop_plant.refrigerator.file import SHIPPED, read_refrigerator_file
 from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.program import RefrigeratorProgram
-from coldloop_plant.refrigerator.station_control import StationControl
-from coldloop_plant.refrigerator.station_law import SHUT, StationMeasurement, beyond, opened_by, shut_by
-from coldloop_plant.refrigerator.station_settings import StationSettings
+from coldloop_plant.refrigerator.program import SHIPPED, RefrigeratorProgram, read_refrigerator_file
+from coldloop_plant.refrigerator.settings import EventSchedule, RefrigeratorEvent, StationSettings
+from coldloop_plant.refrigerator.station_control import (
+    MEMORY_SIZE,
+    SHUT,
+    Commands,
+    StationMeasurement,
+    beyond,
+    control_station,
+    opened_by,
+    shut_by,
+    station_law,
+)
 from coldloop_plant.settings import PlantSection
 
 FILE = read_refrigerator_file(SHIPPED)
@@ -28,6 +35,19 @@ AT_REST = StationMeasurement(
     16.0, 1.05, 6.0, FILE.v0[0], 0.0, 0.0, 60.0, 0.0, 1.23, nc1=True, nc2=True,
     loaded=2, turbine=True, overspeed=False, deviating=False, suction=False,
 )  # fmt: skip
+
+
+class Controller:
+    """The station's controller without a plant."""
+
+    def __init__(self, settings: StationSettings) -> None:
+        self.law = station_law(settings, FILE.gains, FILE.v0, REFERENCE_REFRIGERATOR.station)
+        self.memory, self.mode = np.zeros(MEMORY_SIZE), StationMode.AUTOMATIC
+
+    def step(self, measured: StationMeasurement) -> Commands:
+        commands, mode = control_station(self.law, self.memory, measured)
+        self.mode = StationMode(mode)
+        return commands
 
 
 def make(
@@ -178,7 +198,7 @@ def test_a_leak_is_made_up_from_the_buffer() -> None:
 @pytest.mark.parametrize("lp", [0.0, 0.5, 3.0])
 def test_openings_stay_between_shut_and_open_whatever_is_measured(control: str, hp: float, lp: float) -> None:
     settings = StationSettings.model_validate({"control": control})
-    controller = StationControl(settings, FILE.reference, REFERENCE_REFRIGERATOR.station)
+    controller = Controller(settings)
     for _ in range(400):
         commands = controller.step(AT_REST._replace(hp=hp, lp=lp))
         assert all(0.0 <= opening <= 100.0 for opening in commands)
@@ -189,7 +209,7 @@ def test_openings_stay_between_shut_and_open_whatever_is_measured(control: str, 
 def test_integrals_do_not_wind_up_while_a_valve_is_at_its_end(control: str) -> None:
     """After ten minutes of a pressure that no valve could mend, one that is 5 mbar too low opens the bypass soon."""
     settings = StationSettings.model_validate({"control": control})
-    controller = StationControl(settings, FILE.reference, REFERENCE_REFRIGERATOR.station)
+    controller = Controller(settings)
     for _ in range(2400):
         controller.step(AT_REST._replace(lp=1.3, bypass=0.0))
     assert controller.mode != StationMode.AUTOMATIC
@@ -200,7 +220,7 @@ def test_integrals_do_not_wind_up_while_a_valve_is_at_its_end(control: str) -> N
 
 @pytest.mark.usefixtures("compiles")
 def test_charging_stops_when_the_low_pressure_is_too_high() -> None:
-    controller = StationControl(StationSettings(), FILE.reference, REFERENCE_REFRIGERATOR.station)
+    controller = Controller(StationSettings())
     for _ in range(40):
         commands = controller.step(AT_REST._replace(hp=9.0, lp=1.05 + 0.081))
     assert commands.cv953 == 0.0
@@ -234,9 +254,7 @@ def test_a_pressure_beyond_its_limit_first_opens_a_valve_then_shuts_the_other(
 @BOTH
 @pytest.mark.usefixtures("compiles")
 def test_both_limits_at_once_make_the_buffer_a_bypass(control: str) -> None:
-    controller = StationControl(
-        StationSettings.model_validate({"control": control}), FILE.reference, REFERENCE_REFRIGERATOR.station
-    )
+    controller = Controller(StationSettings.model_validate({"control": control}))
     commands = controller.step(AT_REST._replace(hp=17.7, lp=0.85))
     assert (commands.cv952, commands.cv953, controller.mode) == (100.0, 100.0, StationMode.OVERRIDE)
     controller.step(AT_REST)

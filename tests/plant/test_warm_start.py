@@ -9,13 +9,10 @@ from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.plant import StationMode
 from coldloop_plant.helium.properties import load_helium
-from coldloop_plant.kinds import plant_maker
-from coldloop_plant.own_model import own_header
-from coldloop_plant.refrigerator.file import SHIPPED, read_refrigerator_file
+from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.refrigerator.physics import inventory
 from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.program import RefrigeratorProgram
-from coldloop_plant.refrigerator.warm_start import warm_state
+from coldloop_plant.refrigerator.program import SHIPPED, RefrigeratorProgram, read_refrigerator_file, warm_state
 from coldloop_plant.settings import PlantSettings
 
 pytestmark = pytest.mark.usefixtures("compiles")

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from coldloop.errors import ColdloopError
-from coldloop_plant.own.fmu import FmuSimulation, Wiring
-from coldloop_plant.own.fmu_file import Fmu
+from coldloop_plant.own.fmu import Fmu, FmuSimulation, Wiring
 from coldloop_rig.process_file.judgement import described
 from coldloop_rig.process_file.making import Made, made_from
 from tests.harness.process_files import EXAMPLES, fmu
@@ -374,7 +373,7 @@ def test_a_damaged_member_gets_one_line(place: str, compiled: Path, tmp_path: Pa
 
 def test_no_archive_is_unpacked_without_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By its directory; where the directory lies, no more comes out, and the checksum is wrong."""
-    monkeypatch.setattr("coldloop_plant.own.fmu_file.MOST_UNPACKED", 2 << 20)
+    monkeypatch.setattr("coldloop_plant.own.fmu.MOST_UNPACKED", 2 << 20)
     file = tmp_path / "two_tanks.fmu"
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
         packed.writestr("zeros", bytes(3 << 20))

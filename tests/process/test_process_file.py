@@ -17,9 +17,8 @@ from coldloop.process.declaration import Process
 from coldloop.process.model_file import read_header
 from coldloop.process.sections import Lag
 from coldloop_rig.process_file.judgement import described
-from coldloop_rig.process_file.linearised import lag_model
+from coldloop_rig.process_file.linear_model import lag_model, realised
 from coldloop_rig.process_file.making import Made, made_from
-from coldloop_rig.process_file.matrices import realised
 from tests.harness.installed import installed
 from tests.harness.unstable_plants import pendulum, stirred_tank
 

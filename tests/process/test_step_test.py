@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ColdloopError
 from coldloop.process.lti_model import discretise
-from coldloop_rig.process_file.gain_intervals import gains_after, half_widths
-from coldloop_rig.process_file.identified import Record, identified
 from coldloop_rig.process_file.judgement import described
 from coldloop_rig.process_file.making import Made, made_from
+from coldloop_rig.process_file.step_test import Record, gains_after, half_widths, identified
 
 Array = NDArray[np.float64]
 

@@ -10,10 +10,9 @@ from coldloop.process.cold_box import COLD_BOX, L1, STATE_NAMES, T5
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop_plant.helium.properties import load_helium
-from coldloop_plant.kinds import plant_maker
+from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.load import find_load
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.own_model import own_header
 from coldloop_plant.refrigerator.program import RefrigeratorProgram
 from coldloop_plant.settings import PlantSettings
 from coldloop_rig import Simulation, simulate

@@ -30,7 +30,7 @@ from coldloop.registers.configuration import (
 from coldloop.registers.control_plc import LadderStatus, Operator
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.text import to_words
-from coldloop_plant.own_model import own_header
+from coldloop_plant.kinds import own_header
 from coldloop_rig.cosim.wiring import SERVICES
 from coldloop_rig.settings import Settings
 from coldloop_rig.testing.live_rig import BackgroundLoop

@@ -9,8 +9,8 @@ import pytest
 from coldloop.process.cold_box import COLD_BOX, T5_BAND
 from coldloop.process.lti_model import load
 from coldloop.process.settings import ModelSettings
+from coldloop_plant.kinds import own_header
 from coldloop_plant.load import find_load
-from coldloop_plant.own_model import own_header
 from coldloop_plant.settings import PlantSection
 from coldloop_rig import simulate as run_in_process
 from coldloop_rig.cosim.scenario import Scenario

@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
 
 from coldloop.process.settings import declared, settings_process
-from coldloop_plant.refrigerator.events import EventTarget, RefrigeratorEvent
+from coldloop_plant.refrigerator.settings import EventTarget, RefrigeratorEvent
 
 Share = Annotated[float, Field(gt=0, le=1)]
 Duration = Annotated[float, Field(gt=0, le=86_400)]

@@ -8,10 +8,9 @@ import numpy as np
 
 from coldloop.process.cold_box import L1, TICK_S
 from coldloop.process.lti_model import discretise, load
-from coldloop_plant.cold_box.equilibrium import find_equilibrium
-from coldloop_plant.cold_box.linearisation import linearise
+from coldloop_plant.cold_box.model import find_equilibrium, linearise
 from coldloop_plant.helium.properties import load_helium
-from coldloop_plant.own_model import box_of
+from coldloop_plant.kinds import box_of
 
 WRONG_MODEL: Final = "wrong_model.json"
 """Its file in the folder of a run."""

@@ -11,18 +11,20 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
 from coldloop_optimizer_plc.qp.design import ControlDesign
-from coldloop_plant.cold_box.capacity import LOOP_MARGIN, held_loads
-from coldloop_plant.cold_box.diagnosis import operating_point
-from coldloop_plant.cold_box.equilibrium import Equilibrium
-from coldloop_plant.cold_box.linearisation import linearisation_error
-from coldloop_plant.cold_box.model import model_at
+from coldloop_plant.cold_box.model import (
+    LOOP_MARGIN,
+    Equilibrium,
+    held_loads,
+    linearisation_error,
+    model_at,
+    operating_point,
+)
 from coldloop_plant.cold_box.physics import ColdBox
 from coldloop_plant.cold_box.plant_file import PlantFile
 from coldloop_plant.helium.properties import load_helium
-from coldloop_plant.refrigerator.diagnosis import cold_part, cooled_file, refrigerator_operating_point
-from coldloop_plant.refrigerator.equilibrium import Rest
+from coldloop_plant.refrigerator.model import Rest, cold_part, cooled_file, refrigerator_operating_point
 from coldloop_plant.refrigerator.plant_file import RefrigeratorPlantFile
-from coldloop_plant.refrigerator.station_settings import StationSettings
+from coldloop_plant.refrigerator.settings import StationSettings
 
 DEFAULT_CONTROL: Final = StationSettings()
 HORIZON_S = 100.0

@@ -28,7 +28,7 @@ def named_process(arguments: Sequence[str]) -> Iterator[list[str]]:
     left, named = _split(arguments)
     model = _configured(left)
     if named is not None:
-        from coldloop_rig.process_file.model_of import model_file_of  # noqa: PLC0415 most commands are for the cold box
+        from coldloop_rig.process_file.reading import model_file_of  # noqa: PLC0415 most commands are for the cold box
 
         model, told = model_file_of(Path(named), in_child=True)
         sys.stderr.writelines(f"coldloop: {named}: {line}\n" for line in told)

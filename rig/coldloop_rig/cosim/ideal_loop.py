@@ -20,8 +20,7 @@ from coldloop_optimizer_plc.estimator import begin_prediction, correct, estimato
 from coldloop_optimizer_plc.qp.prediction import prediction_of
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 from coldloop_optimizer_plc.solvers.daqp import DaqpSolver
-from coldloop_plant.kinds import plant_maker
-from coldloop_plant.own_model import own_header
+from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.results.recording import Recorder
 from coldloop_rig.settings import Settings

@@ -16,8 +16,7 @@ from coldloop.registers.plant import LoadStep, Measurement, PlantSample, Station
 from coldloop_control_plc.program import ControlProgram
 from coldloop_control_plc.program import make_program as make_control_program
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_plant.kinds import plant_maker
-from coldloop_plant.own_model import own_header
+from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.program import PlantProgram
 from coldloop_plant.settings import PlantKind
 from coldloop_rig.cosim.scenario import Scenario

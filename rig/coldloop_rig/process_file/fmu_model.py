@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ModelFileError, UsageError
 from coldloop.process.declaration import Process
-from coldloop_plant.own.fmu import FmuSimulation, Wiring
-from coldloop_plant.own.fmu_file import DOUBLE, Fmu
-from coldloop_plant.own.maker import FMU, file_digest
-from coldloop_rig.process_file.identified import Record, identified
-from coldloop_rig.process_file.linear_model import Linearised, jacobian, operating_point
-from coldloop_rig.process_file.step_test import model_identified
+from coldloop_plant.equilibrium import Linear, central_differences
+from coldloop_plant.own.fmu import DOUBLE, Fmu, FmuSimulation, Wiring
+from coldloop_plant.own.plants import FMU, file_digest
+from coldloop_rig.process_file.linear_model import STEP, Linearised, operating_point
+from coldloop_rig.process_file.step_test import Record, identified, model_identified
 
 Array = NDArray[np.float64]
 
@@ -78,11 +77,9 @@ def from_fmu(file: Process, folder: Path, name: str) -> Linearised:
         model = model_identified(file, tested, y, file.outside)
     else:
         u, w = operating_point(file)
-        (J, H, how), n, m = found, len(x), len(x) + len(u)
-        model = Linearised(
-            J[:, :n], J[:, n:m], J[:, m:], H[:, :n], H[:, n:m], H[:, m:], x, u, w, y, _named(fmu, wiring), FMU, {},
-            "", 0.0, (f"model      by {how} of the FMU",),
-        )  # fmt: skip
+        J, how = found
+        how_made = (f"model      by {how} of the FMU",)
+        model = Linearised(*Linear.of(J, len(x), len(u)), x, u, w, y, _named(fmu, wiring), FMU, {}, "", 0.0, how_made)
     rest = (
         f"rest       after {wiring.rest_ticks * file.tick_s:g} s from the FMU's start, which each session begins with"
     )
@@ -115,11 +112,8 @@ def _shown_states(fmu: Fmu) -> list[str]:
     """Return the names of an FMU's states; none where it hides them, or where what it calls so is an input."""
     derivatives = [each.variable for each in fmu.description.derivatives]
     states = [each.derivative for each in derivatives]
-    if any(each.causality == "input" for each in derivatives) or None in states:
-        return []
-    return (
-        [] if any(each.causality == "input" or each.dimensions for each in states) else [each.name for each in states]
-    )
+    hidden = None in states or any(each.causality == "input" for each in [*derivatives, *states])
+    return [] if hidden or any(each.dimensions for each in states) else [each.name for each in states]
 
 
 def _steps_per_tick(file: Process, fmu: Fmu) -> int:
@@ -136,10 +130,6 @@ def _steps_per_tick(file: Process, fmu: Fmu) -> int:
             f"{fmu.path}: does steps of {float(fixed):g} s only; choose tick_s and plant.steps_per_tick for whole ones"
         )
     return steps
-
-
-def _horizon(file: Process) -> int:
-    return file.prediction.decision_instants[-1]
 
 
 def _sample(file: Process, simulation: FmuSimulation) -> Array:
@@ -159,15 +149,15 @@ def _at_rest(file: Process, fmu: Fmu, wiring: Wiring) -> tuple[FmuSimulation, Wi
     simulation.put(u, w)
     spans = np.array([one.range[1] - one.range[0] for one in file.outputs])
     windows = max(1, round(file.plant.rest_s / file.horizon_s)) if file.plant.rest_s else HORIZONS_TO_REST
-    moved = spans
+    moved, horizon = spans, file.prediction.decision_instants[-1]
     for k in range(1, windows + 1):
-        y = np.array([_sample(file, simulation) for _ in range(_horizon(file))])
+        y = np.array([_sample(file, simulation) for _ in range(horizon)])
         if not np.isfinite(y).all():
             wrong = file.outputs[int(np.flatnonzero(~np.isfinite(y).all(axis=0))[0])].name
             raise UsageError(f"{fmu.path}: {wrong} is not finite with the inputs at their operating point")
         moved = np.ptp(y, axis=0)
         if (moved <= STILL * spans).all():
-            return simulation, replace(wiring, rest_ticks=k * _horizon(file) * file.ticks_per_sample)
+            return simulation, replace(wiring, rest_ticks=k * horizon * file.ticks_per_sample)
     worst = int(np.argmax(moved / spans))
     raise UsageError(
         f"{fmu.path}: does not come to rest with the inputs at their operating point: {file.outputs[worst].name} still"
@@ -176,13 +166,8 @@ def _at_rest(file: Process, fmu: Fmu, wiring: Wiring) -> tuple[FmuSimulation, Wi
     )
 
 
-# -- an FMU that shows its states -------------------------------------------------------------------------------------
-
-
-def _differentiated(
-    file: Process, fmu: Fmu, wiring: Wiring, simulation: FmuSimulation
-) -> tuple[Array, Array, str] | None:
-    """Return derivatives of the states' rates and of the outputs by states, inputs and load; None if it has none.
+def _differentiated(file: Process, fmu: Fmu, wiring: Wiring, simulation: FmuSimulation) -> tuple[Array, str] | None:
+    """Return derivatives of the states' rates and the outputs by states, inputs and load, and how; None without states.
 
     Raises:
         ModelFileError: It says that it has, and fails.
@@ -194,24 +179,22 @@ def _differentiated(
         return None
     rates = [fmu.port(each.variable.name) for each in fmu.description.derivatives]
     if fmu.has_derivatives:
-        return simulation.derivatives(rates), simulation.derivatives(outputs), "directional derivatives"
+        return simulation.derivatives([*rates, *outputs]), "directional derivatives"
     if fmu.is_single or any(fmu.variables[name].initial != "exact" for name in wiring.states):
         return None
     u, w = operating_point(file)
-    p = len(outputs)
 
     def evaluated(v: Array) -> Array:
         values = {name: value for name, value in zip(names, v.tolist(), strict=True) if name is not None}
         start = {**wiring.start, **values}
         begun = FmuSimulation(fmu, replace(wiring, start=start), file.tick_s)
-        return np.append(begun.outputs(), begun.read(rates))
+        return np.append(begun.read(rates), begun.outputs())
 
     at = np.array([*simulation.states(), *u, *w])
     spans = np.array([one.range[1] - one.range[0] for one in file.outputs])
-    if not (np.abs(evaluated(at)[:p] - simulation.outputs()) <= 1e-3 * spans).all():
+    if not (np.abs(evaluated(at)[-len(outputs) :] - simulation.outputs()) <= 1e-3 * spans).all():
         return None  # its start values are not its states
-    both, _ = jacobian(evaluated, at, np.maximum(1.0, np.abs(at)))
-    return both[p:], both[:p], "differences of start values"
+    return central_differences(evaluated, at, STEP * np.maximum(1.0, np.abs(at)))[0], "differences of start values"
 
 
 def _named(fmu: Fmu, wiring: Wiring) -> dict[str, str]:
@@ -222,13 +205,10 @@ def _named(fmu: Fmu, wiring: Wiring) -> dict[str, str]:
     return {name: fmu.variables[state].unit or "" for name, state in zip(unique, wiring.states, strict=True)}
 
 
-# -- an FMU that hides its states -------------------------------------------------------------------------------------
-
-
 def _step_tested(file: Process, simulation: FmuSimulation, where: str) -> Record:
     """Return what outputs do when inputs and load step at random about the operating point, for all lengths of time."""
     generator = np.random.default_rng(0)
-    horizon = _horizon(file)
+    horizon = file.prediction.decision_instants[-1]
     count = max(SAMPLES, 10 * horizon)
     signals = [(one.name, one.at, (one.low, one.high)) for one in file.inputs]
     signals += [(one.name, one.at, one.span) for one in file.outside]

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from coldloop.number_text import ends_text, number_text
 from coldloop.process.declaration import Process
-from coldloop.process.sections import Input, Output
+from coldloop.process.lti_model import LtiModel
+from coldloop.process.sections import Bath, Input, Output
 from coldloop_rig.plc_sizing.holding import NOTHING, digits_last_s, leaves_its_band, shortest_period_s, waiting
-from coldloop_rig.process_file.bath import exchanged
-from coldloop_rig.process_file.gain_intervals import LEVEL, half_widths
 from coldloop_rig.process_file.making import Made
+from coldloop_rig.process_file.step_test import LEVEL, half_widths
 
 Array = NDArray[np.float64]
 
@@ -212,6 +212,19 @@ def _unstable(made: Made, growth: float) -> list[str]:
     return found
 
 
+def _exchanged(model: LtiModel, bath: Bath, horizon_s: float) -> list[str]:
+    """Return what a control engineer would want to know of the outputs that are named, in words."""
+    values, modes = np.linalg.eig(model.A[np.ix_(model.moved, model.moved)])
+    slowest = int(np.argmin(np.abs(values)))
+    shown = np.abs(model.C[:, model.moved] @ modes[:, slowest])
+    level, outlet = (shown[model.output_names.index(name)] for name in (bath.level, bath.turbine_outlet))
+    if abs(values[slowest]) * horizon_s > 0.1:  # part of itself that a mode may move by and still integrate
+        return [f"bath: no mode integrates as a level does, so {bath.level} is none"]
+    if level <= outlet:
+        return [f"bath: {bath.turbine_outlet} integrates as a level does, {bath.level} less; are they exchanged?"]
+    return []
+
+
 def _warnings(made: Made) -> list[str]:
     """Return what a control engineer would want to know, in words."""
     m, process, found = made.model, made.process, list[str]()
@@ -240,7 +253,7 @@ def _warnings(made: Made) -> list[str]:
     if made.linear.error > ROUGH:
         found.append(f"kink: derivatives differ by {made.linear.error:.1e} with the step; the model holds for one side")
     if process.bath is not None:
-        found += exchanged(m, process.bath, process.horizon_s)
+        found += _exchanged(m, process.bath, process.horizon_s)
     found += [f"loop: {text}" for text in _loops(made, effect)]
     found += _inverse_responses(made)
     found += [f"dead time: {text}" for text in _dead_times(made)]

@@ -1,4 +1,4 @@
-"""A process file made into a model file: the linear model, and the process that it completes."""
+"""A process file made into a model file: the linear model of its plant, and the process that it completes."""
 
 import hashlib
 import json
@@ -14,16 +14,27 @@ from coldloop.errors import UsageError
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel, discretise
 from coldloop.process.sections import Output, State
-from coldloop_plant.own.maker import file_digest
+from coldloop_plant.own.plants import file_digest
 from coldloop_rig.plc_sizing.operations import ProblemSizes, iteration_shares
 from coldloop_rig.process_file.bath import check_bath
-from coldloop_rig.process_file.courses import courses_of, forecasts_of
+from coldloop_rig.process_file.reading import courses_of, forecasts_of
 from coldloop_rig.process_file.fmu_model import with_units
 from coldloop_rig.process_file.linear_model import Linearised
-from coldloop_rig.process_file.linearised import linearised
+from coldloop.process.sections import Bath, Output, State
+from coldloop_plant.equilibrium import Linear, model_of
+from coldloop_plant.own.plants import FMU, PYTHON, file_digest
+from coldloop_rig.plc_sizing.operations import ProblemSizes, iteration_shares
+from coldloop_rig.process_file.fmu_model import from_fmu, with_units
+from coldloop_rig.process_file.linear_model import (
+    Linearised,
+    from_equations,
+    from_lags,
+    from_matrices,
+    with_disturbances,
+)
 from coldloop_rig.process_file.mimic import drawing_of
-from coldloop_rig.process_file.reading import read_process_file
-from coldloop_rig.process_file.source import installed_source
+from coldloop_rig.process_file.reading import courses_of, forecasts_of, installed_source, read_process_file, source_of
+from coldloop_rig.process_file.step_test import from_step_test, record_compared
 
 Array = NDArray[np.float64]
 
@@ -34,6 +45,12 @@ TOLD_APART: Final = 1e-6
 """Least singular value, of columns of size 1, with which constants are told from states."""
 USUAL_WALK: Final = 0.01
 """Process noise of a state over what it moves by when each input makes its largest step, held for the horizon."""
+SINGULAR: Final = 1e-9
+"""Least singular value over the largest, of equations with rows and columns of size 1, that still have a solution."""
+SEEN: Final = 0.1
+"""Gain over the largest of an output, from which on a record must show it."""
+ALIKE: Final = (0.5, 2.0)
+"""Gains of a record's model over those of the plant."""
 
 
 @dataclass(frozen=True)
@@ -70,25 +87,72 @@ def made_from(path: Path) -> Made:
     })  # fmt: skip
     _check_room(process)
     _check_rest(file, linear)
-    tick = discretise(linear.A, linear.B, linear.F[:, 0], file.tick_s)
-    played = courses_of(file, path.parent)
-    names, units = zip(*linear.states.items(), strict=True)
-    model = LtiModel(
-        A=linear.A, B=linear.B, F=linear.F[:, 0], C=linear.C, D=linear.D, G=linear.G[:, 0],
-        A_tick=tick.A, B_tick=tick.B, F_tick=tick.F,
-        x0=linear.x0, u0=linear.u0, w0=float(linear.w0[0]), y0=linear.y0,
-        state_names=names, state_units=units,
-        input_names=tuple(one.name for one in process.inputs), input_units=tuple(one.unit for one in process.inputs),
-        output_names=tuple(one.name for one in process.outputs),
-        output_units=tuple(one.unit for one in process.outputs),
-        load_name=process.load.name, load_unit=process.load.unit, parameters_digest=linear.digest, plant=linear.kind,
-        note=f"made from {path.name}", plant_parameters=linear.parameters | played,
-        process=process.model_dump(mode="json"),
+    matrices = Linear(linear.A, linear.B, linear.F[:, 0], linear.C, linear.D, linear.G[:, 0])
+    model = model_of(
+        matrices, linear.x0, linear.u0, float(linear.w0[0]), linear.y0, process, linear.states, linear.digest,
+        plant=linear.kind, note=f"made from {path.name}", process=process.model_dump(mode="json"),
+        plant_parameters=linear.parameters | courses_of(file, path.parent),
         declaration_digest=declaration_digest(said, path.parent),
     )  # fmt: skip
     if process.bath is not None:
-        check_bath(file, model, process.bath)
+        _check_bath(file, model, process.bath)
     return Made(model, process, linear, len(file.disturbances))
+
+
+def linearised(file: Process, folder: Path) -> Linearised:
+    """Return the model of a process whose file is in a folder.
+
+    Raises:
+        ColdloopError: The plant cannot be read, does not rest, or does not fit the signals: one line.
+    """
+    plant = file.plant
+    if plant.python is not None:
+        found = from_equations(file, plant.python, *source_of(folder, plant.python))
+    elif plant.installed is not None:
+        found = from_equations(file, plant.installed, *installed_source(plant.installed))
+    elif plant.matrices is not None:
+        found = from_matrices(file, folder, plant.matrices)
+    elif plant.step_test is not None:
+        found = from_step_test(file, folder / plant.step_test)
+    elif plant.fmu is not None:
+        found = from_fmu(file, folder, plant.fmu)
+    else:
+        found = from_lags(file, plant)
+    if not len(found.A):
+        raise UsageError(
+            "plant: it has no states, so there is nothing to predict; give the dynamics of its actuators at least"
+        )
+    if file.prediction.step_test is not None:
+        found = _by_record(file, found, folder / file.prediction.step_test)
+    for name in ("A", "B", "F", "C", "D", "G", "x0", "y0"):
+        if not np.isfinite(getattr(found, name)).all():
+            raise UsageError(f"plant: {name} of the linear model is not finite; look at the plant's equations there")
+    return with_disturbances(file, found)
+
+
+def _by_record(file: Process, plant: Linearised, path: Path) -> Linearised:
+    """Return the model of a record, for a plant that hides its states."""
+    model = from_step_test(file, path)
+    hidden = dict(plant.parameters)
+    if plant.kind == PYTHON:
+        hidden["rest"] = plant.x0.tolist()
+    elif plant.kind == FMU:
+        hidden["wiring"] = {**hidden["wiring"], "states": ()}
+    compared = (*_gains_compared(file, plant, model), *record_compared(file, path, plant, model))
+    notes = (*plant.notes, *model.notes, *compared)
+    return model._replace(kind=plant.kind, parameters=hidden, digest=plant.digest, notes=notes)
+
+
+def _gains_compared(file: Process, plant: Linearised, model: Linearised) -> list[str]:
+    """Return which gains of a record's model, after the horizon, are far from those of the plant that it is for."""
+    true, found = (one.C @ discretise(one.A, one.B, one.F[:, 0], file.horizon_s).B + one.D for one in (plant, model))
+    seen = np.abs(true) > SEEN * np.abs(true).max(axis=1, keepdims=True)
+    return [
+        f"warning    gain: of {file.outputs[i].name} by {file.inputs[j].name} {found[i, j]:.3g}, of the plant itself "
+        f"{true[i, j]:.3g}; is the record of this plant, in the units of this file?"
+        for i, j in np.argwhere(seen)
+        if not ALIKE[0] <= found[i, j] / true[i, j] <= ALIKE[1]
+    ]
 
 
 def declaration_digest(file: Process, folder: Path) -> str:
@@ -188,11 +252,7 @@ def _sizes(file: Process, states: int) -> ProblemSizes:
 
 
 def _check_room(process: Process) -> None:
-    """Check that what the link exchanges in each scan and update fits into one request.
-
-    Raises:
-        UsageError: One does not.
-    """
+    """Check that what the link exchanges in each scan and update fits into one request (`UsageError`)."""
     inputs, outputs, states = len(process.inputs), len(process.outputs), len(process.states)
     words = {
         "the latched update": 12 + 2 * (2 * inputs + outputs + states),
@@ -207,14 +267,46 @@ def _check_room(process: Process) -> None:
 
 
 def _check_rest(file: Process, linear: Linearised) -> None:
-    """Check that outputs at rest are within the ranges of their sensors.
-
-    Raises:
-        UsageError: One is not.
-    """
+    """Check that outputs at rest are within the ranges of their sensors (`UsageError`)."""
     for one, value in zip(file.outputs, linear.y0, strict=True):
         if not one.range[0] <= value <= one.range[1]:
             raise UsageError(
                 f"outputs: {one.name} rests at {value:.5g}, outside the range of its sensor, {one.range[0]:g} to "
                 f"{one.range[1]:g}: every reading would be taken for a failed sensor"
             )
+
+
+def _check_bath(file: Process, model: LtiModel, bath: Bath) -> None:
+    """Check that the laws of a bath have an answer (`UsageError`)."""
+    for name in bath.states:
+        if name not in model.state_names:
+            raise UsageError(f"bath: {name} is no state of the plant: {', '.join(model.state_names)}")
+        if bath.states.count(name) > 1:
+            raise UsageError(f"bath: {name} is named twice")
+    level = model.C[model.output_names.index(bath.level)]
+    if bath.level_state and not level[model.state_names.index(bath.level_state)]:
+        raise UsageError(f"bath: {bath.level} does not show {bath.level_state}; name the state that is its level")
+    disturbances = {one.name for one in file.disturbances}.intersection(bath.states)
+    if disturbances:
+        raise UsageError(f"bath: {min(disturbances)} is a disturbance, and no state of the bath; take it out")
+    if bath.holdable_load is not None and not bath.holdable_load[0] <= model.w0 <= bath.holdable_load[1]:
+        raise UsageError(f"bath: holdable_load is without the operating point, {model.w0:g}, which is held; widen it")
+    if not _rests(model, bath):
+        raise UsageError(
+            f"bath: with constant inputs no load lets the states and {bath.level} rest: either the load does not move "
+            "it, or something else does that never rests"
+        )
+
+
+def _rests(model: LtiModel, bath: Bath) -> bool:
+    moved, level = model.moved, model.output_names.index(bath.level)
+    equations = np.block([
+        [model.A[np.ix_(moved, moved)], model.F[moved, None]], [model.C[[level]][:, moved], model.G[[[level]]]],
+    ])  # fmt: skip
+    for axis in (1, 0, 1, 0):
+        size = np.abs(equations).max(axis=axis, keepdims=True)
+        if not size.all():
+            return False
+        equations = equations / size
+    sizes = np.linalg.svd(equations, compute_uv=False)
+    return bool(sizes[-1] > SINGULAR * sizes[0])

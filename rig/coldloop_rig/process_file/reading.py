@@ -1,12 +1,25 @@
-"""Reads a process file, and checks what only a file may not have."""
+"""Reads a process file and what it names: sources of plants, courses of disturbances; or has its model file made."""
 
+import multiprocessing
+import signal
+import tempfile
+from collections.abc import Callable
+from importlib.metadata import entry_points
+from importlib.util import decode_source, find_spec
+from itertools import pairwise
 from keyword import iskeyword
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from coldloop.config import load_configuration
-from coldloop.errors import ConfigurationError
+from coldloop.errors import ColdloopError, ConfigurationError, UsageError
+from coldloop.kernels.cache_folder import find_cache_folder
 from coldloop.process.declaration import Process
+from coldloop.process.sections import Disturbance, Forecast, Load
+from coldloop.table import TIME, read_table
+from coldloop.text_file import read_bytes
+from coldloop_rig.interruption import SIGNALS
 
 LISTING: Final = "`coldloop docs keys` lists all keys"
 RESERVED: Final = frozenset((
@@ -53,3 +66,168 @@ def _wrong(file: Process) -> str:  # noqa: PLR0911 a return for each
     if plant.fmu is None and (named := [one.name for one in signals if one.variable]):
         return f"{named[0]}: variable is for an FMU"
     return ""
+
+
+GROUP: Final = "coldloop.plants"
+"""Of entry points: classes with the equations of a plant."""
+
+
+def source_of(folder: Path, place: str) -> tuple[str, str]:
+    """Return the text of the file that `file.py:NAME` names, and the name.
+
+    Raises:
+        UsageError: It cannot be read.
+    """
+    file, _, name = place.partition(":")
+    data = read_bytes(folder / file, "a plant's file is looked for beside the process file")
+    try:
+        return decode_source(data), name  # as Python reads it: byte order mark, declared encoding
+    except (SyntaxError, UnicodeDecodeError) as error:
+        raise UsageError(f"{folder / file}: {error}; save it as UTF-8") from None
+
+
+def installed_source(name: str) -> tuple[str, str]:
+    """Return the text of the module of an entry point, and the name of its class.
+
+    Raises:
+        UsageError: There is none, or it has no source.
+    """
+    there = entry_points(group=GROUP)
+    if name not in there.names:
+        known = ", ".join(sorted(there.names)) or "none is installed"
+        raise UsageError(f"plant.installed: no plant '{name}' among the entry points {GROUP}: {known}")
+    point = there[name]
+    try:
+        spec = find_spec(point.module)
+        if spec is None or spec.origin is None:
+            raise ImportError(f"no module {point.module}")  # noqa: TRY301 told as the others
+        return decode_source(Path(spec.origin).read_bytes()), point.attr
+    except Exception as error:
+        said = " ".join(str(error).split())
+        raise UsageError(
+            f"plant.installed: {name}, {point.value}, has no source: {type(error).__name__}: {said}"
+        ) from error
+
+
+def courses_of(file: Process, folder: Path) -> dict[str, Any]:
+    """Return what a model file says of the disturbances among the plant's parameters; nothing if there are none.
+
+    Raises:
+        UsageError: A course cannot be read, or leaves the span: one line.
+    """
+    if not file.disturbances:
+        return {}
+    return {"disturbances": [_course(one, folder, file.tick_s) for one in file.disturbances]}
+
+
+def forecasts_of(file: Process, folder: Path) -> tuple[Forecast, ...]:
+    """Return what the optimiser expects.
+
+    Raises:
+        UsageError: A forecast cannot be read, or leaves the span: one line.
+    """
+    return tuple(
+        Forecast(name=one.name, ticks=tuple(ticks), values=tuple(values))
+        for one in file.outside
+        if one.forecast is not None
+        for ticks, values in [_steps(one, folder / one.forecast, file.tick_s)]
+    )
+
+
+def _course(one: Disturbance, folder: Path, tick_s: float) -> dict[str, Any]:
+    ticks, values = ([0], [one.at]) if one.course is None else _steps(one, folder / one.course, tick_s)
+    return {"ticks": ticks, "values": values, "measured": one.noise is not None}
+
+
+def _steps(one: Load | Disturbance, path: Path, tick_s: float) -> tuple[list[int], list[float]]:
+    """Return ticks and values of a CSV file with time_s and the name of a signal."""
+    wanted = (TIME, one.name)
+    times, values = read_table(path, wanted, "name a CSV file beside the process file").columns(wanted)
+    ticks = [round(time / tick_s) for time in times]
+    if ticks[0] != 0:
+        raise UsageError(f"{path}: {TIME} begins at {times[0]:g}; it begins at 0, which is when a session begins")
+    at = next((at for at, (before, tick) in zip(times[1:], pairwise(ticks), strict=True) if tick <= before), None)
+    if at is not None:
+        raise UsageError(f"{path}: {TIME} = {at:g}: it rises by at least a tick, {tick_s:g} s, from line to line")
+    low, high = one.span
+    wrong = next((value for value in values if not low <= value <= high), None)
+    if wrong is not None:
+        raise UsageError(f"{path}: {one.name} = {wrong:g} is outside its span, {low:g} to {high:g}")
+    return ticks, values
+
+
+def text_of_child(path: Path, work: Callable[[], str], limit_s: int) -> str:
+    """Return what a child process returns, which does this work on a process file.
+
+    Raises:
+        ColdloopError: As the work does; or the child has crashed, or has taken longer than the limit.
+    """
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    with tempfile.TemporaryDirectory(prefix="coldloop-") as folder:  # whatever ends the child, nothing is left
+        child = context.Process(target=_work, args=(work, limit_s, folder, sender))
+        child.start()
+        sender.close()
+        try:
+            found: str | ColdloopError = receiver.recv()
+        except EOFError:
+            found = ""
+        child.join()
+    code = child.exitcode or 0
+    if code == -signal.SIGALRM:
+        found = UsageError(
+            f"{path}: its plant has not come to an end within {limit_s} s; mend it, or give it longer with `coldloop "
+            "process FILE --limit SECONDS --out MODEL`, and then --process MODEL"
+        )
+    elif not found:
+        how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        found = UsageError(f"{path}: its plant has ended the process that it ran in ({how}); mend it")
+    if isinstance(found, ColdloopError):
+        raise found
+    return found
+
+
+def _work(work: Callable[[], str], limit_s: int, folder: str, sender: Connection) -> None:
+    tempfile.tempdir = folder
+    for number in (*SIGNALS, signal.SIGALRM):
+        signal.signal(number, signal.SIG_DFL)
+    signal.alarm(limit_s)  # it ends this process, whatever runs in it and whether its parent is still there
+    try:
+        sender.send(work())
+    except ColdloopError as error:
+        sender.send(error)
+
+
+LIMIT_S: Final = 300
+"""How long a plant may take when its model is made."""
+
+
+def model_file_of(path: Path, *, in_child: bool = False) -> tuple[Path, list[str]]:
+    """Return the model file of a process file or a model file, and warnings; that of a process file is made now.
+
+    Args:
+        path: What is named.
+        in_child: The plant runs in a process of its own, which ends it when it takes too long.
+
+    Raises:
+        ColdloopError: There is no such file, or no model can be made of it.
+    """
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file; name a process file or a model file")
+    if path.suffix != ".toml":
+        return path.resolve(), []
+
+    def work() -> str:
+        from coldloop_rig.process_file.judgement import described  # noqa: PLC0415 a model file is read without
+        from coldloop_rig.process_file.making import made_from  # noqa: PLC0415
+
+        made = made_from(path)
+        out = find_cache_folder("processes") / f"{path.stem}-{made.model.digest[:12]}.json"
+        made.model.save(out)
+        return f"{out}\n{described(made)}"
+
+    from coldloop_rig.process_file.reading import text_of_child  # noqa: PLC0415
+
+    said = text_of_child(path, work, LIMIT_S) if in_child else work()
+    out, *lines = said.splitlines()
+    return Path(out), [line for line in lines if line.startswith("warning")]

@@ -1,27 +1,106 @@
-"""Makes the plant that a configuration asks for."""
+"""Plants by model file and configuration: a file's parameters, or those of the reference plant.
 
-from functools import partial
+A model of neither is refused at once.
+"""
+
+from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from pydantic import ValidationError
+
+from coldloop.config import explained
+from coldloop.errors import ModelFileError
+from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from coldloop.process.lti_model import LtiModel
+from coldloop.process.model_file import COLD_BOX, ModelHeader, read_header
+from coldloop_plant.cold_box.model import parameters_digest
+from coldloop_plant.cold_box.physics import ColdBox
+from coldloop_plant.cold_box.plant_file import LISTING, BoxParameters
+from coldloop_plant.helium.properties import load_helium
+
+if TYPE_CHECKING:
+    from coldloop_plant.refrigerator.physics import Refrigerator
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from coldloop.errors import ConfigurationError, ModelFileError
+from coldloop.errors import ConfigurationError
 from coldloop.kernels.first_use import kernels_of
-from coldloop.process.model_file import COLD_BOX, ModelHeader
-from coldloop_plant.cold_box.physics import ColdBox
 from coldloop_plant.cold_box.plant_file import REFERENCE
-from coldloop_plant.cold_box.program import ColdBoxProgram
+from coldloop_plant.cold_box.program import ColdBoxProgram, MismatchedPlant
 from coldloop_plant.components.valve import Valve
-from coldloop_plant.mismatched import MismatchedPlant
-from coldloop_plant.own_model import box_of, refrigerator_in
 from coldloop_plant.program import HeatLoad, MeasurementNoise, PlantProgram
 from coldloop_plant.rack.rack import MakePlant
-from coldloop_plant.refrigerator.events import EventSchedule
-from coldloop_plant.refrigerator.station_settings import StationControlKind
+from coldloop_plant.refrigerator.settings import EventSchedule, StationControlKind
 from coldloop_plant.settings import MismatchSettings, PlantKind, PlantSection, RefrigeratorStart, SensorSettings
 
 if TYPE_CHECKING:
-    from coldloop_plant.refrigerator.file import RefrigeratorFile
     from coldloop_plant.refrigerator.physics import Refrigerator
+    from coldloop_plant.refrigerator.program import RefrigeratorFile
+
+
+P = TypeVar("P", bound=BoxParameters)
+
+
+def own_header(file: Path) -> ModelHeader:
+    """Return the header of a model file whose plant can be made: a cold box alone, or the refrigerator.
+
+    Raises:
+        ModelFileError: The file cannot be read, its parameters cannot be used, or the model was made from others.
+    """
+    header = read_header(file)
+    if header.process:
+        from coldloop_plant.own.plants import check_files  # noqa: PLC0415 a cold box starts without it
+
+        check_files(header)
+        return header
+    names = (header.state_names[: len(STATE_NAMES)], header.input_names, header.output_names)
+    if header.plant == COLD_BOX:
+        own = _box_digest(box_of(header, str(file)))
+    else:
+        own = _refrigerator_digest(refrigerator_in(header, str(file)))
+    if header.parameters_digest != own or names != (STATE_NAMES, INPUT_NAMES, OUTPUT_NAMES):
+        raise ModelFileError(f"{file}: a model of another plant; make one with `coldloop model --out FILE`")
+    return header
+
+
+def box_of(model: ModelHeader | LtiModel, where: str = "model.file") -> ColdBox:
+    """Return the cold box that a model file describes, the reference plant if it describes none; `where` names it.
+
+    Raises:
+        ModelFileError: A parameter is unknown or out of range.
+    """
+    if model.plant == COLD_BOX:
+        return _parameters(model, BoxParameters, where).box
+    return refrigerator_in(model, where).box
+
+
+def refrigerator_in(model: ModelHeader | LtiModel, where: str = "model.file") -> "Refrigerator":
+    """Return the refrigerator that a model file describes, likewise."""
+    from coldloop_plant.refrigerator.plant_file import RefrigeratorParameters  # noqa: PLC0415 a cold box starts without it
+
+    return _parameters(model, RefrigeratorParameters, where).refrigerator
+
+
+def _parameters(model: ModelHeader | LtiModel, kind: type[P], where: str) -> P:
+    try:
+        return kind.model_validate(model.plant_parameters)
+    except ValidationError as error:
+        wrong = explained(error, {}, kind, LISTING)
+        raise ModelFileError(f"{where}: plant_parameters: {wrong}; make it with `coldloop model --plant`") from None
+
+
+@cache
+def _box_digest(box: ColdBox) -> str:
+    return parameters_digest(box, load_helium())
+
+
+@cache
+def _refrigerator_digest(plant: "Refrigerator") -> str:
+    from coldloop_plant.refrigerator.program import refrigerator_digest  # noqa: PLC0415
+
+    return refrigerator_digest(plant, load_helium())
+
 
 NO_MISMATCH: Final = MismatchSettings()
 
@@ -40,7 +119,7 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
     if header.process:
         if section.mismatch != NO_MISMATCH:
             raise ConfigurationError("plant.mismatch: for a cold box alone; leave it out")
-        from coldloop_plant.own.maker import own_plant_maker  # noqa: PLC0415 a cold box starts without it
+        from coldloop_plant.own.plants import own_plant_maker  # noqa: PLC0415 a cold box starts without it
 
         return own_plant_maker(header, partial(noise_of, section.sensors))
     if section.kind is PlantKind.COLD_BOX:
@@ -66,8 +145,8 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
 
 def _refrigerator_and_rest(header: ModelHeader, named: Path | None) -> "tuple[Refrigerator, RefrigeratorFile]":
     """Return the refrigerator that a model file describes, and its rest: of a file that is named, or of its own."""
-    from coldloop_plant.refrigerator.file import SHIPPED, read_refrigerator_file, rest_in  # noqa: PLC0415 as below
     from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR  # noqa: PLC0415 a cold box starts without it
+    from coldloop_plant.refrigerator.program import SHIPPED, read_refrigerator_file, rest_in  # noqa: PLC0415 as below
 
     plant = REFERENCE_REFRIGERATOR if header.plant == COLD_BOX else refrigerator_in(header)
     if named is None and header.plant_rest:
@@ -76,11 +155,7 @@ def _refrigerator_and_rest(header: ModelHeader, named: Path | None) -> "tuple[Re
 
 
 def make_program(
-    header: ModelHeader,
-    sensors: SensorSettings,
-    load: HeatLoad,
-    seed: int,
-    mismatch: MismatchSettings = NO_MISMATCH,
+    header: ModelHeader, sensors: SensorSettings, load: HeatLoad, seed: int, mismatch: MismatchSettings = NO_MISMATCH
 ) -> PlantProgram:
     """Return the cold box that a model file describes, at its operating point."""
     with kernels_of("the cold box", about_s=10):
@@ -106,13 +181,9 @@ def mismatched_box(box: ColdBox, mismatch: MismatchSettings) -> ColdBox:
 
 
 def _make_refrigerator(
-    header: ModelHeader,
-    section: PlantSection,
-    plant: "Refrigerator",
-    file: "RefrigeratorFile",
-    load: HeatLoad,
+    header: ModelHeader, section: PlantSection, plant: "Refrigerator", file: "RefrigeratorFile", load: HeatLoad,
     seed: int,
-) -> PlantProgram:
+) -> PlantProgram:  # fmt: skip
     from coldloop_plant.refrigerator.program import RefrigeratorProgram  # noqa: PLC0415
 
     happening = section.refrigerator

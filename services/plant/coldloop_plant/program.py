@@ -110,10 +110,8 @@ class PlantProgram:
     def retained(self) -> dict[str, Any]:
         """Return what `resume` needs, as plain data."""
         noise_state = self._generator.bit_generator.state
-        return {
-            "tick": self.tick, "x": self._x.tolist(), "u": self._u.tolist(), "y": self._measured,
-            "noise_state": noise_state,
-        }  # fmt: skip
+        own = {"tick": self.tick, "x": self._x.tolist(), "u": self._u.tolist(), "y": self._measured}
+        return {**own, "noise_state": noise_state}
 
     def take_over(self, tick: int, x: RealArray, u: RealArray, y: RealArray) -> None:
         """Go on from another tick: with what state and measurements are there, and the inputs held up to it."""

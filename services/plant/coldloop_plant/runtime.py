@@ -19,8 +19,7 @@ from coldloop.service.metrics_server import MetricsServer
 from coldloop.service.start import SERVING
 from coldloop.service.telemetry import Telemetry
 from coldloop.session.clock import Pacer, Schedule
-from coldloop_plant.kinds import plant_maker
-from coldloop_plant.own_model import own_header
+from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.rack.registers import RackRegisters
 from coldloop_plant.settings import PlantSettings
 

@@ -5,11 +5,12 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Final
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
+from pydantic import Field, FiniteFloat, field_validator
 
 from coldloop.modbus.endpoints import PLANT_PORT
 from coldloop.modbus.settings import ServerSettings
 from coldloop.process.limits import InputLimits
+from coldloop.process.sections import Section
 from coldloop.process.settings import (
     PerInput,
     ProcessSettings,
@@ -24,8 +25,7 @@ from coldloop.safety.retained import RetainSettings
 from coldloop.service.metrics_settings import MetricsSettings
 from coldloop.service.telemetry_settings import TelemetrySettings
 from coldloop.session.settings import SessionSettings
-from coldloop_plant.refrigerator.events import RANGES, EventTarget, RefrigeratorEvent
-from coldloop_plant.refrigerator.station_settings import StationSettings
+from coldloop_plant.refrigerator.settings import RANGES, EventTarget, RefrigeratorEvent, StationSettings
 
 SHOWN: Final = (
     "plant.kind", "plant.station", "plant.refrigerator", "plant.mismatch", "plant.sensors", "plant.clock_error_ppm",
@@ -38,10 +38,8 @@ Deviation = Annotated[float, Field(ge=0)]
 Factor = Annotated[float, Field(ge=0.5, le=1.4)]
 
 
-class MismatchSettings(BaseModel):
+class MismatchSettings(Section):
     """What of the cold box is not as in its model: most are factors. It begins at the model's point of rest."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     heat_transfer: Factor = 1.0
     """UA of the three heat exchangers."""
@@ -159,10 +157,8 @@ class RefrigeratorStart(StrEnum):
     """At ambient temperature, its helium in the buffer, its compressors about to start."""
 
 
-class RefrigeratorSettings(BaseModel):
+class RefrigeratorSettings(Section):
     """Start and disturbances of a refrigerator."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     file: Path | None = None
     """Its operating point and the gains of its pressure controller; by default those of the reference plant."""

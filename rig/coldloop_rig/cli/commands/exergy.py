@@ -22,10 +22,10 @@ def declare(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Solve for the rest of the refrigerator and print its exergy balance."""
     from coldloop.errors import UsageError
-    from coldloop_plant.cold_box.equilibrium import NoEquilibriumError
+    from coldloop_plant.equilibrium import NoEquilibriumError
     from coldloop_plant.helium.properties import load_helium
-    from coldloop_plant.refrigerator.diagnosis import refrigerator_operating_point
     from coldloop_plant.refrigerator.exergy import exergy_balance
+    from coldloop_plant.refrigerator.model import refrigerator_operating_point
     from coldloop_plant.refrigerator.plant_file import RefrigeratorPlantFile, read_refrigerator
 
     settings = configuration(options).settings

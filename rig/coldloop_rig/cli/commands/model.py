@@ -19,8 +19,8 @@ def execute(options: argparse.Namespace) -> int:
     from coldloop.errors import UsageError
     from coldloop.process.lti_model import load
     from coldloop.whole_file import require_regular_file
-    from coldloop_plant.cold_box.equilibrium import NoEquilibriumError
     from coldloop_plant.cold_box.plant_file import PlantFile
+    from coldloop_plant.equilibrium import NoEquilibriumError
     from coldloop_plant.refrigerator.plant_file import RefrigeratorPlantFile, read_plant_file
     from coldloop_plant.settings import PlantKind
     from coldloop_rig.cli.model_listing import describe_model, held_line

@@ -25,9 +25,9 @@ def execute(options: argparse.Namespace) -> int:
     from coldloop.process.declaration import Process
     from coldloop.whole_file import require_regular_file
     from coldloop_rig.cli.key_listing import key_listing
-    from coldloop_rig.process_file.in_child import text_of_child
     from coldloop_rig.process_file.judgement import described
     from coldloop_rig.process_file.making import made_from
+    from coldloop_rig.process_file.reading import text_of_child
 
     out: Path | None = options.out
     if options.keys:

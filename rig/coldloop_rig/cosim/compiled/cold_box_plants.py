@@ -6,14 +6,13 @@ import numpy as np
 
 from coldloop.kernels.compiled import kernel
 from coldloop.process.cold_box import TICK_S
-from coldloop_plant.cold_box.physics import ColdBox, evaluate
+from coldloop_plant.cold_box.physics import ColdBox, advance_along, evaluate
 from coldloop_plant.cold_box.program import ColdBoxProgram
 from coldloop_plant.helium.properties import Helium, load_helium
-from coldloop_plant.integrator import advance_along
 from coldloop_plant.program import PlantProgram
 from coldloop_plant.refrigerator.physics import BOX_STATES, SIGNALS, Refrigerator
 from coldloop_plant.refrigerator.program import RefrigeratorProgram
-from coldloop_plant.refrigerator.station_law import StationLaw
+from coldloop_plant.refrigerator.station_control import StationLaw
 from coldloop_plant.refrigerator.tick import ALARMS, MODE, RefrigeratorMemory, advance_tick
 from coldloop_rig.cosim.compiled.plants import CompiledPlant, advances
 from coldloop_rig.cosim.compiled.records import Array

@@ -5,8 +5,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import kernel
-from coldloop_plant.own.linear import LinearPlant, Matrices, advance_linear
-from coldloop_plant.own.transfer_functions import LagTable, TransferFunctionPlant, advance_lags
+from coldloop_plant.own.plants import (
+    LagTable,
+    LinearPlant,
+    Matrices,
+    TransferFunctionPlant,
+    advance_lags,
+    advance_linear,
+)
 from coldloop_plant.program import PlantProgram
 from coldloop_rig.cosim.compiled.plants import CompiledPlant, advances
 from coldloop_rig.cosim.compiled.records import Array

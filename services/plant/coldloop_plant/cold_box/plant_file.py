@@ -1,18 +1,55 @@
 """The plant file: the parameters of a cold box and its operating point, as a lab would write them down (TOML).
 
-Every key is optional; the defaults are the reference plant. Numbers of cells are no keys: they name the states.
+Every key is optional; the defaults are the reference plant. Numbers of cells are no keys: they name the states. The end
+of a key names its unit; components have SI units.
 """
 
 from typing import Annotated, Any, Final
 
+from pydantic import Field
+from pydantic.fields import FieldInfo
+
+from coldloop.process import sections
 from coldloop.process.model_range import SATURATION_BAR, SUPPLY_BAR
 from coldloop_plant.cold_box.physics import CELLS, ColdBox
 from coldloop_plant.components.heat_exchanger import HeatExchanger
 from coldloop_plant.components.phase_separator import PhaseSeparator
-from coldloop_plant.components.return_line import ReturnLine
-from coldloop_plant.components.turbine import Turbine
+from coldloop_plant.components.turbine import ReturnLine, Turbine
 from coldloop_plant.components.valve import Valve
-from coldloop_plant.lab_units import Section, within
+
+IN_SI: Final = {
+    "_g_sqrt_k_per_s_bar": (1.0, 1e8),  # kg sqrt(K)/(s Pa)
+    "_bar": (1e5, 1.0),
+    "_mm2": (1.0, 1e6),
+    "_l": (1.0, 1e3),
+    "_l_per_s": (1.0, 1e3),
+    "_g_per_s": (1.0, 1e3),
+    "_kj_per_k": (1e3, 1.0),
+}
+"""A unit's multiple of that of SI, as numerator and denominator; the first unit counts that a key ends with."""
+
+
+def within(low: float, high: float) -> FieldInfo:
+    """Return the range of a number; texts and truth values are none."""
+    info: FieldInfo = Field(strict=True, ge=low, le=high)
+    return info
+
+
+class Section(sections.Section):
+    """A section of a plant file."""
+
+    @property
+    def si(self) -> tuple[float, ...]:
+        """Its values in the order of its keys, in SI."""
+        return tuple(_in_si(key, value) for key, value in self)
+
+
+def _in_si(key: str, value: float) -> float:
+    for unit, (numerator, denominator) in IN_SI.items():
+        if key.endswith(unit):
+            return value * numerator / denominator
+    return value
+
 
 LISTING: Final = "`coldloop docs your-refrigerator` lists the keys"
 

@@ -1,65 +1,40 @@
-"""The cold box as a plant's program: its kernels, and what is known between two ticks."""
+"""The cold box as a plant's program, and the same with a mismatch between plant and model."""
 
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Sequence
 from math import nan
 from typing import Any
 
 import numpy as np
 
 from coldloop.kernels.named import plain_tuples
-from coldloop.process.cold_box import TICK_S
+from coldloop.process.cold_box import L1, TICK_S
 from coldloop.process.model_range import model_range
-from coldloop_plant.cold_box.physics import ColdBox, outputs
+from coldloop_plant.cold_box.physics import ColdBox, advance_and_read, outputs
 from coldloop_plant.helium.properties import load_helium
-from coldloop_plant.integrator import advance_and_read
 from coldloop_plant.numeric import PA_PER_BAR, RealArray
-from coldloop_plant.program import HeatLoad, MeasurementNoise, PlantProgram
+from coldloop_plant.program import PlantProgram
+from coldloop_plant.settings import MismatchSettings
 
 
 class ColdBoxProgram(PlantProgram):
     """The simulated cold box, advanced tick by tick.
 
-    Args:
-        box: The parameters of the cold box.
-        x0: State at tick 0, 28 numbers; from the model file, so that trajectories agree to the bit everywhere.
-        u0: Inputs held until the first `apply`, 3 numbers.
-        load: The heat load over time.
-        noise: Noise on the measurements; None measures exactly.
-        tick_s: Length of a tick in seconds, above 0 and at most 0.5, where the integration stays stable.
-
-    Raises:
-        ValueError: an argument of wrong length, not finite, or out of range.
+    Its state at tick 0 is that of the model file, so that trajectories agree to the bit everywhere. `arguments` are
+    those of `PlantProgram`.
     """
 
-    def __init__(
-        self,
-        *,
-        box: ColdBox,
-        x0: Sequence[float],
-        u0: Sequence[float],
-        load: HeatLoad,
-        noise: MeasurementNoise | None = None,
-        tick_s: float = TICK_S,
-    ) -> None:
-        if not 0.0 < tick_s <= 0.5:
-            raise ValueError(f"a tick of {tick_s} s is outside 0 to 0.5 s")
-        self._tick_s = tick_s
+    def __init__(self, *, box: ColdBox, x0: Sequence[float], **arguments: Any) -> None:  # noqa: ANN401 of the base
         self.box = box
         self._box, self._helium = plain_tuples(box), plain_tuples(load_helium())
         self._slope = np.empty(len(x0))
         self._held: tuple[float, ...] = (nan,) * 4
         """Inputs and load that the slope of the state was computed with."""
-        super().__init__(x0=x0, u0=u0, load=load, noise=noise)
+        super().__init__(x0=x0, **arguments)
 
-    def resume(
-        self, tick: int, x: Sequence[float], u: Sequence[float], y: Sequence[float], noise_state: Mapping[str, Any]
-    ) -> None:
-        """Resume from what `retained` returned.
-
-        Raises:
-            ValueError: it is not of this plant.
-        """
-        super().resume(tick, x, u, y, noise_state)
+    def resume(self, *retained: Any, **named: Any) -> None:  # noqa: ANN401 of the base
+        """Resume from what `retained` returned (ValueError if it is not of this plant)."""
+        super().resume(*retained, **named)
         self._held = (nan,) * 4
 
     def between_ticks(self) -> tuple[RealArray, RealArray, RealArray]:
@@ -87,4 +62,40 @@ class ColdBoxProgram(PlantProgram):
 
     def _step(self, w: float) -> tuple[RealArray, RealArray]:
         held = (*self._u.tolist(), w) == self._held
-        return advance_and_read(self._x, self._slope, held, self._u, w, self._tick_s, self._box, self._helium)
+        return advance_and_read(self._x, self._slope, held, self._u, w, TICK_S, self._box, self._helium)
+
+
+class MismatchedPlant(ColdBoxProgram):
+    """Inputs act later and the heater otherwise, the load is another than is announced, L1 is shown by a wrong scale.
+
+    Of the mismatch these are the last four fields; the load among `arguments` is that which is announced.
+    """
+
+    def __init__(self, *, mismatch: MismatchSettings, u0: Sequence[float], **arguments: Any) -> None:  # noqa: ANN401
+        self._mismatch = mismatch
+        self._on_their_way = self._filled(u0)
+        super().__init__(u0=u0, **arguments)
+
+    def resume(self, *retained: Any, **named: Any) -> None:  # noqa: ANN401 of the base
+        """Resume from what `retained` returned; inputs that were on their way have arrived."""
+        super().resume(*retained, **named)
+        self._on_their_way = self._filled(self._u.tolist())
+
+    def _filled(self, u: Sequence[float]) -> deque[RealArray]:
+        """Return inputs on their way that are all the same."""
+        return deque([np.array(u, dtype=float)] * self._mismatch.delay_ticks)
+
+    def _step(self, w: float) -> tuple[RealArray, RealArray]:
+        self._on_their_way.append(self._u)
+        u = self._on_their_way.popleft().copy()
+        u[1] *= self._mismatch.heater
+        asked, self._u = self._u, u
+        self._held = (nan,) * 4  # what acts may have moved on
+        reached = super()._step(w * self._mismatch.load)
+        self._u = asked
+        return reached
+
+    def _sample(self, y: RealArray) -> tuple[float, ...]:
+        y = np.array(y)
+        y[L1] *= self._mismatch.level_gauge
+        return super()._sample(y)

@@ -1,13 +1,24 @@
-"""Counter-flow heat exchanger: cells of high-pressure gas and aluminium, and a low-pressure side without storage."""
+"""Counter-flow heat exchanger: cells of high-pressure gas and aluminium, and a low-pressure side without storage.
+
+A Runge-Kutta step integrates the temperatures of the cells. Where a cell warms by much in one step, while its heat
+capacity bends, it gains a little more or less than its flows brought; `settle_cells` corrects the temperature for that.
+In ordinary operation the stages of a step move cells by less than `COARSE`, and nothing is corrected.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from coldloop.kernels.compiled import inlined, kernel
-from coldloop_plant.helium.interpolation import Surface
-from coldloop_plant.helium.properties import Helium, Saturation, saturation, supply_cell, vapour_enthalpy_and_cp
-from coldloop_plant.numeric import Array, at_least, at_most
+from coldloop_plant.helium.properties import (
+    Helium,
+    Saturation,
+    Surface,
+    saturation,
+    supply_cell,
+    vapour_enthalpy_and_cp,
+)
+from coldloop_plant.numeric import Array, RealArray, at_least, at_most
 
 LARGEST_RATIO = 8.0  # of the mean to the cold-end difference; more would be too stiff for a step of 0.25 s
 STILL = 2e-3  # kg/s of high-pressure gas, below which the walls alone warm the low-pressure gas more and more
@@ -122,3 +133,74 @@ def exchange(
         else:
             given[i] = heat
     return LowPressureFlow(low.mass_flow, low.P, T_low, h_low)
+
+
+COARSE = 0.04  # K
+WILD = 50.0  # K in one step: no state of a plant, and not worth being summed up
+PANEL = 0.1  # K, of the integral over the heat capacity
+LEAST_ENERGY = 1e-3  # J: what is less is left alone,
+SETTLED_ENERGY = 1e-6  # J, and what is more is corrected to this
+MOST_CORRECTIONS = 4
+NODE = np.sqrt(0.6)  # of Gauss and Legendre's rule of three nodes
+
+
+@kernel
+def heat_capacity(exchanger: HeatExchanger, P: float, T: float, helium: Helium) -> float:
+    """Return the heat capacity of one cell (J/K) at `P` (Pa) and `T` (K)."""
+    _, rho_cp, c_wall = supply_cell(P, T, helium.isobar, helium.departure)
+    return (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells
+
+
+@inlined
+def widest_move(stages: RealArray, x: RealArray, first: int, last: int) -> float:
+    """Return how far the states `first` to `last` - 1 go from those of the first stage, at most, up to `x`."""
+    widest: float = 0.0
+    for i in range(first, last):
+        widest = max(widest, abs(x[i] - stages[0, i]))
+    for k in range(1, 4):
+        for i in range(first, last):
+            widest = max(widest, abs(stages[k, i] - stages[0, i]))
+    return widest
+
+
+@kernel
+def settle_cells(
+    exchanger: HeatExchanger, first: int, P: float, stages: RealArray, slopes: RealArray, dt: float, x: RealArray,
+    helium: Helium,
+) -> None:  # fmt: skip
+    """Correct the temperatures in `x` of an exchanger's cells, whose first is `first`, where they moved by much.
+
+    Those that hold what they were brought within `LEAST_ENERGY` are left alone: halving a step has to pay. `P` (Pa) is
+    the supply pressure; `stages` and `slopes`, the states at the stages of a step of `dt` (s) and their rates, have the
+    shape (4, N).
+    """
+    for i in range(first, first + exchanger.cells):
+        widest = abs(x[i] - stages[0, i])
+        for k in range(1, 4):
+            widest = max(widest, abs(stages[k, i] - stages[0, i]))
+        if COARSE < widest < WILD:
+            brought: float = 0.0
+            for k in range(4):
+                weight = dt / 6.0 if k in (0, 3) else dt / 3.0
+                brought += weight * heat_capacity(exchanger, P, stages[k, i], helium) * slopes[k, i]
+            missing = brought - _held_between(exchanger, P, stages[0, i], x[i], helium)
+            if abs(missing) <= LEAST_ENERGY:
+                continue
+            for _ in range(MOST_CORRECTIONS):
+                x[i] += missing / heat_capacity(exchanger, P, x[i], helium)
+                missing = brought - _held_between(exchanger, P, stages[0, i], x[i], helium)
+                if abs(missing) <= SETTLED_ENERGY:
+                    break
+
+
+@kernel
+def _held_between(exchanger: HeatExchanger, P: float, low: float, high: float, helium: Helium) -> float:
+    """Return what one cell takes up from one temperature to another (J)."""
+    panels = 1 + int(abs(high - low) / PANEL)
+    width, total = (high - low) / panels, 0.0
+    for panel in range(panels):
+        middle = low + (panel + 0.5) * width
+        outer = heat_capacity(exchanger, P, middle - 0.5 * NODE * width, helium)
+        outer += heat_capacity(exchanger, P, middle + 0.5 * NODE * width, helium)
+        total += width * (5.0 * outer + 8.0 * heat_capacity(exchanger, P, middle, helium)) / 18.0
+    return total

@@ -13,14 +13,17 @@ from typing import NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import inlined, kernel
-from coldloop_plant.components.gas_valve import CHOKED
-from coldloop_plant.helium.interpolation import hermite_slope_weights, hermite_weights, locate, read_curve
+from coldloop_plant.components.valve import CHOKED
 from coldloop_plant.helium.properties import (
     ALUMINIUM_ENTHALPY,
     WARM_CP,
     WARMEST_ISOBAR,
     Helium,
     Saturation,
+    hermite_slope_weights,
+    hermite_weights,
+    locate,
+    read_curve,
     saturation,
     saturation_slopes,
     vapour_density,

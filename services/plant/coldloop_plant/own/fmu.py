@@ -1,19 +1,263 @@
-"""A plant that is an FMU: its variables connected to the signals, at rest when a session begins."""
+"""A plant that is an FMU, a model of another tool for co-simulation by FMI 2.0 or 3.0, as FMPy loads and calls it.
+
+Its variables are connected to the signals; it is at rest when a session begins.
+"""
 
 import base64
 import logging
-from collections.abc import Callable, Mapping, Sequence
+import math
+import re
+import shutil
+import tempfile
+import weakref
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from itertools import accumulate
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from coldloop.errors import ModelFileError
+from coldloop.errors import ColdloopError, ModelFileError
+from coldloop.foreign import foreign
 from coldloop.process.declaration import Process
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.own.disturbances import NO_DISTURBANCES, Disturbances, DisturbedPlant
-from coldloop_plant.own.fmu_file import Fmu, Port
-from coldloop_plant.program import HeatLoad, MeasurementNoise
+from coldloop_plant.own.plants import NO_DISTURBANCES, Disturbances, DisturbedPlant
+
+NUMBERS: Final = ("Real", "Float", "Integer", "Int", "UInt", "Boolean", "Enumeration")
+"""Beginnings of the types of variables that are numbers here."""
+CONTINUOUS: Final = ("Real", "Float")
+DOUBLE: Final = ("Real", "Float64")  # what derivatives can be asked for
+MOST_UNPACKED: Final = 512 * 1024 * 1024  # bytes
+ELEMENT: Final = re.compile(r"(.+)\[(\d+(?:,\s*\d+)*)\]")
+ERROR: Final = 3
+"""Status of FMI from which on a message says what is wrong."""
+
+
+class Port(NamedTuple):
+    """A number that an FMU shows: a variable, or an element of an array of FMI 3.0."""
+
+    reference: int
+    type: str
+    """Of the functions that set and get it."""
+    place: int = 0
+    size: int = 1
+    """Elements of the array, which are set and read together."""
+
+    @property
+    def is_discrete(self) -> bool:
+        """Whether values are rounded to whole numbers, or to false and true."""
+        return not self.type.startswith(CONTINUOUS)
+
+    def typed(self, value: float) -> float:
+        """Return a value as the FMU takes it: the nearest whole number; true from one half on."""
+        if not self.is_discrete:
+            return value
+        return value >= 0.5 if self.type == "Boolean" else math.floor(value + 0.5)
+
+
+class Fmu:
+    """The file, unpacked for as long as this object lives; its instances do not know of one another.
+
+    Raises:
+        ModelFileError: It cannot be read, or not be run here.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            import fmpy  # noqa: PLC0415 an extra: plants of other kinds do without it
+        except ImportError:
+            raise ModelFileError(f"{path}: an FMU needs FMPy: pip install 'coldloop[fmu]'") from None
+        self.path = path
+        if not path.is_file():
+            raise ModelFileError(f"{path}: no such file; plant.fmu names an FMU beside the process file")
+        self._folder = self._unpacked(MOST_UNPACKED)
+        self.findings: tuple[str, ...] = ()
+        """What of its description breaks the standard, and does not keep it from being run."""
+        with foreign(f"{path}: not a readable FMU", "get it anew from the tool that made it"):
+            try:
+                self.description = fmpy.read_model_description(self._folder)
+            except Exception as error:  # noqa: BLE001 tools do not keep to the standard, and their FMUs run
+                self.findings = tuple(" ".join(str(one).split()) for one in getattr(error, "problems", [error]))
+                self.description = fmpy.read_model_description(self._folder, validate=False)
+            platforms = fmpy.supported_platforms(self._folder)
+        self.variables = {each.name: each for each in self.description.modelVariables}
+        slave = self.description.coSimulation
+        self._check(slave, platforms, fmpy.platform)
+        self.keeps_state = bool(slave.canGetAndSetFMUstate and slave.canSerializeFMUstate)
+        """Whether a state of it can be saved, and be returned to."""
+        self.has_derivatives = bool(slave.providesDirectionalDerivative)
+        self.is_single = bool(slave.canBeInstantiatedOnlyOncePerProcess)
+        """Whether a new instance ends the one before it."""
+        self._end_former: Any = None
+
+    def _unpacked(self, most: int) -> str:
+        """Return a folder with the members of the archive; zipfile gives no more of one than its directory says."""
+        folder = tempfile.gettempdir()
+        with foreign(f"{self.path}: not a readable FMU", "get it anew from where it comes from"):
+            try:
+                folder = tempfile.mkdtemp(prefix="coldloop-fmu-")
+                weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+                with zipfile.ZipFile(self.path) as archive:
+                    if sum(one.file_size for one in archive.infolist()) > most:
+                        raise ModelFileError(f"{self.path}: unpacks to more than {most >> 20} MiB; get a smaller one")
+                    archive.extractall(folder)
+            except OSError as error:
+                raise ModelFileError(
+                    f"{self.path}: cannot be unpacked into {folder}: {error.strerror or error}; free space there, or "
+                    "set TMPDIR to another folder"
+                ) from error
+        return folder
+
+    def _check(self, slave: Any, platforms: Sequence[str], here: str) -> None:  # noqa: ANN401 FMPy has no types
+        where, version = self.path, str(self.description.fmiVersion)
+        if not version.startswith(("2.0", "3.0")):
+            raise ModelFileError(f"{where}: is of FMI {version}; get one of FMI 2.0 or 3.0 from the tool that made it")
+        if slave is None:
+            raise ModelFileError(f"{where}: has no co-simulation; get one with it from the tool that made it")
+        if here not in platforms:
+            others = ", ".join(platforms) or "none"
+            raise ModelFileError(f"{where}: has no library for {here}, but for {others}; get it made for this platform")
+
+    def instance(self, start: Mapping[str, float]) -> "FmuInstance":
+        """Return an instance at time 0, initialised with start values by name of variable.
+
+        Raises:
+            ModelFileError: It cannot be.
+        """
+        if self._end_former is not None:
+            self._end_former()
+        made = FmuInstance(self, self._folder, start)
+        self._end_former = made.end if self.is_single else None
+        return made
+
+    def port(self, name: str) -> Port:
+        """Return the number of this name; elements of an array, as `x[1]` or `x[2,1]`, count from 1, row by row.
+
+        Raises:
+            ModelFileError: There is none, or it is no number.
+        """
+        element = None if name in self.variables else ELEMENT.fullmatch(name)
+        variable = self.variables.get(element[1] if element else name)
+        if variable is None or (element and not variable.dimensions):
+            some = ", ".join(each.name for each in self.variables.values() if each.causality in ("input", "output"))
+            raise ModelFileError(f"{self.path}: has no variable {name}; inputs and outputs are {some}"[:400])
+        if not variable.type.startswith(NUMBERS):
+            raise ModelFileError(f"{self.path}: {name} is no number")
+        shape = tuple(variable.shape) if variable.dimensions else ()
+        index = [int(one) - 1 for one in element[2].split(",")] if element else [0] * len(shape)
+        if (
+            len(index) != len(shape)
+            or (not element and math.prod(shape) > 1)
+            or not all(0 <= i < size for i, size in zip(index, shape, strict=True))
+        ):
+            raise ModelFileError(
+                f"{self.path}: {name} is no single number: elements are "
+                f"{variable.name}[{','.join('1' for _ in shape)}] to {variable.name}[{','.join(map(str, shape))}]"
+            )
+        place = int(np.ravel_multi_index(index, shape)) if shape else 0
+        kind = variable.type.replace("Enumeration", "Integer" if self.is_fmi2 else "Int64")
+        return Port(int(variable.valueReference), kind, place, math.prod(shape))
+
+    @property
+    def is_fmi2(self) -> bool:
+        """Whether it is of FMI 2.0."""
+        return str(self.description.fmiVersion) == "2.0"
+
+
+class FmuInstance:
+    """A running instance of an FMU; made by `Fmu.instance`. All of it raises `ColdloopError` where the FMU fails."""
+
+    def __init__(self, fmu: Fmu, folder: str, start: Mapping[str, float]) -> None:
+        from fmpy.simulation import instantiate_fmu  # noqa: PLC0415
+
+        self._fmu = fmu
+        self._said = said = list[str]()
+
+        def note(*arguments: Any) -> None:  # noqa: ANN401 of FMI 2: component, name, status, category, text; of 3: ...
+            if arguments[-3] >= ERROR and arguments[-1]:
+                said[:] = [arguments[-1].decode(errors="replace")]
+
+        with foreign(f"{fmu.path}: cannot be started", said=said):
+            self._slave = instantiate_fmu(folder, fmu.description, "CoSimulation", logger=note, debug_logging=True)
+            self.end = weakref.finalize(self, self._slave.freeInstance)
+            self._set([fmu.port(name) for name in start], list(start.values()))
+            if fmu.is_fmi2:
+                self._slave.setupExperiment(startTime=0.0)
+            self._slave.enterInitializationMode()
+            self._slave.exitInitializationMode()
+
+    @contextmanager
+    def _calling(self, what: str) -> Iterator[None]:
+        if not self.end.alive:
+            raise ColdloopError(f"{self._fmu.path}: allows one instance at a time, and another has taken its place")
+        self._said.clear()
+        with foreign(f"{self._fmu.path}: {what}", said=self._said):
+            yield
+
+    def put(self, ports: Sequence[Port], values: Sequence[float]) -> None:
+        """Set variables; those that are no real numbers to the nearest value that they can have."""
+        with self._calling("does not take its inputs"):
+            self._set(ports, values)
+
+    def _set(self, ports: Sequence[Port], values: Sequence[float]) -> None:
+        wholes: dict[str, dict[int, list[float]]] = {}
+        for port, value in zip(ports, values, strict=True):
+            alike = wholes.setdefault(port.type, {})
+            if port.reference not in alike:
+                alike[port.reference] = [0.0] if port.size == 1 else self._get(port.type, {port.reference: port.size})
+            alike[port.reference][port.place] = port.typed(value)
+        for kind, alike in wholes.items():
+            getattr(self._slave, f"set{kind}")(list(alike), [value for whole in alike.values() for value in whole])
+
+    def read(self, ports: Sequence[Port]) -> RealArray:
+        """Return variables."""
+        found = np.empty(len(ports))
+        with self._calling("does not give its variables"):
+            for kind in dict.fromkeys(port.type for port in ports):
+                alike = {port.reference: port.size for port in ports if port.type == kind}
+                flat = self._get(kind, alike)
+                first = dict(zip(alike, accumulate(alike.values(), initial=0), strict=False))
+                for i, port in enumerate(ports):
+                    if port.type == kind:
+                        found[i] = flat[first[port.reference] + port.place]
+        return found
+
+    def _get(self, kind: str, counts: Mapping[int, int]) -> list[float]:
+        sizes = () if self._fmu.is_fmi2 else (sum(counts.values()),)
+        return list(getattr(self._slave, f"get{kind}")(list(counts), *sizes))
+
+    def step(self, time_s: float, length_s: float) -> None:
+        """Do a step from a time."""
+        with self._calling(f"stopped at {time_s:g} s"):
+            answer = self._slave.doStep(time_s, length_s)
+        if answer and answer[1]:
+            raise ColdloopError(f"{self._fmu.path}: has ended its simulation at {time_s:g} s")
+
+    def derivatives(self, of: Sequence[Port], by: Sequence[Port]) -> RealArray:
+        """Return partial derivatives of real variables at the present state, shape (of, by)."""
+        unknown = [port.reference for port in of]
+        with self._calling("directional derivatives fail"):
+            columns = [self._slave.getDirectionalDerivative(unknown, [one.reference], [1.0]) for one in by]
+            return np.array(columns, dtype=np.float64).T
+
+    def state(self) -> bytes:
+        """Return the whole state."""
+        with self._calling("cannot save its state"):
+            held = self._slave.getFMUState()
+            content: bytes = self._slave.serializeFMUState(held)
+            self._slave.freeFMUState(held)
+        return content
+
+    def return_to(self, state: bytes) -> None:
+        """Return to a state."""
+        with self._calling("cannot return to a state"):
+            held = self._slave.deserializeFMUState(state)
+            self._slave.setFMUState(held)
+            self._slave.freeFMUState(held)
+
 
 log = logging.getLogger("coldloop.plant")
 
@@ -37,13 +281,7 @@ class Wiring:
 
 
 class FmuSimulation:
-    """An instance with its signals connected.
-
-    Args:
-        fmu: The FMU.
-        wiring: Of its variables.
-        tick_s: Length of a tick.
-    """
+    """An instance with its signals connected."""
 
     def __init__(self, fmu: Fmu, wiring: Wiring, tick_s: float) -> None:
         names = [*wiring.inputs, *([wiring.load] if wiring.load else []), *wiring.disturbances]
@@ -61,11 +299,11 @@ class FmuSimulation:
 
     def outputs(self) -> RealArray:
         """Return the outputs."""
-        return self._instance.read(self._outputs)
+        return self.read(self._outputs)
 
     def states(self) -> RealArray:
         """Return the states that it shows."""
-        return self._instance.read(self._states)
+        return self.read(self._states)
 
     def read(self, ports: Sequence[Port]) -> RealArray:
         """Return other variables."""
@@ -105,34 +343,17 @@ class FmuSimulation:
 
 
 class FmuPlant(DisturbedPlant):
-    """An FMU as the plant, at rest at its operating point at tick 0.
-
-    Args:
-        simulation: The FMU there.
-        keeps_state: Whether it can return to a state.
-        u0: Inputs there, held until the first `apply`.
-        load: The load over time.
-        disturbances: Others than the load.
-        noise: Noise on the measurements; None measures exactly.
-        process: Whose plant it is.
-    """
+    """An FMU as the plant, at rest at its operating point at tick 0; whether it can return to a state is known."""
 
     def __init__(
-        self,
-        simulation: FmuSimulation,
-        *,
-        keeps_state: bool,
-        u0: Sequence[float],
-        load: HeatLoad,
-        disturbances: Disturbances = NO_DISTURBANCES,
-        noise: MeasurementNoise | None = None,
-        process: Process,
-    ) -> None:
+        self, simulation: FmuSimulation, *, keeps_state: bool, process: Process,
+        disturbances: Disturbances = NO_DISTURBANCES, **arguments: Any,  # noqa: ANN401 of the base
+    ) -> None:  # fmt: skip
         self._simulation = simulation
         self._keeps_state = keeps_state
         self._hidden = np.zeros(len(process.states) - len(disturbances.courses))
         x0 = np.append(self._shown(), disturbances.at(0))
-        super().__init__(disturbances, x0=x0.tolist(), u0=u0, load=load, noise=noise, process=process)
+        super().__init__(disturbances=disturbances, x0=x0.tolist(), process=process, **arguments)
 
     def _shown(self) -> RealArray:
         """Return the states; zeros where the FMU hides them."""

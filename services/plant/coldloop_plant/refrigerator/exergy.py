@@ -5,6 +5,7 @@ count; nitrogen comes from outside, so that its exergy is about 1 atm, too. Ever
 what leaves it, of the same streams: the rows sum to what is put in less the useful exergy, by construction.
 """
 
+from types import SimpleNamespace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -12,10 +13,55 @@ import numpy as np
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop_plant.cold_box.physics import OUTPUTS
-from coldloop_plant.helium.entropy import entropy, supply_entropy
-from coldloop_plant.helium.properties import Helium, saturation, supply_enthalpy_and_density, vapour_enthalpy_and_cp
-from coldloop_plant.refrigerator.equilibrium import AMBIENT, Rest
+from coldloop_plant.helium.properties import (
+    HIGHEST_SATURATION,
+    WARM_CP,
+    Helium,
+    entropy_before_expansion,
+    saturation,
+    supply_enthalpy_and_density,
+    vapour_enthalpy_and_cp,
+)
+from coldloop_plant.refrigerator.model import AMBIENT, Rest
 from coldloop_plant.refrigerator.physics import SIGNALS, Crossing, Refrigerator, evaluate_refrigerator
+
+LOWEST_ENTHALPY, HIGHEST_ENTHALPY = 7e3, 1580e3  # J/kg, within the table of `entropy_before_expansion`
+WARM_EXCESS, WARM_EXCESS_BY_P = 5.03e3, 3.27e-3  # J/kg, and per Pa: of the enthalpy of warm helium above cp T
+STEPS = 200
+
+
+def entropy(P: float, h: float, helium: Helium) -> float:
+    """Return s (J/(kg K)) at `P` (Pa) and `h` (J/kg), with CoolProp's reference.
+
+    Up to 2.25 bar for all h from that of the saturated liquid on, within 0.2 J/(kg K) (wet or 0.3 K above saturation:
+    0.02); from there to 19 bar for h of 7e3 or more, within 0.1 J/(kg K). Up to 350 K.
+    """
+    if P <= HIGHEST_SATURATION:
+        sat = saturation(P, helium)
+        if h <= sat.h_v:
+            return sat.s_v + (h - sat.h_v) / sat.T
+    if h > HIGHEST_ENTHALPY:
+        excess = WARM_EXCESS + WARM_EXCESS_BY_P * P
+        warmer = (h - excess) / (HIGHEST_ENTHALPY - excess)
+        return entropy_before_expansion(P, HIGHEST_ENTHALPY, helium) + WARM_CP * float(np.log(warmer))
+    return entropy_before_expansion(P, h, helium)
+
+
+def supply_entropy(P: float, T: float, helium: Helium) -> float:
+    """Return s (J/(kg K)) of the high-pressure gas at `P` (Pa, 5e5 to 19e5) and `T` (K, 4 to 350).
+
+    Where it is colder than the table of entropies goes, ds = dh/T along the isobar. At 16 bar within 0.01 J/(kg K), up
+    to 300 K; elsewhere as close as the enthalpy is, over T.
+    """
+    h, _ = supply_enthalpy_and_density(P, T, helium)
+    if h >= LOWEST_ENTHALPY:
+        return entropy(P, h, helium)
+    temperatures = T + np.arange(STEPS + 1) * (10.0 - T) / STEPS
+    enthalpies = np.array([supply_enthalpy_and_density(P, each, helium)[0] for each in temperatures])
+    edge = int(np.argmax(enthalpies >= LOWEST_ENTHALPY))
+    between = 0.5 * (temperatures[:edge] + temperatures[1 : edge + 1])
+    return entropy(P, enthalpies[edge], helium) - float(np.sum(np.diff(enthalpies[: edge + 1]) / between))
+
 
 LIQUID_NITROGEN: Final = 754.2e3
 """J/kg at 80 K and 2.5 bar, about 300 K and 1 atm (CoolProp 8.0)."""
@@ -59,29 +105,6 @@ class ExergyBalance(NamedTuple):
         return self.electricity / self.cold_power
 
 
-class _Exergies(NamedTuple):
-    """h - T0 s of helium (J/kg) at each place, high pressure from warm to cold, then low pressure from cold to warm."""
-
-    compressed: float
-    before_nef5: float
-    before_nef34: float
-    before_nef2: float
-    before_nef1: float
-    before_cv155: float
-    before_bath: float
-    before_nozzle: float
-    exhaust: float
-    vapour: float
-    after_nef1: float
-    at_mixing: float
-    """That of the vapour, as it is when it meets the exhaust."""
-    mixed: float
-    after_nef2: float
-    after_nef34: float
-    after_nef6: float
-    suction: float
-
-
 def exergy_balance(rest: Rest, plant: Refrigerator, helium: Helium) -> ExergyBalance:
     """Return the balance of a refrigerator at rest; the heater counts as load, its electricity is left out."""
     crossing = evaluate_refrigerator(
@@ -117,8 +140,12 @@ def exergy_balance(rest: Rest, plant: Refrigerator, helium: Helium) -> ExergyBal
 
 def _exergies(
     rest: Rest, crossing: Crossing, signals: dict[str, float], plant: Refrigerator, helium: Helium
-) -> _Exergies:
-    """Return the exergy at each place; enthalpies of the return follow from the balances of the exchangers."""
+) -> SimpleNamespace:
+    """Return h - T0 s of helium (J/kg) at each place, high pressure first, from warm to cold, then low pressure back.
+
+    Enthalpies of the return follow from the balances of the exchangers. `at_mixing` is the vapour as it meets the
+    exhaust.
+    """
     s, P_HP, P_LP, y = crossing.cold, 1e5 * signals["P12"], 1e5 * signals["P11"], rest.y
     P_bath, T_in = float(rest.x[0]), float(y[T9])
 
@@ -137,7 +164,7 @@ def _exergies(
     h_2 = h_mixed + s.m_jt / (s.m_v + s.m_t) * (upper[0] - middle[0])
     h_suction, _ = vapour_enthalpy_and_cp(P_LP, AMBIENT, saturation(P_LP, helium).T, helium.vapour)
     h_6 = crossing.cooling.warm_end.h
-    return _Exergies(
+    return SimpleNamespace(
         compressed=hot[1], before_nef5=supply(signals["T13"])[1], before_nef34=inlet[1], before_nef2=upper[1],
         before_nef1=middle[1], before_cv155=lower[1], before_bath=at(P_bath, s.h_jt),
         before_nozzle=at(s.P_turbine, upper[0]), exhaust=at(s.P_mix, s.exhaust.h_out),

@@ -14,31 +14,18 @@ The exchangers' passes take and give helium as the high pressure moves (`refrige
 no pressure drop besides that of the cold box's return.
 """
 
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
-from coldloop.kernels.named import named
 from coldloop.process import cold_box, station
 from coldloop_plant.cold_box.physics import OUTPUTS, ColdBox, Streams, evaluate
-from coldloop_plant.components.actuator import opening_rate
-from coldloop_plant.components.cell_account import WILD, widest_move
-from coldloop_plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow
-from coldloop_plant.components.nitrogen_bath import nitrogen_level
+from coldloop_plant.components.heat_exchanger import WILD, HighPressureFlow, LowPressureFlow, widest_move
 from coldloop_plant.components.phase_separator import Content, add_to_account, content, settle_account, start_account
+from coldloop_plant.components.valve import opening_rate
 from coldloop_plant.helium.properties import Helium
 from coldloop_plant.numeric import PA_PER_BAR, Array, RealArray
-from coldloop_plant.refrigerator.compression_station import (
-    STATION_STATE_UNITS,
-    STATION_STATES,
-    CompressionStation,
-    StationFlows,
-    check_station,
-    station_pressures,
-    station_rates,
-)
 from coldloop_plant.refrigerator.high_pressure import (
     COARSE_CELL,
     COARSE_PRESSURE,
@@ -58,7 +45,15 @@ from coldloop_plant.refrigerator.precooler import (
     PRECOOLER_STATES,
     Precooler,
     Precooling,
-    check_precooler,
+    nitrogen_level,
+)
+from coldloop_plant.refrigerator.station import (
+    STATION_STATE_UNITS,
+    STATION_STATES,
+    CompressionStation,
+    StationFlows,
+    station_pressures,
+    station_rates,
 )
 
 BOX_STATES: Final = len(cold_box.STATE_NAMES)
@@ -110,19 +105,11 @@ class Crossing(NamedTuple):
 
 @kernel
 def evaluate_refrigerator(
-    x: Array,
-    u: Array,
-    v: Array,
-    d: Array,
-    plant: Refrigerator,
-    helium: Helium,
-    dx: Array,
-    y: Array,
-    signals: Array,
+    x: Array, u: Array, v: Array, d: Array, plant: Refrigerator, helium: Helium, dx: Array, y: Array, signals: Array
 ) -> Crossing:
     """Write the rates (48, per second), the cold box's outputs (22) and the warm signals (19, `SIGNAL_NAMES`).
 
-    Returns the streams that cross the boundary of its cold part, for `plant.refrigerator.balance`.
+    Returns the streams that cross the boundary of its cold part.
     """
     station, precooler, box = plant.station, plant.precooler, plant.box
     pipes = piped(box, precooler)
@@ -225,30 +212,12 @@ def advance_refrigerator(
 
 @kernel
 def advance_along(
-    x: RealArray,
-    first: RealArray,
-    cells: RealArray,
-    P: float,
-    u: RealArray,
-    v: RealArray,
-    d: RealArray,
-    dt: float,
-    plant: Refrigerator,
-    helium: Helium,
-) -> RealArray:
+    x: RealArray, first: RealArray, cells: RealArray, P: float, u: RealArray, v: RealArray, d: RealArray, dt: float,
+    plant: Refrigerator, helium: Helium,
+) -> RealArray:  # fmt: skip
     """Return the state after `dt` seconds, where the first stage is known.
 
-    Args:
-        x: State, shape (48,).
-        first: dx/dt there.
-        cells: `Filling.cells` there.
-        P: High pressure there, Pa.
-        u: Inputs.
-        v: Commands.
-        d: Disturbances.
-        dt: s.
-        plant: Parameters.
-        helium: Tables.
+    At `x` dx/dt is `first`, the high pressure is `P` (Pa), and `cells` are those of `Filling`.
     """
     n = x.shape[0]
     slope, y, signals = np.empty(n), np.empty(OUTPUTS), np.empty(SIGNALS)
@@ -283,26 +252,3 @@ def advance_along(
         T_hot = d[1] + plant.station.cooler_approach
         settle_passes(stage[STATION], gains, dt / 6.0, T_hot, plant.station.hp.volume, pipes, stage, helium)
     return stage
-
-
-@kernel
-def advance_and_read_refrigerator(
-    x: RealArray,
-    u: RealArray,
-    v: RealArray,
-    d: RealArray,
-    dt: float,
-    plant: Any,  # noqa: ANN401 - any nesting of tuples
-    helium: Any,  # noqa: ANN401 - any nesting of tuples
-) -> tuple[RealArray, RealArray, RealArray]:
-    """Return the state after `dt` seconds, the outputs and the signals there; parameters come as `plain_tuples`."""
-    parameters, tables = named(Refrigerator, plant), named(Helium, borrowed(helium))
-    ahead = advance_refrigerator(x, u, v, d, dt, parameters, tables)
-    y, signals = read(ahead, u, v, d, parameters, tables)
-    return ahead, y, signals
-
-
-def check_refrigerator(plant: Refrigerator) -> None:
-    """Refuse parameters that no refrigerator has (`coldloop_plant.components.parameters.ParameterError`)."""
-    check_precooler(plant.precooler)
-    check_station(plant.station)

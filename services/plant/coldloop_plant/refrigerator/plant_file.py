@@ -10,17 +10,20 @@ from typing import Annotated, Any, Final
 from coldloop.config import load_configuration
 from coldloop.errors import ConfigurationError
 from coldloop.process.limits import InputLimits
-from coldloop_plant.cold_box.plant_file import LISTING, BoxParameters, ExchangerSection, HeatTransfer, Litres, PlantFile
-from coldloop_plant.components.actuator import Actuator
-from coldloop_plant.components.gas_valve import ReliefValve
-from coldloop_plant.components.gas_volume import GasVolume
-from coldloop_plant.components.nitrogen_bath import NitrogenBath
-from coldloop_plant.components.screw_compressor import ScrewCompressor
-from coldloop_plant.components.valve import Valve
-from coldloop_plant.lab_units import Section, within
-from coldloop_plant.refrigerator.compression_station import CompressionStation
+from coldloop_plant.cold_box.plant_file import (
+    LISTING,
+    BoxParameters,
+    ExchangerSection,
+    HeatTransfer,
+    Litres,
+    PlantFile,
+    Section,
+    within,
+)
+from coldloop_plant.components.valve import Actuator, ReliefValve, Valve
 from coldloop_plant.refrigerator.physics import Refrigerator
-from coldloop_plant.refrigerator.precooler import NEF6_CELLS, Precooler
+from coldloop_plant.refrigerator.precooler import NEF6_CELLS, NitrogenBath, Precooler
+from coldloop_plant.refrigerator.station import CompressionStation, GasVolume, ScrewCompressor
 
 CubicMetres = Annotated[float, within(0.05, 1000)]
 Area = Annotated[float, within(0.05, 100_000)]

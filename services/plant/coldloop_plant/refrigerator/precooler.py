@@ -2,17 +2,151 @@
 
 States, `PRECOOLER_STATES`: the cells of NEF6 from the hot end on and the coil of NEF5 (K), the nitrogen in the bath
 (kg), the opening of its feed valve CV167 (%).
+
+Helium flows through the coil in nitrogen that boils at about atmospheric pressure. Saturated nitrogen at 1.05 bar boils
+at 77.66 K with 198.8 kJ/kg and weighs 804.7 kg/m3; delivered at 2.5 bar and 80 K it brings 4.9 kJ/kg above the
+saturated liquid, which flash off (CoolProp 8.0). The cold vapour leaves unused.
+
+NEF6 is warm: the heat capacity of its helium is constant, and few cells are enough. The cells of `heat_exchanger` take
+the mean of each as the driving temperature, so their number bounds how close the streams come: half the fall over a
+cell, 14 K between 300 and 80 K with eight of them. Here each cell is itself a counter-flow exchanger: at rest, cells in
+series are exactly one exchanger of the sum of their UA.
 """
 
 from typing import Final, NamedTuple
 
+import numpy as np
+
 from coldloop.kernels.compiled import kernel
-from coldloop_plant.components.actuator import Actuator, check_actuator
-from coldloop_plant.components.heat_exchanger import HeatExchanger, LowPressureFlow
-from coldloop_plant.components.nitrogen_bath import Boiling, NitrogenBath, boil, check_nitrogen_bath
-from coldloop_plant.components.warm_exchanger import check_warm_exchanger, transfer_warm
+from coldloop_plant.components.heat_exchanger import STILL, TRICKLE, HeatExchanger, LowPressureFlow
+from coldloop_plant.components.valve import Actuator, Valve, effective_area
 from coldloop_plant.helium.properties import WARM_CP
-from coldloop_plant.numeric import Array
+from coldloop_plant.numeric import Array, at_least, at_most
+
+BOILING_POINT = 77.66  # K
+LATENT_HEAT = 198.8e3  # J/kg
+LIQUID_DENSITY = 804.7  # kg/m3
+FEED_EXCESS = 4.9e3  # J/kg
+FEED_PRESSURE = 1.45e5  # Pa, from the tank to the bath
+LEAST_FLOW = 1e-6  # kg/s
+ROOM = 0.02  # share of the vessel that vapour needs to condense freely
+
+
+class NitrogenBath(NamedTuple):
+    """NEF5, its vessel and its feed valve."""
+
+    UA: float
+    """Of the wetted coil, W/K."""
+    volume: float
+    """Of the vessel, m3."""
+    wet_level: float
+    """Level (%) above which the whole coil is wet."""
+    capacity: float
+    """Heat capacity of the coil and the helium in it at 80 K, J/K."""
+    feed: Valve
+    """CV167, for liquid nitrogen."""
+
+
+class Boiling(NamedTuple):
+    """What the bath does."""
+
+    heat: float
+    """Taken from the helium, W."""
+    boil_off: float
+    """Vapour, kg/s."""
+    feed: float
+    """Liquid delivered, kg/s."""
+
+
+@kernel
+def nitrogen_level(bath: NitrogenBath, mass: float) -> float:
+    """Return the level (%, 0 to 100) of `mass` (kg) of nitrogen."""
+    return at_most(at_least(100.0 * mass / (LIQUID_DENSITY * bath.volume), 0.0), 100.0)
+
+
+@kernel
+def boil(
+    bath: NitrogenBath, mass: float, helium_flow: float, cp: float, T_in: float, T_coil: float, opening: float,
+    supply: float,
+) -> Boiling:  # fmt: skip
+    """Return heat, boil-off and feed with `mass` (kg) of nitrogen in the bath and helium entering at `T_in` (K).
+
+    Q = m cp (T_in - T_N) (1 - exp(-UA wet/(m cp))), `cp` in J/(kg K); as the helium comes to rest it is the heat of the
+    coil itself, at `T_coil` (K). Heat to colder helium condenses vapour that the vent line gives back, where the vessel
+    has room for it: less and less in the last of it (`ROOM`). The wet share of
+    the coil grows smoothly with the level. `opening` (%) is that of the feed valve, `supply` 1 with nitrogen
+    in the tank and 0 without. A full vessel takes no more than what boils off.
+    """
+    share = at_most(nitrogen_level(bath, mass) / bath.wet_level, 1.0)
+    wet = share * share * (3.0 - 2.0 * share)
+    capacity_flow = at_least(helium_flow, LEAST_FLOW) * cp
+    heat = capacity_flow * (T_in - BOILING_POINT) * (1.0 - np.exp(-bath.UA * wet / capacity_flow))
+    moving = at_least(at_most(helium_flow / STILL, 1.0), 0.0)
+    if moving.real < 1.0:
+        heat = moving * heat + (1.0 - moving) * bath.UA * wet * (T_coil - BOILING_POINT)
+    if heat.real < 0.0:
+        room = 1.0 - mass / (LIQUID_DENSITY * bath.volume)
+        heat = heat * at_most(at_least(room / ROOM, 0.0), 1.0)
+    feed = supply * effective_area(bath.feed, opening) * np.sqrt(2.0 * LIQUID_DENSITY * FEED_PRESSURE)
+    if mass.real >= LIQUID_DENSITY * bath.volume:
+        feed = at_most(feed, at_least(heat, 0.0) / (LATENT_HEAT - FEED_EXCESS))
+    return Boiling(heat, (heat + feed * FEED_EXCESS) / LATENT_HEAT, feed)
+
+
+SMALL = 1e-3
+LARGEST_EXPONENT = 30.0
+
+
+@kernel
+def _decay(z: float) -> float:
+    """Return (1 - exp(-z))/z, which is 1 at z = 0."""
+    if abs(z.real) < SMALL:
+        return 1.0 - z * (0.5 - z * (1.0 / 6.0 - z / 24.0))
+    decay: float = (1.0 - np.exp(-z)) / z
+    return decay
+
+
+@kernel
+def exchanged_heat(UA: float, C_high: float, C_low: float, difference: float) -> float:
+    """Return the heat (W) between two counter-flowing streams of heat capacity flows `C_high` and `C_low` (W/K).
+
+    `difference` (K) is that of the two temperatures at which they enter. The closed solution of the two energy
+    balances, written so that it is smooth where both capacity flows are equal: Q = dT g/(1/UA + g/C_high), g = (1 -
+    exp(-z))/z, z = UA (1/C_low - 1/C_high).
+    """
+    unbalance = 1.0 / C_low - 1.0 / C_high
+    if abs(UA * unbalance.real) > LARGEST_EXPONENT:
+        UA = LARGEST_EXPONENT / abs(unbalance.real)  # a longer one exchanges no more
+    g = _decay(UA * unbalance)
+    return difference * g / (1.0 / UA + g / C_high)
+
+
+@kernel
+def transfer_warm(
+    exchanger: HeatExchanger, T: Array, T_hot: float, flows: Array, low: LowPressureFlow, heat: Array
+) -> LowPressureFlow:
+    """Write what each cell gives to the low-pressure gas into `heat` (W) and return that gas at the hot end.
+
+    `T` holds the temperature at which the high-pressure gas leaves each cell, hot end first (K), and of its wall;
+    `T_hot` (K) is that at which it enters the first one, `flows` (kg/s) what enters each. As that flow comes to rest,
+    the low-pressure gas takes its heat from the wall.
+    """
+    UA = exchanger.UA / exchanger.cells
+    swept = at_least(low.mass_flow, TRICKLE)
+    C_low, sweeping = swept * WARM_CP, at_most(low.mass_flow / TRICKLE, 1.0)
+    T_low, h_low = low.T, low.h
+    for i in range(exchanger.cells - 1, -1, -1):
+        T_before = T[i - 1] if i > 0 else T_hot
+        given = exchanged_heat(UA, at_least(flows[i], TRICKLE) * WARM_CP, C_low, T_before - T_low)
+        if flows[i].real < STILL:
+            moving = at_least(flows[i] / STILL, 0.0)
+            by_wall = (1.0 - moving) * C_low * (1.0 - np.exp(-2.0 * UA / C_low))
+            given = sweeping * (moving * given + by_wall * (T[i] - T_low))
+        heat[i] = given
+        T_low = T_low + given / C_low
+        h_low = h_low + given / swept
+    return LowPressureFlow(low.mass_flow, low.P, T_low, h_low)
+
 
 NEF6_CELLS: Final = 8
 PRECOOLER_STATES: Final = (*(f"T_nef6_{i}" for i in range(1, NEF6_CELLS + 1)), "T_nef5", "M_N2", "CV167")
@@ -40,26 +174,13 @@ class Precooling(NamedTuple):
 
 @kernel
 def precooler_flows(
-    x: Array,
-    T_hot: float,
-    flows: Array,
-    low: LowPressureFlow,
-    supply: float,
-    precooler: Precooler,
-    dx: Array,
+    x: Array, T_hot: float, flows: Array, low: LowPressureFlow, supply: float, precooler: Precooler, dx: Array
 ) -> Precooling:
     """Write the rate of the nitrogen into `dx` (11, per second); return what the pre-cooler does.
 
-    In the place of the rates of the exchangers' temperatures is the heat that they give (W).
-
-    Args:
-        x: States, `PRECOOLER_STATES`.
-        T_hot: Of the helium from the compressors, K.
-        flows: Of high-pressure helium into each cell of NEF6 and through the coil, kg/s, shape (9,).
-        low: From the cold box.
-        supply: 1 with nitrogen in the tank, 0 without.
-        precooler: Parameters.
-        dx: Heats and rates.
+    In the place of the rates of the exchangers' temperatures is the heat that they give (W). `T_hot` (K) is that of the
+    helium from the compressors, `flows` (9, kg/s) are those of high-pressure helium into each cell of NEF6 and through
+    the coil, `low` comes from the cold box, `supply` is 1 with nitrogen in the tank and 0 without.
     """
     cells = precooler.nef6.cells
     warm_end = transfer_warm(precooler.nef6, x[:cells], T_hot, flows[:cells], low, dx[:cells])
@@ -67,10 +188,3 @@ def precooler_flows(
     dx[cells] = boiling.heat
     dx[cells + 1] = boiling.feed - boiling.boil_off
     return Precooling(warm_end, boiling)
-
-
-def check_precooler(precooler: Precooler) -> None:
-    """Refuse parameters that no pre-cooler has (`ParameterError`)."""
-    check_warm_exchanger("nef6", precooler.nef6, NEF6_CELLS)
-    check_nitrogen_bath("nef5", precooler.nef5)
-    check_actuator("cv167", precooler.actuator)

@@ -12,22 +12,14 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from coldloop.kernels.named import plain_tuples
 from coldloop.process.cold_box import INPUT_NAMES, TICK_S
 from coldloop_plant.helium.properties import load_helium
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.refrigerator.file import SHIPPED, RefrigeratorFile, read_refrigerator_file
-from coldloop_plant.refrigerator.physics import (
-    COMMAND_NAMES,
-    SIGNAL_NAMES,
-    STATE_NAMES,
-    advance_and_read_refrigerator,
-    read,
-)
+from coldloop_plant.refrigerator.physics import COMMAND_NAMES, SIGNAL_NAMES, STATE_NAMES, advance_refrigerator, read
 from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.station_control import StationControl
-from coldloop_plant.refrigerator.station_law import StationMeasurement
-from coldloop_plant.refrigerator.station_settings import StationControlKind, StationSettings
+from coldloop_plant.refrigerator.program import SHIPPED, RefrigeratorFile, read_refrigerator_file
+from coldloop_plant.refrigerator.settings import StationControlKind, StationSettings
+from coldloop_plant.refrigerator.station_control import MEMORY_SIZE, StationMeasurement, control_station, station_law
 
 LOAD: Final = "load"
 STEPS: Final = (
@@ -55,12 +47,9 @@ class Response(NamedTuple):
 
 
 def response_of(deviations: RealArray, band: float, tick_s: float = TICK_S) -> Response:
-    """Judge one pressure.
+    """Judge one pressure by its deviations from rest (bar) at each tick, from that of the step on.
 
-    Args:
-        deviations: From rest at each tick, (N,), N >= 1, bar; the first is that of the tick of the step.
-        band: Around the last deviation, bar.
-        tick_s: Time between two of them.
+    It has settled when it stays within `band` (bar) of the last one.
     """
     at = int(np.argmax(np.abs(deviations)))
     peak = float(deviations[at])
@@ -74,17 +63,11 @@ def response_of(deviations: RealArray, band: float, tick_s: float = TICK_S) -> R
 def pressures_after(
     name: str, size: float, control: StationControlKind | None, seconds: float, file: RefrigeratorFile
 ) -> RealArray:
-    """Let one quantity step at once; return high and low pressure of each tick, (N, 2), bar.
+    """Let an input, a valve of the station or `LOAD` step by a size (% or W); return both pressures, (N, 2), bar.
 
-    Args:
-        name: An input of the cold box, a valve of the station, or `LOAD`.
-        size: By how much, in % or W.
-        control: How the pressures are controlled; None: not at all.
-        seconds: Plant time.
-        file: Operating point and gains.
+    Without `control` the openings stay those of the operating point.
     """
     plant, helium = REFERENCE_REFRIGERATOR, load_helium()
-    plain, tables = plain_tuples(plant), plain_tuples(helium)
     u, added = np.array(file.u0, dtype=np.float64), np.zeros(len(COMMAND_NAMES))
     d = np.array([file.w0, AMBIENT_K, 0.0, 1.0, 1.0, 1.0])
     x, v = np.array(file.x0), np.array(file.v0, dtype=np.float64)
@@ -95,14 +78,16 @@ def pressures_after(
         u[INPUT_NAMES.index(name)] += size
     else:
         added[COMMAND_NAMES.index(name)] = size
-    settings = StationSettings(control=control or StationControlKind.LQ)
-    controller = StationControl(settings, file.reference, plant.station)
+    settings, memory = StationSettings(control=control or StationControlKind.LQ), np.zeros(MEMORY_SIZE)
+    law = station_law(settings, file.gains, file.v0, plant.station)
     rows = np.empty((round(seconds / TICK_S), len(PRESSURES)))
     for row in rows:
         row[:] = signals[list(PRESSURES)]
         if control is not None:
-            v = np.array(controller.step(_measured(x, signals)))
-        x, _, signals = advance_and_read_refrigerator(x, u, np.clip(v + added, 0.0, 100.0), d, TICK_S, plain, tables)
+            v = np.array(control_station(law, memory, _measured(x, signals))[0])
+        opened = np.clip(v + added, 0.0, 100.0)
+        x = advance_refrigerator(x, u, opened, d, TICK_S, plant, helium)
+        _, signals = read(x, u, opened, d, plant, helium)
     return rows
 
 
@@ -110,23 +95,9 @@ def _measured(x: RealArray, signals: RealArray) -> StationMeasurement:
     hp, lp, buffer, nitrogen = (float(signals[index]) for index in (*PRESSURES, BUFFER, NITROGEN))
     bypass, discharge, charge = (float(x[index]) for index in OPENINGS)
     return StationMeasurement(
-        hp,
-        lp,
-        buffer,
-        bypass,
-        discharge,
-        charge,
-        nitrogen,
-        lost=0.0,
-        bath=1.23,
-        nc1=True,
-        nc2=True,
-        loaded=2,
-        turbine=True,
-        overspeed=False,
-        deviating=False,
-        suction=False,
-    )
+        hp, lp, buffer, bypass, discharge, charge, nitrogen, lost=0.0, bath=1.23, nc1=True, nc2=True, loaded=2,
+        turbine=True, overspeed=False, deviating=False, suction=False,
+    )  # fmt: skip
 
 
 def table(seconds: float, steps: Sequence[tuple[str, float]] = STEPS) -> list[str]:
@@ -143,14 +114,12 @@ def table(seconds: float, steps: Sequence[tuple[str, float]] = STEPS) -> list[st
             responses = [
                 response_of(rows[:, column] - rows[0, column], band) for column, band in enumerate(SETTLED_BAR)
             ]
-            cells = " | ".join(_cells(response) for response in responses)
+            cells = " | ".join(
+                f"{1e3 * peak:+.1f} | {1e3 * overshoot:.1f} | {'no' if settled_s is None else f'{settled_s:.0f}'}"
+                for peak, overshoot, settled_s in responses
+            )
             lines.append(f"| {name} {size:+g} {unit} | {control.value if control else 'none'} | {cells} |")
     return lines
-
-
-def _cells(response: Response) -> str:
-    settled = "no" if response.settled_s is None else f"{response.settled_s:.0f}"
-    return f"{1e3 * response.peak:+.1f} | {1e3 * response.overshoot:.1f} | {settled}"
 
 
 def main() -> None:

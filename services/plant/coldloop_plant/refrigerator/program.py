@@ -1,27 +1,50 @@
-"""The whole refrigerator as a program: the plant, its station's controller, and their disturbances."""
+"""The whole refrigerator as a program: the plant, its station's controller, their disturbances, and how it starts.
 
+It starts at the operating point of its file, which `python -m coldloop_plant.refrigerator.model FILE` makes off line. Like the
+model file it is JSON with its own digest, so that every run, on any machine, begins with the same bits. Or it starts
+warm, before its cool-down.
+"""
+
+import hashlib
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
 
+from coldloop.config import explained
+from coldloop.errors import ModelFileError
 from coldloop.kernels.named import plain_tuples
+from coldloop.process.model_file import FORMAT, read_document, write_document
 from coldloop.process.model_range import model_range
 from coldloop.registers.plant import StationAlarm, StationMode, StationSample, StationStatus, Surroundings
+from coldloop_plant.cold_box.model import parameters_digest
 from coldloop_plant.cold_box.program import ColdBoxProgram
-from coldloop_plant.helium.properties import load_helium
+from coldloop_plant.components.phase_separator import SUPERHEAT, content
+from coldloop_plant.helium.properties import Helium, load_helium, saturation, vapour_enthalpy_and_cp
 from coldloop_plant.numeric import RealArray
 from coldloop_plant.program import HeatLoad, MeasurementNoise
-from coldloop_plant.refrigerator.equipment import ACTING, DEVIATING, GIVEN_NAMES, resting_equipment, standing_equipment
-from coldloop_plant.refrigerator.events import EventSchedule
-from coldloop_plant.refrigerator.file import RefrigeratorFile
-from coldloop_plant.refrigerator.physics import BOX_STATES, Refrigerator, check_refrigerator, read
+from coldloop_plant.refrigerator.physics import (
+    BOX_STATES,
+    COIL,
+    COMMAND_NAMES,
+    STATE_NAMES,
+    STATION,
+    Refrigerator,
+    high_pressure_mass,
+    inventory,
+    read,
+)
 from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.station_control import station_law
-from coldloop_plant.refrigerator.station_law import Commands
-from coldloop_plant.refrigerator.station_settings import StationSettings
+from coldloop_plant.refrigerator.settings import EventSchedule, LqWeights, StationSettings
+from coldloop_plant.refrigerator.station import gas_mass
+from coldloop_plant.refrigerator.station_control import Commands, station_law
 from coldloop_plant.refrigerator.tick import (
+    ACTING,
     ALARMS,
+    DEVIATING,
+    GIVEN_NAMES,
     HP,
     LP,
     MODE,
@@ -29,32 +52,118 @@ from coldloop_plant.refrigerator.tick import (
     advance_program_tick,
     begin_memory,
     control_tick,
+    resting_equipment,
+    standing_equipment,
 )
-from coldloop_plant.refrigerator.warm_start import warm_state
+
+KIND: Final = "refrigerator"
+SHIPPED = Path(__file__).with_name("refrigerator.json")
+REMEDY = "make a new one with `python -m coldloop_plant.refrigerator.model FILE`"
+
+
+class RefrigeratorFile(BaseModel):
+    """The operating point of a refrigerator, and its pressure controller's gains."""
+
+    model_config = ConfigDict(frozen=True)
+
+    state_names: tuple[str, ...] = STATE_NAMES
+    command_names: tuple[str, ...] = COMMAND_NAMES
+    weights: LqWeights
+    """What the gains were designed with."""
+    parameters_digest: str
+    """SHA-256 of the parameters and tables that it was made from."""
+    w0: float
+    """Heat load, W."""
+    x0: tuple[float, ...]
+    """Shape (48,)."""
+    u0: tuple[float, ...]
+    """Inputs of the cold box, shape (3,)."""
+    v0: tuple[float, ...]
+    """Openings of the warm valves, shape (4,)."""
+    gains: tuple[tuple[float, ...], tuple[float, ...]]
+    """K of the LQ controller, shape (2, 6)."""
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """As plain data: what a model file of the refrigerator carries as its `plant_rest`."""
+        return self.model_dump(mode="json")
+
+    def save(self, path: Path) -> None:
+        """Write the file (OSError if it cannot be written)."""
+        write_document(path, {"format": FORMAT, "plant": KIND, **self.document})
+
+
+def read_refrigerator_file(path: Path, plant: Refrigerator = REFERENCE_REFRIGERATOR) -> RefrigeratorFile:
+    """Return what a file holds that was made for this very refrigerator.
+
+    Raises:
+        ModelFileError: The file cannot be read, is damaged, or was made from another plant.
+    """
+    document = read_document(path, REMEDY)
+    if document.get("plant") != KIND:
+        raise ModelFileError(f"{path}: not the file of a refrigerator; {REMEDY}")
+    return rest_in(document, plant, str(path))
+
+
+def rest_in(document: dict[str, Any], plant: Refrigerator, path: str) -> RefrigeratorFile:
+    """Return what `RefrigeratorFile.document` has made of this very refrigerator; `path` is for the message.
+
+    Raises:
+        ModelFileError: It is incomplete, or was made from another plant.
+    """
+    try:
+        file = RefrigeratorFile.model_validate(document)
+    except ValidationError as error:
+        raise ModelFileError(f"{path}: {explained(error, {}, RefrigeratorFile, REMEDY)}") from error
+    names, sizes = (file.state_names, file.command_names), list(map(len, (file.x0, file.u0, file.v0, *file.gains)))
+    if names != (STATE_NAMES, COMMAND_NAMES) or sizes != [len(STATE_NAMES), 3, len(COMMAND_NAMES), 6, 6]:
+        raise ModelFileError(f"{path}: made for a refrigerator with other states; {REMEDY}")
+    if file.parameters_digest != refrigerator_digest(plant, load_helium()):
+        raise ModelFileError(f"{path}: made for a refrigerator with other parameters; {REMEDY}")
+    return file
+
+
+def refrigerator_digest(plant: Refrigerator, helium: Helium) -> str:
+    """Return the SHA-256 over all parameters, tables and what the states mean, in hexadecimal."""
+    digest = hashlib.sha256(parameters_digest(plant.box, helium).encode())
+    digest.update(helium.departure.nodes.astype("<f8").tobytes())
+    digest.update(repr((plant.precooler, plant.station)).encode())
+    digest.update(b"M_HP is the mass in the line and in the passes")  # a file from before has another mass
+    return digest.hexdigest()
+
+
+def warm_state(
+    rest: Sequence[float], plant: Refrigerator, helium: Helium, *, ambient: float, low_pressure: float
+) -> RealArray:
+    """Return the state, shape (48,), of a warm refrigerator with as much helium as it holds at rest.
+
+    No compressor runs. The low-pressure line is at its set point and the bath, a vessel of vapour, with it; what is
+    left of the helium of the operating point is on the high-pressure side and in the buffer, at one pressure. The
+    nitrogen bath is empty.
+
+    `rest` (48) is the state at the operating point. Everything has the temperature `ambient` (K) but the high-pressure
+    line, which has that of the cooler's gas; low-pressure line and bath have the pressure `low_pressure` (Pa).
+    """
+    station, bath = plant.station, plant.box.separator
+    total = inventory(np.array(rest), plant, helium)
+    saturated = saturation(low_pressure, helium)
+    h, _ = vapour_enthalpy_and_cp(low_pressure, ambient, saturated.T, helium.vapour)
+    x = np.zeros(len(STATE_NAMES))
+    x[0], x[1] = low_pressure, (saturated.h_v - h) / SUPERHEAT * bath.volume
+    x[STATE_NAMES.index("T_nef1_1") : BOX_STATES] = x[BOX_STATES : COIL + 1] = ambient
+    lp_line = gas_mass(station.lp, low_pressure, ambient)
+    elsewhere = total - lp_line - content(bath, x[0], x[1], helium).mass
+    pressure = low_pressure
+    for _ in range(20):  # masses are nearly in proportion to the pressure
+        high = high_pressure_mass(x, pressure, ambient, plant, helium)
+        pressure *= elsewhere / (high + gas_mass(station.buffer, pressure, ambient))
+    x[STATION : STATION + 3] = high, lp_line, elsewhere - high
+    return x
+
 
 AMBIENT: Final = GIVEN_NAMES.index("T_ambient")
 RETAINED: Final = ("x", "y", "signals", "commands", "integrals", "equipment")
 """Of the memory; the rest follows from it."""
-
-
-class GaugeNoise:
-    """White Gaussian noise on the station's gauges: of each tick by itself, so that nothing of it is retained.
-
-    Args:
-        deviation: Standard deviation, bar; 0 measures exactly.
-        seed: Of the draws, 0 or more.
-    """
-
-    def __init__(self, deviation: float, seed: int) -> None:
-        self._deviation, self._seed = deviation, seed
-
-    def at(self, tick: int) -> tuple[float, float]:
-        """Return by how much the gauges of the high and of the low pressure are off, bar."""
-        if not self._deviation:
-            return 0.0, 0.0
-        generator = np.random.Generator(np.random.Philox(key=self._seed, counter=[0, tick, 0, 0]))
-        hp, lp = self._deviation * generator.standard_normal(2)
-        return float(hp), float(lp)
 
 
 class RefrigeratorProgram(ColdBoxProgram):
@@ -63,19 +172,8 @@ class RefrigeratorProgram(ColdBoxProgram):
     `state` and `measure` are those of the cold box, so that all who know a cold box know this plant; `station` is the
     rest.
 
-    Args:
-        plant: The parameters of the refrigerator.
-        file: Its operating point and gains; `x0` of the plant is its.
-        u0: Inputs held until the first `apply`, 3 numbers.
-        load: The heat load over time.
-        station: Settings of the station's controller.
-        events: Disturbances of the refrigerator.
-        noise: Noise on the cold box's measurements; None measures exactly.
-        seed: Of the noise on the station's gauges.
-        warm: Begin with a warm refrigerator that stands, in the place of the operating point.
-
-    Raises:
-        ValueError: An argument of wrong length, not finite, or out of range.
+    It begins at the operating point of `file`, or `warm`, with compressors that stand. `seed` is that of the noise on
+    the station's gauges, `noise` is on the cold box's outputs.
     """
 
     def __init__(
@@ -91,14 +189,13 @@ class RefrigeratorProgram(ColdBoxProgram):
         seed: int = 0,
         warm: bool = False,
     ) -> None:
-        check_refrigerator(plant)
         self.plant = plant
         self._plant, self._tables = plain_tuples(plant), plain_tuples(load_helium())
-        self.law = station_law(station, file.reference, plant.station)
+        self.law = station_law(station, file.gains, file.v0, plant.station)
         """Of the station's controller."""
         self._law = plain_tuples(self.law)
         self._events = events
-        self._gauges = GaugeNoise(station.noise_bar, seed)
+        self._gauge_deviation, self._seed = station.noise_bar, seed
         x, v = np.array(file.x0, dtype=np.float64), np.array(file.v0, dtype=np.float64)
         d = self._disturbances(0, load.value(0))
         equipment = standing_equipment(np.array(u0)) if warm else resting_equipment(np.array(u0))
@@ -167,7 +264,14 @@ class RefrigeratorProgram(ColdBoxProgram):
         physical = (w, ambient, 1e-3 * given.leak, given.nitrogen, given.nc1, given.nc2)
         equipment = (given.turbine, given.cv155, given.cv156, given.heater)
         blocking = (given.blocked_nef1, given.blocked_nef2, given.blocked_nef34, given.blocked_nef6)
-        return np.array([*physical, *self._gauges.at(tick), *equipment, *blocking], dtype=np.float64)
+        return np.array([*physical, *self._gauge_noise(tick), *equipment, *blocking], dtype=np.float64)
+
+    def _gauge_noise(self, tick: int) -> RealArray:
+        """Return by how much the gauges of high and low pressure are off (bar): a function of tick and seed alone."""
+        if not self._gauge_deviation:
+            return np.zeros(2)
+        generator = np.random.Generator(np.random.Philox(key=self._seed, counter=[0, tick, 0, 0]))
+        return self._gauge_deviation * generator.standard_normal(2)
 
     def ahead(self, ticks: int) -> RealArray:
         """Return the disturbances, without load, of `ticks` ticks and of the one behind them, shape (ticks + 1, 16)."""
@@ -184,15 +288,7 @@ class RefrigeratorProgram(ColdBoxProgram):
         self.take_over(tick, memory.x[:BOX_STATES], u, y)
         self._memory = memory
 
-    def resume(
-        self,
-        tick: int,
-        x: Sequence[float],
-        u: Sequence[float],
-        y: Sequence[float],
-        noise_state: Mapping[str, Any],
-        warm: Mapping[str, Any] | None = None,
-    ) -> None:
+    def resume(self, *retained: Any, warm: Mapping[str, Any] | None = None, **named: Any) -> None:  # noqa: ANN401
         """Resume from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
         if warm is None:
             raise ValueError("the retained state is that of a cold box, not of a refrigerator")
@@ -200,7 +296,7 @@ class RefrigeratorProgram(ColdBoxProgram):
         for name, values in kept.items():
             if values.shape != getattr(self._memory, name).shape:
                 raise ValueError(f"{name}: expected {len(getattr(self._memory, name))} numbers")
-        super().resume(tick, x, u, y, noise_state)
+        super().resume(*retained, **named)
         for since, put in warm["given"]:
             self._events.put(int(since), Surroundings(*put))
         self._memory = self._memory._replace(**kept)
