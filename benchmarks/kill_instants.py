@@ -12,8 +12,7 @@ from coldloop_rig.chaos.evaluation import Evaluation
 from coldloop_rig.chaos.experiment import perform
 from coldloop_rig.chaos.faults import Kill, Pause
 from coldloop_rig.chaos.plan import ChaosPlan
-from coldloop_rig.chaos.progress import ChaosProgress
-from coldloop_rig.chaos.report import summary_lines, write_report
+from coldloop_rig.chaos.report import ChaosProgress, summary_lines, write_report
 from coldloop_rig.results.folders import claim_folder
 from coldloop_rig.settings import Settings
 
@@ -93,7 +92,7 @@ def main() -> int:
         plan = make_plan(options)
         with ChaosProgress(plan) as progress:
             experiment = perform(plan, patient(options.patience), folder, progress, arguments={}, formats=["png"])
-        write_report(folder, plan, experiment.trace, experiment.evaluation, {}, experiment.failure)
+        write_report(folder, experiment)
     tell(experiment.evaluation)
     print(*summary_lines(experiment.trace, experiment.evaluation), sep="\n")
     if experiment.failure is not None:

@@ -16,7 +16,6 @@ from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.process.lti_model import load
 from coldloop_optimizer_plc.computing_settings import OdeSettings
 from coldloop_optimizer_plc.qp.costs import matrices_of
-from coldloop_optimizer_plc.qp.penalties import DEFAULT_PENALTIES
 from coldloop_optimizer_plc.solvers.ode import descend, flow_in, warm_start
 from coldloop_plant.cold_box.physics import advance_along, evaluate
 from coldloop_plant.cold_box.plant_file import REFERENCE
@@ -74,7 +73,7 @@ def floors(problems: list[RecordedProblem], count: int) -> Floors:
     model, helium, flow = (
         load(Settings().model.file),
         load_helium(),
-        flow_in(OdeSettings(), DEFAULT_PENALTIES, np.float64),
+        flow_in(OdeSettings(), None, np.float64),
     )
     state = np.array(model.x0) * 1.001, np.array(model.u0), model.w0, REFERENCE, helium
     steps(*state, 0, 1)

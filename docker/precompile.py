@@ -155,8 +155,8 @@ def transfer_functions() -> None:
 def run_modules() -> None:
     """Import what a run needs besides kernels, so that its bytecode is written."""
     for module in (
-        "control_plc.runtime", "rig.cli", "rig.cli.commands.run", "rig.runs.running", "rig.cosim.networked_run",
-        "rig.cosim.one_process", "rig.progress", "rig.figures.worker", "rig.figures.run_plot",
+        "control_plc.runtime", "rig.cli", "rig.cli.commands.runs", "rig.runs.running", "rig.cosim.networked_run",
+        "rig.cosim.one_process", "rig.progress", "rig.figures.worker", "rig.figures.plot",
     ):  # fmt: skip
         import_module(f"coldloop_{module}")
 

@@ -1,11 +1,15 @@
 """The rig: puts the three services together, drives, records and evaluates them. `simulate` is its front door."""
 
-from typing import TYPE_CHECKING, Any
+import sys
+from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from coldloop_rig.runs.simulation import Simulation, simulate
 
 __all__ = ["Simulation", "simulate"]
+
+PYTHON: Final = (sys.executable, "-P")
+"""Starts processes of this package, without the folder where the user is: a `plant.py` there is not ours."""
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401 whatever it is

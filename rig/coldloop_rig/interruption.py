@@ -8,9 +8,9 @@ import contextlib
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from types import FrameType, TracebackType
-from typing import Final, NoReturn, Self
+from typing import Any, Final, NoReturn, Self
 
 from coldloop.errors import RunInterruptedError
 
@@ -107,3 +107,32 @@ def end_at_once(number: int) -> NoReturn:
 
 INTERRUPTION: Final = Interruption()
 """That of the command line."""
+
+
+def run_until_interrupted(start: Callable[[], Coroutine[Any, Any, None]]) -> bool:
+    """Run a coroutine to its end, or cancel it at the first signal; return whether a signal ended it."""
+    import asyncio  # noqa: PLC0415 most commands do without, and this module is imported first of all
+
+    from coldloop.service.start import run_event_loop  # noqa: PLC0415
+
+    interrupted = False
+
+    async def watched() -> int:
+        loop = asyncio.get_running_loop()
+        task = asyncio.ensure_future(start())
+
+        def stop(_: signal.Signals) -> None:
+            nonlocal interrupted
+            interrupted = True
+            loop.call_soon_threadsafe(task.cancel)
+
+        with INTERRUPTION.passed_to(stop):
+            try:
+                await task
+            except asyncio.CancelledError:
+                if not interrupted:
+                    raise
+        return 0
+
+    run_event_loop(watched)
+    return interrupted

@@ -11,10 +11,9 @@ from pydantic import BaseModel
 
 from coldloop.process.declaration import Process
 from coldloop_rig.cli import make_parser
-from coldloop_rig.cli.command_listing import command_listing
-from coldloop_rig.cli.commands.docs import anchor, headings
-from coldloop_rig.cli.key_listing import key_listing
-from coldloop_rig.cli.register_listing import FORMATS
+from coldloop_rig.cli.commands.help import anchor, headings
+from coldloop_rig.cli.listings import command_listing, key_listing
+from coldloop_rig.cli.registers import FORMATS
 from coldloop_rig.plc_sizing.plc import PlcProfile
 from coldloop_rig.settings import Settings
 from tests.harness.path_options import path_table

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from coldloop_rig.cli import COMMANDS, USES, make_parser
-from coldloop_rig.cli.command_listing import _subparsers
+from coldloop_rig.cli.listings import _subparsers
 from coldloop_rig.text_tables import markdown_table
 
 REFUSED: Final = "not a regular file"

@@ -5,9 +5,8 @@ from collections.abc import Callable
 from typing import Self
 
 from coldloop.modbus.endpoints import Endpoint
-from coldloop_rig.chaos.disturbance import Mangler
 from coldloop_rig.chaos.faults import Direction
-from coldloop_rig.chaos.proxy import LinkProxy, reset
+from coldloop_rig.chaos.proxy import LinkProxy, Mangler, reset
 
 Treatment = Callable[[Direction, bytes], bytes | None]
 """Takes a frame; returns what goes on of it. None resets the connection."""

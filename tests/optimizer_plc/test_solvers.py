@@ -24,8 +24,8 @@ from coldloop_optimizer_plc.solvers.qpoases import QpoasesSolver
 from coldloop_plant.load import find_load
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.results.recording import Recorder
 from coldloop_rig.settings import Settings
+from tests.optimizer_plc.conftest import Recorder
 
 if TYPE_CHECKING:
     from tests.harness.processes import Processes

@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from coldloop_rig.results.arrow_arrays import number_array, numbers_of, text_array
+from coldloop_rig.results.columns import number_array, numbers_of, text_array
 
 
 @pytest.mark.parametrize("kind", [pa.int64(), pa.int32(), pa.float32(), pa.float64()])

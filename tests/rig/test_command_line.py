@@ -19,9 +19,9 @@ from coldloop_optimizer_plc.settings import SolverName
 from coldloop_plant.load import NAMED
 from coldloop_rig.chaos.plan import shipped_plans
 from coldloop_rig.cli import COMMANDS, EXTRAS, make_parser
-from coldloop_rig.cli.commands import choices
-from coldloop_rig.cli.register_listing import FORMATS
-from coldloop_rig.cli.tag_exports import EXPORTS
+from coldloop_rig.cli.commands import options
+from coldloop_rig.cli.commands.rig import COMMANDS as RIG_COMMANDS
+from coldloop_rig.cli.registers import EXPORTS, FORMATS
 from coldloop_rig.studies import APART, STUDIES
 from tests.harness.processes import Ended, Processes
 from tests.harness.records import MAPS
@@ -49,15 +49,15 @@ def python(processes: Processes) -> Python:
 
 
 def test_the_names_that_are_offered_are_those_that_exist() -> None:
-    assert tuple(mode.value for mode in TimeMode) == choices.MODES
-    assert tuple(solver.value for solver in SolverName) == choices.SOLVERS
-    assert tuple(preset.value for preset in Preset) == choices.PRESETS
-    assert tuple(NAMED) == choices.LOADS
-    assert sorted(choices.SERVICES) == sorted(MAPS)
-    assert sorted(choices.REGISTER_FORMATS) == sorted(FORMATS)
-    assert sorted(choices.TAG_FORMATS) == sorted(EXPORTS)
-    assert (*STUDIES, *APART) == choices.STUDIES
-    assert choices.plans() == [plan.name for plan in shipped_plans()]
+    assert tuple(mode.value for mode in TimeMode) == options.MODES
+    assert tuple(solver.value for solver in SolverName) == options.SOLVERS
+    assert tuple(preset.value for preset in Preset) == options.PRESETS
+    assert tuple(NAMED) == options.LOADS
+    assert sorted(options.SERVICES) == sorted(MAPS)
+    assert sorted(options.REGISTER_FORMATS) == sorted(FORMATS)
+    assert sorted(options.TAG_FORMATS) == sorted(EXPORTS)
+    assert (*STUDIES, *APART) == options.STUDIES
+    assert options.plans() == [plan.name for plan in shipped_plans()]
 
 
 ONE_AFTER_THE_OTHER = """
@@ -230,7 +230,7 @@ def test_an_error_that_is_not_the_outputs_is_not_called_so(
     def refused(_: object) -> int:
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
-    monkeypatch.setattr("coldloop_rig.cli.commands.down.execute", refused)
+    monkeypatch.setitem(RIG_COMMANDS, "down", RIG_COMMANDS["down"]._replace(execute=refused))
     assert coldloop("down").complaints == ["coldloop: down: Operation not permitted"]
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from coldloop.process.lti_model import load
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop_rig.cli.register_listing import COLUMNS
+from coldloop_rig.cli.registers import COLUMNS
 from tests.harness.records import MAPS
 
 if TYPE_CHECKING:

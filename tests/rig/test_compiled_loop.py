@@ -21,9 +21,10 @@ from coldloop_rig.cosim.compiled.control import guard_records
 from coldloop_rig.cosim.compiled.stretches import CompiledStretches, Stretch
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.results.recording import MemorySink, Recorder
+from coldloop_rig.results.recording import MemorySink
 from coldloop_rig.settings import Settings
 from tests.harness.configurations import COMPILED, LEFT_TO_PROGRAMS, UNUSUAL
+from tests.optimizer_plc.conftest import Recorder
 
 pytestmark = pytest.mark.usefixtures("compiles")
 

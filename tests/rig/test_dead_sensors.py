@@ -17,8 +17,8 @@ from coldloop_optimizer_plc.settings import OptimizerSection, ProgramSettings
 from coldloop_plant.program import PlantProgram
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.results.recording import Recorder
 from coldloop_rig.settings import Settings
+from tests.optimizer_plc.conftest import Recorder
 
 BANDS = ControlDesign()
 BEGIN, TEN_MINUTES, HALF_HOUR = 1200, 2400, 7200

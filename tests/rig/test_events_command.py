@@ -24,7 +24,7 @@ from coldloop.registers.control_plc import Mode
 from coldloop.registers.declaration import Block, RegisterMap
 from coldloop.registers.safety import AlarmKind
 from coldloop.service.journal import KEPT, Journal, JournalPublication
-from coldloop_rig.cli.commands.events import COLUMNS
+from coldloop_rig.cli.commands.bus import COLUMNS
 from tests.harness.processes import Processes
 from tests.harness.records import CONTROL_MAP, PLANT_MAP
 

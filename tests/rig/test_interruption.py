@@ -12,14 +12,15 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-import coldloop_rig.results.disk_reserve
 import coldloop_rig.results.file_sinks
 from coldloop.errors import LinkError
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
+from coldloop_rig.cosim.compiled.records import BLOCK_TICKS
 from coldloop_rig.cosim.one_process import OneProcessRig
-from coldloop_rig.results.recording import BLOCK_TICKS, KEPT_TICKS, Recorder, SampleBlock, Sink
+from coldloop_rig.results.recording import KEPT_TICKS, SampleBlock, Sink
 from tests.harness.processes import Process, Processes
+from tests.optimizer_plc.conftest import Recorder
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
@@ -190,15 +191,15 @@ class SmallDisk:
 
     def __init__(self, limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
         self._limit = limit
-        write = coldloop_rig.results.disk_reserve.ReservedFile.write
+        write = coldloop_rig.results.file_sinks.ReservedFile.write
 
-        def limited(file: coldloop_rig.results.disk_reserve.ReservedFile, data: bytes) -> int:
+        def limited(file: coldloop_rig.results.file_sinks.ReservedFile, data: bytes) -> int:
             self._limit -= len(data)
             if self._limit < 0 and not file._reserve.released:  # noqa: SLF001
                 file._reserve.release()  # noqa: SLF001
             return write(file, data)
 
-        monkeypatch.setattr(coldloop_rig.results.disk_reserve.ReservedFile, "write", limited)
+        monkeypatch.setattr(coldloop_rig.results.file_sinks.ReservedFile, "write", limited)
 
 
 @pytest.mark.usefixtures("compiles", "programs")

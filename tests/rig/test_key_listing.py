@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
-from coldloop_rig.cli.key_listing import key_listing
+from coldloop_rig.cli.listings import key_listing
 
 
 class _Section(BaseModel):

@@ -13,8 +13,7 @@ from typing import Final
 
 import pytest
 
-from coldloop_rig import cli
-from coldloop_rig.interpreter import PYTHON
+from coldloop_rig import PYTHON, cli
 from tests.conftest import draw_nothing
 from tests.harness.path_options import PathOption, path_options
 from tests.harness.processes import environment

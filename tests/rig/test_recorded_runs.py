@@ -26,7 +26,7 @@ from coldloop.process.model_file import digest_of
 from coldloop_rig import cli
 from coldloop_rig.results.folders import claim_folder
 from coldloop_rig.results.run_folder import RunFolder
-from coldloop_rig.runs.inputs import configuration_digest, file_digest
+from coldloop_rig.runs.running import file_digest, json_digest
 from tests.conftest import draw_nothing
 from tests.harness.processes import Processes
 
@@ -325,7 +325,7 @@ def test_a_manifest_names_files_of_its_folder_alone(place: str, coldloop: "Coldl
 def test_no_file_that_a_configuration_names_is_opened_outside_the_folder(coldloop: "Coldloop", mpc: Path) -> None:
     manifest = json.loads((mpc / "manifest.json").read_text())
     manifest["configuration"] |= {"plant.kind": "refrigerator", "plant.refrigerator.file": "/dev/zero"}
-    manifest["hashes"]["configuration_sha256"] = configuration_digest(manifest["configuration"])
+    manifest["hashes"]["configuration_sha256"] = json_digest(manifest["configuration"])
     (mpc / "manifest.json").write_text(json.dumps(manifest))
     complaint = f"coldloop: {mpc / 'manifest.json'}: plant.refrigerator.file: the folder has no copy of it"
     assert coldloop("rerun", mpc).complaints == [complaint]
@@ -429,7 +429,7 @@ def test_a_folder_that_calls_a_plant_of_its_own_a_cold_box_executes_nothing(
     manifest["configuration"] |= {"plant.kind": "of-process", "model.file": str(model)}
     copy = {"file": "inputs/model.json", "sha256": file_digest(model)} if is_copied else {"file": None, "sha256": None}
     manifest["inputs"]["model"] |= copy
-    manifest["hashes"]["configuration_sha256"] = configuration_digest(manifest["configuration"])
+    manifest["hashes"]["configuration_sha256"] = json_digest(manifest["configuration"])
     (mpc / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
     outcome = coldloop("rerun", mpc)
     assert (outcome.code, len(outcome.complaints)) != (0, 0)

@@ -25,8 +25,9 @@ from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.results.columns import FILES, STATION
 from coldloop_rig.results.folders import claim_folder_of_now, write_json
 from coldloop_rig.results.indicators import evaluate
-from coldloop_rig.results.recording import LinkStatistics, Recorder, Recording
+from coldloop_rig.results.recording import LinkStatistics, Recording
 from coldloop_rig.settings import Settings
+from tests.optimizer_plc.conftest import Recorder
 
 if TYPE_CHECKING:
     from coldloop.process.load_profile import LoadProfile

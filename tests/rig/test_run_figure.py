@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from coldloop.process.cold_box import COLD_BOX, INPUT_NAMES
-from coldloop_rig.figures.plot import Bounds, RunCurves, draw_run, label_marks, labels_of
-from coldloop_rig.figures.run_plot import curves_of
+from coldloop_rig.figures.plot import Bounds, RunCurves, curves_of, draw_run, label_marks, labels_of
 from coldloop_rig.results.run_folder import RunFolder, _in_force
 from coldloop_rig.studies.drawing import _updates
 from coldloop_rig.studies.request import Outcome

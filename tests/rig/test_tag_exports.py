@@ -20,7 +20,7 @@ from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import AlarmKind
 from coldloop.service.event_text import alarm_word
 from coldloop.service.metrics import metric_name
-from coldloop_rig.cli.tag_exports import exported, runs
+from coldloop_rig.cli.registers import exported, runs
 from tests.conftest import Coldloop
 from tests.harness.records import CONTROL_MAP, MAPS, PLANT_MAP
 

@@ -5,11 +5,17 @@ from typing import TYPE_CHECKING
 import pytest
 
 import coldloop_rig.studies.execution
-from coldloop_rig.studies.execution import Workers, perform_all
-from coldloop_rig.studies.identical import families, iteration_limit, never_cut_off, same_run
+from coldloop_rig.studies.execution import (
+    Store,
+    Workers,
+    families,
+    iteration_limit,
+    never_cut_off,
+    perform_all,
+    same_run,
+)
+from coldloop_rig.studies.paper.solver_comparison import throttled
 from coldloop_rig.studies.request import Outcome, RunRequest, perform
-from coldloop_rig.studies.solver_runs import throttled
-from coldloop_rig.studies.store import Store
 from coldloop_rig.studies.study import Load, StudyOptions, draw_of
 
 if TYPE_CHECKING:

@@ -12,11 +12,16 @@ from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind
 from coldloop_rig.studies import STUDIES
-from coldloop_rig.studies.beyond.coupling import CASES as PLANTS
-from coldloop_rig.studies.paper.cholesky import SLOW_DOWN, SPEED
+from coldloop_rig.studies.beyond.refrigerator import PLANTS
+from coldloop_rig.studies.paper.reference_plc import SLOW_DOWN, SPEED
 from coldloop_rig.studies.paper.solver_comparison import measures
-from coldloop_rig.studies.paper.trade_off import share_falling, won_and_lost
-from coldloop_rig.studies.paper.trajectories import furthest_outside, iterations_by_event, load_steps
+from coldloop_rig.studies.paper.trajectories import (
+    furthest_outside,
+    iterations_by_event,
+    load_steps,
+    share_falling,
+    won_and_lost,
+)
 from coldloop_rig.studies.request import Happening
 from coldloop_rig.studies.study import Load, Outcomes, StudyOptions, StudyResult
 

@@ -22,12 +22,26 @@ from coldloop_optimizer_plc.solvers import make_solver
 from coldloop_plant.load import find_load
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.studies import STUDIES
-from coldloop_rig.studies.harsh_problems import harsh_request, harsh_table, harsh_values
-from coldloop_rig.studies.paired_run import equal_counts, harsh_run, paired_indicators, paired_run
-from coldloop_rig.studies.paired_sums import watch
-from coldloop_rig.studies.paper.open_loop import LABELS, open_loop, open_loop_table, paired_request, powers_of
-from coldloop_rig.studies.played_profiles import PlayedProfiles
-from coldloop_rig.studies.problem_sequence import ProblemSequence, problem_sequence
+from coldloop_rig.studies.intervals import watch
+from coldloop_rig.studies.paired_run import (
+    PlayedProfiles,
+    ProblemSequence,
+    equal_counts,
+    harsh_run,
+    paired_indicators,
+    paired_run,
+    problem_sequence,
+)
+from coldloop_rig.studies.paper.solver_comparison import (
+    LABELS,
+    harsh_request,
+    harsh_table,
+    harsh_values,
+    open_loop,
+    open_loop_table,
+    paired_request,
+    powers_of,
+)
 from coldloop_rig.studies.request import Outcome, perform
 from coldloop_rig.studies.study import StudyOptions, draw_of
 

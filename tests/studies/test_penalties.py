@@ -9,19 +9,22 @@ import pytest
 
 from coldloop.errors import StudyError
 from coldloop.process.load_profile import LoadProfile
-from coldloop_rig.studies.beyond.penalties import PenaltiesStudy, misfit
-from coldloop_rig.studies.beyond.penalty_variants import (
+from coldloop_rig.studies.beyond.penalties import (
+    FIRST,
     OWN,
     PRESETS,
     VARIANTS,
     Paired,
+    PenaltiesStudy,
     PenaltyVariant,
+    end_over_best,
+    misfit,
     paired,
     paired_sums,
     powers_of,
+    share_inside,
 )
-from coldloop_rig.studies.paper.best_periods import FIRST, end_over_best, share_inside
-from coldloop_rig.studies.paper.open_loop import paired_loads
+from coldloop_rig.studies.paper.solver_comparison import paired_loads
 from coldloop_rig.studies.paper.updating_period import is_inside
 from coldloop_rig.studies.request import Outcome, RunRequest
 from coldloop_rig.studies.settings import settings_of

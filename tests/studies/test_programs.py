@@ -107,7 +107,7 @@ def digest_in(folder: Path, first: str = "", **environment: str) -> str:
 @pytest.mark.usefixtures("compiles")
 def test_the_digest_is_the_same_elsewhere_and_whatever_was_imported_or_done_before(copy: Path) -> None:
     before = (
-        "import coldloop_rig.cosim.compiled.own_plants, coldloop_rig.cli.commands.run, coldloop_rig as rig\n"
+        "import coldloop_rig.cosim.compiled.own_plants, coldloop_rig.cli.commands.runs, coldloop_rig as rig\n"
         "rig.simulate(load='a', duration_s=15)"
     )
     assert digest_in(copy, before, PYTHONHASHSEED="1") == programs_digest()

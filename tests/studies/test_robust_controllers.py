@@ -5,11 +5,13 @@ import pytest
 
 from coldloop.config import load_configuration
 from coldloop_rig.settings import Settings
-from coldloop_rig.studies.beyond.conditions import ESTIMATED, LINEAR, NOMINAL
-from coldloop_rig.studies.beyond.robust_controllers import (
-    CONDITIONS,
+from coldloop_rig.studies.beyond.robustness import (
+    CONTROLLER_CONDITIONS,
     CONTROLLERS,
     DEFAULT,
+    ESTIMATED,
+    LINEAR,
+    NOMINAL,
     HoursUnder,
     comparison,
     controllers_remarks,
@@ -31,7 +33,7 @@ def found(changed: dict[Key, Hours]) -> dict[Key, HoursUnder]:
     usual: Hours = ([100.0, 200.0], [0.0, 0.0], [0.0, 0.0])
     return {
         (condition, controller): HoursUnder(*map(np.array, changed.get((condition, controller), usual)))
-        for condition in CONDITIONS for controller in CONTROLLERS
+        for condition in CONTROLLER_CONDITIONS for controller in CONTROLLERS
     }  # fmt: skip
 
 
@@ -43,7 +45,7 @@ def test_a_band_is_held_if_the_mean_share_outside_is_one_per_cent_at_most() -> N
             ("UA +10 %", DEFAULT): ([1e4, 2e4], [0.0, 0.0], [6.0, 0.0]),
         })
     )  # fmt: skip
-    every = len(CONDITIONS)
+    every = len(CONTROLLER_CONDITIONS)
     assert (
         f"- `{DEFAULT}` in {every - 2} of {every}; not under UA +10 % (0.0 / 3.0), valves +20 % (1.1 / 0.0).\n" in said
     )
@@ -60,7 +62,7 @@ def test_a_cost_is_less_or_more_only_where_the_interval_is_clear_of_one() -> Non
             ("UA -20 %", FIXED): ([300.0, 600.0], [0.0, 0.0], [0.0, 0.0]),
         })
     )  # fmt: skip
-    every = len(CONDITIONS)
+    every = len(CONTROLLER_CONDITIONS)
     assert f"- of `{PAPER}`: less under UA -10 % (0.5); more under UA -20 % (3); undecided in {every - 2} of" in said
     assert f"- of `{FIXED}`: less under UA -10 % (0.5); more under no condition; undecided in {every - 1} of" in said
 
@@ -85,14 +87,14 @@ def test_what_being_off_costs_is_over_the_same_controller_on_its_model() -> None
 def test_conditions_are_what_they_are_called() -> None:
     default = load_configuration(Settings, environment={}).settings
     assert settings_of(CONTROLLERS[DEFAULT][1]) == default, "the first controller is the default"
-    under = {condition: settings_of(changes) for condition, changes in CONDITIONS.items()}
+    under = {condition: settings_of(changes) for condition, changes in CONTROLLER_CONDITIONS.items()}
     distinct = {settings.model_dump_json() for settings in under.values()}
-    assert len(distinct) == len(CONDITIONS) - len(LINEAR), "a linear plant is no setting"
+    assert len(distinct) == len(CONTROLLER_CONDITIONS) - len(LINEAR), "a linear plant is no setting"
     reckoned = under[NOMINAL].optimizer_plc.program.estimator
     for condition, factor in {"sensor noise": 1.0, "sensor noise doubled": 2.0}.items():
         sensors = under[condition].plant.sensors
         assert (sensors.level, sensors.speed) == (factor * reckoned.level_sensor, factor * reckoned.speed_sensor)
         assert sensors.temperature == factor * reckoned.temperature_sensor
         assert sensors.pressure == factor * reckoned.pressure_sensor
-    tuned = settings_of((*CONTROLLERS[DEFAULT][1], *CONDITIONS[ESTIMATED])).optimizer_plc.program.estimator
+    tuned = settings_of((*CONTROLLERS[DEFAULT][1], *CONTROLLER_CONDITIONS[ESTIMATED])).optimizer_plc.program.estimator
     assert tuned.disturbances == default.optimizer_plc.program.estimator.disturbances, "whether or not it is measured"

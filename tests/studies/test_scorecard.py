@@ -16,19 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from coldloop_rig.report.document import (
-    PLACEHOLDER,
-    as_page,
-    deviations,
-    explained,
-    findings,
-    revisions,
-    scorecard_table,
-    verdict_counts,
-)
-from coldloop_rig.report.reproduction import EXPLANATIONS, circumstances, lead
-from coldloop_rig.report.scorecard import (
+from coldloop_rig.report.reproduction import (
+    EXPLANATIONS,
     FROM_POINTS,
+    PLACEHOLDER,
     TOLERANCES,
     Claim,
     ClaimKind,
@@ -36,19 +27,28 @@ from coldloop_rig.report.scorecard import (
     Judged,
     Revision,
     as_json,
+    as_page,
+    circumstances,
     claims,
     counted,
     counts,
+    deviations,
+    explained,
+    findings,
     judge,
+    lead,
     paper_values,
+    revisions,
+    scorecard_table,
     verdict,
+    verdict_counts,
     withdrawn,
 )
 from coldloop_rig.studies import STUDIES
 from coldloop_rig.studies import published as paper
-from coldloop_rig.studies.crossing import crossing
-from coldloop_rig.studies.paper.load_response import response
+from coldloop_rig.studies.intervals import crossing
 from coldloop_rig.studies.paper.solver_comparison import measures
+from coldloop_rig.studies.paper.trajectories import response
 from coldloop_rig.studies.study import StudyOptions
 
 ROOT = Path(__file__).parents[2]

@@ -14,11 +14,9 @@ import pytest
 import coldloop_rig.studies.execution
 from coldloop.errors import ResultsError, StudyError, UsageError
 from coldloop_rig.studies import STUDIES
-from coldloop_rig.studies.execution import Workers, perform_all
+from coldloop_rig.studies.execution import Store, StoredOutcomes, Workers, perform_all
 from coldloop_rig.studies.request import RunRequest, perform
-from coldloop_rig.studies.results import conduct
-from coldloop_rig.studies.shards import Shard, conduct_shard, merge
-from coldloop_rig.studies.store import Store, StoredOutcomes
+from coldloop_rig.studies.results import Shard, conduct, conduct_shard, merge
 from coldloop_rig.studies.study import RUNS, StudyOptions
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop_rig.studies import STUDIES
-from coldloop_rig.studies.paper.load_response import held_periods, response, response_table
+from coldloop_rig.studies.paper.trajectories import held_periods, response, response_table
 from coldloop_rig.studies.paper.updating_period import FEW, POLICIES
 from coldloop_rig.studies.study import StudyOptions
 

@@ -1,30 +1,83 @@
 """One plan from beginning to end: run and record it, run the same without faults, evaluate."""
 
+import asyncio
 from collections.abc import Mapping, Sequence
+from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from coldloop.config import Configuration
 from coldloop.errors import LinkError
 from coldloop.process.lti_model import load as load_model
 from coldloop_optimizer_plc.qp.design import ControlDesign
-from coldloop_rig.chaos.evaluation import Evaluation, evaluate
+from coldloop_rig.chaos.evaluation import ChaosTrace, Evaluation, evaluate
+from coldloop_rig.chaos.faults import WrongModel
 from coldloop_rig.chaos.plan import ChaosPlan
-from coldloop_rig.chaos.runner import conduct
-from coldloop_rig.chaos.sequencer import Progress
-from coldloop_rig.chaos.trace import ChaosTrace
+from coldloop_rig.chaos.proxy import ProxiedServices
+from coldloop_rig.chaos.sequencer import WRONG_MODEL, FaultSequencer, Injector, Progress, save_wrong_model
 from coldloop_rig.cosim.one_process import OneProcessRig
-from coldloop_rig.cosim.scenario import Job, Scenario
+from coldloop_rig.cosim.scenario import Job, Scenario, with_copied_load
+from coldloop_rig.cosim.session import SessionClient
+from coldloop_rig.cosim.wiring import START_PATIENCE_S
 from coldloop_rig.figures.worker import FigureProcess
-from coldloop_rig.results.recording import Recorder, Recording
-from coldloop_rig.results.way import Way
+from coldloop_rig.results.recording import Recorder, Recording, Way
 from coldloop_rig.runs.running import run_into
 from coldloop_rig.settings import Settings
 
+SLOWEST: Final = 20.0
+"""Seconds of plant time in a second that lock-step should reach with proxies and all."""
+
+
+async def conduct(
+    plan: ChaosPlan,
+    scenario: Scenario,
+    settings: Settings,
+    folder: Path,
+    recorder: Recorder,
+    trace: ChaosTrace,
+    progress: Progress,
+) -> None:
+    """Run a plan on three services started for it; `trace`, a sink of the recorder, has what there was.
+
+    Raises:
+        LinkError: A service ended by itself, plant time stopped, or the run took too long.
+    """
+    if any(isinstance(fault, WrongModel) for fault in plan.schedule()):  # not while the clock is running
+        await asyncio.to_thread(save_wrong_model, settings.model.file, folder / WRONG_MODEL)
+    copied = with_copied_load(settings, scenario.load, folder)
+    async with AsyncExitStack() as stack:
+        proxied = await stack.enter_async_context(ProxiedServices(copied, folder, str(plan.seed)))
+        services = proxied.services
+        client = SessionClient(services.endpoints, settings, tolerant=True)
+        stack.callback(client.close)
+        await services.during(client.connect(START_PATIENCE_S))
+        await proxied.connect_links()
+        await services.during(client.begin(scenario, recorder))
+        injector = Injector(services, proxied.proxies, client.plant, folder)
+        driver = FaultSequencer(plan, services, client, injector, trace, progress)
+        try:
+            async with asyncio.timeout(_patience_s(plan)):
+                await services.during(driver.run())
+        except TimeoutError:
+            raise LinkError(
+                f"plan {plan.name} has taken {_patience_s(plan):.0f} s of real time and is at "
+                f"{driver.tick * plan.process.tick_s:g} s: see the logs in {folder / 'logs'}"
+            ) from None
+        finally:
+            driver.finish()
+            await client.last_look()
+
+
+def _patience_s(plan: ChaosPlan) -> float:
+    schedule = plan.schedule()
+    speed = SLOWEST if not plan.realtime else plan.factor / 2
+    return 300.0 + plan.duration_s / speed + sum(60.0 + fault.duration_s / speed for fault in schedule)
+
 
 class Experiment(NamedTuple):
-    """What a plan has led to."""
+    """A plan, and what it has led to."""
 
+    plan: ChaosPlan
     trace: ChaosTrace
     undisturbed: Recording
     evaluation: Evaluation
@@ -43,15 +96,9 @@ def perform(
     arguments: Mapping[str, Any],
     formats: Sequence[str],
 ) -> Experiment:
-    """Run a plan into a folder that is claimed; a run that fails is evaluated as far as it went.
+    """Run a plan into a folder that is claimed, and the same without faults; a run that fails is evaluated as it is.
 
-    Args:
-        plan: What goes wrong in it.
-        effective: Configuration of the services; what the plan has too is recorded with the plan's values.
-        folder: Gets the files of an ordinary run.
-        progress: Takes where the run is.
-        arguments: Options of the command.
-        formats: Of the run's figure.
+    The values of the plan are recorded in the place of those of the configuration.
 
     Raises:
         LoadFileError: The load of the plan cannot be had.
@@ -73,13 +120,8 @@ def perform(
         if trace.missing == trace.ticks:
             raise
         failure = str(error)
-    reference = undisturbed(settings, scenario)
-    design = settings.optimizer_plc.program.design
-    return Experiment(trace, reference, evaluate(trace, reference, settings.limits.rate, design), design, failure)
-
-
-def undisturbed(settings: Settings, scenario: Scenario) -> Recording:
-    """Return the same run without faults."""
-    recorder = Recorder(scenario.ticks)
-    OneProcessRig(settings).run(scenario, recorder)
-    return recorder.recording()
+    alone = Recorder(scenario.ticks)
+    OneProcessRig(settings).run(scenario, alone)
+    undisturbed, design = alone.recording(), settings.optimizer_plc.program.design
+    evaluation = evaluate(trace, undisturbed, settings.limits.rate, design)
+    return Experiment(plan, trace, undisturbed, evaluation, design, failure)

@@ -1,7 +1,7 @@
 """The faults that a chaos plan may hold; each knows what belongs to it."""
 
 from enum import StrEnum
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, ClassVar, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
 
@@ -55,10 +55,13 @@ class Fault(BaseModel):
         """The tick before which it is to end."""
         return self.tick + round(self.duration_s / self._tick_s)
 
+    in_tables: ClassVar[str] = "{what}"
+    """What tables call it, with `what`, its kind in words, and its fields."""
+
     @property
     def label(self) -> str:
         """What tables call it."""
-        return self.kind.replace("_", " ")
+        return self.in_tables.format(what=self.kind.replace("_", " "), **self.__dict__)
 
     @property
     def processes(self) -> frozenset[str]:
@@ -74,6 +77,7 @@ class Fault(BaseModel):
 class LinkFault(Fault):
     """Something wrong with a link, as its proxy does it."""
 
+    in_tables = "{what} link {link}"
     link: Link
 
     @property
@@ -81,11 +85,6 @@ class LinkFault(Fault):
         """Kind of the fault, and the share of frames hit."""
         given = self.model_dump(mode="json", exclude={"at_s", "duration_s", "kind", "link"})
         return " ".join([self.kind, *(f"{name}={value}" for name, value in given.items())])
-
-    @property
-    def label(self) -> str:
-        """What tables call it."""
-        return f"{super().label} link {self.link}"
 
 
 class FrameFault(LinkFault):
@@ -187,14 +186,10 @@ class ExceptionAnswer(FrameFault):
 class ProcessFault(Fault):
     """Something done to a process."""
 
+    in_tables = "{kind} {process}"
     process: Literal["optimizer", "control", "plant"]
     offset_ms: Milliseconds = 0.0
     """Real time by which the signal is sent later than the tick, while the rig moves on."""
-
-    @property
-    def label(self) -> str:
-        """What tables call it."""
-        return f"{self.kind} {self.process}"
 
     @property
     def processes(self) -> frozenset[str]:
@@ -224,12 +219,8 @@ class Restart(ProcessFault):
 class Clock(Fault):
     """A jump of the clock as all three processes see it: all are suspended and resumed."""
 
+    in_tables = "clock +{duration_s:g} s"
     kind: Literal["clock"]
-
-    @property
-    def label(self) -> str:
-        """What tables call it."""
-        return f"clock +{self.duration_s:g} s"
 
     @property
     def processes(self) -> frozenset[str]:
@@ -263,6 +254,7 @@ class Sensor(Fault):
 class BoundaryFault(Fault):
     """Something that a refrigerator is given is otherwise: a compressor trips, nitrogen runs out, helium leaks."""
 
+    in_tables = "{target} = {value:g}"
     kind: Literal["given"]
     target: EventTarget
     value: Annotated[float, Field(allow_inf_nan=False)]
@@ -271,11 +263,6 @@ class BoundaryFault(Fault):
     def _possible(self) -> Self:
         RefrigeratorEvent(at_s=0.0, target=self.target, value=self.value)
         return self
-
-    @property
-    def label(self) -> str:
-        """What tables call it."""
-        return f"{self.target} = {self.value:g}"
 
 
 class WrongModel(Fault):

@@ -2,14 +2,122 @@
 
 import asyncio
 import contextlib
+import random
 import socket
 import struct
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AsyncExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Final, NamedTuple, Self
 
+from coldloop.errors import UsageError
 from coldloop.modbus.endpoints import Endpoint
-from coldloop_rig.chaos.disturbance import Mangler, take_frames
-from coldloop_rig.chaos.faults import Direction, FrameFault, Freeze, LinkFault, Reset
+from coldloop.modbus.framing import MalformedFrameError, next_frame
+from coldloop_rig.chaos import faults
+from coldloop_rig.chaos.plan import LinkPlan
+from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.cosim.wiring import Detours, ReservedPorts, RigEndpoints, retaining
+from coldloop_rig.settings import Settings
+
+Replacing = faults.Drop | faults.Duplicate | faults.ExceptionAnswer | faults.Flip | faults.WrongUnit
+UNIT: Final = 6
+"""Where a frame has its unit; the function comes next."""
+
+
+class FrameAction(NamedTuple):
+    """How one frame is forwarded."""
+
+    data: bytes
+    """Bytes to forward, with any that were held back before."""
+    delay_s: float = 0.0
+    """Delay before forwarding."""
+    close: bool = False
+    """Whether the connection is closed afterwards."""
+    reset: bool = False
+    """Whether it is closed by a reset (RST)."""
+
+
+class Mangler:
+    """Decides about the frames of one direction of one connection: seed, frames and faults determine it."""
+
+    def __init__(self, direction: faults.Direction, seed: str) -> None:
+        self.direction = direction
+        self._draw = random.Random(seed)  # noqa: S311 not for secrets
+        self._held = b""
+        self.hold_s: float | None = None
+        """While a frame is held back: how long, unless another one comes."""
+
+    def decide(self, frame: bytes, active: Iterable[faults.FrameFault]) -> FrameAction:  # noqa: C901 a branch for each kind
+        """Return how a frame is forwarded under the active faults."""
+        pieces, delay_s, overtaken = [frame], 0.0, self.release()
+        for fault in active:
+            if fault.direction not in {faults.Direction.BOTH, self.direction}:
+                continue
+            if isinstance(fault, faults.Delay):
+                delay_s += max(0.0, fault.delay_ms + fault.jitter_ms * self._draw.uniform(-1, 1)) / 1000
+            elif isinstance(fault, faults.Truncate):
+                if pieces and self._hit(fault.share):
+                    return FrameAction(b"".join(pieces[:-1]) + pieces[-1][: len(pieces[-1]) // 2], delay_s, close=True)
+            elif isinstance(fault, faults.Abort):
+                if pieces and self._hit(fault.share):
+                    return FrameAction(b"", delay_s, close=True, reset=True)
+            elif isinstance(fault, faults.Reorder):
+                if pieces and not overtaken and self._hit(fault.share):
+                    self._held, self.hold_s = pieces.pop(), fault.hold_ms / 1000
+            elif isinstance(fault, Replacing):
+                pieces = [new for piece in pieces for new in self._instead(piece, fault)]
+            else:
+                raise TypeError(f"no frame is disturbed by {fault.kind}: add a branch")
+        return FrameAction(b"".join([*pieces, overtaken]), delay_s)
+
+    def release(self) -> bytes:
+        """Return the held frame and clear it."""
+        held, self._held, self.hold_s = self._held, b"", None
+        return held
+
+    def _instead(self, piece: bytes, fault: Replacing) -> list[bytes]:
+        """Return the frames that replace `piece`."""
+        if not self._hit(fault.share):
+            return [piece]
+        if isinstance(fault, faults.Drop):
+            return []
+        if isinstance(fault, faults.Duplicate):
+            return [piece, piece]
+        if isinstance(fault, faults.Flip):
+            return [self._flipped(piece, fault.bits)]
+        return [_with_other_words(piece, fault) if len(piece) > UNIT + 1 else piece]
+
+    def _flipped(self, piece: bytes, bits: int) -> bytes:
+        damaged = bytearray(piece)
+        for bit in self._draw.sample(range(8 * len(piece)), min(bits, 8 * len(piece))):
+            damaged[bit // 8] ^= 1 << bit % 8
+        return bytes(damaged)
+
+    def _hit(self, share: float) -> bool:
+        return self._draw.random() < share
+
+
+def _with_other_words(frame: bytes, fault: faults.ExceptionAnswer | faults.WrongUnit) -> bytes:
+    unit, function = frame[UNIT], frame[UNIT + 1]
+    if isinstance(fault, faults.WrongUnit):
+        return frame[:UNIT] + bytes([unit + 1 & 0xFF]) + frame[UNIT + 1 :]
+    return frame[:4] + b"\x00\x03" + bytes([unit, function | 0x80, fault.code])
+
+
+def take_frames(buffer: bytearray) -> list[bytes]:
+    """Take all whole frames out of a buffer; what is not Modbus/TCP comes as one piece, unchanged."""
+    frames, position = [], 0
+    try:
+        while (frame := next_frame(buffer, position)) is not None:
+            frames.append(bytes(buffer[position : frame.end]))
+            position = frame.end
+    except MalformedFrameError:
+        frames.append(bytes(buffer[position:]))
+        position = len(buffer)
+    del buffer[:position]
+    return frames
+
 
 HOST: Final = "127.0.0.1"
 CHUNK: Final = 4096
@@ -42,7 +150,7 @@ class LinkProxy:
         self._host = host
         self._tell = tell
         self._seed = seed
-        self._faults: list[LinkFault] = []
+        self._faults: list[faults.LinkFault] = []
         self._flowing = asyncio.Event()
         self._flowing.set()
         self._number = 0
@@ -66,19 +174,19 @@ class LinkProxy:
         await asyncio.gather(*self._serving, return_exceptions=True)
         await asyncio.sleep(0)  # aborted connections close their sockets in the next turn of the loop
 
-    def begin(self, fault: LinkFault) -> None:
+    def begin(self, fault: faults.LinkFault) -> None:
         """Disturb the link."""
         self._faults.append(fault)
-        if isinstance(fault, Freeze):
+        if isinstance(fault, faults.Freeze):
             self._flowing.clear()
-        elif isinstance(fault, Reset):
+        elif isinstance(fault, faults.Reset):
             for writer in tuple(self._open):
                 reset(writer)
 
-    def end(self, fault: LinkFault) -> None:
+    def end(self, fault: faults.LinkFault) -> None:
         """Stop disturbing it."""
         self._faults.remove(fault)
-        if not any(isinstance(other, Freeze) for other in self._faults):
+        if not any(isinstance(other, faults.Freeze) for other in self._faults):
             self._flowing.set()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -91,7 +199,7 @@ class LinkProxy:
                     one.cancel()
         ends = [writer]
         try:
-            if any(isinstance(fault, Reset) for fault in self._faults):
+            if any(isinstance(fault, faults.Reset) for fault in self._faults):
                 reset(writer)
                 return
             far_reader, far_writer = await asyncio.open_connection(self._target.host, self._target.port)
@@ -119,8 +227,8 @@ class LinkProxy:
         self._number += 1
         seed = f"{self._seed}/{self._number}"
         pumps = [
-            asyncio.create_task(self._pump(near[0], far[1], Mangler(Direction.REQUESTS, f"{seed}/requests"))),
-            asyncio.create_task(self._pump(far[0], near[1], Mangler(Direction.ANSWERS, f"{seed}/answers"))),
+            asyncio.create_task(self._pump(near[0], far[1], Mangler(faults.Direction.REQUESTS, f"{seed}/requests"))),
+            asyncio.create_task(self._pump(far[0], near[1], Mangler(faults.Direction.ANSWERS, f"{seed}/answers"))),
         ]
         try:
             ended, left = await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
@@ -157,7 +265,7 @@ class LinkProxy:
 
     async def _pass(self, frame: bytes, writer: asyncio.StreamWriter, mangler: Mangler) -> bool:
         """Forward a frame as decided; return whether the connection stays open."""
-        outcome = mangler.decide(frame, [fault for fault in self._faults if isinstance(fault, FrameFault)])
+        outcome = mangler.decide(frame, [fault for fault in self._faults if isinstance(fault, faults.FrameFault)])
         if outcome.delay_s > 0:
             await asyncio.sleep(outcome.delay_s)
         await self._flowing.wait()
@@ -175,3 +283,96 @@ def reset(writer: asyncio.StreamWriter) -> None:
     if connection is not None and not writer.is_closing():
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_NOT)
     writer.transport.abort()
+
+
+async def disturb(plan: LinkPlan, listen: tuple[str, int], target: Endpoint, say: Callable[[str], object]) -> None:
+    """Pass frames on to a server, under the faults of a plan, until it is cancelled.
+
+    `say` is called with lines: where the proxy listens, faults that begin and end, refused connections.
+
+    Raises:
+        UsageError: It cannot listen at the address and port `listen`.
+    """
+    host, port = listen
+    loop = asyncio.get_running_loop()
+    proxy = LinkProxy(port, target, str(plan.seed), host=host, tell=say)
+    try:
+        await proxy.start()
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise UsageError(f"--listen {host}:{port}: {reason}; name an address and a free port of this machine") from None
+    try:
+        say(f"{host}:{proxy.port} -> {target.host}:{target.port}")
+        began = loop.time()
+        for change in plan.changes():
+            await asyncio.sleep(began + change.at_s - loop.time())
+            (proxy.begin if change.begins else proxy.end)(change.fault)
+            say(f"{change.at_s:9.1f} s  {'begin' if change.begins else 'end'} {change.fault.in_words}")
+        await loop.create_future()
+    finally:
+        await proxy.close()
+
+
+class LinkProxies:
+    """A proxy in each of the two links; a context that has their ports. The seed decides which frames are hit."""
+
+    def __init__(self, seed: str) -> None:
+        self._seed = seed
+        self._reserved = ReservedPorts(len(Detours._fields))
+        self.detours = Detours(*self._reserved.numbers)
+        self.by_link: Mapping[faults.Link, LinkProxy] = {}
+
+    def put_before(self, ends: RigEndpoints) -> None:
+        """Make them, for these servers."""
+        self.by_link = {
+            faults.Link.PLANT: LinkProxy(self.detours.plant, ends.plant, f"{self._seed}/plant"),
+            faults.Link.OPTIMIZER: LinkProxy(self.detours.control_plc, ends.control_plc, f"{self._seed}/optimizer"),
+        }
+
+    async def connect(self) -> None:
+        """Start them: until then no client reaches a server."""
+        for proxy in self.by_link.values():
+            await proxy.start()
+
+    async def __aenter__(self) -> Self:
+        """Return them, not started yet."""
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Close them."""
+        for proxy in self.by_link.values():
+            await proxy.close()
+        self._reserved.release()
+
+
+class ProxiedServices:
+    """Processes of the three services, whose clients are pointed at proxies; an async context in which they run.
+
+    The control PLC and the plant keep their state in the folder: one that is killed and restarted resumes. Logs are in
+    `logs` there.
+    """
+
+    def __init__(self, settings: Settings, folder: Path, seed: str) -> None:
+        self._proxies = LinkProxies(seed)
+        self.services = LocalServices(
+            retaining(settings, folder, always=True), folder / "logs", detours=self._proxies.detours
+        )
+        self._proxies.put_before(self.services.endpoints)
+        self.proxies = self._proxies.by_link
+        self._stack = AsyncExitStack()
+
+    async def __aenter__(self) -> Self:
+        """Start the services."""
+        await self._stack.enter_async_context(self._proxies)
+        await self._stack.enter_async_context(self.services)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End services and proxies."""
+        await self._stack.__aexit__(kind, error, trace)
+
+    async def connect_links(self) -> None:
+        """Start the proxies: until then no service reaches another one."""
+        await self._proxies.connect()

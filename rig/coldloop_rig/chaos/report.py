@@ -1,21 +1,63 @@
-"""The files of a run under chaos, and its table."""
+"""What is shown of a run under chaos: its progress, table, files and picture."""
 
+import time
 from collections import Counter
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+from coldloop.number_text import ends_text
 from coldloop.parsing import parsed_json
 from coldloop.process.declaration import Process
-from coldloop.registers.control_plc import Mode
+from coldloop.process.sections import Input
+from coldloop.registers.control_plc import LadderStatus, Mode
 from coldloop.registers.safety import AlarmState, alarm_key, alarms_of
 from coldloop.service.event_text import alarm_word
-from coldloop.whole_file import whole_text
-from coldloop_rig.chaos.evaluation import Evaluation, RaisedAlarm, Row
+from coldloop.whole_file import whole_file, whole_text
+from coldloop_rig.chaos.evaluation import ChaosTrace, Evaluation, RaisedAlarm, Row
+from coldloop_rig.chaos.experiment import Experiment
 from coldloop_rig.chaos.plan import ChaosPlan
-from coldloop_rig.chaos.trace import ChaosTrace
+from coldloop_rig.figures import plot
+from coldloop_rig.progress import PlantTimeBar, clock, make_console
 from coldloop_rig.results.folders import write_json
 from coldloop_rig.text_tables import aligned, markdown_table
+
+REFRESH_S: Final = 0.2
+
+
+class ChaosProgress(PlantTimeBar):
+    """A progress bar on standard error: plant time, mode, and the faults that are on."""
+
+    def __init__(self, plan: ChaosPlan) -> None:
+        self._bar = Progress(
+            TextColumn("{task.fields[clock]}"), BarColumn(bar_width=24), TaskProgressColumn(),
+            TextColumn("{task.fields[line]}"), console=make_console(), auto_refresh=False,
+        )  # fmt: skip
+        self._task = self._bar.add_task("", total=plan.ticks, clock="0:00:00", line="")
+        self._plan = plan
+        self._shown = time.monotonic()
+
+    def __call__(self, tick: int, ladder: LadderStatus | None, faults: list[str]) -> None:
+        """Show where the run is, a few times a second, and its end."""
+        now = time.monotonic()
+        if now - self._shown < REFRESH_S and tick < self._plan.ticks:
+            return
+        self._shown = now
+        self._bar.start()
+        mode = Mode(ladder.mode).name if ladder is not None else "control PLC away"
+        self._bar.update(
+            self._task, completed=tick, clock=clock(tick * self._plan.process.tick_s),
+            line="  ".join([mode, *faults]),
+        )  # fmt: skip
+        self._bar.refresh()
+
 
 MANY_MODES: Final = 8
 """More modes than this are not all named in a table."""
@@ -31,19 +73,10 @@ def _headings(process: Process) -> list[str]:
     return ["fault", "at s", "lasted s", "modes", "alarms (s after)", "step/limit", *bands, "back to MPC s"]
 
 
-def write_report(
-    out: Path, plan: ChaosPlan, trace: ChaosTrace, evaluation: Evaluation, hashes: dict[str, str], failure: str | None
-) -> None:
+def write_report(out: Path, experiment: Experiment) -> None:
     """Write chaos.json and chaos.md."""
-    write_json(out / "chaos.json", document(plan, trace, evaluation, hashes, failure))
-    whole_text(out / "chaos.md", _page(plan, trace, evaluation, failure))
-
-
-def document(
-    plan: ChaosPlan, trace: ChaosTrace, evaluation: Evaluation, hashes: dict[str, str], failure: str | None
-) -> dict[str, Any]:
-    """Return what chaos.json holds."""
-    return {
+    plan, trace, undisturbed, evaluation, _, failure = experiment
+    write_json(out / "chaos.json", {
         "plan": parsed_json(plan.model_dump_json()),
         "failure": failure,
         "faults": [
@@ -61,8 +94,19 @@ def document(
         "resources": [sample._asdict() for sample in trace.resources],
         "log_lines": trace.log_lines,
         "wall_seconds": round(trace.seconds, 3),
-        **hashes,
-    }
+        "trace_sha256": trace.recording().trace_sha256,
+        "undisturbed_trace_sha256": undisturbed.trace_sha256,
+    })  # fmt: skip
+    lines = [
+        f"# Chaos plan {plan.name}\n",
+        f"{plan.description}\n",
+        f"Load {plan.load}, {plan.duration_s:g} s, seed {plan.seed}, {plan.mode}.\n",
+        *([f"**The run failed:** {failure}\n"] if failure else []),
+        markdown_table(_headings(trace.process), (_cells(row, trace.process) for row in evaluation.rows)) + "\n",
+        *(f"- {line}" for line in summary_lines(trace, evaluation)),
+        "\n![Outputs, inputs, modes, faults](chaos.png)\n",
+    ]
+    whole_text(out / "chaos.md", "\n".join(lines))
 
 
 def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
@@ -84,13 +128,6 @@ def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
     active = [alarm_word(i, process) for i, alarm in enumerate(trace.alarms) if alarm.state != AlarmState.NORMAL]
     if active:
         lines.append(f"alarms active or unacknowledged: {', '.join(active)}")
-    return [*lines, *_resource_lines(trace)]
-
-
-def _resource_lines(trace: ChaosTrace) -> list[str]:
-    if not trace.resources:
-        return []
-    lines = []
     for service, count in trace.log_lines.items():
         sizes = [sample.rss_mb[service] for sample in trace.resources if service in sample.rss_mb]
         if sizes:
@@ -99,19 +136,6 @@ def _resource_lines(trace: ChaosTrace) -> list[str]:
                 f"{count} log lines"
             )
     return lines
-
-
-def _page(plan: ChaosPlan, trace: ChaosTrace, evaluation: Evaluation, failure: str | None) -> str:
-    lines = [
-        f"# Chaos plan {plan.name}\n",
-        f"{plan.description}\n",
-        f"Load {plan.load}, {plan.duration_s:g} s, seed {plan.seed}, {plan.mode}.\n",
-        *([f"**The run failed:** {failure}\n"] if failure else []),
-        markdown_table(_headings(trace.process), (_cells(row, trace.process) for row in evaluation.rows)) + "\n",
-        *(f"- {line}" for line in summary_lines(trace, evaluation)),
-        "\n![Outputs, inputs, modes, faults](chaos.png)\n",
-    ]
-    return "\n".join(lines)
 
 
 def _cells(row: Row, process: Process) -> list[str]:
@@ -140,3 +164,90 @@ def _alarms(alarms: Sequence[RaisedAlarm], process: Process) -> str:
     times, first = Counter(name for name, _ in named), dict(reversed(named))
     cells = [f"{name} {first[name]:g}" + (f" (x{count})" if count > 1 else "") for name, count in times.items()]
     return ", ".join(cells) or "none"
+
+
+MODE_COLOURS: Final = {
+    Mode.MPC: plot.INK, Mode.REST: "#7f9cb8", Mode.HOLD: "#d9a441", Mode.CLASSICAL: plot.ACCENT,
+    Mode.MANUAL: plot.THIRD,
+}  # fmt: skip
+MANY: Final = 24
+"""More faults than this are marked, but not named."""
+
+
+def plot_chaos(path: Path, experiment: Experiment) -> None:
+    """Draw outputs with their bands and without faults, inputs, and modes, with the faults marked (PNG)."""
+    plan, trace, undisturbed, _, design, _ = experiment
+    process = trace.process
+    minutes = np.arange(trace.ticks) * process.tick_s / 60
+    recording = trace.recording()
+    bands = list(zip(design.output_low, design.output_high, strict=True))
+    with plot.styled({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False}):
+        figure = Figure(figsize=(10, 10), layout="constrained")
+        units: dict[str, list[int]] = {}  # inputs that have the same unit share a panel
+        for number, unit in enumerate(process.input_units):
+            units.setdefault(unit, []).append(number)
+        *panels, ribbon = figure.subplots(
+            len(bands) + len(units) + 1, 1, sharex=True, height_ratios=[*[3] * (len(bands) + len(units)), 1]
+        )
+        axes: list[Axes] = panels
+        controlled = zip(process.controlled, process.banded, bands, strict=True)
+        for place, (output, one, band) in zip(axes, controlled, strict=False):
+            place.axhspan(*band, color=plot.BAND, alpha=0.35, label=f"band {ends_text(*band)}")
+            place.plot(minutes, undisturbed.y[:, output], color=plot.THIRD, linewidth=0.8, label="undisturbed")
+            place.plot(minutes, recording.y[:, output], color=plot.INK, linewidth=1, label="with faults")
+            place.set_ylabel(plot.with_unit(one.name, one.unit))
+            plot.legend_above(place)
+        for place, inputs in zip(axes[len(bands) :], units.values(), strict=True):
+            _inputs(place, [process.inputs[i] for i in inputs], minutes, recording.u[:, inputs])
+        _draw_modes(ribbon, trace)
+        for place in axes:
+            _mark_faults(place, trace)
+        _name_faults(axes[0], trace)
+        ribbon.set_xlabel("time (min)")
+        ribbon.set_xlim(0, trace.ticks * process.tick_s / 60)
+        plot.label_marks(figure)
+        figure.suptitle(f"{plan.name}: {plan.description}")
+        whole_file(path, lambda draft: figure.savefig(draft, dpi=130, format="png"))
+
+
+def _inputs(axes: Axes, inputs: Sequence[Input], minutes: plot.Series, u: plot.Series) -> None:
+    for one, values, colour in zip(inputs, u.T, cycle(plot.COLOURS), strict=False):
+        axes.plot(minutes, values, color=colour, linewidth=1, label=one.name)
+    axes.set_ylim(*plot.view(u))
+    axes.set_ylabel(plot.with_unit(inputs[0].name if len(inputs) == 1 else "inputs", inputs[0].unit))
+    if len(inputs) > 1:
+        plot.legend_above(axes)
+
+
+def _draw_modes(axes: Axes, trace: ChaosTrace) -> None:
+    tick_s = trace.process.tick_s
+    changes = [(event.tick, Mode(event.subject)) for event in trace.modes()]
+    ends = [tick for tick, _ in changes[1:]] + [trace.ticks]
+    for (tick, mode), end in zip(changes, ends, strict=False):
+        axes.axvspan(tick * tick_s / 60, end * tick_s / 60, color=MODE_COLOURS[mode], linewidth=0)
+    present = {mode for _, mode in changes}
+    axes.legend(
+        handles=[Patch(color=colour, label=mode.name) for mode, colour in MODE_COLOURS.items() if mode in present],
+        loc="upper center", bbox_to_anchor=(0.5, -0.6), ncols=len(MODE_COLOURS), frameon=False,
+    )  # fmt: skip
+    axes.set_yticks([])
+    axes.set_ylabel("mode")
+
+
+def _mark_faults(axes: Axes, trace: ChaosTrace) -> None:
+    tick_s = trace.process.tick_s
+    for mark in trace.marks:
+        begin, end = mark.begin * tick_s / 60, (mark.end or mark.begin) * tick_s / 60
+        axes.axvline(begin, color=plot.ACCENT, linewidth=0.8, linestyle=":")
+        if end > begin:
+            axes.axvspan(begin, end, color=plot.ACCENT, alpha=0.08, linewidth=0)
+
+
+def _name_faults(axes: Axes, trace: ChaosTrace) -> None:
+    if len(trace.marks) > MANY:
+        return
+    for mark in trace.marks:
+        axes.annotate(
+            mark.fault.label, (mark.begin * trace.process.tick_s / 60, 1.14), xycoords=("data", "axes fraction"),
+            rotation=35, ha="left", va="bottom", fontsize=7,
+        )  # fmt: skip

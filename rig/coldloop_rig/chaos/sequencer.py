@@ -2,22 +2,222 @@
 
 import asyncio
 import contextlib
+import re
+import signal
 import time
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final, NamedTuple, TypeVar
 
-from coldloop.errors import LinkError
+import numpy as np
+
+from coldloop.config import PREFIX
+from coldloop.errors import LinkError, PeerUnreachableError, RequestRefusedError
+from coldloop.modbus.client import RegisterClient
+from coldloop.process.cold_box import L1, TICK_S
+from coldloop.process.lti_model import discretise, load
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import LadderStatus
+from coldloop.registers.plant import SensorFault, SensorFaultKind, Surroundings
 from coldloop.registers.safety import Alarm, alarms_of
-from coldloop_rig.chaos.faults import AnyFault, ProcessFault, WrongModel
-from coldloop_rig.chaos.injection import Injector
+from coldloop_plant.cold_box.model import find_equilibrium, linearise
+from coldloop_plant.helium.properties import load_helium
+from coldloop_plant.kinds import box_of
+from coldloop_rig.chaos import faults
+from coldloop_rig.chaos.evaluation import ChaosTrace, Mark, Resources
 from coldloop_rig.chaos.plan import ChaosPlan
-from coldloop_rig.chaos.resources import log_lines, resident_mb
-from coldloop_rig.chaos.timeline import Moment, Timeline
-from coldloop_rig.chaos.trace import ChaosTrace, Mark, Resources
+from coldloop_rig.chaos.proxy import LinkProxy
 from coldloop_rig.cosim.local_services import LocalServices
-from coldloop_rig.cosim.session import SessionClient
+from coldloop_rig.cosim.session import CONTACT_S, SessionClient
+from coldloop_rig.cosim.wiring import SERVICES
+
+WRONG_MODEL: Final = "wrong_model.json"
+"""Its file in the folder of a run."""
+MOVED_INPUTS: Final = (-3.0, -15.0, 2.0)
+"""From those of the right model: CV155 %, NCR22_A W, CV156 %."""
+GAIN: Final = 0.9
+"""Of other processes: over those of the right model."""
+
+
+def save_wrong_model(right: Path, wrong: Path) -> None:
+    """Write the model of the same plant with its inputs moved by `MOVED_INPUTS`; of another process with less gain."""
+    model, helium = load(right), load_helium()
+    if model.process:
+        less = replace(model, B=GAIN * model.B, D=GAIN * model.D, B_tick=GAIN * model.B_tick, declaration_digest="")
+        less.save(wrong)
+        return
+    box = box_of(model)
+    rest = find_equilibrium(model.u0 + np.array(MOVED_INPUTS), float(model.y0[L1]), box, helium)
+    linear = linearise(rest.x, rest.u, rest.w, box, helium)
+    tick = discretise(linear.A, linear.B, linear.F, TICK_S)
+    replace(
+        model, **linear._asdict(), A_tick=tick.A, B_tick=tick.B, F_tick=tick.F,
+        x0=rest.x, u0=rest.u, w0=rest.w, y0=rest.y,
+    ).save(wrong)  # fmt: skip
+
+
+T = TypeVar("T")
+
+ATTEMPTS: Final = 20
+_SHOWN: Final = {"nan": SensorFaultKind.NOT_A_NUMBER, "frozen": SensorFaultKind.FROZEN, "value": SensorFaultKind.VALUE}
+
+
+@dataclass
+class Injector:
+    """Acts on the processes, the proxies and the plant's sensors of one run, in whose folder is a wrong model."""
+
+    services: LocalServices
+    proxies: Mapping[faults.Link, LinkProxy]
+    plant: RegisterClient
+    folder: Path
+    _given_before: dict[str, float] = field(default_factory=dict)
+
+    async def begin(self, fault: faults.AnyFault) -> None:
+        """Bring a fault about."""
+        if isinstance(fault, faults.LinkFault):
+            self.proxies[fault.link].begin(fault)
+        elif isinstance(fault, faults.Kill):
+            await self.services.stop(faults.SERVICE_OF[fault.process], signal.SIGKILL)
+        elif isinstance(fault, faults.Restart):
+            await self.services.stop(faults.SERVICE_OF[fault.process], signal.SIGTERM)
+        elif isinstance(fault, faults.Pause | faults.Clock):
+            for service in filter(fault.processes.__contains__, SERVICES):
+                self.services.pause(service)
+        elif isinstance(fault, faults.Sensor):
+            await self._set_sensor(fault.output, SensorFault(_SHOWN[fault.shows], fault.value or 0.0))
+        elif isinstance(fault, faults.BoundaryFault):
+            before = await self._give(fault.target, fault.value)
+            self._given_before.setdefault(fault.target, before)
+        elif isinstance(fault, faults.WrongModel):
+            await self.services.stop("optimizer_plc", signal.SIGTERM)
+            await self.services.start(
+                "optimizer_plc", {f"{PREFIX}MODEL__FILE": str(self.folder / WRONG_MODEL)}, may_end=True
+            )
+
+    async def end(self, fault: faults.AnyFault) -> str | None:
+        """Take a fault back; return the service that has been started again, if one has."""
+        if isinstance(fault, faults.LinkFault):
+            self.proxies[fault.link].end(fault)
+        elif isinstance(fault, faults.Kill | faults.Restart):
+            service = faults.SERVICE_OF[fault.process]
+            await self.services.start(service)
+            return service
+        elif isinstance(fault, faults.Pause | faults.Clock):
+            for service in filter(fault.processes.__contains__, SERVICES):
+                self.services.resume(service)
+        elif isinstance(fault, faults.Sensor):
+            await self._set_sensor(fault.output, SensorFault(SensorFaultKind.NONE, 0.0))
+        elif isinstance(fault, faults.BoundaryFault):
+            await self._give(fault.target, self._given_before.pop(fault.target))
+        elif isinstance(fault, faults.WrongModel):
+            await self.services.stop("optimizer_plc", signal.SIGTERM)
+            await self.services.start("optimizer_plc")
+            return "optimizer_plc"
+        return None
+
+    async def _give(self, target: str, value: float) -> float:
+        """Change one of a refrigerator's surroundings; return its old value."""
+
+        async def write() -> float:
+            given = await self.plant.read(Surroundings)
+            before = getattr(given, target)
+            await self.plant.write(given._replace(**{target: type(before)(value)}))
+            return float(before)
+
+        return await _insisted(write, f"{target} = {value:g}")
+
+    async def _set_sensor(self, output: str, fault: SensorFault) -> None:
+        row = self.plant.process.output_names.index(output)
+        await _insisted(lambda: self.plant.write_rows([fault], row), f"sensor fault for {output}")
+
+
+async def _insisted(request: Callable[[], Awaitable[T]], what: str) -> T:
+    """Return the answer to a request, which is repeated for a while."""
+    reason = "no answer in time"
+    for _ in range(ATTEMPTS):
+        try:
+            async with asyncio.timeout(CONTACT_S):
+                return await request()
+        except (PeerUnreachableError, RequestRefusedError) as error:
+            reason = str(error)
+        except TimeoutError:
+            pass
+        await asyncio.sleep(0.5)
+    raise LinkError(f"the plant did not accept {what}: {reason}")
+
+
+class Moment(NamedTuple):
+    """The beginning or the end of a fault."""
+
+    tick: int
+    """Tick before which it is due."""
+    is_begin: bool
+    fault: faults.AnyFault
+    due_s: float | None = None
+    """Real time since the start of the session at which it is due in any case."""
+
+
+class Timeline:
+    """Faults that are still to come; `factor`: seconds of plant time in a second in real time, None in lock-step."""
+
+    def __init__(self, faults: Iterable[faults.AnyFault], factor: float | None) -> None:
+        self._factor = factor
+        self._begins = [Moment(fault.tick, True, fault) for fault in faults]  # noqa: FBT003 - a NamedTuple's field
+        self.on: list[Moment] = []
+        """Ends of the faults that are on, the next one first."""
+
+    @property
+    def next_tick(self) -> int | None:
+        """The tick of the next moment; None when there is none."""
+        return min((moment.tick for moment in [*self._begins[:1], *self.on[:1]]), default=None)
+
+    def left_s(self, seconds: float) -> float | None:
+        """Return the real time until an end is due by the clock; None when there is none."""
+        due = [end.due_s for end in self.on if end.due_s is not None]
+        return max(0.001, min(due) - seconds) if due else None
+
+    def due(self, tick: int, seconds: float) -> Moment | None:
+        """Take out and return a moment that is due; ends come before beginnings."""
+        for end in self.on:
+            if tick >= end.tick or (end.due_s is not None and seconds >= end.due_s):
+                return self.take(end)
+        if self._begins and tick >= self._begins[0].tick:
+            return self._begins.pop(0)
+        return None
+
+    def take(self, end: Moment) -> Moment:
+        """Take out the end of a fault."""
+        self.on.remove(end)
+        return end
+
+    def begun(self, moment: Moment, seconds: float) -> None:
+        """A fault has begun; its end is to come."""
+        fault = moment.fault
+        due_s = None if self._factor is None else seconds + fault.duration_s / self._factor
+        self.on.append(Moment(moment.tick + fault.end_tick - fault.tick, False, fault, due_s))  # noqa: FBT003
+        self.on.sort(key=lambda end: end.tick)
+
+
+def resident_mb(services: LocalServices) -> dict[str, float]:
+    """Return the resident memory of the services that run, where the system reports it (Linux)."""
+    sizes = {}
+    for service, process in services.processes.items():
+        with contextlib.suppress(OSError):
+            found = re.search(r"VmRSS:\s*(\d+) kB", Path(f"/proc/{process.pid}/status").read_text(encoding="utf-8"))
+            if found:
+                sizes[service] = int(found[1]) / 1024
+    return sizes
+
+
+def log_lines(services: LocalServices) -> dict[str, int]:
+    """Return the number of lines in each log."""
+    counts = {}
+    for service in SERVICES:
+        with services.log(service).open("rb") as log:
+            counts[service] = sum(1 for _ in log)
+    return counts
+
 
 Progress = Callable[[int, LadderStatus | None, list[str]], None]
 """Takes the plant's tick, the state of the control PLC (None while it does not answer), and the faults that are on."""
@@ -31,28 +231,22 @@ RESOURCE_TICKS: Final = 1200
 LOOK_S: Final = 0.005
 
 
+@dataclass
 class FaultSequencer:
     """Takes a session from fault to fault."""
 
-    def __init__(
-        self,
-        plan: ChaosPlan,
-        services: LocalServices,
-        client: SessionClient,
-        injector: Injector,
-        trace: ChaosTrace,
-        progress: Progress,
-    ) -> None:
-        self._plan = plan
-        self._services = services
-        self._client = client
-        self._injector = injector
-        self._trace = trace
-        self._progress = progress
-        self._timeline = Timeline(plan.schedule(), factor=plan.factor if plan.realtime else None)
-        self._marks: dict[int, Mark] = {}
+    plan: ChaosPlan
+    services: LocalServices
+    client: SessionClient
+    injector: Injector
+    trace: ChaosTrace
+    progress: Progress
+    tick: int = 0
+    _marks: dict[int, Mark] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._timeline = Timeline(self.plan.schedule(), factor=self.plan.factor if self.plan.realtime else None)
         self._began = self._stopped_since = time.monotonic()
-        self.tick = 0
 
     async def run(self) -> None:
         """Drive the session to its end."""
@@ -62,17 +256,17 @@ class FaultSequencer:
             else:
                 await self._end(moment)
             self._stopped_since = time.monotonic()
-        alarms = await self._client.contact(
-            self._client.control.read_rows(Alarm, 0, len(alarms_of(self._client.control.process)))
+        alarms = await self.client.contact(
+            self.client.control.read_rows(Alarm, 0, len(alarms_of(self.client.control.process)))
         )
-        self._trace.alarms = alarms or []
-        await self._client.conclude()
+        self.trace.alarms = alarms or []
+        await self.client.conclude()
 
     def finish(self) -> None:
         """Record the state at the end, however the run ended."""
-        self._trace.seconds = self._seconds
-        self._trace.log_lines = log_lines(self._services)
-        self._trace.lost_contacts = self._client.lost_contacts
+        self.trace.seconds = self._seconds
+        self.trace.log_lines = log_lines(self.services)
+        self.trace.lost_contacts = self.client.lost_contacts
 
     @property
     def _seconds(self) -> float:
@@ -87,90 +281,86 @@ class FaultSequencer:
             moment = self._timeline.due(self.tick, self._seconds) or self._cut_short()
             if moment is not None:
                 return moment
-            if self.tick >= self._plan.ticks:
+            if self.tick >= self.plan.ticks:
                 return None
-            await self._go_on(self._timeline.next_tick or self._plan.ticks)
+            await self._go_on(self._timeline.next_tick or self.plan.ticks)
             await asyncio.sleep(LOOK_S)
 
     async def _go_on(self, until: int) -> None:
-        if not self._plan.realtime:
-            await self._client.grant(min(until, self._plan.ticks))
+        if not self.plan.realtime:
+            await self.client.grant(min(until, self.plan.ticks))
 
     async def _look(self) -> LadderStatus | None:
         """Record what has happened; return the state of the control PLC, None while it does not answer."""
-        tick = await self._client.look()
-        ladder = await self._client.ladder()
+        tick = await self.client.look()
+        ladder = await self.client.ladder()
         if tick is not None and tick != self.tick:
             self.tick, self._stopped_since = tick, time.monotonic()
-        self._trace.ladder = ladder or self._trace.ladder
-        resources = self._trace.resources
+        self.trace.ladder = ladder or self.trace.ladder
+        resources = self.trace.resources
         if not resources or self.tick - resources[-1].tick >= RESOURCE_TICKS:
-            resources.append(Resources(self.tick, self._seconds, resident_mb(self._services)))
-        self._progress(self.tick, ladder, [moment.fault.label for moment in self._timeline.on])
+            resources.append(Resources(self.tick, self._seconds, resident_mb(self.services)))
+        self.progress(self.tick, ladder, [moment.fault.label for moment in self._timeline.on])
         return ladder
 
     def _cut_short(self) -> Moment | None:
-        """Return the end of a fault that stops plant time.
-
-        Raises:
-            LinkError: Plant time stopped without a fault.
-        """
+        """Return the end of a fault that stops plant time. Raises LinkError if plant time stopped without a fault."""
         stopped_s = time.monotonic() - self._stopped_since
         for end in self._timeline.on:
             fault = end.fault
-            bearable = self._plan.standstill_s
+            bearable = self.plan.standstill_s
             if fault.stops_time:
                 bearable = min(bearable, fault.duration_s)
-            if not self._plan.realtime and stopped_s > bearable:
+            if not self.plan.realtime and stopped_s > bearable:
                 return self._timeline.take(end)
-        tick_s = self._plan.process.tick_s
-        if not self._timeline.on and stopped_s > max(STANDSTILL_PATIENCE_S, 4 * tick_s / self._plan.factor):
+        tick_s = self.plan.process.tick_s
+        if not self._timeline.on and stopped_s > max(STANDSTILL_PATIENCE_S, 4 * tick_s / self.plan.factor):
             raise LinkError(
-                f"plan {self._plan.name}: the plant has been at {self.tick * tick_s:g} s for {stopped_s:.0f} s "
-                f"without a fault: see {self._services.log('control_plc')}"
+                f"plan {self.plan.name}: the plant has been at {self.tick * tick_s:g} s for {stopped_s:.0f} s "
+                f"without a fault: see {self.services.log('control_plc')}"
             )
         return None
 
     async def _begin(self, moment: Moment) -> None:
         fault = moment.fault
-        if isinstance(fault, ProcessFault) and fault.offset_ms:
+        if isinstance(fault, faults.ProcessFault) and fault.offset_ms:
             await self._go_on(fault.end_tick)  # the signal is to come while the rig moves on
             await asyncio.sleep(fault.offset_ms / 1000)
             await self._look()
-        mark = Mark(fault, begin=self.tick, first_event=len(self._trace.events))
+        mark = Mark(fault, begin=self.tick, first_event=len(self.trace.events))
         self._marks[id(fault)] = mark
-        self._trace.marks.append(mark)
-        await self._injector.begin(fault)
+        self.trace.marks.append(mark)
+        await self.injector.begin(fault)
         await self._look()
         mark.done = self.tick
-        if isinstance(fault, WrongModel) and not self._plan.realtime:
+        if isinstance(fault, faults.WrongModel) and not self.plan.realtime:
             await self._until_refused()
         self._timeline.begun(moment, self._seconds)
 
     async def _end(self, moment: Moment) -> None:
         mark = self._marks.pop(id(moment.fault))
-        started = await self._injector.end(moment.fault)
+        started = await self.injector.end(moment.fault)
         if started is not None:
             await self._until_up(started, moment.fault)
-        if not self._plan.realtime and not self._timeline.on:
+        if not self.plan.realtime and not self._timeline.on:
             await self._until_optimizer_is_known()
         await self._look()
         mark.end = self.tick
 
-    async def _until_up(self, service: str, fault: AnyFault) -> None:
+    async def _until_up(self, service: str, fault: faults.AnyFault) -> None:
         """Wait until a service that was started again answers."""
         since = time.monotonic()
-        while await self._client.contact(self._client.clients[service].read(Identity)) is None:
+        while await self.client.contact(self.client.clients[service].read(Identity)) is None:
             if time.monotonic() - since > RESTART_PATIENCE_S:
                 raise LinkError(f"after '{fault.label}' the {service} service does not answer: see its log")
-            if self._plan.realtime:
+            if self.plan.realtime:
                 await self._look()
             await asyncio.sleep(LOOK_S)
 
     async def _until_refused(self) -> None:
         """Hold plant time until an optimiser with a wrong model has ended, if it does."""
         since = time.monotonic()
-        while not self._services.ended("optimizer_plc") and time.monotonic() - since < PRESENCE_S:
+        while not self.services.ended("optimizer_plc") and time.monotonic() - since < PRESENCE_S:
             await self._look()
             await asyncio.sleep(LOOK_S)
 

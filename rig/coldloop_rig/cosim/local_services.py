@@ -17,10 +17,10 @@ from coldloop.errors import LinkError
 from coldloop.kernels.first_use import Kernels, announce
 from coldloop.parsing import parsed_json
 from coldloop.service.start import COMPILING, SERVING
+from coldloop_rig import PYTHON
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.cosim.session import SessionClient
 from coldloop_rig.cosim.wiring import SERVICES, START_PATIENCE_S, Detours, ReservedPorts, endpoints_on, wired
-from coldloop_rig.interpreter import PYTHON
 from coldloop_rig.results.recording import Recorder
 from coldloop_rig.settings import Settings
 

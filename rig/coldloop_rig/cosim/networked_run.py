@@ -22,8 +22,7 @@ from coldloop_rig.cosim.saved_session import restore_session, save_session
 from coldloop_rig.cosim.scenario import Job, Scenario, StopRequest, with_copied_load
 from coldloop_rig.cosim.session import SessionClient, SessionUnderWay, find_session, record_session
 from coldloop_rig.cosim.wiring import RigEndpoints, answered_in_time
-from coldloop_rig.results.recording import Recorder
-from coldloop_rig.results.way import Way
+from coldloop_rig.results.recording import Recorder, Way
 from coldloop_rig.settings import Settings
 
 SHOWN: Final[Mapping[str, Sequence[str]]] = {

@@ -13,8 +13,7 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.table import TIME
 from coldloop.whole_file import whole_text
 from coldloop_plant.load import HOUR_TICKS, named_families
-from coldloop_rig.results.recording import Recorder
-from coldloop_rig.results.way import Way
+from coldloop_rig.results.recording import Recorder, Way
 from coldloop_rig.settings import Settings
 
 INPUTS: Final = "inputs"

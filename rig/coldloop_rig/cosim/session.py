@@ -24,15 +24,9 @@ from coldloop.registers.maps import maps_of
 from coldloop.registers.optimizer_plc import Optimization, OptimizerSession
 from coldloop.registers.plant import HISTORY_ROWS, STATION_ROWS, LoadStatus, PlantSample, PlantSession, StationSample
 from coldloop_plant.kinds import own_header
-from coldloop.registers.optimizer_plc import OptimizerSession
-from coldloop.registers.plant import HISTORY_ROWS, STATION_ROWS, PlantSession
-from coldloop_plant.kinds import own_header
-from coldloop_rig.cosim.wiring import QUIET_S
-from coldloop_rig.cosim.wiring import RigEndpoints
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.cosim.wiring import QUIET_S, SERVICES, RigEndpoints
-from coldloop_rig.results.driving import CONTROL, PLANT
-from coldloop_rig.results.recording import SETTLED_TICKS, LinkStatistics, Recorder
+from coldloop_rig.results.recording import CONTROL, PLANT, SETTLED_TICKS, LinkStatistics, Recorder
 from coldloop_rig.settings import Settings
 
 T = TypeVar("T")

@@ -1,8 +1,11 @@
-"""The picture of a run, in the manner of the paper's time figures."""
+"""Figures of recorded runs as PNG, PDF or SVG, in the manner of the paper's time figures."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
+from io import BytesIO
+from itertools import cycle
+from pathlib import Path
 from string import ascii_lowercase, ascii_uppercase
 from threading import RLock
 from typing import Any, Final, NamedTuple
@@ -15,9 +18,17 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import ScalarFormatter
 from numpy.typing import NDArray
 
-from coldloop.number_text import axis_labels, ends_text
+from coldloop.errors import UsageError
+from coldloop.number_text import axis_labels, ends_text, number_text
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
 from coldloop.process.sections import Input, Output
+from coldloop.whole_file import whole_file
+from coldloop_rig.results.columns import STATION, excess_keys
+from coldloop_rig.results.folders import writing
+from coldloop_rig.results.recording import Way
+from coldloop_rig.results.run_folder import Curves, RunFolder
+from coldloop_rig.text_tables import aligned
 
 Series = NDArray[np.floating]
 
@@ -284,3 +295,175 @@ def alarm_times(events: Sequence[Mapping[str, Any]], scale_s: float, end: float)
         elif event["kind"] == "alarm returned" and event["subject"] in active:
             times.append((active.pop(event["subject"]), time))
     return times + [(begin, end) for begin in active.values()]
+
+
+DPI: Final = 130
+LEAST_PIXELS: Final = 900
+"""Width of a figure that is narrow on paper."""
+
+
+def plot_run(folder: Path, formats: Sequence[str]) -> list[Path]:
+    """Draw the run of a folder; return the files, `run.png` for the format png.
+
+    Raises:
+        OSError: A file cannot be written.
+        UsageError: There is no run in the folder.
+    """
+    figure = draw_run(curves_of(RunFolder(folder)))
+    paths = [folder / f"run.{extension}" for extension in formats]
+    for path in paths:
+        save_figure(figure, path)
+    return paths
+
+
+def draw_nothing() -> None:
+    """Draw one tick into memory: fonts, and what else the first figure of a process needs, are loaded then."""
+    series, edges = {name: np.zeros(1) for name in ("time_s", *labels_of(COLD_BOX))}, {"L1": (0.0, 1.0)}
+    draw_run(RunCurves(COLD_BOX, series, [], Bounds(edges, {}), "", "")).savefig(BytesIO(), dpi=DPI)
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure in the format of the file's name; nothing in it depends on the time of day."""
+    extension = path.suffix.removeprefix(".")
+    metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(extension)
+    dpi = max(DPI, LEAST_PIXELS / figure.get_figwidth())
+    with styled():
+        whole_file(path, lambda draft: figure.savefig(draft, dpi=dpi, format=extension, metadata=metadata))
+
+
+def curves_of(run: RunFolder) -> RunCurves:
+    """Return what is drawn of a run."""
+    pressures = pressure_limits(run.configuration) if (run.path / STATION).exists() else {}
+    process = run.process
+    series = run.series([*labels_of(process)])
+    if pressures:
+        series |= at_times(run.series(list(pressures), file_name=STATION), series["time_s"])
+    return RunCurves(
+        process,
+        series,
+        run.events(),
+        Bounds.of(run.configuration, process),
+        title_of(run.configuration, process, run.manifest["way"]),
+        identity_of(run.manifest),
+        pressures,
+    )
+
+
+def pressure_limits(configuration: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+    """Return the pressures of a station with the limits of their alarms, bar."""
+    alarms = {
+        key: float(configuration[f"plant.station.alarms.{key}_bar"])
+        for key in ("hp_low", "hp_high", "lp_low", "lp_high")
+    }
+    return {"P12": (alarms["hp_low"], alarms["hp_high"]), "P11": (alarms["lp_low"], alarms["lp_high"])}
+
+
+def at_times(series: Curves, times_s: NDArray[np.float64]) -> Curves:
+    """Return the curves of a file at the times of another one."""
+    known = series["time_s"]
+    return {n: np.interp(times_s, known, curve, np.nan, np.nan) for n, curve in series.items() if n != "time_s"}
+
+
+def title_of(configuration: Mapping[str, Any], process: Process, way: str = "") -> str:
+    """Return what a run was, in a few words; of a session that was recorded, the load is not known by name."""
+    named = f"load {Path(configuration['plant.load']).name}" if process.has_load else process.name
+    load = "session under way" if way == Way.RECORDED else named
+    if configuration["control_plc.driver"] == "classical":
+        return f"{load}, classical loops"
+    period = configuration["optimizer_plc.program.updating_period_s"]
+    updating = f"tau_u {period:g} s" if period else "tau_u adaptive"
+    solver = configuration.get("optimizer_plc.program.outside.solver") or configuration["optimizer_plc.program.solver"]
+    return f"{load}, solver {solver}, {updating}"
+
+
+def identity_of(manifest: Mapping[str, Any]) -> str:
+    """Return which run it was: trace, version, start, way; and whether it is complete."""
+    trace = manifest["hashes"]["trace_sha256"] or ""
+    parts = [
+        f"trace {trace[:12]}", f"coldloop {manifest['coldloop']}", manifest["started_utc"], manifest["way"],
+        f"model {manifest['hashes']['model_sha256'][:12]}",
+    ]  # fmt: skip
+    if not manifest["complete"]:
+        parts.append(f"INCOMPLETE, {manifest['recorded_ticks']} of {manifest['ticks']} ticks: {manifest['reason']}")
+    return "  ·  ".join(parts)
+
+
+FIGURES: Final = (
+    "complete", "ticks", "updates", "J_BF", "J_open_mean", "J_dev", "J_cst", "c1", "c2", "tau_u_mean",
+    "tau_u_mean_per_update", "iterations_total",
+)  # fmt: skip
+
+
+def compare(paths: Sequence[Path], out: Path) -> str:
+    """Draw the runs over each other; return their table as text.
+
+    Raises:
+        UsageError: A folder has no run, or one of another process.
+        ResultsError: The figure cannot be written.
+    """
+    runs = [RunFolder(path) for path in paths]
+    process = runs[0].process
+    for run in runs:
+        if labels_of(run.process) != labels_of(process):
+            raise UsageError(f"{run.path}: a run of {run.process.name}, and not of {process.name}; compare runs of one")
+    names = [path.resolve().name for path in paths]
+    labels = names if len(set(names)) == len(names) else [str(path) for path in paths]
+    with writing(out):
+        save_figure(_draw_comparison(runs, labels), out)
+    return _comparison_table(runs, labels) + f"figure in {out}\n"
+
+
+def _comparison_table(runs: Sequence[RunFolder], labels: Sequence[str]) -> str:
+    summaries = [run.summary for run in runs]
+    rows = [["", *labels]]
+    process = runs[0].process
+    shares = (f"{one.name}_outside_band_pct" for one in process.banded)
+    figures = (*FIGURES, *shares, *excess_keys(process), "deadline_misses", "trace_sha256")
+    rows += [[name, *(_cell(summary.get(name)) for summary in summaries)] for name in figures]
+    keys = sorted({key for run in runs for key in run.configuration})
+    different = [key for key in keys if len({repr(run.configuration.get(key)) for run in runs}) > 1]
+    rows += [[key, *(_cell(run.configuration.get(key)) for run in runs)] for key in different]
+    return aligned(rows, numbers=True)
+
+
+def _cell(value: Any) -> str:  # noqa: ANN401 a value of a JSON document
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return number_text(value, 5)
+    return f"{value[:12]}" if isinstance(value, str) and len(value) == 64 else str(value)
+
+
+def _draw_comparison(runs: Sequence[RunFolder], labels: Sequence[str]) -> Figure:
+    named = labels_of(runs[0].process)
+    curves = [run.series([*named]) for run in runs]
+    scale_s, unit = time_unit(max((one["time_s"] for one in curves), key=lambda times: float(times[-1])))
+    with styled():
+        figure = Figure(figsize=(9.5, 13), layout="constrained")
+        axes: dict[str, Axes] = dict(zip(named, figure.subplots(len(named), 1, sharex=True), strict=True))
+        for one, label, colour in zip(curves, labels, cycle(COLOURS), strict=False):
+            for name, place in axes.items():
+                if name == "tau_u_s":
+                    draw_tau_u(place, one["time_s"] / scale_s, one[name], one["time_s"], colour, label)
+                else:
+                    place.plot(one["time_s"] / scale_s, one[name], color=colour, linewidth=0.9, label=label)
+        _scale(axes, runs[0], curves)
+        for name, label in named.items():
+            axes[name].set_ylabel(label)
+            legend_above(axes[name])
+        label_marks(figure)
+        axes["stage_cost"].set_xlabel(f"plant time ({unit})")
+        axes["stage_cost"].set_xlim(0, max(float(one["time_s"][-1]) for one in curves) / scale_s)
+        figure.align_ylabels(list(axes.values()))
+        figure.suptitle("  ·  ".join(labels))
+    return figure
+
+
+def _scale(axes: dict[str, Axes], first: RunFolder, curves: Sequence[Curves]) -> None:
+    bounds = Bounds.of(first.configuration, first.process)
+    for name, edges in {**bounds.bands, **bounds.inputs}.items():
+        values = np.concatenate([one[name] for one in curves])
+        limit(axes[name], values, edges, f"{'band' if name in bounds.bands else 'bounds'} {ends_text(*edges)}")
+    axes["tau_u_s"].set_ylim(0, first.process.sampling_period_s + 0.3)
+    axes["stage_cost"].set_yscale("log")
+    axes["stage_cost"].set_ylim(bottom=1e-6)

@@ -14,17 +14,13 @@ from typing import Final, Self
 
 from coldloop.errors import ColdloopError, ResultsError, UsageError
 from coldloop.parsing import parsed_json
-from coldloop_rig.interpreter import PYTHON
+from coldloop_rig import PYTHON
 
 COMMAND: Final = (*PYTHON, "-m", "coldloop_rig.figures.worker")
 
 
 class FigureProcess:
-    """Draws the figure of a run; a context at whose end its process has ended.
-
-    Args:
-        formats: Of the figure, such as png.
-    """
+    """Draws the figure of a run in some formats; a context at whose end its process has ended."""
 
     def __init__(self, formats: Sequence[str]) -> None:
         self._formats = list(formats)
@@ -71,7 +67,7 @@ class FigureProcess:
 
 def main() -> None:
     """Draw the run that standard input names; none when it is closed."""
-    from coldloop_rig.figures.run_plot import draw_nothing, plot_run  # noqa: PLC0415 what takes long comes before the wait
+    from coldloop_rig.figures.plot import draw_nothing, plot_run  # noqa: PLC0415 what takes long comes before the wait
 
     draw_nothing()
     request = sys.stdin.buffer.read()

@@ -26,8 +26,8 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from coldloop.errors import ColdloopError, UsageError
 from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
+from coldloop_rig import PYTHON
 from coldloop_rig.cosim.wiring import REQUIRED, RigEndpoints
-from coldloop_rig.interpreter import PYTHON
 from coldloop_rig.interruption import INTERRUPTION
 
 MOST_BYTES: Final = 65536

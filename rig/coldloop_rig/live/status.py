@@ -17,7 +17,7 @@ from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import AlarmState
 from coldloop.service.event_text import alarm_cause, alarm_word
 from coldloop_rig.cosim.wiring import RigEndpoints, answered_in_time
-from coldloop_rig.terminal import Colour, coloured
+from coldloop_rig.text_tables import Colour, coloured
 
 Work = Callable[[Clients], Awaitable[str]]
 QUIET: Final = (AlarmState.NORMAL, AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE)

@@ -28,8 +28,9 @@ from coldloop.registers.maps import maps_of
 from coldloop.registers.plant import Measurement
 from coldloop_hmi.settings import HmiSection, HmiSettings
 from coldloop_hmi.users import PageRole, write_user
+from coldloop_rig import PYTHON
 from coldloop_rig.chaos.faults import Freeze, Link
-from coldloop_rig.chaos.proxied_services import LinkProxies
+from coldloop_rig.chaos.proxy import LinkProxies
 from coldloop_rig.cosim.local_services import (
     LocalServices,
     end_of,
@@ -43,7 +44,6 @@ from coldloop_rig.cosim.local_services import (
 from coldloop_rig.cosim.scenario import with_copied_load
 from coldloop_rig.cosim.session import SessionClient
 from coldloop_rig.cosim.wiring import RETAINING, SERVICES, START_PATIENCE_S, RigEndpoints, retaining
-from coldloop_rig.interpreter import PYTHON
 from coldloop_rig.live.started_rigs import (
     DEFAULT_PORTS,
     STATE_FILE,
@@ -304,7 +304,7 @@ class PageProcess:
 class UpRig:
     """Starts the services, begins a session in real time, and keeps both up until it is cancelled.
 
-    A service or page that ends is started again (`coldloop_rig.cosim.local_services`), and resumes from its retained state.
+    A service or page that ends is started again (`cosim.local_services`), and resumes from its retained state.
     `services` are those that are started; where the optimiser is not one of them, another client takes its place.
     `optimizer` is a program that is started in the place of ours.
     """

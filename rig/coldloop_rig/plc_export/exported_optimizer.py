@@ -37,7 +37,7 @@ from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.rules import UpdatingRule
 from coldloop_optimizer_plc.runtime import serve
 from coldloop_optimizer_plc.settings import SHOWN, OptimizerSettings, ProgramSettings
-from coldloop_rig.interpreter import PYTHON
+from coldloop_rig import PYTHON
 
 if TYPE_CHECKING:
     from coldloop_rig.settings import Settings

@@ -13,13 +13,6 @@ from numpy.typing import NDArray
 from coldloop.errors import UsageError
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel, discretise
-from coldloop.process.sections import Output, State
-from coldloop_plant.own.plants import file_digest
-from coldloop_rig.plc_sizing.operations import ProblemSizes, iteration_shares
-from coldloop_rig.process_file.bath import check_bath
-from coldloop_rig.process_file.reading import courses_of, forecasts_of
-from coldloop_rig.process_file.fmu_model import with_units
-from coldloop_rig.process_file.linear_model import Linearised
 from coldloop.process.sections import Bath, Output, State
 from coldloop_plant.equilibrium import Linear, model_of
 from coldloop_plant.own.plants import FMU, PYTHON, file_digest

@@ -1,24 +1,99 @@
-"""Sinks that write the files of a run while it runs, row group by row group, in constant memory."""
+"""Sinks that write the files of a run while it runs, row group by row group, in constant memory.
 
+Space on the disk is reserved for ending a run in good order when the disk is full.
+"""
+
+import errno
+import os
+import tempfile
 from collections import deque
-from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Final, Generic, TypeVar
+from typing import BinaryIO, Final, Generic, TypeVar
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from coldloop.errors import ResultsError
+from coldloop.errors import ResultsError, UsageError
 from coldloop.process.declaration import Process
 from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop_rig.results.columns import EVENTS, STATION, TRACE, UPDATES, files_of
-from coldloop_rig.results.disk_reserve import DiskReserve, ReservedFile
-from coldloop_rig.results.driving import DrivingHistory
 from coldloop_rig.results.indicators import StageCost
-from coldloop_rig.results.recorded import joined
-from coldloop_rig.results.recording import SampleBlock, Sink
-from coldloop_rig.results.tables import events_table, station_table, trace_table, updates_table
+from coldloop_rig.results.recording import SampleBlock, Sink, joined
+from coldloop_rig.results.tables import DrivingHistory, events_table, station_table, trace_table, updates_table
+
+RESERVED_BYTES: Final = 24 * 1024**2
+"""A row group of the trace (9 MB), the index of 1,000 h (4 MB), the summary and the figures."""
+FULL: Final = (errno.ENOSPC, errno.EDQUOT)
+
+
+class DiskReserve:
+    """An invisible file of `RESERVED_BYTES`, which the system frees at the latest when the program ends.
+
+    Raises:
+        UsageError: There is less free space than that.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._file: BinaryIO | None = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
+        self.released = False
+        try:
+            os.posix_fallocate(self._file.fileno(), 0, RESERVED_BYTES)
+        except AttributeError:  # not on every platform
+            self.close()
+        except OSError as error:
+            self.close()
+            if error.errno in FULL:
+                raise UsageError(f"{folder}: less than {RESERVED_BYTES >> 20} MB free; choose another --out") from None
+
+    def release(self) -> None:
+        """Release the space: the disk is full otherwise."""
+        self.released = True
+        self.close()
+
+    def close(self) -> None:
+        """Release the space at the end of a run."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+
+class ReservedFile:
+    """A file for writing that draws on a reserve when the disk is full."""
+
+    def __init__(self, path: Path, reserve: DiskReserve) -> None:
+        self._file = path.open("wb", buffering=0)
+        self._reserve = reserve
+
+    def write(self, data: bytes) -> int:
+        """Write all of `data`. Raises OSError if it cannot be written, not even with the reserve."""
+        rest = memoryview(data).cast("B")
+        while rest:
+            try:
+                rest = rest[self._file.write(rest) :]
+            except OSError as error:
+                if error.errno not in FULL or self._reserve.released:
+                    raise
+                self._reserve.release()
+        return len(data)
+
+    def tell(self) -> int:
+        """Return the position."""
+        return self._file.tell()
+
+    def flush(self) -> None:
+        """Do nothing: there is no buffer."""
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    @property
+    def closed(self) -> bool:
+        """Whether the file is closed."""
+        return self._file.closed
+
 
 T = TypeVar("T")
 
@@ -32,51 +107,60 @@ GROUP_ROWS: Final = 16_384
 """Rows of a row group of updates and events."""
 
 
-class ParquetFile:
-    """A file of a run, with the columns that are declared for its name."""
+class _FileSink(Sink, Generic[T]):
+    """Writes a file of a run, with the columns that are declared for its name, in row groups of `enough` rows."""
 
-    def __init__(self, path: Path, reserve: DiskReserve, process: Process) -> None:
+    def __init__(self, path: Path, reserve: DiskReserve, process: Process, enough: int) -> None:
         self._file = ReservedFile(path, reserve)
-        self._reserve = reserve
-        self._path = path
+        self._path, self._reserve, self._process, self._enough = path, reserve, process, enough
+        self._taken: list[T] = []
+        self._rows = 0
         schema = files_of(process)[path.name].schema
         self._writer = pq.ParquetWriter(
             pa.PythonFile(self._file, mode="w"), schema, compression="zstd", write_statistics=SEARCHED,
             use_dictionary=[field.name for field in schema if pa.types.is_string(field.type)],
         )  # fmt: skip
 
-    def write(self, table: pa.Table) -> None:
-        """Write a row group.
+    def _take(self, part: T, rows: int = 1) -> None:
+        """Take rows.
 
         Raises:
-            OSError: It cannot be written.
-        """
-        self._writer.write_table(table)
-
-    def check(self) -> None:
-        """Return whether more can be written.
-
-        Raises:
+            OSError: They cannot be written.
             ResultsError: The disk is full; what was written is whole, and the file can be closed.
         """
-        if self._reserve.released:
-            raise ResultsError(f"{self._path.parent}: the disk is full; what was recorded before is kept")
+        self._taken.append(part)
+        self._rows += rows
+        if self._rows >= self._enough:
+            self._writer.write_table(self._table(self._group()))
+            if self._reserve.released:
+                raise ResultsError(f"{self._path.parent}: the disk is full; what was recorded before is kept")
+
+    def _group(self) -> list[T]:
+        """Return what is written now."""
+        taken, self._taken, self._rows = self._taken, [], 0
+        return taken
+
+    def _table(self, parts: list[T]) -> pa.Table:
+        raise NotImplementedError
 
     def close(self) -> None:
-        """Write the index that makes the file readable, and close it."""
+        """Write the rest, and the index that makes the file readable."""
         try:
-            self._writer.close()
+            if self._taken:
+                self._writer.write_table(self._table(self._taken))
         finally:
-            self._file.close()
+            try:
+                self._writer.close()
+            finally:
+                self._file.close()
 
 
-class TraceSink(Sink):
+class TraceSink(_FileSink[SampleBlock]):
     """Writes `trace.parquet`."""
 
     def __init__(self, folder: Path, reserve: DiskReserve, cost: StageCost) -> None:
-        self._file = ParquetFile(folder / TRACE, reserve, cost.process)
+        super().__init__(folder / TRACE, reserve, cost.process, GROUP_TICKS + HELD_BACK_TICKS)
         self._cost = cost
-        self._blocks: list[SampleBlock] = []
         self._driving = DrivingHistory(cost.process)
         self._updates: deque[Optimization] = deque()
 
@@ -89,119 +173,74 @@ class TraceSink(Sink):
         self._driving.event(service, event)
 
     def block(self, block: SampleBlock) -> None:
-        """Take ticks; write them when they are many."""
-        self._blocks.append(block)
-        if sum(len(one.load) for one in self._blocks) >= GROUP_TICKS + HELD_BACK_TICKS:
-            group, rest = joined(self._blocks).split(GROUP_TICKS)
-            self._blocks = [rest]
-            self._write(group)
-            self._file.check()
+        """Take ticks."""
+        self._take(block, len(block.load))
 
-    def _write(self, block: SampleBlock) -> None:
+    def _group(self) -> list[SampleBlock]:
+        group, rest = joined(self._taken).split(GROUP_TICKS)
+        self._taken, self._rows = [rest], len(rest.load)
+        return [group]
+
+    def _table(self, parts: list[SampleBlock]) -> pa.Table:
+        block = joined(parts)
         table = trace_table(block, self._updates, self._cost, self._driving)
         end = block.first + len(block.load)
         while len(self._updates) > 1 and self._updates[1].tick <= end:
             self._updates.popleft()
         self._driving.forget(end)
-        self._file.write(table)
+        return table
 
-    def close(self) -> None:
-        """Write the rest."""
-        try:
-            if self._blocks:
-                self._write(joined(self._blocks))
-        finally:
-            self._file.close()
+
+class _StationFile(_FileSink[SampleBlock]):
+    def block(self, block: SampleBlock) -> None:
+        self._take(block, len(block.load))
+
+    def _table(self, parts: list[SampleBlock]) -> pa.Table:
+        return station_table(joined(parts), self._process)
 
 
 class StationSink(Sink):
     """Writes `station.parquet`, if there is a station."""
 
     def __init__(self, folder: Path, reserve: DiskReserve, process: Process) -> None:
-        self._path, self._reserve, self._process = folder / STATION, reserve, process
-        self._file: ParquetFile | None = None
-        self._blocks: list[SampleBlock] = []
+        self._make = partial(_StationFile, folder / STATION, reserve, process, GROUP_TICKS)
+        self._file: _StationFile | None = None
 
     def block(self, block: SampleBlock) -> None:
-        """Take ticks; write them when they are many."""
-        if not block.station.size:
-            return
-        if self._file is None:
-            self._file = ParquetFile(self._path, self._reserve, self._process)
-        self._blocks.append(block)
-        if sum(len(one.load) for one in self._blocks) >= GROUP_TICKS:
-            self._write(self._file)
-            self._file.check()
-
-    def _write(self, file: ParquetFile) -> None:
-        blocks, self._blocks = self._blocks, []
-        file.write(station_table(joined(blocks), self._process))
+        """Take ticks."""
+        if block.station.size:
+            self._file = self._file or self._make()
+            self._file.block(block)
 
     def close(self) -> None:
         """Write the rest."""
         if self._file is not None:
-            try:
-                if self._blocks:
-                    self._write(self._file)
-            finally:
-                self._file.close()
-
-
-class _RowFile(Generic[T]):
-    """A file of rows that come one by one."""
-
-    def __init__(
-        self, path: Path, reserve: DiskReserve, process: Process, as_table: Callable[[Sequence[T], Process], pa.Table]
-    ) -> None:
-        self._file = ParquetFile(path, reserve, process)
-        self._process, self._as_table = process, as_table
-        self._rows: list[T] = []
-
-    def add(self, row: T) -> None:
-        """Take a row; write them when they are many."""
-        self._rows.append(row)
-        if len(self._rows) >= GROUP_ROWS:
-            self._write()
-            self._file.check()
-
-    def _write(self) -> None:
-        rows, self._rows = self._rows, []
-        self._file.write(self._as_table(rows, self._process))
-
-    def close(self) -> None:
-        """Write the rest."""
-        try:
-            if self._rows:
-                self._write()
-        finally:
             self._file.close()
 
 
-class UpdatesSink(Sink):
+class UpdatesSink(_FileSink[Optimization]):
     """Writes `updates.parquet`."""
 
     def __init__(self, folder: Path, reserve: DiskReserve, process: Process) -> None:
-        self._rows = _RowFile(folder / UPDATES, reserve, process, updates_table)
+        super().__init__(folder / UPDATES, reserve, process, GROUP_ROWS)
 
     def update(self, update: Optimization) -> None:
-        """Write an update."""
-        self._rows.add(update)
+        """Take an update."""
+        self._take(update)
 
-    def close(self) -> None:
-        """Write the rest."""
-        self._rows.close()
+    def _table(self, parts: list[Optimization]) -> pa.Table:
+        return updates_table(parts, self._process)
 
 
-class EventsSink(Sink):
+class EventsSink(_FileSink[tuple[str, Event]]):
     """Writes `events.parquet`."""
 
     def __init__(self, folder: Path, reserve: DiskReserve, process: Process) -> None:
-        self._rows = _RowFile(folder / EVENTS, reserve, process, events_table)
+        super().__init__(folder / EVENTS, reserve, process, GROUP_ROWS)
 
     def event(self, service: str, event: Event) -> None:
-        """Write an event."""
-        self._rows.add((service, event))
+        """Take an event."""
+        self._take((service, event))
 
-    def close(self) -> None:
-        """Write the rest."""
-        self._rows.close()
+    def _table(self, parts: list[tuple[str, Event]]) -> pa.Table:
+        return events_table(parts, self._process)

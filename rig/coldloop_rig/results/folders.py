@@ -85,11 +85,7 @@ def claim_folder_of_now(parent: Path, name: str) -> Path:
 
 
 def prepare_folder(folder: Path) -> None:
-    """Make the folder of a run.
-
-    Raises:
-        UsageError: It cannot be written to.
-    """
+    """Make the folder of a run. Raises UsageError if it cannot be written to."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

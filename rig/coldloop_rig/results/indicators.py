@@ -8,13 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop_optimizer_plc.qp.design import ControlDesign
 from coldloop_optimizer_plc.qp.prediction import state_weights
-from coldloop_rig.results.recording import BLOCK_TICKS, Recording, SampleBlock, Sink
+from coldloop_rig.cosim.compiled.records import BLOCK_TICKS
+from coldloop_rig.results.columns import excess_keys
+from coldloop_rig.results.recording import Recording, SampleBlock, Sink
 
 
 class Indicators(NamedTuple):
@@ -59,16 +60,6 @@ def excess_of(y: NDArray[Any], design: ControlDesign) -> NDArray[np.float64]:
     constrained = y[:, design.process.controlled].astype(float)
     beyond = np.maximum(constrained - design.output_high, design.output_low - constrained)
     return np.maximum(beyond, 0.0)
-
-
-def excess_keys(process: Process) -> list[str]:
-    """Return the names of what is known of the excess of each output with a band.
-
-    They are the share of the known ticks in which it was beyond by more than its dead band, %; the largest excess over
-    the band itself, in its unit; the time integral of that, in its unit times s.
-    """
-    known = ("outside_dead_band_pct", "largest_excess", "excess_integral")
-    return [f"{one.name}_{what}" for one in process.banded for what in known]
 
 
 class StageCost:

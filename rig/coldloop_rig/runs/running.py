@@ -1,22 +1,276 @@
-"""One run into a folder: driven, recorded, evaluated, drawn. What is recorded survives an interruption."""
+"""One run into a folder: driven, recorded, evaluated, drawn; and again from its manifest.
 
+What is recorded survives an interruption. The folder has copies of the inputs, load and model, and a manifest with
+versions, configuration and hashes: what it takes to repeat the run. The trace depends on the configuration alone, so a
+run over Modbus is repeated in one process. A run in real time has the trace of lock-step if no deadline was missed.
+"""
+
+import argparse
+import contextlib
+import hashlib
+import json
+import math
+import platform
+import shutil
+import sys
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from coldloop.errors import UsageError
+from coldloop import __version__
+from coldloop.config import Configuration, load_configuration
+from coldloop.errors import ColdloopError, ResultsError, UsageError, printable
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
+from coldloop.process.model_file import read_document
+from coldloop.process.settings import SHIPPED_MODELS
 from coldloop.registers.plant import PlantSample
 from coldloop.session.settings import TimeMode
-from coldloop_plant.load import find_load
+from coldloop.text_file import held_file, read_bytes
+from coldloop_plant.load import find_load, named_families
+from coldloop_plant.settings import PlantKind
 from coldloop_rig.cosim.one_process import OneProcessRig
-from coldloop_rig.cosim.scenario import Job, Scenario, StopRequest, natural_ticks
+from coldloop_rig.cosim.scenario import INPUTS, LOAD_COPY, Job, Scenario, StopRequest, natural_ticks, with_copied_load
 from coldloop_rig.figures.worker import FigureProcess
 from coldloop_rig.interruption import INTERRUPTION
-from coldloop_rig.results.recording import Recorder, Sink
-from coldloop_rig.results.way import Way
-from coldloop_rig.runs.run_files import RunFiles
+from coldloop_rig.results.columns import FILES, FORMAT, schema_document
+from coldloop_rig.results.file_sinks import DiskReserve, EventsSink, StationSink, TraceSink, UpdatesSink
+from coldloop_rig.results.folders import claim_folder, installed_version, write_json
+from coldloop_rig.results.indicators import RunEvaluation, StageCost
+from coldloop_rig.results.recording import Recorder, Sink, Way
+from coldloop_rig.results.run_folder import RunFolder
 from coldloop_rig.settings import Settings
+
+MODEL_COPY: Final = f"{INPUTS}/model.json"
+REFRIGERATOR_COPY: Final = f"{INPUTS}/refrigerator.json"
+RESTORE: Final = "the run cannot be repeated without it"
+
+
+def _copy_inputs(settings: Settings, profile: LoadProfile, folder: Path) -> dict[str, Any]:
+    """Copy the files that a run reads into its folder; return their description for the manifest.
+
+    A load that has a name is described by the digest of its steps, the model that is shipped by its own digest.
+    """
+    (folder / INPUTS).mkdir(exist_ok=True)
+    name, model_file = settings.plant.load, settings.model.file
+    load: dict[str, Any] = {"source": name, "file": None, "profile_sha256": json_digest([profile.times, profile.watts])}
+    if with_copied_load(settings, profile, folder) is not settings:
+        load |= {"file": LOAD_COPY, "sha256": file_digest(folder / LOAD_COPY)}
+    model = _copied(model_file, folder, MODEL_COPY)
+    if model_file == SHIPPED_MODELS["cold-box"]:
+        model["source"] = "shipped"
+    rest = settings.plant.refrigerator.file
+    more = {} if rest is None else {"refrigerator": _copied(rest, folder, REFRIGERATOR_COPY)}
+    return {"load": load, "model": model, **more}
+
+
+def _copied(source: Path, folder: Path, name: str) -> dict[str, str]:
+    content = read_bytes(source, RESTORE)
+    (folder / name).write_bytes(content)
+    return {"source": str(source), "file": name, "sha256": hashlib.sha256(content).hexdigest()}
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file's bytes. Raises UsageError if it cannot be read."""
+    return hashlib.sha256(read_bytes(path, RESTORE)).hexdigest()
+
+
+def json_digest(content: object) -> str:
+    """Return the SHA-256 of a configuration as the manifest has it, or of other plain data."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _changed_inputs(manifest: dict[str, Any], folder: Path) -> list[str]:
+    changed = [
+        f"{folder / entry['file']}: is not the {name} that the run read"
+        for name, entry in manifest["inputs"].items()
+        if entry
+        and entry["file"] is not None
+        and file_digest(held_file(folder, entry["file"], RESTORE)) != entry.get("sha256")
+    ]
+    if json_digest(manifest["configuration"]) != manifest["hashes"]["configuration_sha256"]:
+        changed.append(f"{folder / 'manifest.json'}: the configuration is not the one that the run had")
+    return changed
+
+
+DEPENDENCIES: Final = (
+    "numpy", "scipy", "numba", "pymodbus", "pydantic", "aiomqtt", "osqp", "daqp", "casadi", "pyarrow", "matplotlib",
+)  # fmt: skip
+
+
+def _now_utc() -> str:
+    """Return the time in ISO 8601, such as 2026-03-01T12:00:00.000Z."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def _first_manifest(
+    effective: Configuration[Settings], scenario: Scenario, inputs: Mapping[str, Any], way: str,
+    arguments: Mapping[str, Any],
+) -> dict[str, Any]:  # fmt: skip
+    configured = {key: value for key, value, _ in effective.effective() if value is not None}  # None is "not set"
+    model = load_model(effective.settings.model.file)
+    return {
+        "format": FORMAT,
+        "complete": False,
+        "reason": "the run has not ended, or its process was killed",
+        "started_utc": _now_utc(),
+        "ended_utc": None,
+        "coldloop": __version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "dependencies": {name: installed_version(name) for name in DEPENDENCIES},
+        "command": sys.argv[1:],
+        "arguments": dict(arguments),
+        "way": way,
+        "ticks": scenario.ticks,
+        "recorded_ticks": 0,
+        "configuration": configured,
+        "inputs": dict(inputs),
+        "hashes": {
+            "configuration_sha256": json_digest(configured),
+            "model_sha256": model.digest,
+            "plant_parameters_sha256": model.parameters_digest,
+            "trace_sha256": None,
+        },
+    }
+
+
+def plain_arguments(options: argparse.Namespace) -> dict[str, str]:
+    """Return the options of a command that were given, as text."""
+    return {name: str(value) for name, value in vars(options).items() if name != "execute" and value is not None}
+
+
+NAMES: Final = (
+    "manifest.json", "summary.json", "schema.json", *FILES, "run.png", "run.pdf", "run.svg",
+    "chaos.json", "chaos.md", "chaos.png",
+    "report.html", "run.mat", "run.h5", *(f"{Path(name).stem}.csv" for name in FILES),
+)  # fmt: skip
+"""Files of an earlier run, and what was made of them, which a new one in the same folder replaces."""
+
+
+class RunFiles:
+    """Opens the files of a run in a folder, whose earlier run is replaced; `recorder` fills them, `finish` ends them.
+
+    Raises:
+        UsageError: The disk is nearly full, or an input of the run lies in the folder.
+        OSError: A file cannot be made.
+    """
+
+    def __init__(
+        self, folder: Path, effective: Configuration[Settings], scenario: Scenario, way: str,
+        arguments: Mapping[str, Any], sinks: Sequence[Sink],
+    ) -> None:  # fmt: skip
+        settings = effective.settings
+        for file in (settings.model.file, Path(settings.plant.load)):
+            if file.is_file() and file.resolve().is_relative_to((folder / INPUTS).resolve()):
+                raise UsageError(f"{file}: the run replaces what is in {folder}; name another --out")
+        model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
+        process = settings.process
+        self.folder = folder
+        self._evaluation = RunEvaluation(model, design)
+        self._discard()
+        self._reserve = DiskReserve(folder)
+        self._realtime = scenario.realtime
+        with contextlib.ExitStack() as failed:
+            failed.callback(self._reserve.close)
+            self._manifest = _first_manifest(
+                effective, scenario, _copy_inputs(settings, scenario.load, folder), way, arguments
+            )
+            write_json(folder / "manifest.json", self._manifest)
+            is_whole = settings.plant.kind is PlantKind.REFRIGERATOR
+            write_json(folder / "schema.json", schema_document(process, station=is_whole))
+            files = (
+                TraceSink(folder, self._reserve, StageCost(model, design)),
+                UpdatesSink(folder, self._reserve, process),
+                EventsSink(folder, self._reserve, process),
+                StationSink(folder, self._reserve, process),
+            )
+            failed.pop_all()
+        self.recorder = Recorder(scenario.ticks, [self._evaluation, *files, *sinks])
+
+    def finish(self, error: BaseException | None, figure: FigureProcess) -> dict[str, Any]:
+        """Close the files, and write summary, manifest and figures of what was recorded; return the summary.
+
+        Raises:
+            ColdloopError: The run is not complete: `error` ended it early, or a file cannot be written.
+        """
+        try:
+            self.recorder.close()
+        except (OSError, ColdloopError) as of_files:
+            error = error or of_files
+        finally:
+            self._reserve.close()
+        recorded = self.recorder.next_tick
+        if error is not None and not recorded:
+            self._discard()
+            with contextlib.suppress(OSError):
+                self.folder.rmdir()  # it stays if it has logs
+            raise _results_error(error, self.folder)
+        reason = None if error is None else _reason(error)
+        summary = summary_of(self._evaluation, self.recorder, realtime=self._realtime, reason=reason)
+        hashes = {**self._manifest["hashes"], "trace_sha256": self._evaluation.trace_sha256}
+        ended = {"complete": reason is None, "reason": reason, "ended_utc": _now_utc(), "recorded_ticks": recorded}
+        try:
+            write_json(self.folder / "manifest.json", {**self._manifest, **ended, "hashes": hashes})
+            write_json(self.folder / "summary.json", summary)
+            figure.draw(self.folder)
+        except (OSError, ColdloopError) as of_files:
+            error = error or of_files
+        if error is not None:
+            kept = f"{recorded} of {self.recorder.ticks} ticks are recorded in {self.folder}"
+            raise _results_error(error, self.folder, kept)
+        return summary
+
+    def _discard(self) -> None:
+        for name in NAMES:
+            (self.folder / name).unlink(missing_ok=True)
+        shutil.rmtree(self.folder / INPUTS, ignore_errors=True)
+
+
+def summary_of(evaluation: RunEvaluation, recorder: Recorder, *, realtime: bool, reason: str | None) -> dict[str, Any]:
+    """Return the summary of a run; without a reason it is complete. What does not exist is None.
+
+    Nothing is late in lock-step, so that lateness exists in real time only.
+    """
+    wall_s, link = recorder.wall_seconds, recorder.link
+    lateness = link._asdict() if realtime else dict.fromkeys(link._fields)
+    figures = {
+        "complete": reason is None,
+        "reason": reason,
+        "ticks": evaluation.ticks,
+        "missing_ticks": recorder.missing_ticks,
+        "updates": evaluation.updates,
+        "failed_updates": evaluation.failed_updates,
+        "trace_sha256": evaluation.trace_sha256,
+        **evaluation.indicators.by_name,
+        **evaluation.excesses,
+        **lateness,
+        "deadline_misses": link.deadline_misses,
+        "wall_seconds": round(wall_s, 3),
+        "realtime_factor": round(evaluation.ticks * evaluation.process.tick_s / wall_s, 2) if wall_s else None,
+    }
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in figures.items()
+    }
+
+
+def _reason(error: BaseException) -> str:
+    if isinstance(error, ColdloopError):
+        return str(error)
+    if isinstance(error, OSError):
+        return f"{error.strerror or error}"
+    return f"{type(error).__name__}: {error}"
+
+
+def _results_error(error: BaseException, folder: Path, kept: str = "") -> BaseException:
+    """Return the error with what a user needs to know about the files."""
+    if isinstance(error, OSError):
+        error = ResultsError(f"{error.filename or folder}: {error.strerror or error}; choose another --out")
+    if kept and isinstance(error, ColdloopError):
+        error.args = (f"{error}; {kept}",)
+    return error
 
 
 class _FirstTick(Sink):
@@ -42,11 +296,7 @@ def make_scenario(settings: Settings, ticks: int | None = None) -> Scenario:
 
 
 def check_certificates(settings: Settings) -> None:
-    """Refuse a rig in which a client could not show its server a certificate.
-
-    Raises:
-        UsageError: One has none.
-    """
+    """Refuse a rig in which a client could not show its server a certificate. Raises UsageError if one has none."""
     clients = [
         ("rig", settings.rig.tls, ("plant", "control_plc", "optimizer_plc")),
         ("control_plc.plant", settings.control_plc.plant.tls, ("plant",)),
@@ -90,3 +340,96 @@ def _drive(job: Job, recorder: Recorder, folder: Path, stop: StopRequest) -> Non
     from coldloop_rig.cosim import networked_run  # noqa: PLC0415 a run in one process starts without the bus
 
     networked_run.drive(job, recorder, folder, stop)
+
+
+def repeat(folder: Path, out: Path | None, *, force: bool, trusted: Path | None) -> tuple[bool, str]:
+    """Repeat the run of a folder; return whether the traces are the same, and what to print.
+
+    Args:
+        folder: Of the run.
+        out: Folder for the results of the repetition; None keeps none.
+        force: Whether a run in it may be replaced.
+        trusted: A model file with the model of the run, which may hold code that a plant executes; None trusts the
+            folder.
+
+    Raises:
+        UsageError: There is no run to repeat, or an input or the configuration was changed since.
+    """
+    run = RunFolder(folder)
+    manifest = run.manifest
+    if manifest["way"] == Way.CHAOS:
+        raise UsageError(
+            f"{folder}: a run with faults, which depend on the machine; `coldloop chaos` runs the plan again"
+        )
+    if manifest["way"] == Way.RECORDED:
+        raise UsageError(f"{folder}: a session under way was recorded, from its middle on: it cannot be repeated")
+    if not manifest["recorded_ticks"]:
+        raise UsageError(f"{folder}: the run has no ticks: {manifest['reason']}")
+    changed = _changed_inputs(manifest, folder)
+    if changed:
+        raise UsageError("; ".join(changed))
+    if trusted is not None:
+        own, ours = run.model, read_document(trusted)
+        if (own.get("process") or ours.get("process")) and own.get("digest") != ours["digest"]:
+            remedy = "leave out --process"
+            if own.get("process"):
+                remedy = "name its file with --process; rerun --trust executes the plant that the folder holds"
+            raise UsageError(f"{folder}: a run of {run.process.name}, with another model than now; {remedy}")
+    effective = _recorded_configuration(run)
+    scenario = make_scenario(effective.settings, manifest["recorded_ticks"])
+    if json_digest([scenario.load.times, scenario.load.watts]) != manifest["inputs"]["load"]["profile_sha256"]:
+        raise UsageError(f"load {manifest['inputs']['load']['source']}: this version has another load of that name")
+    trace = _repeated_trace(effective, scenario, out, force=force)
+    if trace == manifest["hashes"]["trace_sha256"]:
+        return True, f"{scenario.ticks} ticks, the same trace {trace}\n"
+    return False, _differences(manifest, run, trace)
+
+
+def _recorded_configuration(run: RunFolder) -> Configuration[Settings]:
+    """Return the configuration of a run, with the copies of its inputs instead of the originals."""
+    values = dict(run.configuration)
+    copies = {"plant.load": "load", "model.file": "model", "plant.refrigerator.file": "refrigerator"}
+    for key, entry in copies.items():
+        copy = (run.manifest["inputs"].get(entry) or {}).get("file")
+        if copy is not None:
+            values[key] = str(run.held(copy))
+        elif key == "model.file":  # the shipped one
+            values.pop(key, None)
+        elif key in values and named_families(str(values[key])) is None:
+            raise UsageError(f"{run.path / 'manifest.json'}: {key}: the folder has no copy of it")
+    options: Mapping[str, tuple[object, str]] = {key: (value, "manifest") for key, value in values.items()}
+    return load_configuration(Settings, environment={}, options=options)
+
+
+def _repeated_trace(effective: Configuration[Settings], scenario: Scenario, out: Path | None, *, force: bool) -> str:
+    from coldloop_rig.progress import RunProgress  # noqa: PLC0415 a run without a bar starts sooner
+
+    process = effective.settings.process
+    with RunProgress(scenario.ticks, process) as progress, FigureProcess(["png"]) as figure:
+        if out is not None:
+            claim_folder(out, force=force)
+            summary = run_into(out, Job(effective, scenario, Way.IN_PROCESS), {}, figure, [progress])
+            return str(summary["trace_sha256"])
+        settings = effective.settings
+        evaluation = RunEvaluation(load_model(settings.model.file), settings.optimizer_plc.program.design)
+        recorder = Recorder(scenario.ticks, [evaluation, progress])
+        OneProcessRig(settings).run(scenario, recorder)
+        recorder.close()
+        return evaluation.trace_sha256
+
+
+def _differences(manifest: Mapping[str, Any], run: RunFolder, trace: str) -> str:
+    """Return what may be the reason of another trace."""
+    lines = [f"another trace: {trace} instead of {manifest['hashes']['trace_sha256']}"]
+    if manifest["coldloop"] != __version__:
+        lines.append(f"coldloop {__version__} instead of {manifest['coldloop']}")
+    for name in DEPENDENCIES:
+        there, then = installed_version(name), manifest["dependencies"].get(name, "absent")
+        if there != then:
+            lines.append(f"{name} {there} instead of {then}")
+    misses = run.summary["deadline_misses"]
+    if misses:
+        lines.append(f"the run missed {misses} deadlines, which depend on the machine")
+    if len(lines) == 1:
+        lines.append("inputs, configuration and versions are the same: the programs have changed, or the machine")
+    return "".join(f"{printable(line)}\n" for line in lines)

@@ -28,18 +28,23 @@ from coldloop.process.updating_periods import whole_ticks
 from coldloop.registers.audit import Event
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.durations import duration
-from coldloop_rig.figures.plot import Bounds, RunCurves, draw_run, labels_of
-from coldloop_rig.figures.run_plot import at_times, pressure_limits, save_figure, title_of
-from coldloop_rig.python_settings import Period, configured
-from coldloop_rig.results.driving import DrivingHistory
+from coldloop_rig.figures.plot import (
+    Bounds,
+    RunCurves,
+    at_times,
+    draw_run,
+    labels_of,
+    pressure_limits,
+    save_figure,
+    title_of,
+)
 from coldloop_rig.results.indicators import RunEvaluation, StageCost
 from coldloop_rig.results.recording import MemorySink, Recorder, Recording
-from coldloop_rig.results.run_folder import batch_series
-from coldloop_rig.results.tables import events_table, station_table, trace_table, updates_table
+from coldloop_rig.results.run_folder import batch_series, units_of
+from coldloop_rig.results.tables import DrivingHistory, events_table, station_table, trace_table, updates_table
 from coldloop_rig.runs.remarks import certificate, enforced, too_slow
-from coldloop_rig.runs.run_files import summary_of
-from coldloop_rig.runs.running import make_scenario
-from coldloop_rig.settings import Settings
+from coldloop_rig.runs.running import make_scenario, summary_of
+from coldloop_rig.settings import Period, Settings, configured
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,7 @@ class Table:
     @property
     def units(self) -> dict[str, str]:
         """The unit of each column."""
-        return {field.name: field.metadata[b"unit"].decode() for field in self.arrow.schema}
+        return units_of(self.arrow.schema)
 
     def to_pandas(self) -> Any:  # noqa: ANN401 pandas is not a dependency
         """Return the table as a DataFrame, with the units in `attrs["units"]`; needs pandas."""

@@ -2,20 +2,21 @@
 
 from typing import Final
 
-from coldloop_rig.studies.beyond.classical import ClassicalStudy
-from coldloop_rig.studies.beyond.compare import CompareStudy
-from coldloop_rig.studies.beyond.contest import ContestStudy
-from coldloop_rig.studies.beyond.coupling import CouplingStudy
-from coldloop_rig.studies.beyond.disturbances import DisturbancesStudy
+from coldloop_rig.studies.beyond.any_process import CompareStudy, PeriodsStudy
+from coldloop_rig.studies.beyond.contest import ClassicalStudy, ContestStudy
 from coldloop_rig.studies.beyond.penalties import PenaltiesStudy
-from coldloop_rig.studies.beyond.periods import PeriodsStudy
+from coldloop_rig.studies.beyond.refrigerator import CouplingStudy, DisturbancesStudy
 from coldloop_rig.studies.beyond.robustness import RobustnessStudy
-from coldloop_rig.studies.beyond.single_precision import SinglePrecision
-from coldloop_rig.studies.paper.cholesky import CholeskyStudy
-from coldloop_rig.studies.paper.experiments import ADAPTIVE_2H, PLC_2H
+from coldloop_rig.studies.paper.reference_plc import CholeskyStudy, SinglePrecision
 from coldloop_rig.studies.paper.solver_comparison import SolverComparison
-from coldloop_rig.studies.paper.trade_off import TradeOff
-from coldloop_rig.studies.paper.trajectories import LIMITED_STUDY, TRAJECTORIES_STUDY, UNLIMITED_STUDY
+from coldloop_rig.studies.paper.trajectories import (
+    ADAPTIVE_2H,
+    LIMITED_STUDY,
+    PLC_2H,
+    TRAJECTORIES_STUDY,
+    UNLIMITED_STUDY,
+    TradeOff,
+)
 from coldloop_rig.studies.paper.updating_period import UpdatingPeriodStudy
 from coldloop_rig.studies.study import Study
 

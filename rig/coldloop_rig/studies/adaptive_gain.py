@@ -5,15 +5,43 @@ from itertools import product
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from coldloop.errors import StudyError
 from coldloop.process.declaration import Process
+from coldloop.process.lti_model import load
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop_optimizer_plc.budget import PlcBudget
+from coldloop_plant.load import find_load
 from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.cosim.scenario import Scenario, natural_ticks
+from coldloop_rig.results.indicators import evaluate
+from coldloop_rig.results.recording import Recorder
 from coldloop_rig.settings import Settings
 from coldloop_rig.studies.intervals import Interval, geometric_mean, mean_ratio
-from coldloop_rig.studies.loop_cost import ADAPTIVE, loop_cost, require_costs
+
+ADAPTIVE: Final = 0.0
+"""An updating period, s."""
+
+
+def loop_cost(settings: Settings, name: str, period_s: float, run: Callable[[Scenario, Recorder], None]) -> float:
+    """Return J_BF under a load, a named one or a file, with what runs a scenario."""
+    model = load(settings.model.file)
+    profile = find_load(name, model.w0, settings.process)
+    scenario = Scenario(natural_ticks(name, profile), profile, period_s, settings.plant.seed)
+    recorder = Recorder(scenario.ticks)
+    run(scenario, recorder)
+    return evaluate(recorder.recording(), model, settings.optimizer_plc.program.design).J_BF
+
+
+def require_costs(costs: ArrayLike) -> None:
+    """Refuse costs of which a ratio would say nothing, those of loops in which nothing happens (`StudyError`)."""
+    if not np.all(np.asarray(costs) > 0.0):
+        raise StudyError(
+            "under some load the loop costs nothing (J_BF is 0): with the inputs at rest all outputs stay in their "
+            "bands. Give the process a load or disturbances that drive them out, or a setpoint where it does not rest"
+        )
+
 
 SHARES: Final = (0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
 """Of a sampling period: updating periods that are compared, unless one is given."""
@@ -57,8 +85,7 @@ def adaptive_gain(
 def over_best_fixed(costs: NDArray[np.float64]) -> tuple[int, Interval]:
     """Return which row is the best fixed period, and the cost of the first row, the adaptive one, over its.
 
-    Args:
-        costs: A row for each period, a column for each load.
+    Costs have a row for each period, a column for each load.
 
     Raises:
         StudyError: A loop costs nothing.

@@ -1,8 +1,8 @@
 """How the runs of a study are done: by Dask workers, each run once, what is done already being read back.
 
 Results do not depend on the number of workers: a run is a function of its request. A worker that dies costs only the
-runs it had in hand, which others do again; a stopped study resumes where it was. Workers write outcomes to the
-store themselves: only requests go through the scheduler.
+runs it had in hand, which others do again; a stopped study resumes where it was. Workers write outcomes to the store
+themselves, a file each, named by the digest of its request: only requests go through the scheduler.
 """
 
 import contextlib
@@ -10,7 +10,8 @@ import logging
 import os
 import signal
 import time
-from collections.abc import Iterator, Sequence
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -19,13 +20,137 @@ from distributed import Client, LocalCluster, as_completed
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from coldloop.errors import ColdloopError, ResultsError, StudyError, UsageError
+from coldloop.whole_file import whole_text
+from coldloop_optimizer_plc.budget import BudgetSettings, PlcBudget
+from coldloop_optimizer_plc.solvers import make_solver
 from coldloop_rig.interruption import INTERRUPTION
 from coldloop_rig.progress import make_console
-from coldloop_rig.results.folders import prepare_folder
-from coldloop_rig.studies.identical import families, same_run
-from coldloop_rig.studies.request import RunRequest, check, perform, programs_digest
-from coldloop_rig.studies.store import Store, StoredOutcomes
+from coldloop_rig.results.folders import prepare_folder, writing
+from coldloop_rig.studies.request import (
+    Outcome,
+    Procedure,
+    RunRequest,
+    check,
+    decisive_digest,
+    perform,
+    programs_digest,
+)
+from coldloop_rig.studies.settings import settings_of
 from coldloop_rig.studies.study import RUNS, Study, StudyOptions
+
+REMEMBERED: Final = 64
+"""Outcomes kept in memory: some MB each when they have a trace."""
+
+
+class Store:
+    """Outcomes by the digest of their request."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def path(self, request: RunRequest) -> Path:
+        """Return where an outcome is kept."""
+        return self.folder / f"{request.digest}.json"
+
+    def text(self, request: RunRequest) -> str | None:
+        """Return the file of a request if it is there and whole."""
+        try:
+            text = self.path(request).read_text(encoding="utf-8")
+            Outcome.from_json(text)
+        except (OSError, ValueError):
+            return None
+        return text
+
+    def find(self, request: RunRequest) -> Outcome | None:
+        """Return the outcome of a request if it is there and whole."""
+        text = self.text(request)
+        return None if text is None else Outcome.from_json(text)
+
+    def keep(self, request: RunRequest, outcome: str) -> None:
+        """Keep an outcome. Raises ResultsError if it cannot be written."""
+        path = self.path(request)
+        with writing(path, "what was done before is kept: make room, or choose another --out"):
+            whole_text(path, outcome)
+
+
+class StoredOutcomes(Mapping[RunRequest, Outcome]):
+    """The outcomes of some requests, read when they are wanted: a large study has more than memory holds."""
+
+    def __init__(self, store: Store, requests: Sequence[RunRequest]) -> None:
+        self._store = store
+        self._requests = dict.fromkeys(requests)
+        self._recent: OrderedDict[RunRequest, Outcome] = OrderedDict()
+
+    def __getitem__(self, request: RunRequest) -> Outcome:
+        """Return an outcome. Raises ResultsError if its file is gone, or is not whole any more."""
+        if request not in self._requests:
+            raise KeyError(request)
+        if request not in self._recent:
+            outcome = self._store.find(request)
+            if outcome is None:
+                raise ResultsError(f"{self._store.path(request)}: gone or damaged since it was written; do it again")
+            self._recent[request] = outcome
+            if len(self._recent) > REMEMBERED:
+                self._recent.popitem(last=False)
+        self._recent.move_to_end(request)
+        return self._recent[request]
+
+    def __iter__(self) -> Iterator[RunRequest]:
+        """Go through the requests, in the order in which they were given."""
+        return iter(self._requests)
+
+    def __len__(self) -> int:
+        """Return how many requests there are."""
+        return len(self._requests)
+
+
+def iteration_limit(request: RunRequest) -> int | None:
+    """Return the iterations that fit into the updating period of a run, if power enters it by that number alone.
+
+    In a networked run the time of an answer counts as well, with an adaptive period the number is the rule's, and a
+    period that a load step cuts off leaves no record of its iterations.
+    """
+    program = settings_of(request.assignments).optimizer_plc.program
+    in_one_process = request.procedure is Procedure.CONFIGURED and not request.networked
+    if not in_one_process or not request.updating_period_s or program.interrupting_load_step_w:
+        return None
+    budget = PlcBudget(program.budget, make_solver(program).tau_1_s)
+    return budget.iterations(round(request.updating_period_s / program.process.tick_s))
+
+
+def never_cut_off(outcome: Outcome, limit: int) -> bool:
+    """Return whether each solve of a run ended by itself before `limit` iterations."""
+    return max(outcome.updates["iterations"], default=limit) < limit
+
+
+def families(requests: Iterable[RunRequest]) -> list[list[RunRequest]]:
+    """Return the requests in groups that differ by their limit of iterations only, the largest limit first."""
+    groups: dict[str, list[tuple[int, RunRequest]]] = {}
+    for request in dict.fromkeys(requests):
+        limit = iteration_limit(request)
+        key = request.digest if limit is None else _digest_without_budget(request)
+        groups.setdefault(key, []).append((limit or 0, request))
+    return [
+        [request for _, request in sorted(group, key=lambda one: one[0], reverse=True)] for group in groups.values()
+    ]
+
+
+def same_run(
+    request: RunRequest, done: Sequence[RunRequest], outcomes: Mapping[RunRequest, Outcome]
+) -> RunRequest | None:
+    """Return which of the requests `done` of its family had the outcome that `request` would have, if one is known."""
+    limit = iteration_limit(request)
+    if limit is None:
+        return None
+    for other in done:
+        if iteration_limit(other) == limit or never_cut_off(outcomes[other], limit):
+            return other
+    return None
+
+
+def _digest_without_budget(request: RunRequest) -> str:
+    return decisive_digest(request, settings_of(request.assignments).with_program(budget=BudgetSettings()))
+
 
 CONNECT_PATIENCE_S: Final = 10
 FINISHED: Final = "finished"
@@ -45,11 +170,7 @@ class Workers:
 
     @contextlib.contextmanager
     def connected(self) -> Iterator[Client]:
-        """Connect to the workers for a while.
-
-        Raises:
-            UsageError: The scheduler does not answer.
-        """
+        """Connect to the workers for a while. Raises UsageError if the scheduler does not answer."""
         for name in ("distributed", "distributed.client"):
             logging.getLogger(name).setLevel(logging.CRITICAL)  # their import has set them to less
         # an end at once, by a signal, leaves semaphores to a process that removes them, and need not warn of it

@@ -9,15 +9,18 @@ from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from coldloop_optimizer_plc.budget import PlcBudget
 from coldloop_optimizer_plc.qp.design import ControlDesign
 from coldloop_rig.cosim.ideal_loop import run_ideal_loop
+from coldloop_rig.figures.plot import COLOURS, DASHES, INK
 from coldloop_rig.plc_sizing.budget import counted_sizes, estimator_memory, footprint, problem_of
 from coldloop_rig.plc_sizing.operations import SOLVERS
 from coldloop_rig.settings import Settings
+from coldloop_rig.studies.adaptive_gain import ADAPTIVE, loop_cost, require_costs
+from coldloop_rig.studies.drawing import legend_outside, panels
 from coldloop_rig.studies.intervals import geometric_mean
-from coldloop_rig.studies.loop_cost import ADAPTIVE, loop_cost, require_costs
 from coldloop_rig.text_tables import aligned
 
 KNOTS: Final = (2, 3, 4, 5, 6, 7, 8, 10, 12)
@@ -70,12 +73,7 @@ def candidates(design: ControlDesign) -> dict[str, ControlDesign]:
 
 
 def judged(settings: Settings, names: Sequence[str], done: Callable[[int, int], None]) -> list[Judged]:
-    """Return the sets with what they cost under some loads.
-
-    Args:
-        settings: With the design whose horizon and instants others are compared with.
-        names: Loads, named ones or files.
-        done: Is called with the number of sets done and that of all.
+    """Return the sets with what they cost under some loads; `done` is called with the number of sets done and of all.
 
     Raises:
         StudyError: The loop costs nothing.
@@ -139,3 +137,37 @@ def configuration(found: Sequence[Judged]) -> str:
         f"decision_instants = {list(design.decision_instants)}\n"
         f"constraint_instants = {list(design.constraint_instants)}\n"
     )
+
+
+def drawn(found: Sequence[Judged], names: Sequence[str]) -> Figure:
+    """Return loss and iterations over the number of variables; the configured and the proposed set are named."""
+    sets = sorted(found[1:], key=lambda one: one.variables)
+    sizes = [one.variables for one in sets]
+    with panels(2, 1, 4.6, sharex=True) as (figure, (loss, iterations)):
+        for name, colour, cost, fullest in zip(
+            names, COLOURS, zip(*(one.costs for one in sets), strict=True), found[-1].costs, strict=False
+        ):
+            loss.plot(
+                sizes,
+                [each / fullest for each in cost],
+                color=colour,
+                linestyle=DASHES[colour],
+                marker=".",
+                label=f"load {name}",
+            )
+        loss.axhline(ENOUGH, color=INK, linewidth=0.8, linestyle=":", label=f"small enough, {ENOUGH:g}")
+        iterations.plot(sizes, [one.iterations for one in sets], color=COLOURS[0], marker=".")
+        lost = dict(zip([one.label for one in found], losses(found), strict=True))
+        for label, one, marker in (("configured", found[0], "s"), ("proposed", proposed(found), "o")):
+            for axes, value in ((loss, lost[one.label]), (iterations, one.iterations)):
+                axes.plot(one.variables, value, color=INK, marker=marker, markerfacecolor="none", markersize=9,
+                          linestyle="", label=label)  # fmt: skip
+        loss.set_ylabel("loss: J_BF over the fullest (1)")
+        iterations.set_ylabel(f"iterations in {found[0].design.process.sampling_period_s:g} s (1)")
+        iterations.set_xlabel("variables (1)")
+        iterations.set_xscale("log")  # the fullest set has several times the variables of the others
+        marks = [mark for mark in (10, 20, 50, 100, 200, 500) if sizes[0] <= mark <= sizes[-1]]
+        iterations.set_xticks(marks, map(str, marks))
+        iterations.minorticks_off()
+        legend_outside(figure, loss)
+    return figure

@@ -34,10 +34,8 @@ from coldloop_rig.results.folders import installed_version
 from coldloop_rig.results.indicators import Indicators, StageCost, evaluate, has_no_answer
 from coldloop_rig.results.recording import Recorder, Recording
 from coldloop_rig.settings import Settings
-from coldloop_rig.studies.outside_parts import outside_digests
-from coldloop_rig.studies.paired_run import harsh_run, paired_indicators, paired_run
-from coldloop_rig.studies.problem_sequence import problem_sequence
-from coldloop_rig.studies.settings import settings_of
+from coldloop_rig.studies.paired_run import harsh_run, paired_indicators, paired_run, problem_sequence
+from coldloop_rig.studies.settings import outside_digests, settings_of
 
 Series = NDArray[np.float64]
 
@@ -133,11 +131,7 @@ class Outcome:
 
     @classmethod
     def from_json(cls, text: str) -> "Outcome":
-        """Return the outcome of a document.
-
-        Raises:
-            ValueError: It is not one.
-        """
+        """Return the outcome of a document. Raises ValueError if it is not one."""
         try:
             content = parsed_json(text)
             events = [Happening(*event) for event in content["events"]]

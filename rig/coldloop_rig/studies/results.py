@@ -1,23 +1,31 @@
-"""The files of a study: a table of all runs, its figures, and its section of the report."""
+"""A study done: as a whole, with its table, figures and section of the report, or in shards, as by jobs of an array.
+
+Shard i of n has every n-th run of the study, from the i-th on. Its folder gets a record of what it is a part of, so
+that shards of different options or versions are not mistaken for parts of one study.
+"""
 
 import csv
+import hashlib
 import io
+import json
 import platform
 import re
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
+
+from pydantic import BaseModel, ConfigDict
 
 from coldloop import __version__
+from coldloop.errors import StudyError, UsageError
+from coldloop.parsing import parsed_json
 from coldloop.whole_file import whole_text
-from coldloop_rig.figures.run_plot import save_figure
-from coldloop_rig.results.folders import installed_version, write_json, writing
-from coldloop_rig.studies.execution import Workers, checked_requests, perform_all
-from coldloop_rig.studies.outside_parts import outside_digests
+from coldloop_rig.figures.plot import save_figure
+from coldloop_rig.results.folders import installed_version, prepare_folder, write_json, writing
+from coldloop_rig.studies.execution import Store, Workers, checked_requests, perform_all
 from coldloop_rig.studies.request import LIBRARIES, RunRequest, programs_digest
-from coldloop_rig.studies.settings import settings_of
-from coldloop_rig.studies.store import Store
+from coldloop_rig.studies.settings import outside_digests, settings_of
 from coldloop_rig.studies.study import RUNS, Study, StudyOptions, StudyResult
 from coldloop_rig.text_tables import markdown_table
 
@@ -75,14 +83,146 @@ def figure_file(name: str) -> str:
     return re.sub(r"[^\w.-]+", "-", name) + ".png"
 
 
-LONGEST_TABLE = 24
-"""Rows that a section shows; the file has them all."""
-
-
 def section(result: StudyResult, folder: str = "") -> str:
-    """Return figures, remarks and, if it is shown, the table as Markdown; figures are looked for in `folder`."""
+    """Return figures, remarks and a table of up to 24 rows as Markdown; figures are looked for in `folder`."""
     parts = [f"![{name}]({folder}{figure_file(name)})" for name in result.figures]
     parts += result.remarks
-    if result.rows and (result.always_shown or len(result.rows) <= LONGEST_TABLE):
+    if result.rows and (result.always_shown or len(result.rows) <= 24):
         parts.append(markdown_table(result.columns, result.rows))
     return "\n\n".join(parts) + "\n"
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of several parts of a study."""
+
+    number: int
+    """From 1 on."""
+    of: int
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Return the shard that is written as `2/7`. Raises UsageError if it is none."""
+        number, _, of = text.partition("/")
+        if not (number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of)):
+            raise UsageError(f"--shard {text}: write i/n with i from 1 to n, such as 2/7")
+        return cls(int(number), int(of))
+
+    def __str__(self) -> str:
+        """Write it as it is read."""
+        return f"{self.number}/{self.of}"
+
+
+class ShardRecord(BaseModel):
+    """What a shard is a part of."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    study: str
+    shard: int
+    of: int
+    options: dict[str, Any]
+    """Of the study."""
+    programs: str
+    """Digest of the programs that do its runs."""
+    runs: str
+    """Digest of all runs of the study."""
+
+    @classmethod
+    def of_study(cls, study: Study, options: StudyOptions, shard: Shard) -> Self:
+        """Return the record of a shard that is about to be done."""
+        digests = [request.digest for request in unique(study.requests(options))]
+        runs = hashlib.sha256("\n".join(digests).encode()).hexdigest()[:20]
+        plain = parsed_json(json.dumps(asdict(options)))
+        return cls(
+            study=study.name, shard=shard.number, of=shard.of, options=plain, programs=programs_digest(), runs=runs
+        )
+
+
+def unique(requests: Sequence[RunRequest]) -> list[RunRequest]:
+    """Return one request for each run, in their order: the same run may be asked for in several ways."""
+    found: dict[str, RunRequest] = {}
+    for request in requests:
+        found.setdefault(request.digest, request)
+    return list(found.values())
+
+
+def conduct_shard(study: Study, options: StudyOptions, workers: Workers, folder: Path, shard: Shard) -> int:
+    """Do what is missing of a shard; return how many runs it has.
+
+    Raises:
+        ColdloopError: A run failed, or a file cannot be written.
+    """
+    requests = checked_requests(study, options, folder)
+    record = ShardRecord.of_study(study, options, shard)
+    path = folder / study.name / f"shard-{shard.number}-of-{shard.of}.json"
+    with writing(path):
+        write_json(path, record.model_dump())
+    mine = unique(requests)[shard.number - 1 :: shard.of]
+    perform_all(mine, Store(folder / RUNS), workers, f"{study.name} {shard}")
+    return len(mine)
+
+
+def merge(study: Study, options: StudyOptions, sources: Sequence[Path], folder: Path) -> None:
+    """Gather the runs of all shards in one store.
+
+    Raises:
+        UsageError: A folder has no shard of this study with these options, done by these programs.
+        StudyError: Runs are missing.
+        ResultsError: A file cannot be written.
+    """
+    of = _common_number(study, options, sources)
+    prepare_folder(folder / RUNS)
+    target = Store(folder / RUNS)
+    requests = unique(study.requests(options))
+    missing = []
+    for place, request in enumerate(requests):
+        if target.find(request) is not None:
+            continue
+        found = (Store(source / RUNS).text(request) for source in sources)
+        text = next((text for text in found if text is not None), None)
+        if text is None:
+            missing.append(f"{place % of + 1}/{of}")
+        else:
+            target.keep(request, text)
+    if missing:
+        shards = ", ".join(sorted(set(missing), key=lambda shard: int(shard.partition("/")[0])))
+        raise StudyError(
+            f"study {study.name}: {len(missing)} of {len(requests)} runs are missing or damaged, of shards {shards}; "
+            "do these with --shard, then merge again"
+        )
+
+
+def _common_number(study: Study, options: StudyOptions, sources: Sequence[Path]) -> int:
+    """Return in how many shards the study was cut; all records must agree, with each other and with what is asked."""
+    cuts = {}
+    for source in sources:
+        paths = sorted((source / study.name).glob("shard-*-of-*.json"))
+        if not paths:
+            raise UsageError(f"{source}: no shard of study {study.name}; name the --out folders of the shards")
+        for path in paths:
+            try:
+                record = ShardRecord.model_validate_json(path.read_text(encoding="utf-8"))
+            except OSError as error:
+                raise UsageError(f"{path}: {error.strerror}; do this shard again") from None
+            except ValueError:
+                raise UsageError(f"{path}: not the record of a shard; do this shard again") from None
+            _compare(path, record, ShardRecord.of_study(study, options, Shard(record.shard, record.of)))
+            cuts[record.of] = path
+    if len(cuts) > 1:
+        (of, path), (other, other_path) = list(cuts.items())[:2]
+        raise UsageError(f"{other_path}: one of {other} shards, while {path} is one of {of}; merge shards of one set")
+    return next(iter(cuts))
+
+
+def _compare(path: Path, record: ShardRecord, wanted: ShardRecord) -> None:
+    if record.programs != wanted.programs:
+        raise UsageError(f"{path}: done by another version of Coldloop; do all shards and the merge with the same one")
+    names = {**record.options, **wanted.options}
+    different = [
+        f"{name} {record.options.get(name)} there, {wanted.options.get(name)} here"
+        for name in names if record.options.get(name) != wanted.options.get(name)
+    ]  # fmt: skip
+    if different or record.runs != wanted.runs:
+        reason = "; ".join(different) or "load files differ"
+        raise UsageError(f"{path}: of another configuration ({reason}); give all shards and the merge the same options")

@@ -21,14 +21,12 @@ from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap
 from coldloop.registers.maps import maps_of
 from coldloop_rig.chaos.faults import AnyFault, WrongModel
-from coldloop_rig.chaos.injection import Injector
-from coldloop_rig.chaos.models import WRONG_MODEL, save_wrong_model
-from coldloop_rig.chaos.proxied_services import ProxiedServices
+from coldloop_rig.chaos.proxy import ProxiedServices
+from coldloop_rig.chaos.sequencer import WRONG_MODEL, Injector, save_wrong_model
 from coldloop_rig.cosim.session import SessionClient
 from coldloop_rig.cosim.wiring import QUIET_S, SERVICES, START_PATIENCE_S, RigEndpoints
-from coldloop_rig.python_settings import Period, configured
 from coldloop_rig.runs.running import check_certificates, make_scenario
-from coldloop_rig.settings import Settings
+from coldloop_rig.settings import Period, Settings, configured
 
 T = TypeVar("T")
 LOOK_S: Final = 0.01

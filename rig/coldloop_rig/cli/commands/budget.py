@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from coldloop.errors import UsageError
 from coldloop.service.command_line import add_configuration_options
 from coldloop_rig.cli.commands.options import check_load, configuration, fixed_updating_period, positive_count
-from coldloop_rig.terminal import fitted, width
+from coldloop_rig.text_tables import fitted, width
 
 if TYPE_CHECKING:
     from coldloop_optimizer_plc.qp.problem import PredictiveProblem
@@ -89,7 +89,7 @@ def _shown(options: argparse.Namespace) -> str:
 
         return aligned([(name, find_profile(name).name) for name in shipped_profiles()])
     if options.keys:
-        from coldloop_rig.cli.key_listing import key_listing
+        from coldloop_rig.cli.listings import key_listing
 
         return key_listing(PlcProfile)
     if options.export:

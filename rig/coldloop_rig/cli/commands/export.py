@@ -48,7 +48,7 @@ def execute(options: argparse.Namespace) -> int:
 
 def _recorded_run(options: argparse.Namespace) -> list[Path]:
     from coldloop.errors import UsageError
-    from coldloop_rig.results.export import export
+    from coldloop_rig.results.run_folder import export
 
     if options.ticks is not None:
         raise UsageError("--ticks: is for coldloop export plc --target")
@@ -75,7 +75,7 @@ def _solver(options: argparse.Namespace) -> list[Path]:
 def _settings(options: argparse.Namespace) -> "Settings":
     """Return the settings of the optimiser: those of the paper's PLC, unless the user says otherwise."""
     from coldloop.config import load_configuration
-    from coldloop_rig.cli.process_option import process_setting
+    from coldloop_rig.cli import process_setting
     from coldloop_rig.plc_export.golden import SINGLE
     from coldloop_rig.settings import Settings
 

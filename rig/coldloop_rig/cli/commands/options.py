@@ -1,23 +1,50 @@
-"""Options that several subcommands share, and how their values are read."""
+"""Options that several commands share, how their values are read, and the names that they offer.
+
+These names are written down, so that they can be offered without importing what they name;
+`tests/rig/test_command_line.py` compares them with what there is.
+"""
 
 import argparse
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from coldloop.errors import UsageError
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.service.command_line import add_configuration_options
-from coldloop_rig.cli.commands.choices import FIGURE_FORMATS, LOADS, PRESETS, SOLVERS
-from coldloop_rig.cli.process_option import process_setting
+from coldloop_rig.cli import process_setting
 
 if TYPE_CHECKING:
     from coldloop.config import Configuration
     from coldloop_rig.cosim.wiring import RigEndpoints
     from coldloop_rig.operator_settings import OperatorSettings
     from coldloop_rig.settings import Settings
+
+
+MODES: Final = ("lockstep", "realtime")
+SOLVERS: Final = ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "hybrid", "daqp")
+PRESETS: Final = ("tuned", "paper", "as-printed")
+LOADS: Final = ("a", "b", "c", "d", "e", "f", "2h", "6h", "8h", "pulses", "quench")
+SERVICES: Final = ("control_plc", "optimizer_plc", "plant")
+WITHOUT: Final = ("optimizer",)
+REGISTER_FORMATS: Final = ("csv", "json", "markdown", "table")
+TAG_FORMATS: Final = ("fuxa", "grafana", "ignition", "node-red", "telegraf")
+FIGURE_FORMATS: Final = ("png", "pdf", "svg")
+STUDIES: Final = (
+    "cholesky", "unlimited", "limited", "solver-comparison", "trajectories", "updating-period", "plc-2h", "adaptive-2h",
+    "trade-off", "classical", "single-precision", "coupling", "disturbances",
+    "robustness", "contest", "penalties", "periods", "compare",
+)  # fmt: skip
+
+
+def plans() -> list[str]:
+    """Return the names of the chaos plans that are shipped."""
+    folder = files("coldloop_rig.chaos") / "plans"
+    return sorted(file.name.removesuffix(".toml") for file in folder.iterdir() if file.name.endswith(".toml"))
+
 
 KEYS = {
     "load": ("plant.load", "--load"),
@@ -34,6 +61,13 @@ KEYS = {
 
 
 LOOPBACK: Final = ("127.0.0.1", "localhost", "::1")
+
+
+class Command(NamedTuple):
+    """A command: its options, and what does it; that one's docstring describes it."""
+
+    declare: Callable[[argparse.ArgumentParser], None]
+    execute: Callable[[argparse.Namespace], int]
 
 
 class HostPort(NamedTuple):
@@ -164,11 +198,16 @@ def exported(given: str | None, settings: "Settings") -> tuple[str, ...]:
     return exported_optimizer(given, settings)
 
 
+def say(line: str) -> None:
+    """Write a line at once; a closed output ends the command."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
 def tell(text: str) -> None:
     """Write a line about progress; a closed output does not stop the command."""
     with suppress(BrokenPipeError):
-        sys.stdout.write(f"{text}\n")
-        sys.stdout.flush()
+        say(text)
 
 
 def rig_endpoints(options: argparse.Namespace, settings: "OperatorSettings | Settings") -> "RigEndpoints":
@@ -294,12 +333,8 @@ def operator_settings(options: argparse.Namespace) -> "OperatorSettings":
 def refuse_ineffective(effective: "Configuration[Settings]", keys: Mapping[str, str]) -> None:
     """Refuse values that the command replaces by its own; a file and the environment may repeat the default.
 
-    Args:
-        effective: The configuration.
-        keys: Dotted keys, and what to do instead.
-
     Raises:
-        UsageError: One of them was set.
+        UsageError: One of the dotted keys was set; the message has what to do instead, the value of the key in `keys`.
     """
     from coldloop.config import DEFAULT, flattened
 

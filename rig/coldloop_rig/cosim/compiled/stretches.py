@@ -24,7 +24,7 @@ from coldloop_rig.cosim.compiled.records import (
     empty_reports,
     empty_trace,
 )
-from coldloop_rig.results.recorded import NO_STATION, STATION_COLUMNS, SampleBlock
+from coldloop_rig.results.recording import NO_STATION, STATION_COLUMNS, SampleBlock
 
 SHORTEST: Final = 6
 """Ticks to an updating instant below which the programs are as quick."""

@@ -1,17 +1,60 @@
-"""Solvers in the closed loop, under fixed periods and under rules: what a better solver is worth there."""
+"""Controllers in the closed loop: solvers under fixed periods and under rules; the classical loops as the baseline."""
 
 from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from coldloop_rig.studies.drawing import ratio_rows
+from coldloop_rig.studies.drawing import cost_bars, ratio_rows
 from coldloop_rig.studies.intervals import Interval, mean_ratio
 from coldloop_rig.studies.paper.updating_period import ADAPTIVE, INTERRUPT, RULE, Policy
 from coldloop_rig.studies.request import RunRequest, Series
 from coldloop_rig.studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, first_and_fresh, loads
 from coldloop_rig.text_tables import markdown_table
+
+CASES: Final = {
+    "classical loops": (2.5, ("control_plc.driver=classical",)),
+    "MPC, 2.5 s": (2.5, ()),
+    "MPC, adaptive": (0.0, ()),
+}
+
+
+class ClassicalStudy:
+    """Two PI loops against MPC."""
+
+    name = "classical"
+    title = "The classical loops as a baseline (section IV-A)"
+
+    def requests(self, options: StudyOptions) -> list[RunRequest]:
+        """Return every case under every draw."""
+        return [request for load in loads(options, *"abcdef") for request in _runs(load)]
+
+    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+        """Compare closed-loop costs and bands."""
+        result = StudyResult(("load", "case", "J_BF", "L1 outside (%)", "T5 outside (%)"), [], {})
+        for load in loads(options, *"abcdef"):
+            runs = [outcomes[request].indicators for request in _runs(load)]
+            for label, run in zip(CASES, runs, strict=True):
+                result.rows.append((load.name, label, run.J_BF, *run.outside_band_pct.values()))
+            result.note("J_BF of the classical loops over MPC at 2.5 s", runs[0].J_BF / runs[1].J_BF)
+        result.figures["closed-loop cost"] = cost_bars(result, CASES, 0.25, logarithmic=True)
+        result.remarks.append(_classical_table(result))
+        return result
+
+
+def _runs(load: Load) -> list[RunRequest]:
+    return [load.request(period, *assignments) for period, assignments in CASES.values()]
+
+
+def _classical_table(result: StudyResult) -> str:
+    """Return a table: J_BF and the time outside the bands of each case."""
+    rows = []
+    for name in dict.fromkeys(row[0] for row in result.rows):
+        mine = [row for row in result.rows if row[0] == name]
+        cells = [f"{float(row[2]):,.0f} ({float(row[3]):.1f} / {float(row[4]):.1f})" for row in mine]
+        rows.append((name, *cells))
+    return markdown_table(("hour", *CASES), rows, "**J_BF (time outside the bands, %: L1 / T5)**")
+
 
 SOLVERS: Final = {
     "ODE": (),
@@ -61,8 +104,10 @@ class ContestStudy:
             costs = {key: np.array(values) for key, values in table.items()}
             for column, cost in enumerate(COSTS.values()):
                 ratios = {key: _ratios(values[:, column], costs[REFERENCE][:, column]) for key, values in costs.items()}
-                result.remarks.append(_table(f"{title}, {cost}", ratios, len(hours)))
-                result.figures[f"{title}, {cost}"] = _figure(ratios, cost)
+                result.remarks.append(_contest_table(f"{title}, {cost}", ratios, len(hours)))
+                means = {solver: {way.label: ratios[solver, way.label][0] for way in WAYS} for solver in SOLVERS}
+                what = f"{cost} over that of {' under '.join(REFERENCE)} (1)"
+                result.figures[f"{title}, {cost}"] = ratio_rows(means, what, 4.0, 0.16, len(SOLVERS))
                 for (solver, label), (mean, _) in ratios.items():
                     result.values[f"{cost} over ODE, Algorithm 1, {title}: {solver}, {label}"] = [mean.value]
         return result
@@ -85,7 +130,7 @@ def _ratios(costs: Series, reference: Series) -> Ratio:
     return mean_ratio(costs, reference), float((costs / reference).max())
 
 
-def _table(title: str, ratios: Mapping[tuple[str, str], Ratio], hours: int) -> str:
+def _contest_table(title: str, ratios: Mapping[tuple[str, str], Ratio], hours: int) -> str:
     caption = (
         f"**{title}** over that of {' under '.join(REFERENCE)}, geometric mean of {hours} hours with its 95 % "
         "interval; in brackets the worst hour."
@@ -95,8 +140,3 @@ def _table(title: str, ratios: Mapping[tuple[str, str], Ratio], hours: int) -> s
         found = (ratios[solver, way.label] for solver in SOLVERS)
         rows.append((way.label, *(f"{mean.text()} ({worst:.2f})" for mean, worst in found)))
     return markdown_table(("way", *SOLVERS), rows, caption)
-
-
-def _figure(ratios: Mapping[tuple[str, str], Ratio], cost: str) -> Figure:
-    means = {solver: {way.label: ratios[solver, way.label][0] for way in WAYS} for solver in SOLVERS}
-    return ratio_rows(means, f"{cost} over that of {' under '.join(REFERENCE)} (1)", 4.0, 0.16, len(SOLVERS))

@@ -1,30 +1,209 @@
-"""Costs of throttled solvers against the computing power of the PLC (paper, figure `solv_cmp`)."""
+"""Costs of throttled solvers against the computing power of the PLC (paper, figure `solv_cmp`).
+
+The paper compares 20 iterations of the ODE-based solver with 10 of qpOASES: 5 s over tau_1, without a slot for the
+preparation (section V), so that slot is left out here. Paired, every solver at every power has the same problems and is
+judged by what would be played; harsh problems show what solvers make of the same bad guess in the same PLC time.
+"""
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import Final
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from coldloop_plant.load import HOUR_TICKS
 from coldloop_rig.figures.plot import COLOURS
 from coldloop_rig.studies import published
-from coldloop_rig.studies.crossing import crossing
-from coldloop_rig.studies.drawing import legend_outside, panels, paper, spans_decade, spread
-from coldloop_rig.studies.harsh_problems import harsh_ratios, harsh_requests, harsh_table, harsh_values
-from coldloop_rig.studies.paper.open_loop import (
-    open_loop,
-    open_loop_figure,
-    open_loop_table,
-    paired_requests,
-    paper_powers,
-)
-from coldloop_rig.studies.request import RunRequest, Series
-from coldloop_rig.studies.solver_runs import throttled
-from coldloop_rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
-from coldloop_rig.text_tables import Cell
+from coldloop_rig.studies.drawing import above_lowest, legend_outside, panels, paper, spans_decade, spread
+from coldloop_rig.studies.intervals import PairedSums, crossing, watch
+from coldloop_rig.studies.paired_run import HARSH, INTERIOR_POINT_ITERATIONS
+from coldloop_rig.studies.request import Procedure, RunRequest, Series
+from coldloop_rig.studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
+from coldloop_rig.text_tables import Cell, markdown_table
+
+PERIOD_S = 5.0
+UNLIMITED = 50.0
+"""Power at which qpOASES makes 526 recalculations in a period: more than any problem takes."""
+
+
+def throttled(
+    load: Load, solver: str, power: float, trace_ticks: int = 0, procedure: Procedure = Procedure.CONFIGURED
+) -> RunRequest:
+    """Return the run of a solver at a power, relative to the PLC of the paper."""
+    return load.request(
+        PERIOD_S,
+        f"{PROGRAM}solver={solver}",
+        f"{PROGRAM}budget.power={power}",
+        f"{PROGRAM}budget.preparation_slots=0",
+        trace_ticks=trace_ticks,
+        procedure=procedure,
+    )
+
+
+PAIRED_DRAWS: Final = 10
+"""Of the eight hours' families, an hour each, unless another number is asked for."""
+FEW_POWERS: Final = (0.2, 0.6, 1.0, 2.0, 4.0, 10.0)
+QUICK_POWERS: Final = (0.2, 1.0, 25.0)
+LABELS: Final = {
+    "ode": "ODE", "qpoases": "qpOASES", "interior-point": "interior point", "osqp": "OSQP",
+    "fast-gradient": "fast gradient", "daqp": "DAQP, one solve",
+}  # fmt: skip
+
+
+def _paper_powers(options: StudyOptions) -> tuple[float, ...]:
+    return QUICK_POWERS if options.quick else tuple(published.solver_comparison()["ode"]["normalized_power"].tolist())
+
+
+def powers_of(solver: str, options: StudyOptions) -> tuple[float, ...]:
+    """Return the powers at which a solver is compared."""
+    if solver in ("ode", "qpoases") or options.quick:
+        return _paper_powers(options)
+    return (1.0,) if solver == "daqp" else FEW_POWERS
+
+
+def paired_loads(options: StudyOptions) -> list[Load]:
+    """Return the draws, an hour of each."""
+    return loads(options, "8h", usual=PAIRED_DRAWS, longest_ticks=HOUR_TICKS)
+
+
+def paired_request(load: Load, solver: str, power: float) -> RunRequest:
+    """Return the request for one solver at one power on the problems of a load."""
+    return throttled(load, solver, power, procedure=Procedure.PAIRED_PROBLEMS)
+
+
+def _paired_requests(options: StudyOptions) -> list[RunRequest]:
+    """Return all of them, load by load: a worker has the problems of a load at hand."""
+    return [
+        paired_request(load, solver, power)
+        for load in paired_loads(options)
+        for solver in LABELS
+        for power in powers_of(solver, options)
+    ]
+
+
+OpenLoop = PairedSums[str]
+
+
+def open_loop(options: StudyOptions, outcomes: Outcomes) -> OpenLoop:
+    """Gather the outcomes. Raises StudyError if a profile costs less than the optimum."""
+    powers = {solver: powers_of(solver, options) for solver in LABELS}
+    return PairedSums(paired_loads(options), powers, paired_request, str, outcomes)
+
+
+def open_loop_table(found: OpenLoop) -> str:
+    """Return total costs over the lowest with their intervals, and where solvers cross, as Markdown."""
+    some = [power for power in FEW_POWERS if any(power in powers for powers in found.powers.values())]
+    caption = (
+        f"**Paired, open loop**: total cost of all draws ({len(found.loads)}) over the lowest cost of any profile "
+        "that can be played [95 % interval over the draws]. All solvers have the same problems, each with "
+        "its own hot starts, and are judged by what the control PLC would play; no ratio can be below 1."
+    )
+    rows = []
+    for solver, powers in found.powers.items():
+        cells = [found.interval(solver, power).brief(4) if power in powers else "" for power in some]
+        rows.append((LABELS[solver], *cells))
+    table = markdown_table(("solver", *(f"P = {power:g}" for power in some)), rows, caption)
+    parts = [table]
+    for other in ("ode", "interior-point"):
+        power = found.crossing("qpoases", other)
+        parts.append(
+            f"At no power does qpOASES cost as little as {LABELS[other]}, all draws together."
+            if np.isnan(power.value)
+            else f"qpOASES costs no more than {LABELS[other]} from P = {power.brief()} on."
+        )
+    return "\n\n".join(parts)
+
+
+def _open_loop_figure(found: OpenLoop) -> Figure:
+    with panels(1, 1, 3.0) as (figure, (place,)):
+        for (solver, powers), colour in zip(found.powers.items(), COLOURS, strict=False):
+            intervals = [found.interval(solver, power) for power in powers]
+            above_lowest(place, powers, intervals, colour, LABELS[solver])
+        legend_outside(figure, place)
+    return figure
+
+
+HARSH_DRAWS: Final = 3
+"""Of six hours: they have more than 300 harsh problems."""
+
+
+def _harsh_loads(options: StudyOptions) -> list[Load]:
+    return loads(options, *"abcdef", usual=HARSH_DRAWS)
+
+
+def _solvers() -> list[str]:
+    return [name for name in LABELS if name != "daqp"]  # one solve of DAQP is longer than all of these times
+
+
+def harsh_request(load: Load, solver: str) -> RunRequest:
+    """Return the request for one solver on the harsh problems of a load, at P = 1."""
+    return throttled(load, solver, 1.0, procedure=Procedure.HARSH_PROBLEMS)
+
+
+def _harsh_requests(options: StudyOptions) -> list[RunRequest]:
+    return [harsh_request(load, solver) for load in _harsh_loads(options) for solver in _solvers()]
+
+
+def harsh_ratios(options: StudyOptions, outcomes: Outcomes) -> dict[str, dict[int, Series]]:
+    """Return the costs of all harsh problems over the lowest: by solver and by iterations of the interior-point solver.
+
+    Raises:
+        StudyError: A profile costs less than the optimum.
+    """
+    found = {}
+    for solver in _solvers():
+        runs = [outcomes[harsh_request(load, solver)] for load in _harsh_loads(options)]
+        for run, k in product(runs, INTERIOR_POINT_ITERATIONS):
+            watch(run, "lowest", run.column(f"after_{k}"), f"harsh problems, {solver}")
+        found[solver] = {
+            k: np.concatenate([run.column(f"after_{k}") / run.column("lowest") for run in runs])
+            for k in INTERIOR_POINT_ITERATIONS
+        }
+    return found
+
+
+def harsh_values(ratios: Mapping[str, Mapping[int, Series]]) -> dict[str, list[float]]:
+    """Return median and worst by name, and how many problems there were."""
+    values: dict[str, list[float]] = {}
+    for solver, by_count in ratios.items():
+        for k, found in by_count.items():
+            if len(found):
+                name = f"{LABELS[solver]}, in the time of {k} interior-point iterations"
+                values[f"J over the lowest of harsh problems, median: {name}"] = [float(np.median(found))]
+                values[f"J over the lowest of harsh problems, worst: {name}"] = [float(found.max())]
+    counts = [len(found) for found in next(iter(ratios.values())).values()]
+    values["number of harsh problems"] = [float(counts[0])]
+    return values
+
+
+def harsh_table(options: StudyOptions, outcomes: Outcomes) -> str:
+    """Return medians and worst ratios of every solver, with its number of iterations, as Markdown."""
+    ratios = harsh_ratios(options, outcomes)
+    number = len(next(iter(ratios.values()))[INTERIOR_POINT_ITERATIONS[0]])
+    if not number:
+        return "No problem was harsh."
+    first = _harsh_loads(options)
+    caption = (
+        f"**Harsh problems**: {number} problems of {len(first)} hours whose guess, the shifted profile of the "
+        f"converged loop, costs more than {HARSH:g} times the lowest; cost over the lowest, median (worst), after the "
+        "PLC time of so many iterations of the interior-point solver; in brackets each solver's own iterations."
+    )
+    rows = []
+    for solver, by_count in ratios.items():
+        counts = _counts(outcomes, first, solver)
+        cells = [
+            f"{np.median(found):.4g} ({found.max():.3g}) [{counts[k]:.0f}]" for k, found in by_count.items()
+        ]  # fmt: skip
+        rows.append((LABELS[solver], *cells))
+    return markdown_table(("solver", *(f"time of {k}" for k in INTERIOR_POINT_ITERATIONS)), rows, caption)
+
+
+def _counts(outcomes: Outcomes, drawn: list[Load], solver: str) -> dict[int, float]:
+    with_some = next(run for load in drawn if len((run := outcomes[harsh_request(load, solver)]).column("lowest")))
+    return {k: float(with_some.column(f"count_{k}")[0]) for k in INTERIOR_POINT_ITERATIONS}
+
 
 Table = Mapping[str, Mapping[str, Series]]
 """Values against power, by solver and indicator."""
@@ -47,29 +226,26 @@ class SolverComparison:
         """Return the problems of all solvers, then every solver of the paper in the closed loop, long runs first."""
         closed = [
             throttled(load, solver, power)
-            for power in sorted(paper_powers(options), reverse=True)
+            for power in sorted(_paper_powers(options), reverse=True)
             for solver in SOLVERS
             for load in _closed_loads(options)
         ]
-        return [*paired_requests(options), *harsh_requests(options), *closed]
+        return [*_paired_requests(options), *_harsh_requests(options), *closed]
 
+    @np.errstate(divide="ignore", invalid="ignore")  # under a load that never steps nothing costs anything
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Compare costs with those of converged qpOASES, with the lowest there are, and with the paper's."""
-        with np.errstate(divide="ignore", invalid="ignore"):  # under a load that never steps nothing costs anything
-            return self._evaluate(options, outcomes)
-
-    def _evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        powers = np.array(paper_powers(options))
+        powers = np.array(_paper_powers(options))
         paired = open_loop(options, outcomes)
         tables: list[Table] = [paired.table(draw) for draw in range(len(paired.loads))]
         closed = [_closed_table(load, powers, outcomes) for load in _closed_loads(options)]
         result = StudyResult(COLUMNS, [], {
             "indicators": _figure(powers, tables, closed),
-            "paired open loop": open_loop_figure(paired),
+            "paired open loop": _open_loop_figure(paired),
         })  # fmt: skip
         for load, table in zip(paired.loads, tables, strict=True):
             result.rows += _open_rows(load, table, paired.powers)
-            _gather(result, open_loop_measures(powers, table))
+            _gather(result, _open_loop_measures(powers, table))
         for load, table in zip(_closed_loads(options), closed, strict=True):
             result.rows += [
                 (
@@ -84,7 +260,7 @@ class SolverComparison:
                 for solver in SOLVERS
                 for i, power in enumerate(powers.tolist())
             ]
-            _gather(result, closed_loop_measures(powers, table))
+            _gather(result, _closed_loop_measures(powers, table))
         result.values |= harsh_values(harsh_ratios(options, outcomes))
         result.remarks += [open_loop_table(paired), harsh_table(options, outcomes)]
         return result
@@ -119,11 +295,10 @@ def _closed_table(load: Load, powers: Series, outcomes: Outcomes) -> Table:
 
 def measures(powers: Series, table: Table) -> dict[str, float]:
     """Return what the claims are judged by, of points that have both parts: the paper's own."""
-    return {**open_loop_measures(powers, table), **closed_loop_measures(powers, table)}
+    return {**_open_loop_measures(powers, table), **_closed_loop_measures(powers, table)}
 
 
-def open_loop_measures(powers: Series, table: Table) -> dict[str, float]:
-    """Return what the claims on predicted costs are judged by."""
+def _open_loop_measures(powers: Series, table: Table) -> dict[str, float]:
     ode, qpoases = table["ode"], table["qpoases"]
     converged = qpoases["J_total"][-1]
     relative = qpoases["J_total"] / converged
@@ -144,8 +319,7 @@ def open_loop_measures(powers: Series, table: Table) -> dict[str, float]:
     }
 
 
-def closed_loop_measures(powers: Series, table: Table) -> dict[str, float]:
-    """Return what the claims on J_BF are judged by."""
+def _closed_loop_measures(powers: Series, table: Table) -> dict[str, float]:
     ode, qpoases = table["ode"]["J_BF"], table["qpoases"]["J_BF"]
     one = _place(powers, 1.0)
     return {
@@ -180,16 +354,11 @@ def _figure(powers: Series, paired: Sequence[Table], closed: Sequence[Table]) ->
                 base = theirs["qpoases"][name][-1] if relative else 1.0
                 paper(place, theirs[solver]["normalized_power"], theirs[solver][name] / base, colour,
                       f"{SOLVERS[solver]}, paper")  # fmt: skip
-            drawn = np.concatenate([np.ravel(line.get_ydata()) for line in place.lines])
-            _axes(place, labels[name], logarithmic=spans_decade(drawn))
+            place.set_xscale("log")
+            place.set_ylabel(labels[name])
+            if spans_decade(np.concatenate([np.ravel(line.get_ydata()) for line in place.lines])):
+                place.set_yscale("log")
         legend_outside(figure, axes[0])
         for place in axes[-2:]:
             place.set_xlabel("normalised power $P$ (1)")
     return figure
-
-
-def _axes(place: Axes, label: str, *, logarithmic: bool) -> None:
-    place.set_xscale("log")
-    place.set_ylabel(label)
-    if logarithmic:
-        place.set_yscale("log")

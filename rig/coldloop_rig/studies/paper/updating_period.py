@@ -12,7 +12,7 @@ from coldloop_rig.figures.plot import ACCENT, INK, THIRD
 from coldloop_rig.studies import published
 from coldloop_rig.studies.drawing import hour_panels
 from coldloop_rig.studies.intervals import geometric_mean
-from coldloop_rig.studies.paper.load_response import response, response_figure, response_table
+from coldloop_rig.studies.paper.trajectories import response, response_figure, response_table
 from coldloop_rig.studies.request import Outcome, RunRequest, Series
 from coldloop_rig.studies.study import NOISE, PROGRAM, Load, Outcomes, StudyOptions, StudyResult, first_and_fresh, loads
 from coldloop_rig.text_tables import Cell, markdown_table

@@ -1,8 +1,8 @@
 """The whole refrigerator as a program: the plant, its station's controller, their disturbances, and how it starts.
 
-It starts at the operating point of its file, which `python -m coldloop_plant.refrigerator.model FILE` makes off line. Like the
-model file it is JSON with its own digest, so that every run, on any machine, begins with the same bits. Or it starts
-warm, before its cool-down.
+It starts at the operating point of its file, which `python -m coldloop_plant.refrigerator.model FILE` makes off line.
+Like the model file it is JSON with its own digest, so that every run, on any machine, begins with the same bits. Or it
+starts warm, before its cool-down.
 """
 
 import hashlib

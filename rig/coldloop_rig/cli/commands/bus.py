@@ -1,0 +1,316 @@
+"""Commands about what is on the bus: journals, links, certificates, registers."""
+
+import argparse
+import asyncio
+import contextlib
+import csv
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple, TextIO
+
+from coldloop.errors import ResultsError, UsageError
+from coldloop_rig.cli.commands.options import (
+    REGISTER_FORMATS,
+    SERVICES,
+    TAG_FORMATS,
+    Command,
+    HostPort,
+    add_rig_options,
+    endpoint,
+    operator_settings,
+    port_base,
+    rig_endpoints,
+    say,
+)
+from coldloop_rig.interruption import run_until_interrupted
+
+if TYPE_CHECKING:
+    from coldloop.modbus.endpoints import Endpoint
+    from coldloop.operating.observer import JournalReader
+    from coldloop.process.declaration import Process
+    from coldloop.registers.audit import Event
+
+
+COLUMNS: Final = ("number", "boot", "utc", "tick", "plant_time_s", "kind", "subject", "cause", "value", "who")
+LOOK_AGAIN_S: Final = 1.0
+"""With --follow: time between two looks at the journal."""
+
+
+def _declare_events(parser: argparse.ArgumentParser) -> None:
+    add_rig_options(parser)
+    parser.add_argument("endpoint", nargs="?", type=endpoint, metavar="HOST:PORT",
+                        help="where the service is, of a rig that is not up here")  # fmt: skip
+    parser.add_argument("--service", choices=SERVICES, default="control_plc", help="default: control_plc")
+    parser.add_argument("--kind", type=_kinds, default=(), metavar="KIND,...",
+                        help="only events of these kinds, such as alarm-raised,mode")  # fmt: skip
+    parser.add_argument("--since", type=_since, default=Since(1, 0.0), metavar="NUMBER|TIME",
+                        help="from this event on, or from this time (UTC, such as 2026-11-22T01:30)")  # fmt: skip
+    parser.add_argument("--follow", action="store_true", help="print new events until interrupted")
+    parser.add_argument("--csv", type="write", metavar="FILE", help="write a CSV file instead of lines")
+    parser.add_argument("--force", action="store_true", help="overwrite that file")
+
+
+class Since(NamedTuple):
+    """From where on the journal is read."""
+
+    number: int
+    utc: float
+    """Seconds since 1970."""
+
+
+def _kinds(text: str) -> tuple[int, ...]:
+    from coldloop.registers.audit import EventKind
+
+    known = {kind.name.lower().replace("_", "-"): kind for kind in EventKind if kind}
+    try:
+        return tuple(known[name.strip().lower().replace("_", "-").replace(" ", "-")] for name in text.split(","))
+    except KeyError as error:
+        raise argparse.ArgumentTypeError(f"unknown kind {error}; choose from {', '.join(known)}") from None
+
+
+def _since(text: str) -> Since:
+    if text.isdecimal() and 0 < int(text) < 2**32:
+        return Since(int(text), 0.0)
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is neither the number of an event nor a time such as 2026-11-22T01:30"
+        ) from None
+    return Since(1, (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp())
+
+
+def execute_events(options: argparse.Namespace) -> int:
+    """The journal of a running service: what happened, when, and who did it."""
+    if options.csv is not None and options.csv.is_file() and not options.force:
+        raise UsageError(f"{options.csv} exists: name another file with --csv, or overwrite it with --force")
+    interrupted = run_until_interrupted(lambda: _show_journal(options))
+    return 130 if interrupted and not options.follow else 0  # that is how --follow ends
+
+
+async def _show_journal(options: argparse.Namespace) -> None:
+    from coldloop.modbus.client import RegisterClient
+    from coldloop.operating.observer import JournalReader
+    from coldloop.registers.maps import maps_of
+
+    process, place = _place(options)
+    client = RegisterClient.at(maps_of(process).by_service[options.service], place)
+    reader = JournalReader(client, options.since.number, options.kind)
+    output = _CsvFile(options.csv, process) if options.csv else _Lines(process)
+    try:
+        await client.connect(0)
+        await _copy(reader, options, output, client.peer)
+    finally:
+        client.close()
+        output.close()
+
+
+def _place(options: argparse.Namespace) -> "tuple[Process, Endpoint]":
+    """Return the process, and the endpoint of the service whose journal is read."""
+    settings = operator_settings(options)
+    if options.endpoint is not None and (options.rig or options.port_base):
+        raise UsageError("HOST:PORT, --rig and --port-base: give one of them")
+    if options.endpoint is not None:
+        options.rig = [options.endpoint] * len(SERVICES)
+    place: Endpoint = getattr(rig_endpoints(options, settings), options.service)
+    return settings.process, place
+
+
+async def _copy(reader: "JournalReader", options: argparse.Namespace, output: "_Lines | _CsvFile", peer: str) -> None:
+    """Read once, or again and again, and say what cannot be read."""
+    warned: set[str] = set()
+    while True:
+        events = await reader.read_on()
+        for warning in _warnings(reader, peer):
+            if warning not in warned:
+                warned.add(warning)
+                sys.stderr.write(f"coldloop: {warning}\n")
+        output.write([event for event in events if event.utc + event.milliseconds / 1000 >= options.since.utc])
+        if not options.follow:
+            return
+        await asyncio.sleep(LOOK_AGAIN_S)
+
+
+def _warnings(reader: "JournalReader", peer: str) -> Iterator[str]:
+    if reader.limited:
+        yield f"no operator role at {peer}: only its last 256 events can be read"
+    if reader.missed:
+        yield f"{reader.missed} events are no longer kept"
+    if reader.restarted:
+        yield f"{peer} was restarted, and numbers its events from 1 again: it retains no state"
+
+
+class _Lines:
+    """Writes one line an event to standard output."""
+
+    def __init__(self, process: "Process") -> None:
+        self._process = process
+
+    def write(self, events: "Sequence[Event]") -> None:
+        from coldloop.service.event_text import describe, utc_text
+
+        for event in events:
+            sys.stdout.write(
+                f"{event.number:>7}  {utc_text(event)}  boot {event.boot}  tick {event.tick} "
+                f"({event.tick * self._process.tick_s:.2f} s)  {describe(event, self._process).sentence}\n"
+            )
+        sys.stdout.flush()
+
+    def close(self) -> None:
+        pass
+
+
+class _CsvFile:
+    """Writes a CSV file, which appears with the first events."""
+
+    def __init__(self, path: Path, process: "Process") -> None:
+        self._path, self._process = path, process
+        self._file: TextIO | None = None
+        self._events = 0
+
+    def write(self, events: "Sequence[Event]") -> None:
+        """Append events."""
+        present = self._path.exists()
+        try:
+            if self._file is None:
+                self._file = self._path.open("w", encoding="utf-8", newline="")
+                csv.writer(self._file, lineterminator="\n").writerow(COLUMNS)
+            csv.writer(self._file, lineterminator="\n").writerows(_cells(event, self._process) for event in events)
+            self._file.flush()
+        except OSError as error:
+            self._give_up(remove=not present)
+            raise ResultsError(f"{self._path}: {error.strerror}; choose another --csv") from None
+        self._events += len(events)
+
+    def _give_up(self, *, remove: bool) -> None:
+        """Close the file without what could not be written."""
+        with contextlib.suppress(OSError):
+            if self._file is not None:
+                self._file.close()
+        self._file = None
+        if remove:
+            self._path.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Close the file, and say what is in it."""
+        if self._file is not None:
+            self._file.close()
+            sys.stdout.write(f"{self._events} events in {self._path}\n")
+
+
+def _cells(event: "Event", process: "Process") -> list[str]:
+    from coldloop.service.event_text import describe, utc_text
+
+    text = describe(event, process)
+    time = f"{event.tick * process.tick_s:.2f}"
+    return [
+        str(event.number), str(event.boot), utc_text(event), str(event.tick), time, text.kind, text.subject, text.cause,
+        text.value, text.who,
+    ]  # fmt: skip
+
+
+def _declare_proxy(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("plan", type="read", metavar="PLAN", help="TOML file with the faults (`coldloop docs chaos`)")
+    parser.add_argument("--listen", type=_listener, required=True, metavar="[HOST:]PORT",
+                        help="where clients connect; at 127.0.0.1 unless an address is named")  # fmt: skip
+    parser.add_argument("--to", type=endpoint, required=True, metavar="HOST:PORT", help="the server behind it")
+    parser.add_argument("--seed", type=int, help="decides which frames are hit, instead of the plan's")
+
+
+def _listener(text: str) -> HostPort:
+    return endpoint(text if ":" in text else f"127.0.0.1:{text}")
+
+
+def execute_proxy(options: argparse.Namespace) -> int:
+    """A link to any Modbus/TCP server, disturbed by plan: late, lost, doubled, damaged, cut, refused."""
+    from coldloop.modbus.endpoints import Endpoint
+    from coldloop_rig.chaos.plan import find_link_plan
+    from coldloop_rig.chaos.proxy import disturb
+
+    plan = find_link_plan(options.plan, {} if options.seed is None else {"seed": options.seed})
+    if options.listen == options.to:
+        raise UsageError(f"--listen {options.to.host}:{options.to.port} is the server itself; listen at another port")
+    target = Endpoint(host=options.to.host, port=options.to.port)
+    return 130 if run_until_interrupted(lambda: disturb(plan, options.listen, target, say)) else 0
+
+
+def _declare_certificates(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type="into", required=True, metavar="DIR", help="folder for the files")
+    parser.add_argument("--host", dest="hosts", action="append", default=[], type=_host, metavar="NAME",
+                        help="another name or address of the servers, besides localhost; may be repeated")  # fmt: skip
+    parser.add_argument("--days", type=_days, default=365, help="days until they expire (default: 365)")
+    parser.add_argument("--revoke", action="append", default=[], metavar="NAME",
+                        help="revoke a certificate in the folder, such as operator; may be repeated")  # fmt: skip
+    parser.add_argument("--renew-list", action="store_true", help="renew the list of revoked certificates")
+
+
+def _host(text: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9]([A-Za-z0-9.:_-]{0,251}[A-Za-z0-9])?|::1?", text):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a host name or an address")
+    return text
+
+
+def _days(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 3650:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number of days from 1 to 3650")
+    return int(text)
+
+
+def execute_certificates(options: argparse.Namespace) -> int:
+    """Certificates for Modbus/TCP Security on a test site, and configuration for them.
+
+    It also revokes certificates that it has made, by the list of revocations that the configuration names.
+    """
+    from coldloop_rig.cli.certificates import revoke, write_site
+
+    if options.revoke or options.renew_list:
+        if options.hosts:
+            raise UsageError(
+                f"--host {options.hosts[0]}: has no effect on a list of revoked certificates; for another host make "
+                "certificates in another folder"
+            )
+        count, file = revoke(options.out, options.revoke, options.days)
+        sys.stdout.write(f"{count} revoked in {file}; restart the services that use it\n")
+        return 0
+    count, file = write_site(options.out, options.hosts, options.days)
+    sys.stdout.write(f"{count} certificates and their keys in {options.out}; use them with --config {file}\n")
+    return 0
+
+
+def _declare_registers(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--format", choices=(*REGISTER_FORMATS, *TAG_FORMATS), default="table",
+                        help="fuxa, grafana, ignition, node-red, telegraf: files for these programs")  # fmt: skip
+    parser.add_argument("--service", choices=SERVICES, help="default: all")
+    parser.add_argument("--host", default="127.0.0.1", help="where these programs find the rig (default: 127.0.0.1)")
+    parser.add_argument("--port-base", type=port_base, metavar="PORT", help="first of three consecutive ports")
+
+
+def execute_registers(options: argparse.Namespace) -> int:
+    """The register maps, as a table, Markdown, CSV or JSON, or as files of other programs."""
+    from coldloop.process.settings import settings_process
+    from coldloop.registers.maps import maps_of
+    from coldloop_rig.cli.registers import EXPORTS, FORMATS
+
+    every = maps_of(settings_process()).by_service
+    maps = [every[options.service]] if options.service else list(every.values())
+    if options.format in FORMATS:
+        sys.stdout.write(FORMATS[options.format](maps))
+        return 0
+    from coldloop_rig.cosim.wiring import SERVICES as IN_ORDER
+    from coldloop_rig.live.started_rigs import ports_from
+
+    ports = ports_from(options.port_base)
+    places = {service: HostPort(options.host, port) for service, port in zip(IN_ORDER, ports, strict=True)}
+    sys.stdout.write(EXPORTS[options.format](maps, places))
+    return 0
+
+
+COMMANDS: Final = {
+    "events": Command(_declare_events, execute_events),
+    "proxy": Command(_declare_proxy, execute_proxy),
+    "certificates": Command(_declare_certificates, execute_certificates),
+    "registers": Command(_declare_registers, execute_registers),
+}

@@ -1,0 +1,361 @@
+"""Commands about a plant and its controller."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from coldloop.service.command_line import add_configuration_options
+from coldloop_rig.cli.commands.options import Command, check_load, configuration, positive_count
+from coldloop_rig.text_tables import fitted, width
+
+if TYPE_CHECKING:
+    from coldloop_plant.refrigerator.exergy import ExergyBalance
+    from coldloop_rig.studies.instants import Judged
+
+
+FILES: Final = ("process.toml", "my_plant.py")
+INSTALLED: Final = Path(__file__).parents[2] / "examples"
+"""Of a wheel; a clone has them beside the packages."""
+EXAMPLES: Final = (
+    "cool_down", "efficient_refrigerator", "optimiser_by_registers", "optimiser_with_do_mpc", "outside_package",
+    "quadruple_tank", "smaller_turbine", "wood_berry",
+)  # fmt: skip
+
+
+def _declare_new(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type="into", metavar="FOLDER", help="a new folder, or one without such files")
+    parser.add_argument("--example", choices=EXAMPLES, metavar="NAME",
+                        help=f"the files of an example instead: {', '.join(EXAMPLES)}")  # fmt: skip
+
+
+def execute_new(options: argparse.Namespace) -> int:
+    """A folder with a process file and a plant to begin with, commented, or with an example."""
+    from coldloop.errors import UsageError
+    from coldloop.whole_file import whole_text
+
+    folder: Path = options.folder
+    texts = _template() if options.example is None else _example(options.example)
+    present = next((name for name in texts if (folder / name).exists()), None)
+    if present is not None:
+        raise UsageError(f"{folder / present}: is there already; name another folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in texts.items():
+            whole_text(folder / name, text)
+    except OSError as error:
+        raise UsageError(f"{folder}: {error.strerror}; name a folder that can be written to") from None
+    begin = "" if options.example else f"; now coldloop process {folder / FILES[0]}"
+    sys.stdout.write(f"{folder}: {', '.join(texts)}{begin}\n")
+    return 0
+
+
+def _template() -> dict[str, str]:
+    place = files("coldloop_rig.process_file").joinpath("template")
+    return {name: place.joinpath(f"{name}.txt").read_text(encoding="utf-8") for name in FILES}
+
+
+def _example(name: str) -> dict[str, str]:
+    from coldloop.errors import UsageError
+
+    folder = INSTALLED if INSTALLED.is_dir() else Path(__file__).parents[4] / "examples"
+    found = sorted(file for file in folder.rglob("*.*") if name in (file.parent.name, file.name[: len(name)]))
+    texts = {file.name: file.read_text(encoding="utf-8") for file in found if file.suffix != ".pyc"}
+    if not texts:
+        raise UsageError(f"--example {name}: this installation has no examples; they are in the wheel and in a clone")
+    return texts
+
+
+def _declare_process(parser: argparse.ArgumentParser) -> None:
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("file", type="read", nargs="?", metavar="FILE", help="process file (TOML)")
+    what.add_argument("--keys", action="store_true", help="list the keys of process files, as Markdown")
+    parser.add_argument("--out", type="write", metavar="MODEL",
+                        help="write the model file; then --process MODEL, or the key model.file")  # fmt: skip
+    parser.add_argument("--limit", type=positive_count, default=300, metavar="SECONDS",
+                        help="how long its plant may take, in a process of its own (default: 300)")  # fmt: skip
+
+
+def execute_process(options: argparse.Namespace) -> int:
+    """A process file checked, linearised and judged, and made into the model file of all programs."""
+    from coldloop.errors import UsageError
+    from coldloop.process.declaration import Process
+    from coldloop.whole_file import require_regular_file
+    from coldloop_rig.cli.listings import key_listing
+    from coldloop_rig.process_file.judgement import described
+    from coldloop_rig.process_file.making import made_from
+    from coldloop_rig.process_file.reading import text_of_child
+
+    out: Path | None = options.out
+    if options.keys:
+        if out is not None:
+            raise UsageError("--out: writes the model of a process file; name that file, and leave out --keys")
+        sys.stdout.write(key_listing(Process))
+        return 0
+    if out is not None:
+        require_regular_file(out)
+        if out.resolve() == options.file.resolve():
+            raise UsageError(f"{out}: is the process file; name another one with --out")
+
+    def work() -> str:
+        made = made_from(options.file)
+        if out is None:
+            return described(made)
+        try:
+            made.model.save(out)
+        except OSError as error:
+            raise UsageError(f"{out}: {error.strerror}; name a file that can be written with --out") from None
+        return f"{described(made)}written to {out}\n"
+
+    sys.stdout.write(fitted(text_of_child(options.file, work, options.limit), width()))
+    return 0
+
+
+def _declare_import(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("export", type="read", metavar="RECORD", help="text file of a historian or a spreadsheet")
+    add("--inputs", nargs="+", required=True, metavar="NAME",
+        help="inputs, load, other disturbances, which hold between readings; others are outputs")  # fmt: skip
+    add("--map", action="append", default=[], metavar="TAG=NAME",
+        help="name of a tag in the record; other tags are then left out; TAG=time_s: column of time")  # fmt: skip
+    add("--zone", metavar="ZONE", help="of times without one, as in Europe/Berlin")
+    add("--good", nargs="+", default=[], metavar="TEXT",
+        help="what a quality says of good readings, beside good, ok and such words, and 192 to 255")  # fmt: skip
+    add("--every", type=float, metavar="SECONDS", help="between rows (default: as usual between an output's readings)")
+    add("--gap", type=float, metavar="SECONDS", help="without a reading that cuts the record (default: 5 rows)")
+    add("--out", type="write", required=True, metavar="FILE", help="the record to write")
+
+
+def execute_import(options: argparse.Namespace) -> int:
+    """A historian's export made into a record for `plant.step_test`; says what it assumed and dropped.
+
+    It reads a line for each time or for each reading; commas, semicolons or tabs; dates, or seconds from any start.
+    Inputs hold between readings, outputs are averaged, and gaps cut the record into pieces.
+    """
+    from zoneinfo import available_timezones
+
+    from coldloop.errors import UsageError
+    from coldloop.whole_file import require_regular_file, whole_text
+    from coldloop_rig.process_file.historian import Request, record_of
+    from coldloop_rig.results.folders import writing
+
+    out: Path = options.out
+    require_regular_file(out)
+    if out.resolve() == options.export.resolve():
+        raise UsageError(f"{out}: is the export; name another file with --out")
+    names = dict(each.rpartition("=")[::2] for each in options.map)
+    if "" in {*names, *names.values()} or len({*names.values()}) < len(options.map):
+        raise UsageError("--map: write --map TAG=NAME, with another name for each tag")
+    if not all(given is None or 0.0 < given < float("inf") for given in (options.every, options.gap)):
+        raise UsageError("--every and --gap: a number of seconds above 0")
+    if options.zone is not None and options.zone not in available_timezones():
+        raise UsageError(f"--zone {options.zone}: no such zone; write one as in Europe/Berlin, or UTC")
+    inputs, good = tuple(options.inputs), tuple(options.good)
+    request = Request(options.export, names, inputs, options.zone, good, options.every, options.gap)
+    text, said = record_of(request)
+    with writing(out):
+        whole_text(out, text)
+    sys.stdout.write("".join(f"{line}\n" for line in (*said, f"written    to {out}")))
+    return 0
+
+
+def _declare_model(parser: argparse.ArgumentParser) -> None:
+    add_configuration_options(parser)
+    parser.add_argument("--plant", type="read", metavar="FILE", help="plant file (TOML): parameters of another plant")
+    parser.add_argument("--out", type="write", metavar="FILE", help="write the model file, for model.file")
+
+
+def execute_model(options: argparse.Namespace) -> int:
+    """The plant at its operating point, and its linear model as both PLCs run it."""
+    from coldloop.errors import UsageError
+    from coldloop.process.lti_model import load
+    from coldloop.whole_file import require_regular_file
+    from coldloop_plant.cold_box.plant_file import PlantFile
+    from coldloop_plant.equilibrium import NoEquilibriumError
+    from coldloop_plant.refrigerator.plant_file import RefrigeratorPlantFile, read_plant_file
+    from coldloop_plant.settings import PlantKind
+    from coldloop_rig.cli.model_listing import describe_model, held_line
+
+    if options.out is not None:
+        require_regular_file(options.out)
+    settings = configuration(options).settings
+    in_use = settings.model.file
+    whole = settings.plant.kind is PlantKind.REFRIGERATOR
+    if options.plant is not None:
+        plant = read_plant_file(options.plant, settings.limits, whole=whole)
+    else:
+        plant = RefrigeratorPlantFile() if whole else PlantFile()
+    if options.out is not None and options.plant is not None and options.out.resolve() == options.plant.resolve():
+        raise UsageError(f"{options.out}: is the plant file; name another one with --out")
+    try:
+        model, text, box = describe_model(in_use, plant, settings.optimizer_plc.program.design, settings.plant.station)
+    except NoEquilibriumError as error:
+        raise UsageError(f"{options.plant or 'the reference plant'}: {error}") from None
+    sys.stdout.write(text)
+    if options.out is not None:
+        try:
+            model.save(options.out)
+        except OSError as error:
+            raise UsageError(f"{options.out}: {error.strerror}; name a file that can be written with --out") from None
+        sys.stdout.write(f"written to {options.out}\n")
+    sys.stdout.flush()
+    if options.plant is not None:  # a long search
+        sys.stdout.write(
+            held_line(box, plant.operating_point.level_pct, settings.optimizer_plc.program.design, settings.limits)
+        )
+    load(in_use)
+    return 0
+
+
+def _declare_design(parser: argparse.ArgumentParser) -> None:
+    add_configuration_options(parser)
+    parser.add_argument("--load", type="name", dest="loads", nargs="+", metavar="LOAD", default=["a"],
+                        help="loads to compare them under: names or CSV files (default: a)")  # fmt: skip
+    parser.add_argument("--figure", type="write", metavar="FILE",
+                        help="draw loss and iterations over the number of variables: .png, .pdf or .svg")  # fmt: skip
+    parser.add_argument("--out", type="write", metavar="FILE", help="write the proposed set as a configuration (TOML)")
+
+
+def execute_design(options: argparse.Namespace) -> int:
+    """Which decision and constraint instants the problem needs, by what each set costs in the loop."""
+    from coldloop.errors import UsageError
+    from coldloop.whole_file import require_regular_file, whole_text
+    from coldloop_rig.cli.commands.options import FIGURE_FORMATS
+    from coldloop_rig.progress import make_console
+    from coldloop_rig.results.folders import writing
+    from coldloop_rig.studies import instants
+
+    for name in options.loads:
+        check_load(name)
+    for path in filter(None, (options.figure, options.out)):
+        require_regular_file(path)
+    if options.figure and options.figure.suffix.removeprefix(".") not in FIGURE_FORMATS:
+        raise UsageError(f"--figure {options.figure}: name a .png, .pdf or .svg file")
+    settings = configuration(options).settings
+    with make_console().status("") as status:
+        found = instants.judged(
+            settings, options.loads, lambda done, of: status.update(f"{done} of {of} sets of instants")
+        )
+    sys.stdout.write(instants.table(found, options.loads))
+    if options.figure is not None:
+        _draw(found, options.loads, options.figure)
+    if options.out is not None:
+        with writing(options.out):
+            whole_text(options.out, instants.configuration(found))
+        sys.stdout.write(f"written to {options.out}\n")
+    return 0
+
+
+def _draw(found: "Sequence[Judged]", loads: Sequence[str], path: Path) -> None:
+    from coldloop_rig.figures.plot import save_figure
+    from coldloop_rig.results.folders import writing
+    from coldloop_rig.studies.instants import drawn
+
+    with writing(path, "choose another --figure"):
+        save_figure(drawn(found, loads), path)
+    sys.stdout.write(f"figure in {path}\n")
+
+
+def _declare_identify(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type="folder", metavar="RUN", help="folder of a run, of half an hour or more")
+    parser.add_argument("--model", type="read", metavar="FILE", help="model file (default: that of the run)")
+    parser.add_argument("--out", type="write", metavar="FILE",
+                        help="write the model with these factors, to be looked at, if it predicts better")  # fmt: skip
+
+
+def execute_identify(options: argparse.Namespace) -> int:
+    """The factors on the prediction model's gains with which it predicts what a run has measured.
+
+    They are fitted on the first half of the record and judged on the second. The model of a run is never changed.
+    """
+    from coldloop.errors import UsageError
+    from coldloop.process.lti_model import load
+    from coldloop.whole_file import require_regular_file
+    from coldloop_rig.results.folders import writing
+    from coldloop_rig.results.run_folder import RunFolder
+    from coldloop_rig.runs.identification import describe, identify, note_of, read_record, scaled
+    from coldloop_rig.runs.running import MODEL_COPY
+
+    out: Path | None = options.out
+    if out is not None:
+        require_regular_file(out)
+        if out.exists():
+            raise UsageError(f"{out}: exists; name another file with --out")
+    run = RunFolder(options.run)
+    model = load(options.model or run.held(MODEL_COPY))
+    found = identify(model, read_record(run, model))
+    sys.stdout.write(describe(model, found))
+    if out is None:
+        return 0
+    if not found.fitted:
+        raise UsageError(f"{out}: not written: no factor can be told from this record; name a run that moves more")
+    if not found.improved:
+        raise UsageError(f"{out}: not written: with these factors the half held back is predicted no better")
+    with writing(out):
+        scaled(model, found.factors, note_of(run, model, found)).save(out)
+    sys.stdout.write(
+        f"written to {out}, to be looked at: nothing uses it before a configuration names it, for all three services:\n"
+        f"    coldloop run --set model.file={out}\n"
+    )
+    return 0
+
+
+def _declare_exergy(parser: argparse.ArgumentParser) -> None:
+    add_configuration_options(parser)
+    parser.add_argument("--plant", type="read", metavar="FILE", help="plant file (TOML) of another refrigerator")
+
+
+def execute_exergy(options: argparse.Namespace) -> int:
+    """Specific power of a refrigerator at rest, and where the exergy that it is given is lost."""
+    from coldloop.errors import UsageError
+    from coldloop_plant.equilibrium import NoEquilibriumError
+    from coldloop_plant.helium.properties import load_helium
+    from coldloop_plant.refrigerator.exergy import exergy_balance
+    from coldloop_plant.refrigerator.model import refrigerator_operating_point
+    from coldloop_plant.refrigerator.plant_file import RefrigeratorPlantFile, read_refrigerator
+
+    settings = configuration(options).settings
+    file = RefrigeratorPlantFile() if options.plant is None else read_refrigerator(options.plant, settings.limits)
+    try:
+        rest = refrigerator_operating_point(file, load_helium(), settings.plant.station.weights).rest
+    except NoEquilibriumError as error:
+        raise UsageError(f"{options.plant or 'the reference refrigerator'}: {error}") from None
+    sys.stdout.write("\n".join(lines_of(exergy_balance(rest, file.refrigerator, load_helium()))) + "\n")
+    return 0
+
+
+def lines_of(balance: "ExergyBalance") -> list[str]:
+    """Return a balance as text; rows are sorted by what is lost."""
+    rows = sorted(balance.destroyed.items(), key=lambda row: -row[1])
+    of_all, of_electricity = (100.0 * balance.useful / each for each in (balance.put_in, balance.electricity))
+    return [
+        f"cold power {balance.cold_power:.1f} W at {balance.T_bath:.3f} K, load and heater",
+        f"specific power {balance.specific_power:.0f} W/W of electricity; Carnot {balance.ideal_power:.1f} W/W",
+        f"Carnot fraction {of_electricity:.2f} % by the electricity, {of_all:.2f} % with the nitrogen's exergy",
+        "",
+        f"{'exergy':26} {'kW':>9} {'%':>8}",
+        _row("electricity", balance.electricity, balance.put_in),
+        _row("liquid nitrogen", balance.nitrogen, balance.put_in),
+        "",
+        *(_row(name, lost, balance.put_in) for name, lost in rows),
+        _row("useful: of the cold power", balance.useful, balance.put_in),
+        _row("sum", balance.useful + sum(balance.destroyed.values()), balance.put_in),
+    ]
+
+
+def _row(name: str, exergy: float, whole: float) -> str:
+    kilowatts, share = (round(value, 3) + 0.0 for value in (1e-3 * exergy, 100.0 * exergy / whole))  # no -0.000
+    return f"{name:26} {kilowatts:9.3f} {share:8.2f}"
+
+
+COMMANDS: Final = {
+    "new": Command(_declare_new, execute_new),
+    "process": Command(_declare_process, execute_process),
+    "import": Command(_declare_import, execute_import),
+    "model": Command(_declare_model, execute_model),
+    "design": Command(_declare_design, execute_design),
+    "identify": Command(_declare_identify, execute_identify),
+    "exergy": Command(_declare_exergy, execute_exergy),
+}

@@ -1,0 +1,378 @@
+"""Commands about a run: done, recorded, repeated, drawn, compared."""
+
+import argparse
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from coldloop.errors import NOT_FINITE, LinkError, UsageError
+from coldloop.service.command_line import add_configuration_options
+from coldloop_rig.cli.commands.options import (
+    FIGURE_FORMATS,
+    MODES,
+    OWN_PORTS,
+    PLACES,
+    Command,
+    add_loop_options,
+    add_result_options,
+    add_rig_options,
+    check_load,
+    configuration,
+    endpoint,
+    exported,
+    plans,
+    refuse_ineffective,
+    rig_endpoints,
+)
+from coldloop_rig.durations import duration
+
+if TYPE_CHECKING:
+    from coldloop.config import Configuration
+    from coldloop.process.declaration import Process
+    from coldloop_rig.cosim.scenario import Job
+    from coldloop_rig.figures.worker import FigureProcess
+    from coldloop_rig.results.recording import Sink
+    from coldloop_rig.settings import Settings
+
+
+def _declare_run(parser: argparse.ArgumentParser) -> None:
+    add_configuration_options(parser)
+    parser.add_argument("--mode", choices=MODES, help="default: lockstep")
+    parser.add_argument("--factor", type=float, help="real time only: seconds of plant time per second (default: 1)")
+    way = parser.add_mutually_exclusive_group()
+    way.add_argument("--in-process", action="store_true", help="one process and direct calls instead of Modbus/TCP")
+    way.add_argument("--attach", nargs=3, type=endpoint, metavar="HOST:PORT",
+                     help="use a rig that is up: plant, control PLC, optimiser PLC")  # fmt: skip
+    way.add_argument("--optimizer", type="export", metavar="export:FOLDER",
+                     help="the exported optimiser in the place of ours (`coldloop docs plc-export`)")  # fmt: skip
+    parser.add_argument("--duration", type=duration, help="plant time, such as 2h or 90s (default: that of the load)")
+    add_loop_options(parser, "another draw such as a@2, or ")
+    add_result_options(parser, "<load>")
+
+
+def execute_run(options: argparse.Namespace) -> int:
+    """One run of the loop, recorded, evaluated and drawn."""
+    check_load(options.load)
+    from coldloop_rig.figures.worker import FigureProcess
+
+    with FigureProcess(options.figures) as figure:
+        if options.in_process:
+            from coldloop.kernels.lean_numba import load_numba_alone
+
+            figure.start()  # a short run would wait for matplotlib
+            load_numba_alone()
+        return _do(_run_job(options), options, figure)
+
+
+def _run_job(options: argparse.Namespace) -> "Job":
+    from coldloop.modbus.endpoints import Endpoint
+    from coldloop_rig.cosim.scenario import Job
+    from coldloop_rig.results.recording import Way
+    from coldloop_rig.runs.running import check_certificates, make_scenario
+
+    effective = configuration(options)
+    settings = effective.settings
+    realtime = settings.session.mode == "realtime"
+    if options.in_process and realtime:
+        raise UsageError("--in-process runs in lock-step: drop it, or --mode realtime")
+    factor_from = effective.sources.get("session.factor")
+    if factor_from and not realtime and (settings.session.factor != 1.0 or factor_from.startswith("--")):
+        raise UsageError(f"{factor_from}: a factor has no effect in lock-step; add --mode realtime")
+    ticks = options.duration.ticks(settings.process.tick_s) if options.duration else None
+    scenario = make_scenario(settings, ticks)
+    if options.attach:
+        from coldloop_rig.cosim.networked_run import as_attached
+        from coldloop_rig.cosim.wiring import QUIET_S
+
+        ends = [
+            Endpoint(host=end.host, port=end.port, tls=settings.rig.tls, timeout_s=QUIET_S) for end in options.attach
+        ]
+        return Job(as_attached(effective, ends), scenario, Way.ATTACHED, tuple(ends))
+    refuse_ineffective(effective, {**dict.fromkeys(PLACES, OWN_PORTS), "session.autostart": "it begins a session"})
+    if options.in_process:
+        return Job(effective, scenario, Way.IN_PROCESS)
+    check_certificates(settings)
+    return Job(effective, scenario, Way.LOCALHOST, optimizer=exported(options.optimizer, settings))
+
+
+def _do(job: "Job", options: argparse.Namespace, figure: "FigureProcess") -> int:
+    """Do a job into the folder of --out, and print a short result; return the exit code.
+
+    Raises:
+        ColdloopError: It is not complete; what was recorded is in the folder.
+    """
+    from coldloop_rig.results.folders import claim_folder, claim_folder_of_now
+    from coldloop_rig.results.recording import Way
+    from coldloop_rig.runs.remarks import remarks
+    from coldloop_rig.runs.running import plain_arguments, run_into
+
+    told = [] if job.way in (Way.RECORDED, Way.ATTACHED) else remarks(job.effective)  # of a PLC that is ours
+    name = "session" if job.way is Way.RECORDED else Path(job.effective.settings.plant.load).stem
+    out = options.out or claim_folder_of_now(Path("runs"), name)
+    claim_folder(out, force=options.force)
+    sys.stdout.write("".join(f"{line}\n" for line in told))
+    sys.stdout.flush()
+    with _progress(job) as sinks:
+        summary = run_into(out, job, plain_arguments(options), figure, sinks)
+    _tell(out, summary, job.effective.settings.process)
+    if not summary["failed_updates"]:
+        return 0
+    sys.stderr.write(f"coldloop: {_failure(summary, job)}\n")
+    return NOT_FINITE
+
+
+@contextmanager
+def _progress(job: "Job") -> "Iterator[list[Sink]]":
+    """Show a progress bar during the run; none in one process up to ten minutes of plant time, half a second."""
+    from coldloop_rig.results.recording import Way
+
+    if job.way is Way.IN_PROCESS and job.scenario.ticks <= 2400:
+        yield []
+        return
+    from coldloop_rig.progress import RunProgress
+
+    with RunProgress(job.scenario.ticks, job.effective.settings.process) as progress:
+        yield [progress]
+
+
+def _failure(summary: dict[str, Any], job: "Job") -> str:
+    from coldloop.process.lti_model import load
+    from coldloop_rig.process_file.judgement import unheld
+
+    failed, model = summary["failed_updates"], load(job.effective.settings.model.file)
+    return "; ".join(filter(None, (
+        f"{failed} of {failed + summary['updates']} updates have no answer: what the optimiser computed is not finite",
+        unheld(job.effective.settings.process.banded, model.A),
+        "`coldloop docs fail-safe#no-answer`",
+    )))  # fmt: skip
+
+
+def _tell(out: Path, summary: dict[str, Any], process: "Process") -> None:
+    updates = "no updates"
+    if summary["updates"]:
+        updates = f"{summary['updates']} updates, tau_u {summary['tau_u_mean']:.2f} s on average over time"
+    outside = ", ".join(f"{one.name} {summary[f'{one.name}_outside_dead_band_pct']:.2f} %" for one in process.banded)
+    sys.stdout.write(
+        f"{summary['ticks']} ticks, {updates}, {summary['realtime_factor'] or 0:,.0f} x real time\n"
+        f"outside the bands: {outside}; "
+        f"J_BF {summary['J_BF']:.4g}; deadline misses {summary['deadline_misses']}\n"
+        f"trace {summary['trace_sha256']}\n"
+        f"results in {out}\n"
+    )
+
+
+def _declare_record(parser: argparse.ArgumentParser) -> None:
+    add_rig_options(parser)
+    parser.add_argument("--duration", type=duration, default=duration("1h"),
+                        help="plant time, such as 2h or 90s (default: 1h; Ctrl-C ends it before)")  # fmt: skip
+    add_result_options(parser, "session")
+
+
+def execute_record(options: argparse.Namespace) -> int:
+    """Records a session under way from now on, without changing it.
+
+    It leaves the folder that a run leaves; `coldloop page FOLDER` replays it.
+    """
+    from coldloop_rig.figures.worker import FigureProcess
+
+    with FigureProcess(options.figures) as figure:
+        return _do(_record_job(options), options, figure)
+
+
+def _record_job(options: argparse.Namespace) -> "Job":
+    from coldloop_rig.cosim.networked_run import as_attached, session_under_way
+    from coldloop_rig.cosim.scenario import Job
+    from coldloop_rig.results.recording import Way
+
+    effective = configuration(options)
+    ends = tuple(rig_endpoints(options, effective.settings))
+    effective = as_attached(effective, ends)
+    ticks = options.duration.ticks(effective.settings.process.tick_s)
+    return Job(effective, session_under_way(effective, ends).scenario(ticks), Way.RECORDED, ends)
+
+
+def _declare_rerun(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("manifest", type="folder", metavar="MANIFEST", help="manifest.json of a run, or its folder")
+    parser.add_argument("--trust", action="store_true", help="execute the plant of another process that the folder"
+                        " holds; else --process names a file that gives the same model")  # fmt: skip
+    parser.add_argument("--out", type="into", help="folder for the results of the repetition (default: none are kept)")
+    parser.add_argument("--force", action="store_true", help="replace the run in a folder that is not empty")
+
+
+def execute_rerun(options: argparse.Namespace) -> int:
+    """Repeat a recorded run from its manifest, in one process, and compare the traces."""
+    from coldloop.process.settings import ModelSettings
+    from coldloop_rig.runs.running import repeat
+
+    path: Path = options.manifest
+    if path.is_file() and path.name != "manifest.json":
+        raise UsageError(f"{path}: not the manifest.json of a run; name that, or its folder")
+    folder = path.parent if path.name == "manifest.json" else path
+    trusted = None if options.trust else ModelSettings().file
+    same, text = repeat(folder, options.out, force=options.force, trusted=trusted)
+    sys.stdout.write(text)
+    return 0 if same else 1
+
+
+def _declare_plot(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type="folder", metavar="RUN", help="folder of a run")
+    parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png", "pdf", "svg"],
+                        metavar="FORMAT", help="png, pdf, svg (default: all)")  # fmt: skip
+
+
+def execute_plot(options: argparse.Namespace) -> int:
+    """The figure of a recorded run again, as PNG, PDF or SVG."""
+    from coldloop_rig.figures.plot import plot_run
+    from coldloop_rig.results.folders import writing
+
+    with writing(options.run, "the figure was not written"):
+        paths = plot_run(options.run, options.figures)
+    sys.stdout.writelines(f"{path}\n" for path in paths)
+    return 0
+
+
+def _declare_report(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type="folder", metavar="RUN", help="folder of a run")
+    parser.add_argument("--out", type="write", metavar="FILE", help="page (default: report.html in the run's folder)")
+    parser.add_argument("--force", action="store_true", help="replace a page that exists")
+
+
+def execute_report(options: argparse.Namespace) -> int:
+    """One HTML page of a recorded run, with interactive plots, alarms and settings."""
+    from coldloop.whole_file import require_regular_file, whole_text
+    from coldloop_rig.report.run_page import run_page
+    from coldloop_rig.results.folders import writing
+
+    path: Path = options.out or options.run / "report.html"
+    require_regular_file(path)
+    if path.exists() and not options.force:
+        raise UsageError(f"{path}: exists; name another page with --out, or overwrite with --force")
+    page = run_page(options.run)
+    with writing(path):
+        whole_text(path, page)
+    sys.stdout.write(f"{path}\n")
+    return 0
+
+
+def _declare_compare(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("runs", nargs="+", type="folder", metavar="RUN", help="folders of runs, two or more")
+    parser.add_argument("--out", type="write", default=Path("compare.png"), metavar="FILE",
+                        help="figure: .png, .pdf or .svg (default: compare.png)")  # fmt: skip
+    parser.add_argument("--force", action="store_true", help="replace a figure that exists")
+
+
+def execute_compare(options: argparse.Namespace) -> int:
+    """A table and a figure of several recorded runs."""
+    from coldloop_rig.figures.plot import compare
+
+    if len(options.runs) < 2:
+        raise UsageError("compare: name two runs or more")
+    if options.out.suffix.removeprefix(".") not in FIGURE_FORMATS:
+        raise UsageError(f"--out {options.out}: name a .png, .pdf or .svg file")
+    if options.out.exists() and not options.force:
+        raise UsageError(f"{options.out}: exists; name another figure with --out, or overwrite with --force")
+    sys.stdout.write(compare(options.runs, options.out))
+    return 0
+
+
+def _declare_chaos(parser: argparse.ArgumentParser) -> None:
+    add_configuration_options(parser)
+    plan = parser.add_argument("plan", type="name", nargs="?", metavar="PLAN", help="a shipped plan, or a TOML file")
+    plan.completer = lambda **_: plans()  # type: ignore[attr-defined]  # argcomplete looks for it
+    parser.add_argument("--list", action="store_true", help="list the shipped plans")
+    parser.add_argument("--out", type="into", help="folder for the results (default: chaos/<plan>-<time>)")
+    parser.add_argument("--force", action="store_true", help="write into a folder that is not empty")
+    parser.add_argument("--seed", type=_seed, dest="plan_seed", help="instead of the plan's")
+    parser.add_argument("--duration", type=duration, help="plant time, such as 2h or 90s, instead of the plan's")
+    parser.add_argument("--load", type="name", dest="plan_load",
+                        help="a named load or a CSV file, instead of the plan's")  # fmt: skip
+    parser.add_argument("--mode", choices=MODES, dest="plan_mode",
+                        help="instead of the plan's")  # fmt: skip
+    parser.add_argument("--factor", type=float, dest="plan_factor", help="instead of the plan's")
+    parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png"], metavar="FORMAT",
+                        help="of the run's picture: png, pdf, svg (default: png)")  # fmt: skip
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least 0")
+    return int(text)
+
+
+def execute_chaos(options: argparse.Namespace) -> int:
+    """A run with faults on purpose, and what the fail-safe side made of them."""
+    if options.list:
+        from coldloop_rig.chaos.plan import shipped_plans
+
+        sys.stdout.write("".join(f"{plan.name:20} {plan.description}\n" for plan in shipped_plans()))
+        return 0
+    check_load(options.plan_load)
+    if options.plan is None:
+        raise UsageError("name a plan; `coldloop chaos --list` lists the shipped ones")
+    from coldloop.process.settings import settings_of
+    from coldloop_rig.chaos.plan import find_plan
+
+    effective, changes = configuration(options), _changes(options)
+    with settings_of(effective.settings.process):
+        plan = find_plan(options.plan, changes)
+    _refuse_what_has_no_effect(effective)
+    from coldloop_rig.chaos.experiment import perform
+    from coldloop_rig.chaos.report import ChaosProgress, plot_chaos, summary_lines, table, write_report
+    from coldloop_rig.results.folders import claim_folder, claim_folder_of_now, writing
+    from coldloop_rig.runs.running import plain_arguments
+
+    out = options.out or claim_folder_of_now(Path("chaos"), plan.name)
+    claim_folder(out, force=options.force)
+    with ChaosProgress(plan) as progress:
+        experiment = perform(
+            plan, effective, out, progress, arguments=plain_arguments(options), formats=options.figures
+        )
+    with writing(out, "no report was written, choose another --out"):
+        write_report(out, experiment)
+        plot_chaos(out / "chaos.png", experiment)
+    sys.stdout.write(table(experiment.evaluation.rows, plan.process))
+    lines = (*summary_lines(experiment.trace, experiment.evaluation), f"results in {out}")
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    if experiment.failure is not None:
+        raise LinkError(experiment.failure)
+    return 0
+
+
+def _refuse_what_has_no_effect(effective: "Configuration[Settings]") -> None:
+    """Refuse a value from the command line that the plan's own, or that of the command, would replace."""
+    from coldloop_rig.chaos.plan import OF_PLAN
+
+    refuse_ineffective(
+        effective,
+        {
+            **{key: f"the plan has its own value; change it with {option}" for key, option in OF_PLAN.items()},
+            **dict.fromkeys(PLACES, OWN_PORTS),
+            "session.autostart": "it begins a session",
+            "plant.retain.file": "the states are retained in the folder of the results",
+            "control_plc.retain.file": "the states are retained in the folder of the results",
+        },
+    )
+
+
+def _changes(options: argparse.Namespace) -> dict[str, Any]:
+    given = {
+        "seed": options.plan_seed,
+        "duration_s": options.duration and options.duration.seconds,
+        "load": options.plan_load,
+        "mode": options.plan_mode,
+        "factor": options.plan_factor,
+    }
+    return {name: value for name, value in given.items() if value is not None}
+
+
+COMMANDS: Final = {
+    "run": Command(_declare_run, execute_run),
+    "record": Command(_declare_record, execute_record),
+    "rerun": Command(_declare_rerun, execute_rerun),
+    "plot": Command(_declare_plot, execute_plot),
+    "report": Command(_declare_report, execute_report),
+    "compare": Command(_declare_compare, execute_compare),
+    "chaos": Command(_declare_chaos, execute_chaos),
+}

@@ -1,0 +1,202 @@
+"""Pages of the documentation that are made from the code, as Markdown: all commands, and the keys of users' files.
+
+`docs/commands.md`, `docs/keys.md` and `docs/configuration.md` are made of them.
+"""
+
+import argparse
+import ast
+import inspect
+import re
+import sys
+import textwrap
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final, get_args
+
+from pydantic import BaseModel
+
+from coldloop.config import as_toml
+from coldloop_rig.cli import GROUPS, make_parser
+from coldloop_rig.text_tables import markdown_table
+
+Schema = Mapping[str, Any]
+"""A JSON schema, or a part of one."""
+
+KEY_HEADER: Final = ("key", "value", "if not given", "meaning")
+NEEDED: Final = "*needed*"
+WORDS: Final = {
+    "integer": "whole number", "number": "number", "string": "text", "object": "table", "boolean": "true or false",
+}  # fmt: skip
+ARGUMENT: Final = re.compile(r"^    (\w+): (.*(?:\n     +.*)*)", re.MULTILINE)
+"""Of a docstring."""
+FORMATS: Final = {"path": "file", "ipvanynetwork": "address or network"}
+COUNTS: Final = {1: "one number", 2: "two numbers", 3: "three numbers"}
+LIMITS: Final = {"minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most", "exclusiveMaximum": "below"}
+
+
+def key_listing(model: type[BaseModel]) -> str:
+    """Return a table of the keys of each section, those of nested ones with their headings."""
+    schema = model.model_json_schema()
+    sections = schema.get("$defs", {})
+    for name, one in {model.__name__: model, **_models_within(model)}.items():
+        section = sections.get(name, schema)
+        texts = _attribute_docstrings(one)
+        for key, said in section["properties"].items():
+            said.setdefault("description", texts.get(key, ""))
+    return "\n".join(_tables(schema, sections, "", {}))
+
+
+def _models_within(model: type[BaseModel]) -> dict[str, type[BaseModel]]:
+    """Return the models that the fields of a model hold, and those within, by name."""
+    found: dict[str, type[BaseModel]] = {}
+    left = [field.annotation for field in model.model_fields.values()]
+    while left:
+        kind = left.pop()
+        left += get_args(kind)
+        if isinstance(kind, type) and issubclass(kind, BaseModel) and kind.__name__ not in found:
+            found[kind.__name__] = kind
+            left += [field.annotation for field in kind.model_fields.values()]
+    return found
+
+
+def _attribute_docstrings(model: type[BaseModel]) -> dict[str, str]:
+    """Return the text below each field of a model and of those that it is made from, or among their arguments."""
+    texts: dict[str, str] = {}
+    for kind in reversed(model.__mro__):
+        if kind.__module__.partition(".")[0] in ("pydantic", "builtins"):
+            continue
+        for name, text in ARGUMENT.findall(inspect.getdoc(kind) or ""):
+            texts[name] = " ".join(text.split())
+        (body,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+        for field, text in pairwise(getattr(body, "body", ())):
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr):
+                texts[field.target.id] = inspect.cleandoc(str(getattr(text.value, "value", "")))
+    return texts
+
+
+def _tables(section: Schema, declared: Schema, place: str, told: dict[str, str]) -> Iterator[str]:
+    """Yield the table of a section, and of those within it, whose names begin with `place`; each kind once."""
+    keys: Schema = section["properties"]
+    rows = [
+        (f"`{key}`", _value(said, declared), NEEDED if key in section.get("required", ()) else _default(said, declared),
+         _meaning(said, declared))
+        for key, said in keys.items()
+    ]  # fmt: skip
+    yield f"{markdown_table(KEY_HEADER, rows)}\n"
+    for key, said in keys.items():
+        within = _section(said, declared)
+        if within is not None:
+            heading = f"[[{place}{key}]]" if _one(said)["type"] == "array" else f"[{place}{key}]"
+            if within["title"] in told:
+                yield f"### `{heading}`\n\nAs `{told[within['title']]}`.\n"
+                continue
+            told[within["title"]] = heading
+            yield f"### `{heading}`\n\n{within['description'].splitlines()[0]}\n"
+            yield from _tables(within, declared, f"{place}{key}.", told)
+
+
+def _one(said: Schema) -> Schema:
+    """Return what is said of a value where it is given."""
+    kinds = [kind for kind in said.get("anyOf", (said,)) if kind.get("type") != "null"]
+    return {"type": "object", **kinds[0]}
+
+
+def _declared(said: Schema, declared: Schema) -> Schema:
+    """Return what is declared elsewhere of a value, or of each in a list."""
+    one = _one(said)
+    found: Schema = declared.get(str(one.get("items", one).get("$ref", "")).rpartition("/")[2], {})
+    return found
+
+
+def _section(said: Schema, declared: Schema) -> Schema | None:
+    """Return the section that a key holds, or a list of; None where it holds none."""
+    found = _declared(said, declared)
+    return found if "properties" in found else None
+
+
+def _value(said: Schema, declared: Schema) -> str:
+    """Return type and range of a value."""
+    one = {**_one(said), **({} if "items" in _one(said) else _declared(said, declared))}
+    if _section(said, declared):
+        return "sections" if one["type"] == "array" else "section"
+    if "enum" in one:
+        return ", ".join(f"`{each}`" for each in one["enum"])
+    if one["type"] != "array":
+        limits = (f"{word} {one[limit]:g}" for limit, word in LIMITS.items() if limit in one)
+        return ", ".join([FORMATS.get(one.get("format", ""), WORDS[one["type"]]), *limits])
+    if "prefixItems" in one:
+        count = len(one["prefixItems"])
+        return f"{COUNTS[count]}{', [low, high]' * (count == 2)}"
+    if "each" in one:
+        return f"{COUNTS[one['maxItems']]}, one for each {one['each']}"
+    return f"list: {_value(one['items'], declared)}"
+
+
+def _default(said: Schema, declared: Schema) -> str:
+    default = said.get("default")
+    if _one(said).get("format") == "path" and default:
+        return f"`{Path(default).name}`, shipped"
+    return "" if _section(said, declared) or default in (None, "", [], {}) else f"`{as_toml(default)}`"
+
+
+def _meaning(said: Schema, declared: Schema) -> str:
+    """Return what is said of a key, else of what it holds."""
+    told = said.get("description") or str(_declared(said, declared).get("description", "")).partition("\n\n")[0]
+    return " ".join(str(told).split())
+
+
+OPTION_HEADER: Final = ("option", "meaning")
+
+
+def command_listing() -> str:
+    """Return a section for each group of commands, with a table of the options of each."""
+    parts = []
+    for group, commands in GROUPS.items():
+        parts.append(f"## {group[0].upper()}{group[1:]}\n")
+        for name in commands:
+            parts += _of_command(_subparsers(make_parser(name))[name], f"coldloop {name}", "###")
+    return "\n".join(parts)
+
+
+def _of_command(parser: argparse.ArgumentParser, name: str, level: str) -> Iterator[str]:
+    summary = (parser.description or "").partition(": ")[2] or parser.description or ""
+    yield f"{level} `{name}`\n"
+    if summary.strip():
+        yield f"{_cell(summary.strip()[0].upper() + summary.strip()[1:])}\n"
+    actions = [each for each in parser._actions if each.dest != "help"]  # noqa: SLF001 argparse has no other way
+    rows = [
+        (_written(each), _cell(each.help or ""))
+        for each in actions
+        if each.help != argparse.SUPPRESS and not isinstance(each, argparse._SubParsersAction)  # noqa: SLF001
+    ]
+    if rows:
+        yield f"{markdown_table(OPTION_HEADER, rows)}\n"
+    for sub, one in _subparsers(parser).items():
+        yield from _of_command(one, f"{name} {sub}", f"{level}#")
+
+
+def _subparsers(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    found: dict[str, argparse.ArgumentParser] = {}
+    for each in parser._actions:  # noqa: SLF001
+        if isinstance(each, argparse._SubParsersAction):  # noqa: SLF001
+            found |= each.choices
+    return found
+
+
+def _written(action: argparse.Action) -> str:
+    """Return how an option or an argument is written, with its value."""
+    value = action.metavar or ("|".join(map(str, action.choices)) if action.choices else action.dest.upper())
+    values = " ".join(value) if isinstance(value, tuple) else value
+    if not action.option_strings:
+        return f"`{values}`".replace("|", "\\|")
+    shown = (f"{option} {values}" if action.nargs != 0 else option for option in action.option_strings)
+    return f"`{', '.join(shown)}`".replace("|", "\\|")
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.replace("%%", "%").split()).replace("|", "\\|")
+
+
+if __name__ == "__main__":
+    sys.stdout.write(command_listing())
