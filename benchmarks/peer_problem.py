@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load
+from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.qp.design import ControlDesign, trivial_design
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, state_weights
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters

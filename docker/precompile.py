@@ -108,9 +108,8 @@ def default_solver() -> None:
 
 
 def _make_optimizer(settings: "ProgramSettings", kind: "type[OptimizerProgram] | None" = None) -> None:
-    from coldloop.process.limits import InputLimits  # noqa: PLC0415
     from coldloop.process.lti_model import load  # noqa: PLC0415
-    from coldloop.process.settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
+    from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits  # noqa: PLC0415
     from coldloop_optimizer_plc.program import OptimizerProgram  # noqa: PLC0415
 
     (kind or OptimizerProgram)(load(DEFAULT_MODEL_FILE), settings, InputLimits())

@@ -12,7 +12,7 @@ FLOORS = {
         ["process"], ["kernels", "session"], ["registers"], ["safety", "modbus"], ["service"], ["operating"],
     ],
     "services/plant/coldloop_plant": [["helium"], ["components"], ["cold_box"], ["refrigerator", "rack"], ["own"]],
-    "services/optimizer_plc/coldloop_optimizer_plc": [["qp"], ["solvers", "rules"]],
+    "services/optimizer_plc/coldloop_optimizer_plc": [["qp"], ["solvers"]],
     "rig/coldloop_rig": [
         ["results"], ["figures", "cosim"], ["plc_sizing"], ["runs", "plc_export"], ["studies", "chaos", "process_file"],
         ["live"], ["testing", "report"], ["cli"],

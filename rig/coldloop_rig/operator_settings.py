@@ -3,8 +3,7 @@
 from pydantic import BaseModel, ConfigDict, Field
 
 from coldloop.modbus.settings import TlsSettings
-from coldloop.process.limits import InputLimits
-from coldloop.process.settings import RootSettings
+from coldloop.process.settings import InputLimits, RootSettings
 from coldloop.registers.codec import WordOrder
 
 OTHERS = ("session", "telemetry", "hmi")

@@ -9,8 +9,7 @@ from pydantic import Field
 
 from coldloop.config import Configuration, flattened, load_configuration
 from coldloop.errors import UsageError
-from coldloop.process.limits import InputLimits
-from coldloop.process.settings import RootSettings
+from coldloop.process.settings import InputLimits, RootSettings
 from coldloop.service.telemetry_settings import TelemetrySettings
 from coldloop.session.settings import SessionSettings
 from coldloop_control_plc.settings import ControlSection

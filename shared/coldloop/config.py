@@ -10,10 +10,10 @@ the file have of them. What a section has to say of values that were not set is 
 
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from math import inf, isfinite, isnan
+from math import isfinite, isnan
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
@@ -39,7 +39,6 @@ LARGEST: Final = 3.4e38
 """Of a number: registers and records have single precision."""
 MOST_SHOWN: Final = 200
 """Characters of a wrong value that a message shows."""
-
 M = TypeVar("M", bound=BaseModel)
 
 
@@ -163,13 +162,14 @@ def load_configuration(
 def _check_values(settings: BaseModel, sources: Mapping[str, str]) -> None:
     """Refuse values that no key can have, in one line."""
     for key, value in flattened(settings.model_dump()).items():
-        for most, wrong in (
-            (inf, "input should be finite"),
-            (LARGEST, f"is beyond {LARGEST:g}; give a smaller number"),
-        ):
-            if not _is_within(most, value):
-                raise ConfigurationError(f"{_where(key, sources)}: {wrong} (got {value!r})")
-        if _has_nul(value):
+        parts = list(_leaves(value))
+        numbers = [part for part in parts if isinstance(part, float)]
+        if not all(map(isfinite, numbers)):
+            raise ConfigurationError(f"{_where(key, sources)}: input should be finite (got {value!r})")
+        if any(abs(part) > LARGEST for part in numbers):
+            wrong = f"is beyond {LARGEST:g}; give a smaller number"
+            raise ConfigurationError(f"{_where(key, sources)}: {wrong} (got {value!r})")
+        if any(isinstance(part, str | Path) and "\0" in str(part) for part in parts):
             raise ConfigurationError(f"{_where(key, sources)}: contains a NUL character; remove it")
         if value == Path():  # an empty text
             raise ConfigurationError(f"{_where(key, sources)}: is empty; name a file, or leave the key out")
@@ -195,18 +195,13 @@ def _decided(model: type[BaseModel], prefix: str = "") -> dict[str, list[str]]:
     return found
 
 
-def _is_within(most: float, value: object) -> bool:
-    """Return whether all numbers of a value are finite and at most this large."""
+def _leaves(value: object) -> Iterator[object]:
+    """Yield what a value consists of."""
     if isinstance(value, Mapping | list | tuple):
-        return all(_is_within(most, part) for part in (value.values() if isinstance(value, Mapping) else value))
-    return not isinstance(value, float) or (isfinite(value) and abs(value) <= most)
-
-
-def _has_nul(value: object) -> bool:
-    """Return whether a text or a path has a character in it that no file's name can have."""
-    if isinstance(value, Mapping | list | tuple):
-        return any(map(_has_nul, value.values() if isinstance(value, Mapping) else value))
-    return isinstance(value, str | Path) and "\0" in str(value)
+        for part in value.values() if isinstance(value, Mapping) else value:
+            yield from _leaves(part)
+    else:
+        yield value
 
 
 Entry = tuple[str, object, str]
@@ -214,8 +209,14 @@ Entry = tuple[str, object, str]
 
 
 def _from_file(file: Path | None, option: str) -> list[Entry]:
-    content = {} if file is None else flattened(_read_toml(file, option))
-    return [(key, value, str(file)) for key, value in content.items()]
+    if file is None:
+        return []
+    text = read_text(file, f"name a readable TOML file with {option}", ConfigurationError, MOST_BYTES)
+    try:
+        content = parsed_toml(text)
+    except ValueError as error:
+        raise ConfigurationError(f"{file}: not TOML: {error}") from None
+    return [(key, value, str(file)) for key, value in flattened(content).items()]
 
 
 def _from_environment(environment: Mapping[str, str]) -> list[Entry]:
@@ -251,13 +252,6 @@ def as_toml(value: object) -> str:
         return "[" + ", ".join(map(as_toml, value)) + "]"
     text = json.dumps(value, ensure_ascii=False)
     return text.replace("\x7f", "\\u007f")  # the one control character that JSON lets pass and TOML does not
-
-
-def _read_toml(file: Path, option: str) -> dict[str, Any]:
-    try:
-        return parsed_toml(read_text(file, f"name a readable TOML file with {option}", ConfigurationError, MOST_BYTES))
-    except ValueError as error:
-        raise ConfigurationError(f"{file}: not TOML: {error}") from None
 
 
 def model_file_in(environment: Mapping[str, str], file: Path | None, assignments: Iterable[str]) -> object:

@@ -1,9 +1,15 @@
-"""Text files of users: UTF-8, with a byte order mark or without, or UTF-16 with one; files in folders of others."""
+"""Text files of users, files in folders of others, and files that appear whole or not at all.
+
+A text is UTF-8, with a byte order mark or without, or UTF-16 with one. Only a regular file is replaced.
+"""
 
 import codecs
 import errno
 import os
+import socket
 import stat
+import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -13,8 +19,6 @@ MOST_BYTES: Final = 2**28
 """Size of a file, at most."""
 MARKS: Final = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 """Byte order marks, and the encodings that they begin."""
-
-
 HANDED_OVER: Final = ("/dev/stdin", "/dev/fd/", "/proc/self/fd/", os.devnull)
 """Beginnings of the names of what is read though it may be no regular file: a shell's pipes, and nothing."""
 
@@ -103,3 +107,37 @@ def decoded(data: bytes) -> str:
 def not_text(error: UnicodeDecodeError) -> str:
     """Return what is wrong with a file that is no text, and the remedy."""
     return f"not UTF-8 text (byte {error.start}); save it as UTF-8, not compressed"
+
+
+def require_regular_file(path: Path) -> None:
+    """Refuse to replace a device, a folder or a pipe by a file.
+
+    Raises:
+        UsageError: The path exists and is something else than a regular file.
+    """
+    if path.exists() and not path.is_file():
+        raise UsageError(f"{path}: exists and is not a regular file; name another one")
+
+
+def whole_file(path: Path, write: Callable[[Path], object]) -> None:
+    """Let `write` make the file under another name, then give it its own; others may do so at the same time."""
+    require_regular_file(path)
+    writer = f"{socket.gethostname()}.{os.getpid()}.{threading.get_native_id()}"
+    draft = path.with_name(f".{path.name}.{writer}.draft")
+    try:
+        write(draft)
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def whole_text(path: Path, text: str, *, synced: bool = False) -> None:
+    """Write a text; `synced`: the disk has it when it gets its name, also if power fails."""
+
+    def write(draft: Path) -> None:
+        draft.write_text(text, encoding="utf-8")
+        if synced:
+            with draft.open("r+b") as file:
+                os.fsync(file.fileno())
+
+    whole_file(path, write)

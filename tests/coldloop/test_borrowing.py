@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
+from coldloop.kernels.intrinsics import borrowed
 
 pytestmark = pytest.mark.usefixtures("compiles")
 

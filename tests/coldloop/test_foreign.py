@@ -5,8 +5,7 @@ import sys
 
 import pytest
 
-from coldloop.errors import ColdloopError, ConfigurationError, ModelFileError, RunInterruptedError
-from coldloop.foreign import foreign
+from coldloop.errors import ColdloopError, ConfigurationError, ModelFileError, RunInterruptedError, foreign
 
 
 def test_what_it_raises_is_one_line_that_names_it_and_says_what_happens() -> None:

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 import pytest
 
-from coldloop.kernels.implementations import Implementations
+from coldloop.kernels.intrinsics import Implementations
 from coldloop.kernels.reach import digest, reached
 
 TEXT: Final = '''"""Some code."""

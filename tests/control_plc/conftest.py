@@ -5,9 +5,8 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from coldloop.process.cold_box import L1, T5
-from coldloop.process.limits import InputLimits
 from coldloop.process.model_file import read_header
-from coldloop.process.settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.control_plc import Acknowledgement, Plan, SequenceHeader, Update, Verdict
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.registers.safety import AlarmKind, AlarmState

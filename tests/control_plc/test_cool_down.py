@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.process.cold_box import L1, OUTPUT_NAMES, T1, T5
-from coldloop.process.limits import InputLimits
+from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import Cause, CoolDownStep, Mode, Operator, OperatorMode
 from coldloop_control_plc.cool_down import CoolDown, CoolDownSettings
 from coldloop_control_plc.ladder import Ladder, LadderInputs

@@ -15,10 +15,9 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from coldloop.errors import DamagedAnswerError, LinkError, PeerUnreachableError, RequestRefusedError
 from coldloop.process.cold_box import COLD_BOX, TICK_S
-from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
-from coldloop.process.settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits, RateReference
 from coldloop.registers.bank import BusyError, Caller
 from coldloop.registers.control_plc import (
     Operator,
@@ -34,7 +33,7 @@ from coldloop.registers.safety import LeaseState
 from coldloop.safety.lease import WriterLease
 from coldloop.safety.sequence import InputSequence, with_checksum
 from coldloop.service.journal import Journal
-from coldloop.session.time_base import TimeBase
+from coldloop.session.settings import TimeBase
 from coldloop_control_plc.plant_link import PlantLink
 from coldloop_control_plc.program import make_program
 from coldloop_control_plc.rack_clock import PHASE, RackClock

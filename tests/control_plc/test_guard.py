@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from coldloop.process.limits import InputLimits, RateReference
+from coldloop.process.settings import InputLimits, RateReference
 from coldloop.registers.control_plc import Verdict
 from coldloop_control_plc.guard import OutputGuard
 from tests.harness.records import Row

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from coldloop.process.limits import InputLimits
+from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import Mode, Verdict
 from coldloop.registers.safety import AlarmKind, AlarmState
 from tests.control_plc.conftest import HOLD_TICKS, alarm

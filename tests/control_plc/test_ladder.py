@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.process.cold_box import INPUT_NAMES, L1, OUTPUT_NAMES, T5
-from coldloop.process.limits import InputLimits
+from coldloop.process.settings import InputLimits
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Heartbeat, Mode, Operator, OperatorMode, Update, Verdict
 from coldloop.registers.plant import Measurement

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.process.cold_box import COLD_BOX, L1, T5
-from coldloop.process.limits import InputLimits
+from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import LinkCause, Mode, Operator, OperatorMode, Verdict
 from coldloop.registers.safety import AlarmKind
-from coldloop.session.time_base import TimeBase
+from coldloop.session.settings import TimeBase
 from coldloop_control_plc.guard import OutputGuard
 from coldloop_control_plc.retained_state import ControlStateStore, RetainedControlState
 from tests.harness.records import Row, as_transmitted

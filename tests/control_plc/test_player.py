@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.process.declaration import LAST_NUMBER
-from coldloop.process.limits import InputLimits
+from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import Mode, Plan, Update, Verdict
 from coldloop_control_plc.guard import OutputGuard
 from coldloop_control_plc.player import SequencePlayer

@@ -13,9 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coldloop.errors import ImplausibleAnswerError
-from coldloop.process.limits import InputLimits
 from coldloop.process.model_file import read_header
-from coldloop.process.settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.bank import ANYBODY, RefusedAccessError
 from coldloop.registers.codec import codec_of
 from coldloop.registers.control_plc import Operator, OperatorMode, PlantLinkState

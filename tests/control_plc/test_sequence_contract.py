@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from coldloop.process.limits import InputLimits, RateReference
+from coldloop.process.settings import InputLimits, RateReference
 from coldloop.registers.control_plc import Acknowledgement, Verdict
 from coldloop.safety.sequence import InputSequence
 from tests.harness.records import Row, as_transmitted

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from coldloop.process.cold_box import COLD_BOX, L1, T5
-from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.model_file import read_header
-from coldloop.process.settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits, RateReference
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import (
     Cause,
@@ -26,7 +25,7 @@ from coldloop.registers.control_plc import (
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.safety.sequence import InputSequence, with_checksum
-from coldloop.session.time_base import TimeBase
+from coldloop.session.settings import TimeBase
 from coldloop_control_plc.program import ControlProgram, make_program
 from coldloop_control_plc.retained_state import ControlStateStore, RetainedControlState
 from coldloop_control_plc.settings import ControlSection

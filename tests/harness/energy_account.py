@@ -4,9 +4,8 @@ from typing import Final
 
 import numpy as np
 
-from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
-from coldloop.kernels.named import named
+from coldloop.kernels.intrinsics import borrowed, named
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop_plant.components.phase_separator import start_account
 from coldloop_plant.helium.properties import Helium, supply_cell

@@ -12,9 +12,8 @@ import pytest
 
 from coldloop.errors import LinkError
 from coldloop.modbus.client import RegisterClient
-from coldloop.process.limits import InputLimits
 from coldloop.process.model_file import read_header
-from coldloop.process.settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.audit import EVENT_ROWS, Event, EventKind
 from coldloop.registers.codec import WordOrder, codec_of
 from coldloop.registers.common import Identity

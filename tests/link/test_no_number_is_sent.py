@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
-from coldloop.process.limits import InputLimits
 from coldloop.process.model_file import read_header
-from coldloop.process.settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import ControlSession, Grant, LinkCause, PlantLinkState

@@ -18,7 +18,7 @@ from coldloop.registers.common import SessionPace
 from coldloop.registers.declaration import Role
 from coldloop.registers.optimizer_plc import OperatingLimits, OptimizerSession
 from coldloop.registers.text import from_words
-from coldloop_optimizer_plc.budget import BudgetSettings, PlcBudget
+from coldloop_optimizer_plc.computing_settings import BudgetSettings, PlcBudget
 from coldloop_optimizer_plc.publication import OptimizerPublication
 from tests.harness.records import OPTIMIZER_MAP
 

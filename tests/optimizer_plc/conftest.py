@@ -10,18 +10,16 @@ from numpy.typing import NDArray
 
 import coldloop_optimizer_plc.program
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_file import read_header
-from coldloop.process.settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.plant import Measurement
 from coldloop.safety.sequence import InputSequence
 from coldloop_control_plc.program import make_program
 from coldloop_control_plc.settings import ControlSection
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.qp.design import ControlDesign
-from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.design import ControlDesign, Preset
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 from coldloop_optimizer_plc.settings import ProgramSettings

@@ -15,9 +15,8 @@ import numba
 from numba.core.dispatcher import Dispatcher
 
 import coldloop_optimizer_plc
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel, load
-from coldloop.process.settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.control_plc import Update, Verdict
 from coldloop_optimizer_plc.computing_settings import Arithmetic, EstimatorKind, EstimatorSettings
 from coldloop_optimizer_plc.program import OptimizerProgram

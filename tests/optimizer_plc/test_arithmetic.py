@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
+from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.computing_settings import Arithmetic, EstimatorKind, OdeSettings
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.qp.arithmetic import real_of
 from coldloop_optimizer_plc.qp.costs import augmented_cost
-from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.design import Preset
+from coldloop_optimizer_plc.qp.linear_algebra import real_of
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
 from coldloop_optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings
 from coldloop_optimizer_plc.solvers.ode import ode_solver

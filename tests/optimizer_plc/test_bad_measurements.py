@@ -22,8 +22,7 @@ from coldloop_optimizer_plc.estimator import (
     stationary_gains,
 )
 from coldloop_optimizer_plc.plausibility import imputed, note_surprise
-from coldloop_optimizer_plc.qp.arithmetic import DOUBLE, Real, real_of
-from coldloop_optimizer_plc.qp.linear_algebra import add_transposed_product, respond
+from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real, add_transposed_product, real_of, respond
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 
 Array = NDArray[np.float64]

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from coldloop.process.limits import InputLimits
+from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.qp.costs import indicators
-from coldloop_optimizer_plc.qp.design import ControlDesign
-from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.design import ControlDesign, Preset
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 from coldloop_optimizer_plc.settings import ProgramSettings

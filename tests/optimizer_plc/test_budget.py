@@ -2,8 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop_optimizer_plc.budget import BudgetSettings, PlcBudget
-from coldloop_optimizer_plc.computing_settings import OdeSettings
+from coldloop_optimizer_plc.computing_settings import BudgetSettings, OdeSettings, PlcBudget
 
 TAU_1_S = OdeSettings().tau_1_s
 powers = st.floats(0.05, 20.0)

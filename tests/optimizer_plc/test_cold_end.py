@@ -8,11 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.process.cold_box import T1, T2
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
+from coldloop.process.settings import InputLimits
+from coldloop_optimizer_plc.decisions import limit_of_feed, most_open
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.qp.penalties import Preset
-from coldloop_optimizer_plc.scheme import Constants, limit_of_feed, most_open, problem_at
+from coldloop_optimizer_plc.qp.design import Preset
+from coldloop_optimizer_plc.scheme import Constants, problem_at
 from coldloop_optimizer_plc.settings import ProgramSettings
 
 pytestmark = pytest.mark.usefixtures("compiles")  # these kernels are called by others alone

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, T5
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
+from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, signals_of
 from coldloop_optimizer_plc.estimator import (
     begin_prediction,

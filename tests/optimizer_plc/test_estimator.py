@@ -8,15 +8,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from coldloop.process.cold_box import L1
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
+from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import Update
 from coldloop_optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, NoiseReference
 from coldloop_optimizer_plc.estimator import begin_at_rest, begin_prediction, correct, estimator_of, no_belief, predict
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.qp.linear_algebra import respond
-from coldloop_optimizer_plc.qp.prediction import PredictionModel
-from coldloop_optimizer_plc.qp.rest import rest_map
+from coldloop_optimizer_plc.qp.prediction import PredictionModel, rest_map
 from coldloop_optimizer_plc.settings import ProgramSettings
 
 Array = NDArray[np.float64]

@@ -6,18 +6,15 @@ import numpy as np
 import pytest
 
 from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, T5, TICKS_PER_SAMPLE
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.sections import Forecast
-from coldloop.process.settings import settings_of
+from coldloop.process.settings import InputLimits, settings_of
 from coldloop_optimizer_plc.computing_settings import EstimatorSettings
 from coldloop_optimizer_plc.estimator import estimator_of
-from coldloop_optimizer_plc.forecasts import Forecasts
-from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.qp.condensing import condense
+from coldloop_optimizer_plc.program import Forecasts, OptimizerProgram
 from coldloop_optimizer_plc.qp.design import ControlDesign
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
-from coldloop_optimizer_plc.qp.profile import interpolation
+from coldloop_optimizer_plc.qp.problem import condense, interpolation
 from coldloop_optimizer_plc.settings import ProgramSettings
 
 DESIGN = ControlDesign()

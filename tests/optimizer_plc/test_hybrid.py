@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
-from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.design import Preset
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem
 from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
 from coldloop_optimizer_plc.solvers import Answer, Solver, hybrid, make_solver
@@ -22,8 +22,7 @@ from coldloop_optimizer_plc.solvers.hybrid import (
     picoseconds,
     slots_begun,
 )
-from coldloop_optimizer_plc.solvers.interface import Costs
-from coldloop_optimizer_plc.solvers.kernel_solver import KERNELS
+from coldloop_optimizer_plc.solvers.interface import KERNELS, Costs
 
 if TYPE_CHECKING:
     from tests.optimizer_plc.conftest import Jump, Situations

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, V1
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
+from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import Plan, Update
 from coldloop.safety.sequence import InputSequence
 from coldloop_optimizer_plc.program import OptimizerProgram

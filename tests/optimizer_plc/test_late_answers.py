@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from coldloop.process.cold_box import TICK_S, TICKS_PER_SAMPLE
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
+from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import Update, Verdict
-from coldloop_optimizer_plc.budget import PlcBudget
+from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.decisions import PROVEN
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.scheme import shortest_sequence

@@ -15,18 +15,17 @@ from numpy.typing import NDArray
 import coldloop_optimizer_plc.program
 from coldloop.kernels.compiled import kernel
 from coldloop.process.cold_box import TICK_S
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
+from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import Plan, Update
 from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
 from coldloop.safety.sequence import InputSequence
 from coldloop_optimizer_plc import solvers
 from coldloop_optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.design import Preset
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
-from coldloop_optimizer_plc.rules import Assessment, Observation
-from coldloop_optimizer_plc.rules.interface import decides_by
+from coldloop_optimizer_plc.rules import Assessment, Observation, decides_by
 from coldloop_optimizer_plc.settings import ProgramSettings
 
 pytestmark = pytest.mark.usefixtures("compiles")

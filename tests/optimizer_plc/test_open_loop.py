@@ -7,11 +7,18 @@ from numpy.typing import NDArray
 from coldloop.process.cold_box import L1, OUTPUT_NAMES, TICK_S
 from coldloop_optimizer_plc.computing_settings import Arithmetic
 from coldloop_optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
-from coldloop_optimizer_plc.open_loop import has_moved, is_expected_to_move, none_apart, note_movement
-from coldloop_optimizer_plc.plausibility import STUCK, plausibility_of, suspects_of, watched_output
-from coldloop_optimizer_plc.qp.arithmetic import DOUBLE, Real, real_of
-from coldloop_optimizer_plc.qp.linear_algebra import respond
-from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.plausibility import (
+    STUCK,
+    has_moved,
+    is_expected_to_move,
+    none_apart,
+    note_movement,
+    plausibility_of,
+    suspects_of,
+    watched_output,
+)
+from coldloop_optimizer_plc.qp.design import Preset
+from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real, real_of, respond
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.settings import ProgramSettings
 

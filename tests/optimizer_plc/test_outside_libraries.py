@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from coldloop.errors import ConfigurationError
-from coldloop_optimizer_plc import entry_points
+from coldloop_optimizer_plc import outside
 from coldloop_optimizer_plc.computing_settings import DaqpSettings, OutsideSettings
-from coldloop_optimizer_plc.entry_points import Part, made
+from coldloop_optimizer_plc.outside import Part, made
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
-from coldloop_optimizer_plc.solvers.daqp import DaqpSolver
-from coldloop_optimizer_plc.solvers.outside import OutsideSolver
-from coldloop_optimizer_plc.solvers.outside_libraries import softened
+from coldloop_optimizer_plc.solvers.interface import OutsideSolver
+from coldloop_optimizer_plc.solvers.outside_libraries import DaqpSolver, softened
 from coldloop_rig.settings import Settings
 from coldloop_rig.testing.conformance import problems_of, requirements
 
@@ -32,7 +31,7 @@ pytestmark = pytest.mark.parametrize("name", POINTS)
 def named(monkeypatch: pytest.MonkeyPatch) -> None:
     """The entry points of this tree, whatever is installed."""
     monkeypatch.setattr(
-        entry_points, "entry_points",
+        outside, "entry_points",
         lambda group: EntryPoints(EntryPoint(name, value, group) for name, value in POINTS.items()),
     )  # fmt: skip
 

@@ -15,22 +15,20 @@ import pytest
 from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
+from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import Plan, Update
 from coldloop.registers.optimizer_plc import UpdatingRuleKind
-from coldloop_optimizer_plc import entry_points
-from coldloop_optimizer_plc.budget import BudgetSettings, PlcBudget
-from coldloop_optimizer_plc.computing_settings import OutsideSettings
+from coldloop_optimizer_plc import outside
+from coldloop_optimizer_plc.computing_settings import BudgetSettings, OutsideSettings, PlcBudget
 from coldloop_optimizer_plc.estimator import no_belief
-from coldloop_optimizer_plc.outside_estimator import Measured, OutsideEstimator, PlantModel
+from coldloop_optimizer_plc.outside import Measured, OutsideEstimator, PlantModel
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
-from coldloop_optimizer_plc.rules import Assessment, Observation, assess
-from coldloop_optimizer_plc.rules.outside import OutsideRule
+from coldloop_optimizer_plc.rules import Assessment, Observation, OutsideRule, assess
 from coldloop_optimizer_plc.settings import ProgramSettings
-from coldloop_optimizer_plc.solvers.outside import OutsideSolver
+from coldloop_optimizer_plc.solvers.interface import OutsideSolver
 from coldloop_rig.settings import Settings
 from coldloop_rig.testing.conformance import estimator_requirements, problems_of, requirements, rule_requirements
 from tests.harness.processes import PROGRAM_S, Processes
@@ -128,7 +126,7 @@ def named(monkeypatch: pytest.MonkeyPatch) -> None:
     names = [one.__name__ for one in classes] + ["Missing"]
     monkeypatch.setitem(sys.modules, __name__, sys.modules[__name__])
     monkeypatch.setattr(
-        entry_points, "entry_points",
+        outside, "entry_points",
         lambda group: EntryPoints(EntryPoint(name, f"{__name__}:{name}", group) for name in names),
     )  # fmt: skip
 

@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.limits import InputLimits
+from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.computing_settings import (
     PENALTY_WEIGHT,
     EstimatorKind,
@@ -16,8 +16,7 @@ from coldloop_optimizer_plc.computing_settings import (
     PlausibilitySettings,
 )
 from coldloop_optimizer_plc.qp.costs import augmented_cost, indicators
-from coldloop_optimizer_plc.qp.design import ControlDesign
-from coldloop_optimizer_plc.qp.penalties import PenaltySettings, Preset, presets_of
+from coldloop_optimizer_plc.qp.design import ControlDesign, PenaltySettings, Preset, presets_of
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 from coldloop_optimizer_plc.settings import ProgramSettings

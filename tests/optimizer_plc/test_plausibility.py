@@ -16,9 +16,8 @@ from coldloop_optimizer_plc.estimator import (
     predict,
 )
 from coldloop_optimizer_plc.plausibility import MISSING, USED, new_readings, suspects_of, wanders_off
-from coldloop_optimizer_plc.qp.arithmetic import DOUBLE, Real, real_of
-from coldloop_optimizer_plc.qp.linear_algebra import respond
-from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.design import Preset
+from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real, real_of, respond
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.settings import ProgramSettings
 

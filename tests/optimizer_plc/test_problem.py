@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from coldloop.process.cold_box import L1, T5
-from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.lti_model import LtiModel
+from coldloop.process.settings import InputLimits, RateReference
 from coldloop_optimizer_plc.qp import costs
 from coldloop_optimizer_plc.qp.costs import augmented_cost, indicators, matrices_of, quadratic_cost
 from coldloop_optimizer_plc.qp.design import ControlDesign, trivial_design

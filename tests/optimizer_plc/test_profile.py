@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from coldloop_optimizer_plc.qp.profile import interpolation, shift
+from coldloop_optimizer_plc.qp.problem import interpolation, shift
 
 KNOTS = np.array([1.0, 2.0, 4.0, 8.0, 16.0, 50.0, 100.0])
 

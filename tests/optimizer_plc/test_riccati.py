@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop.process.cold_box import SAMPLING_PERIOD_S, TICK_S, TICKS_PER_SAMPLE
-from coldloop_optimizer_plc.riccati import gains_after, is_stationary
+from coldloop_optimizer_plc.estimator import gains_after, is_stationary
 
 Array = NDArray[np.float64]
 

@@ -5,8 +5,9 @@ import pytest
 
 from coldloop.process.cold_box import INPUT_NAMES
 from coldloop.process.lti_model import LtiModel
+from coldloop_optimizer_plc.decisions import shortage
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.scheme import Constants, shortage
+from coldloop_optimizer_plc.scheme import Constants
 from coldloop_optimizer_plc.settings import ProgramSettings
 from tests.optimizer_plc.test_target import LIMITS
 

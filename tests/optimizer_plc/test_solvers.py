@@ -14,18 +14,18 @@ from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Verdict
 from coldloop_optimizer_plc.computing_settings import FastGradientSettings, InteriorPointSettings, QpoasesSettings
-from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.design import Preset
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
 from coldloop_optimizer_plc.settings import OptimizerSection, ProgramSettings, SolverName
-from coldloop_optimizer_plc.solvers import Solver, judged, make_solver, qpoases
+from coldloop_optimizer_plc.solvers import Solver, judged, make_solver, outside_libraries
 from coldloop_optimizer_plc.solvers.fast_gradient import fast_gradient_solver, step_sizes, stiffest_hessian
 from coldloop_optimizer_plc.solvers.interior_point import interior_point_solver
-from coldloop_optimizer_plc.solvers.qpoases import QpoasesSolver
+from coldloop_optimizer_plc.solvers.outside_libraries import QpoasesSolver
 from coldloop_plant.load import find_load
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.results.recording import Recorder
 from coldloop_rig.settings import Settings
-from tests.optimizer_plc.conftest import Recorder
 
 if TYPE_CHECKING:
     from tests.harness.processes import Processes
@@ -216,14 +216,14 @@ def test_an_iteration_of_qpoases_changes_the_working_set_at_most_once(
     solver = QpoasesSolver(QpoasesSettings())
     solver.solve(*harsh_jumps[0], (0,))
     changes = []
-    step = qpoases._Chain.step  # noqa: SLF001
+    step = outside_libraries._Chain.step  # noqa: SLF001
 
-    def counted(chain: qpoases._Chain) -> str:
+    def counted(chain: outside_libraries._Chain) -> str:
         status = step(chain)
         changes.append(chain._buffer.stats()["iter_count"])  # noqa: SLF001 only CasADi knows
         return status
 
-    monkeypatch.setattr(qpoases._Chain, "step", counted)  # noqa: SLF001
+    monkeypatch.setattr(outside_libraries._Chain, "step", counted)  # noqa: SLF001
     solver.solve(*harsh_jumps[1], (200,))
     assert set(changes) == {0, 1}
     assert changes == sorted(changes, reverse=True), "once it has arrived it stays"
@@ -231,7 +231,7 @@ def test_an_iteration_of_qpoases_changes_the_working_set_at_most_once(
 
 @pytest.mark.usefixtures("compiles")
 def test_ten_recalculations_at_once_come_to_the_same_point(harsh_jumps: "list[Jump]") -> None:
-    casadi = qpoases.load_casadi()
+    casadi = outside_libraries.load_casadi()
     ours = QpoasesSolver(QpoasesSettings())
     (first, guess), (second, _) = harsh_jumps[0], harsh_jumps[1]
     answer(ours, first, guess, 1)
@@ -297,7 +297,7 @@ def test_without_casadi_qpoases_says_what_to_do(monkeypatch: pytest.MonkeyPatch)
     def absent(name: str) -> object:
         raise ModuleNotFoundError(name)
 
-    qpoases.load_casadi.cache_clear()
+    outside_libraries.load_casadi.cache_clear()
     monkeypatch.setattr(importlib, "import_module", absent)
     with pytest.raises(ConfigurationError) as caught:
         solver_named("qpoases")

@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from coldloop.process.cold_box import COLD_BOX, L1, OUTPUT_NAMES, T5
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
+from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.computing_settings import Arithmetic, EstimatorSettings
 from coldloop_optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
-from coldloop_optimizer_plc.qp.arithmetic import DOUBLE, Real, real_of
 from coldloop_optimizer_plc.qp.costs import quadratic_cost
-from coldloop_optimizer_plc.qp.design import ControlDesign, Target
-from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.design import ControlDesign, Preset, Target
+from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real, real_of
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, state_weights
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 from coldloop_optimizer_plc.qp.target import TargetSearch, find_target, rest_of, target_search

@@ -7,8 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.registers.optimizer_plc import UpdatingRuleKind
-from coldloop_optimizer_plc.budget import BudgetSettings, PlcBudget
+from coldloop_optimizer_plc.computing_settings import BudgetSettings, PlcBudget
 from coldloop_optimizer_plc.rules import (
+    MEMORY,
     Algorithm1,
     Assessment,
     ContractionRule,
@@ -16,10 +17,10 @@ from coldloop_optimizer_plc.rules import (
     Observation,
     UpdatingRule,
     assess,
+    assessed,
+    decide_by,
     make_rule,
 )
-from coldloop_optimizer_plc.rules.assessment import assessed
-from coldloop_optimizer_plc.rules.interface import MEMORY, decide_by
 from coldloop_optimizer_plc.settings import ProgramSettings
 
 RULE = Algorithm1(q_first=9, q_min=2, q_max=19, delta=2)

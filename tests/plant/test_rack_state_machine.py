@@ -15,7 +15,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from coldloop.process.limits import InputLimits
+from coldloop.process.settings import InputLimits
 from coldloop.registers.audit import EventKind
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict, PlantSession
 from coldloop.registers.safety import LeaseState, LeaseStatus, WatchdogStatus, WatchdogTime

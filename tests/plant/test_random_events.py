@@ -5,9 +5,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
-from coldloop.kernels.named import named, plain_tuples
+from coldloop.kernels.intrinsics import borrowed, named, plain_tuples
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.model_range import model_range
 from coldloop.process.settings import DEFAULT_MODEL_FILE

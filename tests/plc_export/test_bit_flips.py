@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from coldloop.errors import UsageError
-from coldloop.process.limits import InputLimits
+from coldloop.process.settings import InputLimits
 from coldloop_rig.plc_export.bit_flips import flipped
 from coldloop_rig.plc_export.c_files import GuardExport, OdeExport, OptimizerExport
 from coldloop_rig.plc_export.golden import ITERATIONS, GoldenVectors, golden_calls

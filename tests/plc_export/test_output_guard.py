@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.process.cold_box import TICK_S
-from coldloop.process.limits import InputLimits, RateReference
+from coldloop.process.settings import InputLimits, RateReference
 from coldloop.registers.control_plc import Verdict
 from coldloop_control_plc.guard import OutputGuard
 from coldloop_control_plc.output_limits import begin

@@ -7,7 +7,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from coldloop.process.limits import InputLimits
+from coldloop.process.settings import InputLimits
 from coldloop_rig.plc_export.golden import GoldenVectors, golden_calls
 from coldloop_rig.plc_export.kernels import GuardKernels
 from coldloop_rig.plc_export.plcopen import NAMESPACE, POUS, SECTIONS, XHTML, plcopen_xml

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import pytest
 
 from coldloop.process.cold_box import TICK_S
-from coldloop.process.limits import InputLimits
-from coldloop.process.settings import DEFAULT_MODEL_FILE
+from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop_rig.plc_export.c_files import GuardExport
 from coldloop_rig.plc_export.golden import golden_calls
 from coldloop_rig.plc_export.kernels import GuardKernels

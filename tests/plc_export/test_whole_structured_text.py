@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from coldloop.process.limits import InputLimits
+from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_rig.plc_export.golden import golden_calls, integers_of
 from coldloop_rig.plc_export.kernels import GuardKernels

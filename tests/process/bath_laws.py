@@ -10,17 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.process.declaration import Process
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel, load
-from coldloop.process.settings import settings_of
+from coldloop.process.settings import InputLimits, settings_of
 from coldloop_control_plc.cool_down import CoolDown, CoolDownSettings
 from coldloop_control_plc.sensors import SensorCheckSettings, SensorMonitor
 from coldloop_optimizer_plc.computing_settings import signals_of
-from coldloop_optimizer_plc.decisions import Latched, begin_again
+from coldloop_optimizer_plc.decisions import Latched, begin_again, most_open, shortage
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.qp.prediction import state_weights
 from coldloop_optimizer_plc.qp.target import bounds_at, find_target, least_warm_load, loads_held
-from coldloop_optimizer_plc.scheme import most_open, problem_at, shortage
+from coldloop_optimizer_plc.scheme import problem_at
 from coldloop_optimizer_plc.settings import ProgramSettings
 from tests.harness.records import Row
 

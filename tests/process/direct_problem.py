@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load
-from coldloop.process.settings import settings_of
+from coldloop.process.settings import InputLimits, settings_of
 from coldloop_optimizer_plc.qp.design import ControlDesign
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters

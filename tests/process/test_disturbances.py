@@ -10,8 +10,7 @@ import pytest
 
 from coldloop.errors import ColdloopError, ModelFileError
 from coldloop.process.settings import process_of
-from coldloop_optimizer_plc.qp.prediction import PredictionModel
-from coldloop_optimizer_plc.qp.rest import rest_map
+from coldloop_optimizer_plc.qp.prediction import PredictionModel, rest_map
 from coldloop_plant.own.plants import Disturbances
 from coldloop_rig.process_file.judgement import described
 from coldloop_rig.process_file.making import Made, made_from

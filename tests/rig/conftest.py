@@ -27,11 +27,10 @@ from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.cosim.session import SessionClient
 from coldloop_rig.cosim.wiring import SERVICES, ReservedPorts, RigEndpoints, endpoints_on, wired
-from coldloop_rig.results.recording import Recording
+from coldloop_rig.results.recording import Recorder, Recording
 from coldloop_rig.settings import Settings
 from tests.harness import configurations
 from tests.harness.processes import Processes
-from tests.optimizer_plc.conftest import Recorder
 
 PATIENCE_S = 120.0
 """A test on the bus has failed when it takes longer; the first one may have to compile the kernels."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from coldloop.process.cold_box import LEVEL_BAND, T5_BAND
-from coldloop.process.limits import InputLimits
+from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.settings import ProgramSettings
 from coldloop_plant.cold_box.model import LOOP_MARGIN, held_loads
 from coldloop_plant.cold_box.physics import derivative

@@ -14,7 +14,7 @@ from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.sections import NO_LOAD
 from coldloop.process.settings import settings_of
 from coldloop.session.settings import TimeMode
-from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.design import Preset
 from coldloop_optimizer_plc.settings import SolverName
 from coldloop_plant.load import NAMED
 from coldloop_rig.chaos.plan import shipped_plans

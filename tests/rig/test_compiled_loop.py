@@ -12,8 +12,8 @@ import coldloop_rig.cosim.compiled.portable  # noqa: F401 lets numba compile wha
 from coldloop.config import load_configuration
 from coldloop.kernels.compiled import kernel
 from coldloop.kernels.single_precision import neighbour, single
-from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.load_profile import LoadProfile
+from coldloop.process.settings import InputLimits, RateReference
 from coldloop.registers.audit import EventKind
 from coldloop_control_plc.output_limits import admit, beginning, plain
 from coldloop_rig.cosim.compiled import stretches
@@ -21,10 +21,9 @@ from coldloop_rig.cosim.compiled.control import guard_records
 from coldloop_rig.cosim.compiled.stretches import CompiledStretches, Stretch
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.results.recording import MemorySink
+from coldloop_rig.results.recording import MemorySink, Recorder
 from coldloop_rig.settings import Settings
 from tests.harness.configurations import COMPILED, LEFT_TO_PROGRAMS, UNUSUAL
-from tests.optimizer_plc.conftest import Recorder
 
 pytestmark = pytest.mark.usefixtures("compiles")
 

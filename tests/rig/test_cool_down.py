@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coldloop.kernels.named import plain_tuples
+from coldloop.kernels.intrinsics import plain_tuples
 from coldloop.process.cold_box import COLD_BOX, L1, STATE_NAMES, T5
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.process.station import STATION_SIGNAL_NAMES

@@ -11,14 +11,13 @@ from coldloop.process.cold_box import L1, OUTPUT_NAMES, T5
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.control_plc import Plan, Update
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.qp.design import ControlDesign
-from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.design import ControlDesign, Preset
 from coldloop_optimizer_plc.settings import OptimizerSection, ProgramSettings
 from coldloop_plant.program import PlantProgram
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.results.recording import Recorder
 from coldloop_rig.settings import Settings
-from tests.optimizer_plc.conftest import Recorder
 
 BANDS = ControlDesign()
 BEGIN, TEN_MINUTES, HALF_HOUR = 1200, 2400, 7200

@@ -16,11 +16,9 @@ import coldloop_rig.results.file_sinks
 from coldloop.errors import LinkError
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
-from coldloop_rig.cosim.compiled.records import BLOCK_TICKS
 from coldloop_rig.cosim.one_process import OneProcessRig
-from coldloop_rig.results.recording import KEPT_TICKS, SampleBlock, Sink
+from coldloop_rig.results.recording import BLOCK_TICKS, KEPT_TICKS, Recorder, SampleBlock, Sink
 from tests.harness.processes import Process, Processes
-from tests.optimizer_plc.conftest import Recorder
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
@@ -107,7 +105,7 @@ def in_one_process(done: str, out: Path, processes: Processes) -> Process:
     """Start a run whose rig does something else that never returns, and says so in a line before."""
     program = f"""
 import sys
-from coldloop.foreign import foreign
+from coldloop.errors import foreign
 from coldloop.registers.plant import PlantSample
 from coldloop_rig.cosim.one_process import OneProcessRig
 

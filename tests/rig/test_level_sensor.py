@@ -10,8 +10,8 @@ from coldloop_plant.load import find_load
 from coldloop_plant.program import PlantProgram
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.results.recording import Recorder
 from coldloop_rig.settings import Settings
-from tests.optimizer_plc.conftest import Recorder
 
 LOW, HIGH = (band[0] for band in (ControlDesign().output_low, ControlDesign().output_high))
 SIGMA = np.array([{"%": 0.01, "Hz": 1.0, "K": 0.02, "bar": 0.001}[unit] for unit in OUTPUT_UNITS])

@@ -11,10 +11,9 @@ from coldloop.process.lti_model import load as load_model
 from coldloop_rig.cosim.linear_plant import LinearRig
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.results.recording import Recording
+from coldloop_rig.results.recording import Recorder, Recording
 from coldloop_rig.settings import Settings
 from coldloop_rig.studies.settings import settings_of
-from tests.optimizer_plc.conftest import Recorder
 
 pytestmark = pytest.mark.usefixtures("compiles")
 

@@ -15,13 +15,12 @@ from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_rig import cli, simulate
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.results.recording import MemorySink
+from coldloop_rig.results.recording import MemorySink, Recorder
 from coldloop_rig.runs.running import make_scenario
 from coldloop_rig.settings import Settings
 from coldloop_rig.studies.study import StudyResult
 from tests.conftest import Coldloop
 from tests.harness.records import as_transmitted
-from tests.optimizer_plc.conftest import Recorder
 
 Break = Callable[[float], None]
 OVERFLOW = 1e300

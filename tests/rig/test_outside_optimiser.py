@@ -18,8 +18,8 @@ import pytest
 
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.cold_box import LEVEL_BAND, OUTPUT_NAMES, T5_BAND, TICK_S, TICKS_PER_SAMPLE
-from coldloop.process.limits import InputLimits
 from coldloop.process.load_profile import LoadProfile
+from coldloop.process.settings import InputLimits
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import MAGIC, Identity
 from coldloop.registers.control_plc import LadderStatus, Mode, Status, Verdict

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coldloop.errors import ColdloopError
-from coldloop_optimizer_plc.budget import BudgetSettings, PlcBudget
+from coldloop_optimizer_plc.computing_settings import BudgetSettings, PlcBudget
 from coldloop_rig import simulate
 from coldloop_rig.plc_sizing.budget import Footprint, capacity, power_of
 from coldloop_rig.plc_sizing.plc import find_profile, shipped_profiles

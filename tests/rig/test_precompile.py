@@ -10,9 +10,9 @@ from numba.core.dispatcher import Dispatcher
 
 from coldloop.kernels.compiled import forms_of
 from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.results.recording import Recorder
 from coldloop_rig.runs.running import make_scenario
 from coldloop_rig.settings import Settings
-from tests.optimizer_plc.conftest import Recorder
 
 pytestmark = pytest.mark.usefixtures("programs")
 

@@ -10,12 +10,11 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 from coldloop.kernels.compiled import _parts, cache_folder, forms_of
-from coldloop.kernels.ownership import label
-from coldloop.kernels.reach import reached
+from coldloop.kernels.reach import label, reached
 from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.results.recording import Recorder
 from coldloop_rig.runs.running import make_scenario
 from coldloop_rig.settings import Settings
-from tests.optimizer_plc.conftest import Recorder
 from tests.rig.test_precompile import OURS
 
 pytestmark = pytest.mark.usefixtures("compiles")

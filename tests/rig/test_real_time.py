@@ -11,8 +11,8 @@ import pytest
 import coldloop_rig.cosim.session
 from coldloop.modbus.client import RegisterClient
 from coldloop.operating.observer import SampleReader
-from coldloop.process.limits import InputLimits
 from coldloop.process.load_profile import LoadProfile
+from coldloop.process.settings import InputLimits
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import ControlSession, Mode, Plan, ProcessNow, Status, Verdict
 from coldloop.registers.declaration import RegisterMap

@@ -6,9 +6,7 @@ import pytest
 
 from coldloop.errors import LinkError
 from coldloop.registers.plant import PlantSample
-from coldloop_rig.cosim.compiled.records import BLOCK_TICKS
-from coldloop_rig.results.recording import KEPT_TICKS
-from tests.optimizer_plc.conftest import Recorder
+from coldloop_rig.results.recording import BLOCK_TICKS, KEPT_TICKS, Recorder
 
 
 def sample(tick: int, load: float = 1.0) -> PlantSample:

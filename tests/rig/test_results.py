@@ -19,15 +19,14 @@ from coldloop.process.cold_box import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OU
 from coldloop.process.lti_model import load
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
-from coldloop.whole_file import whole_file
+from coldloop.text_file import whole_file
 from coldloop_rig import cli
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.results.columns import FILES, STATION
 from coldloop_rig.results.folders import claim_folder_of_now, write_json
 from coldloop_rig.results.indicators import evaluate
-from coldloop_rig.results.recording import LinkStatistics, Recording
+from coldloop_rig.results.recording import LinkStatistics, Recorder, Recording
 from coldloop_rig.settings import Settings
-from tests.optimizer_plc.conftest import Recorder
 
 if TYPE_CHECKING:
     from coldloop.process.load_profile import LoadProfile

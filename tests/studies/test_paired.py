@@ -9,12 +9,10 @@ import pytest
 
 from coldloop.errors import StudyError
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.settings import SHIPPED_MODELS
+from coldloop.process.settings import SHIPPED_MODELS, InputLimits
 from coldloop_optimizer_plc.computing_settings import QpoasesSettings
-from coldloop_optimizer_plc.qp.design import ControlDesign
-from coldloop_optimizer_plc.qp.penalties import Preset
+from coldloop_optimizer_plc.qp.design import ControlDesign, Preset
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 from coldloop_optimizer_plc.settings import ProgramSettings, SolverName

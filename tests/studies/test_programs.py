@@ -13,8 +13,7 @@ from typing import Any
 
 import pytest
 
-from coldloop.kernels.ownership import is_decisive_module
-from coldloop.kernels.reach import reached
+from coldloop.kernels.reach import is_decisive_module, reached
 from coldloop_rig.cosim.compiled.cold_box_plants import advance_box
 from coldloop_rig.studies.request import Procedure, RunRequest, perform, programs, programs_digest
 

@@ -20,7 +20,7 @@ from coldloop.process.sections import Input
 from coldloop.registers.control_plc import LadderStatus, Mode
 from coldloop.registers.safety import AlarmState, alarm_key, alarms_of
 from coldloop.service.event_text import alarm_word
-from coldloop.whole_file import whole_file, whole_text
+from coldloop.text_file import whole_file, whole_text
 from coldloop_rig.chaos.evaluation import ChaosTrace, Evaluation, RaisedAlarm, Row
 from coldloop_rig.chaos.experiment import Experiment
 from coldloop_rig.chaos.plan import ChaosPlan

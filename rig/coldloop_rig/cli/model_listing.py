@@ -7,8 +7,8 @@ import numpy as np
 
 from coldloop.errors import ModelFileError, printable
 from coldloop.process.cold_box import L1, T5
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel, load
+from coldloop.process.settings import InputLimits
 from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
 from coldloop_optimizer_plc.qp.design import ControlDesign
 from coldloop_plant.cold_box.model import (

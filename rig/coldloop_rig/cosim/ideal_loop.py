@@ -19,7 +19,7 @@ from coldloop_optimizer_plc.computing_settings import EstimatorKind
 from coldloop_optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
 from coldloop_optimizer_plc.qp.prediction import prediction_of
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
-from coldloop_optimizer_plc.solvers.daqp import DaqpSolver
+from coldloop_optimizer_plc.solvers.outside_libraries import DaqpSolver
 from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.results.recording import Recorder

@@ -23,7 +23,7 @@ from coldloop.number_text import axis_labels, ends_text, number_text
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
 from coldloop.process.sections import Input, Output
-from coldloop.whole_file import whole_file
+from coldloop.text_file import whole_file
 from coldloop_rig.results.columns import STATION, excess_keys
 from coldloop_rig.results.folders import writing
 from coldloop_rig.results.recording import Way

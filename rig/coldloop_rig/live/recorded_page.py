@@ -20,7 +20,7 @@ from coldloop.service.event_text import EventText
 from coldloop_hmi.process_image import JournalEntry
 from coldloop_hmi.replay import ReplayFrame
 from coldloop_hmi.signals import Doubts
-from coldloop_optimizer_plc.budget import PlcBudget
+from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.rules import make_rule
 from coldloop_optimizer_plc.settings import OptimizerSettings
 from coldloop_optimizer_plc.solvers import make_solver

@@ -372,25 +372,10 @@ def golden_files(printer: Printer, sum_: int, tables: Mapping[str, Array], **siz
 
 def helpers(real: str, kernels: str) -> str:
     """Return what kernels call: min and max as they have them, and division that rounds down."""
-    known = {
-        **{
-            f"{name}_{of}": f"static inline {kind} {name}_{of}({kind} one, {kind} other) {{\n"
-                            f"    return other {sign} one ? other : one;\n}}\n"
-            for of, kind in (("real", real), ("int", "int32_t")) for name, sign in (("min", "<"), ("max", ">"))
-        },
-        "floor_mod": """static inline int32_t floor_mod(int32_t one, int32_t other) {
-    const int32_t rest = one % other;
-    return rest < 0 ? rest + other : rest;
-}
-""",
-        "floor_div": """static inline int32_t floor_div(int32_t one, int32_t other) {
-    return (one - floor_mod(one, other)) / other;
-}
-""",
-    }  # fmt: skip
-    divided = "floor_div(" in kernels
-    return "".join(text for name, text in known.items()
-                   if f"{name}(" in kernels or (divided and name == "floor_mod"))  # fmt: skip
+    texts = tree.filled(tree.template("c/helpers.c"), {"REAL": real}).split("\n\n")
+    known = {re.findall(r"(\w+)\(", text)[0]: f"{text.rstrip()}\n" for text in texts}
+    called = f"{kernels}{known['floor_div']}" if "floor_div(" in kernels else kernels
+    return "".join(text for name, text in known.items() if f"{name}(" in called)
 
 
 def records_in(types: Iterable[Type]) -> list[RecordType | StructType]:

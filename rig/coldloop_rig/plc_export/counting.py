@@ -17,9 +17,9 @@ from coldloop_control_plc.output_limits import GuardState, Limits, beginning
 from coldloop_optimizer_plc.computing_settings import Arithmetic
 from coldloop_optimizer_plc.decisions import Latched
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.qp.arithmetic import real_of
+from coldloop_optimizer_plc.qp.linear_algebra import real_of
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
-from coldloop_optimizer_plc.session_state import OptimizerState, empty_state
+from coldloop_optimizer_plc.scheme import OptimizerState, empty_state
 from coldloop_optimizer_plc.settings import ProgramSettings
 from coldloop_optimizer_plc.solvers.interface import Costs
 from coldloop_optimizer_plc.solvers.ode import OdeMethod, ode_solver

@@ -23,9 +23,9 @@ from coldloop.config import selected
 from coldloop.errors import UsageError
 from coldloop.kernels.cache_folder import find_cache_folder
 from coldloop.parsing import parsed_json
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.lti_model import load as load_model
+from coldloop.process.settings import InputLimits
 from coldloop.registers.codec import blank
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, Update, Verdict
 from coldloop.registers.maps import maps_of

@@ -13,7 +13,7 @@ import numpy as np
 from coldloop import __version__
 from coldloop.errors import UsageError
 from coldloop.parsing import parsed_json
-from coldloop.process.limits import RateReference
+from coldloop.process.settings import RateReference
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS, control_map
 from coldloop_optimizer_plc.qp.prediction import PredictionModel

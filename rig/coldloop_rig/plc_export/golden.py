@@ -12,8 +12,8 @@ import numpy as np
 from coldloop.config import load_configuration
 from coldloop.errors import UsageError
 from coldloop.kernels.single_precision import single
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load as load_model
+from coldloop.process.settings import InputLimits
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, Update, control_map
 from coldloop.safety.sequence import InputSequence
@@ -31,7 +31,7 @@ from coldloop_control_plc.output_limits import (
 from coldloop_optimizer_plc import scheme
 from coldloop_optimizer_plc.computing_settings import Arithmetic
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.qp.arithmetic import real_of
+from coldloop_optimizer_plc.qp.linear_algebra import real_of
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.rules import UpdatingRule
 from coldloop_optimizer_plc.settings import ProgramSettings

@@ -8,7 +8,7 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
-from coldloop.process.limits import InputLimits
+from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop_control_plc import output_limits
 from coldloop_control_plc.output_limits import beginning, plain
@@ -16,12 +16,10 @@ from coldloop_optimizer_plc import decisions, scheme
 from coldloop_optimizer_plc.computing_settings import Arithmetic
 from coldloop_optimizer_plc.decisions import Latched, Starts
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.qp.arithmetic import real_of
+from coldloop_optimizer_plc.qp.linear_algebra import real_of
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
-from coldloop_optimizer_plc.rules import make_rule
-from coldloop_optimizer_plc.rules.interface import DECISIONS, decide_by
-from coldloop_optimizer_plc.solvers.interface import Costs
-from coldloop_optimizer_plc.solvers.kernel_solver import KERNELS, solve_by
+from coldloop_optimizer_plc.rules import DECISIONS, decide_by, make_rule
+from coldloop_optimizer_plc.solvers.interface import KERNELS, Costs, solve_by
 from coldloop_optimizer_plc.solvers.ode import OdeMethod, solve
 from coldloop_rig.cosim.compiled.portable import PORTABLE
 from coldloop_rig.plc_export.statements import Program

@@ -33,7 +33,6 @@ from coldloop_rig.plc_export.st_pausing import ANEW, PIECE, Pausing, an_answer_i
 from coldloop_rig.plc_export.st_printer import (
     Constants,
     interface_names,
-    main_program,
     memory,
     portable,
     scalar_of,
@@ -143,7 +142,7 @@ class StructuredTextExport:
         n, m, k = len(problem.phi), len(problem.gamma), len(answer.costs)
         checks, pad = template("structured_text/checks.st") + "\n", " " * 16
         arrays = ", ".join(f"{name} := {name}" for name in arrays_in(self.vectors[0]))
-        return filled(checks + template("structured_text/self_test.st") + main_program(self.outputs), {
+        return filled(checks + template("structured_text/self_test.st") + st_printer.main_program(self.outputs), {
             **self.constants.summed(),
             "WORK": str(WORK), "N": str(n), "M": str(m), "K": str(k), "POINTS": str(n * k), "LAST": str(n - 1),
             "INSTANCES": "\n".join(f"    golden_{each} : cl_golden_{each};" for each in range(len(self.vectors))),
@@ -214,7 +213,7 @@ class OptimizerText:
                      else tree.Assign(Name(kind, dotted(path)), Literal(kind, 0)) for path, kind in self.state.items()
                      if path not in {FIXED_TICKS, JOBS})  # fmt: skip
         at = Name(Kind.INT, "at.0")
-        return Block("clear", "coldloop_optimizer_plc/session_state.py", "Make the state zero.", (), (), (), (at,),
+        return Block("clear", "coldloop_optimizer_plc/scheme.py", "Make the state zero.", (), (), (), (at,),
                      tuple(self.state), body)  # fmt: skip
 
     # -- files ---------------------------------------------------------------------------------------------------------
@@ -442,7 +441,8 @@ class GuardText:
         checks = template("structured_text/checks.st")
         checks = checks[checks.index("(* Sums up") :] + "\n"  # the other ones are of single precision
         integers, reals, rows = self._tables.values()
-        return filled(checks + template("structured_text/output_guard/self_test.st") + main_program(self.outputs), {
+        main = st_printer.main_program(self.outputs)
+        return filled(checks + template("structured_text/output_guard/self_test.st") + main, {
             **self._printed_counts(), **self.constants.summed(), "AT_ONCE": str(AT_ONCE),
             "OF_REALS": str(reals.shape[1]), "N_INTEGERS": str(integers.size), "N_REALS": str(reals.size),
             "N_ROWS": str(rows.size), "VECTOR_COUNT": str(len(integers)),

@@ -33,21 +33,7 @@ LONGEST: Final = 32
 """Characters of a name that every tool tells apart."""
 PREFIX: Final = "cl_"
 """Of all that is global: types, functions, function blocks and constants."""
-KEYWORDS: Final = """
-    abs acos action add add_time and and_then andn any any_bit any_num array asin at atan atan2 bool by byte cal
-    calc calcn case char class concat configuration constant continue cos ct ctd ctu ctud d date date_and_time
-    delete dint div do ds dt dword else elsif end end_action end_case end_class end_configuration end_for
-    end_function end_function_block end_if end_interface end_method end_namespace end_program end_repeat
-    end_resource end_step end_struct end_transition end_type end_var end_while eq exit exp expt extends f_edge
-    f_trig false final find for from function function_block ge goto gt if implements in initial_step insert int
-    interface internal interval inv jmp jmpc jmpcn l ld ldate ldt ldn le left len limit lint ln log lower_bound
-    lreal lt ltime ltod lword max method mid min mod move mul mux n namespace ne non_retain not null of on or
-    or_else orn overlap override p priority private program protected public r r1 r_edge r_trig read_only read_write
-    ref ref_to real repeat replace resource ret retain retc retcn return right rol ror rs s s1 sd sel semaphore shl
-    shr sin single sint sl sqrt sr st step stn string struct sub super t tan task then this time time_of_day to tod
-    tof ton tp transition true trunc type udint uint ulint until upper_bound using usint var var_access var_config
-    var_external var_global var_in_out var_input var_output var_temp wchar while with word wstring xor xorn
-"""
+KEYWORDS: Final = tree.template("structured_text/keywords.txt")
 
 
 def identifier(name: str) -> str:
@@ -115,18 +101,8 @@ def main_program(outputs: Sequence[str]) -> str:
         f"    {VERDICT}[{place}] := {f'BOOL_TO_DINT(test.{name})' if name in COMMON[:2] else f'test.{name}'};\n"
         for place, name in enumerate((*COMMON, *outputs))
     )
-    return f"""
-(* Runs the self-test in a task of its own, and puts its outputs into {VERDICT}. *)
-PROGRAM cl_main
-VAR_EXTERNAL
-    {VERDICT} : cl_dints_{LENGTH};
-END_VAR
-VAR
-    test : cl_self_test;
-END_VAR
-    test(run := TRUE);
-{puts}END_PROGRAM
-"""
+    parts = {"VERDICT": VERDICT, "LENGTH": str(LENGTH), "PUTS": puts}
+    return tree.filled(tree.template("structured_text/main.st"), parts)
 
 
 def verdict_table(outputs: Sequence[str]) -> str:
@@ -473,7 +449,7 @@ class Constants:
         """Return the configuration with these lists, a state, and room for the verdict of the self-test."""
         listed = section("VAR_GLOBAL", {global_name(path): self.printer.type(kind) for path, kind in state.items()})
         verdict = section("VAR_GLOBAL", {VERDICT: self.printer.array_type("DINT", LENGTH)})
-        return configuration(iter([*self.lists(), listed, verdict]))
+        return configuration([*self.lists(), listed, verdict])
 
     def sum(self) -> int:
         """Return the sum over all of them that the self-test computes."""
@@ -510,15 +486,9 @@ class Constants:
         return f"{pad}{part}:\n{pad}    {read.replace(chr(10), chr(10) + '    ')}\n"
 
 
-def configuration(lists: Iterator[str]) -> str:
+def configuration(lists: Iterable[str]) -> str:
     """Return a configuration with these lists of variables, and one task that runs `cl_main`."""
-    return f"""CONFIGURATION cl_configuration
-{"".join(lists)}RESOURCE cl_resource ON PLC
-    TASK cl_task(INTERVAL := T#250ms, PRIORITY := 1);
-    PROGRAM cl_program WITH cl_task : cl_main;
-END_RESOURCE
-END_CONFIGURATION
-"""
+    return tree.filled(tree.template("structured_text/configuration.st"), {"LISTS": "".join(lists)})
 
 
 def in_pieces(constants: Mapping[Path, Array]) -> tuple[dict[Path, Array], Split]:

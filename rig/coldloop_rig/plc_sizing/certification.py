@@ -23,7 +23,7 @@ from scipy.special import betaincinv
 
 from coldloop.errors import ConfigurationError
 from coldloop.process.lti_model import load
-from coldloop_optimizer_plc.budget import PlcBudget
+from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.qp.costs import augmented_cost
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.settings import ProgramSettings, SolverName

@@ -11,8 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.errors import UsageError
-from coldloop.foreign import foreign
+from coldloop.errors import UsageError, foreign
 from coldloop.parsing import parsed_json
 from coldloop.process.declaration import Process
 from coldloop.process.sections import Lag, PlantSource

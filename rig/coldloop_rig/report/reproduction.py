@@ -19,7 +19,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, model_validator
 
 from coldloop import __version__
 from coldloop.parsing import parsed_toml
-from coldloop.whole_file import whole_text
+from coldloop.text_file import whole_text
 from coldloop_rig.plc_sizing.operations import dense_cholesky
 from coldloop_rig.plc_sizing.plc import cholesky_times
 from coldloop_rig.results.folders import write_json, writing
@@ -142,12 +142,12 @@ def _document() -> dict[str, Any]:
 
 def judge(values: Mapping[str, Sequence[float]]) -> list[Judged]:
     """Return every claim, judged by the values that the studies gave."""
-    return [_judged(claim, tuple(values.get(claim.value, ()))) for claim in claims()]
-
-
-def _judged(claim: Claim, values: tuple[float, ...]) -> Judged:
-    of_paper = paper_values().get(claim.value) if claim.of_paper == FROM_POINTS else None
-    return Judged(claim, values, of_paper, verdict(claim, values))
+    found = []
+    for claim in claims():
+        given = tuple(values.get(claim.value, ()))
+        of_paper = paper_values().get(claim.value) if claim.of_paper == FROM_POINTS else None
+        found.append(Judged(claim, given, of_paper, verdict(claim, given)))
+    return found
 
 
 def verdict(claim: Claim, values: tuple[float, ...]) -> ClaimVerdict:

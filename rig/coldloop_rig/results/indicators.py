@@ -13,9 +13,8 @@ from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop_optimizer_plc.qp.design import ControlDesign
 from coldloop_optimizer_plc.qp.prediction import state_weights
-from coldloop_rig.cosim.compiled.records import BLOCK_TICKS
 from coldloop_rig.results.columns import excess_keys
-from coldloop_rig.results.recording import Recording, SampleBlock, Sink
+from coldloop_rig.results.recording import BLOCK_TICKS, Recording, SampleBlock, Sink
 
 
 class Indicators(NamedTuple):

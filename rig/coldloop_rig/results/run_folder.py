@@ -21,8 +21,7 @@ from coldloop.parsing import parsed_json
 from coldloop.process.declaration import Process
 from coldloop.process.model_file import process_in, read_document
 from coldloop.registers.control_plc import Mode
-from coldloop.text_file import held_file, read_text
-from coldloop.whole_file import whole_file
+from coldloop.text_file import held_file, read_text, whole_file
 from coldloop_rig.durations import LONGEST_TICKS
 from coldloop_rig.results.columns import EVENTS, FILES, FORMAT, STATION, TRACE, files_of, numbers_of
 from coldloop_rig.results.folders import prepare_folder, writing

@@ -8,8 +8,8 @@ from coldloop.config import Configuration
 from coldloop.errors import UsageError
 from coldloop.process.lti_model import load
 from coldloop.session.settings import TimeMode
-from coldloop_optimizer_plc.budget import PlcBudget
-from coldloop_optimizer_plc.qp.arithmetic import real_of
+from coldloop_optimizer_plc.computing_settings import PlcBudget
+from coldloop_optimizer_plc.qp.linear_algebra import real_of
 from coldloop_optimizer_plc.settings import AdaptiveSettings, ProgramSettings, RuleName
 from coldloop_rig.plc_sizing.holding import digits_last_s, shortest_period_s, waiting
 from coldloop_rig.settings import Settings

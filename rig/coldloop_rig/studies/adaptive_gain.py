@@ -11,7 +11,7 @@ from coldloop.errors import StudyError
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import load
 from coldloop.process.updating_periods import SHORTEST_TICKS
-from coldloop_optimizer_plc.budget import PlcBudget
+from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_plant.load import find_load
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario, natural_ticks

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from coldloop.number_text import ends_text
 from coldloop.process.cold_box import SAMPLING_PERIOD_S, TICK_S
-from coldloop.process.limits import InputLimits
+from coldloop.process.settings import InputLimits
 from coldloop.registers.plant import StationMode
 from coldloop_rig.figures.plot import COLOURS, DASHES, INK, STYLE, draw_tau_u, label_marks, limit, styled
 from coldloop_rig.studies.intervals import Interval

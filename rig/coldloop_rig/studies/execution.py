@@ -20,8 +20,8 @@ from distributed import Client, LocalCluster, as_completed
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from coldloop.errors import ColdloopError, ResultsError, StudyError, UsageError
-from coldloop.whole_file import whole_text
-from coldloop_optimizer_plc.budget import BudgetSettings, PlcBudget
+from coldloop.text_file import whole_text
+from coldloop_optimizer_plc.computing_settings import BudgetSettings, PlcBudget
 from coldloop_optimizer_plc.solvers import make_solver
 from coldloop_rig.interruption import INTERRUPTION
 from coldloop_rig.progress import make_console

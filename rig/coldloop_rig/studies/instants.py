@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from coldloop_optimizer_plc.budget import PlcBudget
+from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.qp.design import ControlDesign
 from coldloop_rig.cosim.ideal_loop import run_ideal_loop
 from coldloop_rig.figures.plot import COLOURS, DASHES, INK

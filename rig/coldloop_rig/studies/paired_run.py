@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import StudyError
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load as load_model
+from coldloop.process.settings import InputLimits
 from coldloop.safety.sequence import InputSequence
-from coldloop_optimizer_plc.budget import PlcBudget
+from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.qp.costs import indicators
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, prediction_of

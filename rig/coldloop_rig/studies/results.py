@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict
 from coldloop import __version__
 from coldloop.errors import StudyError, UsageError
 from coldloop.parsing import parsed_json
-from coldloop.whole_file import whole_text
+from coldloop.text_file import whole_text
 from coldloop_rig.figures.plot import save_figure
 from coldloop_rig.results.folders import installed_version, prepare_folder, write_json, writing
 from coldloop_rig.studies.execution import Store, Workers, checked_requests, perform_all
@@ -112,6 +112,10 @@ class Shard:
         """Write it as it is read."""
         return f"{self.number}/{self.of}"
 
+    def part(self, requests: Sequence[RunRequest]) -> list[RunRequest]:
+        """Return the runs of this shard."""
+        return unique(requests)[self.number - 1 :: self.of]
+
 
 class ShardRecord(BaseModel):
     """What a shard is a part of."""
@@ -158,7 +162,7 @@ def conduct_shard(study: Study, options: StudyOptions, workers: Workers, folder:
     path = folder / study.name / f"shard-{shard.number}-of-{shard.of}.json"
     with writing(path):
         write_json(path, record.model_dump())
-    mine = unique(requests)[shard.number - 1 :: shard.of]
+    mine = shard.part(requests)
     perform_all(mine, Store(folder / RUNS), workers, f"{study.name} {shard}")
     return len(mine)
 

@@ -8,7 +8,7 @@ from typing import Final
 
 from coldloop.config import load_configuration
 from coldloop_optimizer_plc.computing_settings import OutsideSettings
-from coldloop_optimizer_plc.entry_points import Part, loaded
+from coldloop_optimizer_plc.outside import Part, loaded
 from coldloop_rig.settings import Settings
 
 PAPER: Final = ("model.file=cold-box", "optimizer_plc.program.preset=paper")

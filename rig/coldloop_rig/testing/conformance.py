@@ -16,15 +16,13 @@ from coldloop.process.declaration import REFERENCE_TICK_S, Process
 from coldloop.process.lti_model import load
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop_optimizer_plc.computing_settings import DaqpSettings, OutsideSettings
-from coldloop_optimizer_plc.entry_points import Part, made
-from coldloop_optimizer_plc.outside_estimator import Measured, OutsideCorrection, PlantModel, plant_model
+from coldloop_optimizer_plc.outside import Measured, OutsideCorrection, Part, PlantModel, made, plant_model
 from coldloop_optimizer_plc.qp.costs import augmented_cost
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, prediction_of
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
-from coldloop_optimizer_plc.rules import Observation, assess
-from coldloop_optimizer_plc.rules.outside import OutsideDecision
-from coldloop_optimizer_plc.solvers.daqp import DaqpSolver
-from coldloop_optimizer_plc.solvers.outside import OutsideMethod, OutsideSolver
+from coldloop_optimizer_plc.rules import Observation, OutsideDecision, assess
+from coldloop_optimizer_plc.solvers.interface import OutsideMethod, OutsideSolver
+from coldloop_optimizer_plc.solvers.outside_libraries import DaqpSolver
 from coldloop_rig.settings import Settings
 from coldloop_rig.text_tables import aligned
 

@@ -128,12 +128,9 @@ class NamedRegisters:
         for name, field in where.fields.items():  # registers of their own names are given by these, or as one array
             single = {element: values.pop(element) for element in field.elements if field.each and element in values}
             if single:
-                known = (
-                    single
-                    if len(single) == len(field.elements)
-                    else {**dict(zip(field.elements, getattr(self._record(where, row), name), strict=True)), **single}
-                )
-                values[name] = tuple(known[element] for element in field.elements)
+                if len(single) < len(field.elements):
+                    single = dict(zip(field.elements, getattr(self._record(where, row), name), strict=True)) | single
+                values[name] = tuple(single[element] for element in field.elements)
         if len(values) == len(names):
             record = where.record(**values, **({"crc": 0} if where.sealed else {}))
         else:

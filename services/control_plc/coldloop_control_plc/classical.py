@@ -13,9 +13,8 @@ from typing import Annotated, Self
 from pydantic import BaseModel, ConfigDict, FiniteFloat, PositiveFloat, model_validator
 
 from coldloop.process.cold_box import LEVEL_LOOP, T5_LOOP
-from coldloop.process.limits import InputLimits
 from coldloop.process.sections import Band, Loop
-from coldloop.process.settings import ProcessSettings, declared, within
+from coldloop.process.settings import InputLimits, ProcessSettings, declared, within
 from coldloop.process.updating_periods import whole_ticks
 from coldloop.safety.sequence import Inputs
 

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Awaitable
 from typing import Final
 
-from coldloop.process.limits import InputLimits
+from coldloop.process.settings import InputLimits
 from coldloop.registers.audit import EventKind, JournalQuery
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
 from coldloop.registers.common import SessionPace, pace_subject
@@ -25,7 +25,7 @@ from coldloop.registers.declaration import Block, Role
 from coldloop.registers.safety import AlarmCommand, AlarmKind, LeaseEvent, WatchdogTime
 from coldloop.safety.lease import WriterLease
 from coldloop.safety.sequence import InputSequence
-from coldloop.session.time_base import TimeBase
+from coldloop.session.settings import TimeBase
 from coldloop_control_plc.program import ControlProgram
 from coldloop_control_plc.publication import ControlPublication
 from coldloop_control_plc.sessions import Sessions

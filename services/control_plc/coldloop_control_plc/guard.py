@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from coldloop.kernels.single_precision import neighbour, single
-from coldloop.process.limits import InputLimits
+from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import Verdict
 from coldloop.safety.sequence import Inputs
 from coldloop_control_plc.output_limits import admit, beginning, in_range, judge, plain, resume

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from coldloop.kernels.single_precision import neighbour, single
-from coldloop.process.limits import InputLimits, RateReference
+from coldloop.process.settings import InputLimits, RateReference
 from coldloop_control_plc.numbers import Numbers, Rows
 
 TOLERANCE: Final = 1e-5

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from coldloop.errors import ConfigurationError
-from coldloop.process.limits import InputLimits
 from coldloop.process.model_file import ModelHeader
+from coldloop.process.settings import InputLimits
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import (
     Acknowledgement,

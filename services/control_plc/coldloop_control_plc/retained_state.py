@@ -18,7 +18,7 @@ from coldloop.registers.control_plc import SEQUENCE_ROWS, CoolDownStep, Operator
 from coldloop.registers.safety import Alarm, alarms_of
 from coldloop.safety.retained import RetainedFile, RetainedStateError, RetainedStateWriter
 from coldloop.safety.sequence import InputSequence, checksum
-from coldloop.session.time_base import TimeBase
+from coldloop.session.settings import TimeBase
 from coldloop_control_plc.program import ControlProgram
 
 log = logging.getLogger("coldloop.control_plc")

@@ -31,7 +31,7 @@ from coldloop.service.logs import dropped
 from coldloop.service.metrics_server import MetricsServer
 from coldloop.service.start import SERVING
 from coldloop.service.telemetry import Telemetry
-from coldloop.session.time_base import TimeBase
+from coldloop.session.settings import TimeBase
 from coldloop_control_plc.certificate_watch import CertificateWatch
 from coldloop_control_plc.client_requests import Clients
 from coldloop_control_plc.plant_link import FROZEN_S, FROZEN_TICKS, PlantLink

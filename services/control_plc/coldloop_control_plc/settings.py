@@ -8,8 +8,7 @@ from pydantic import Field
 
 from coldloop.modbus.endpoints import CONTROL_PORT, PLANT_PORT, Endpoint
 from coldloop.modbus.settings import ServerSettings
-from coldloop.process.limits import InputLimits
-from coldloop.process.settings import ProcessSettings, RootSettings, declared, stretched, within
+from coldloop.process.settings import InputLimits, ProcessSettings, RootSettings, declared, stretched, within
 from coldloop.registers.codec import WordOrder
 from coldloop.safety.retained import RetainSettings
 from coldloop.service.metrics_settings import MetricsSettings

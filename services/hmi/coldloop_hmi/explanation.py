@@ -1,7 +1,7 @@
 """Explains an updating period: from the record of an update to the branch that decided it, and to a sentence.
 
 A pure function of registers: it works on a running rig and on a recorded run alike. Symbols are those of Algorithm 1
-(`coldloop_optimizer_plc/rules/`): the quantities of update i were found at t_i, of the period that ended there.
+(`coldloop_optimizer_plc/rules.py`): the quantities of update i were found at t_i, of the period that ended there.
 """
 
 import math

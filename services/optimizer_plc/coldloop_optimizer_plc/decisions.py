@@ -1,6 +1,7 @@
-"""Decisions of the optimiser as kernels: what an update says of what is played, and how its q is decided.
+"""An update and its answer, as kernels: steps (4), (5) and (2) of the paper's section II.
 
-`take_update` is all that an update asks for, `scheme.solve` all that its answer does.
+`take_update` is all that an update asks for: what is played from it on, what that costs at the estimated state, which q
+follows, and the period that begins. Its answer is `scheme.solve`; `note_answer` notes whether it came in time.
 """
 
 from typing import Final, NamedTuple
@@ -10,14 +11,28 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from coldloop.registers.control_plc import SEQUENCE_ROWS
-from coldloop_optimizer_plc.estimator import begin_at_rest, forget
-from coldloop_optimizer_plc.qp.profile import hold, shift, shifted
-from coldloop_optimizer_plc.rules.interface import UpdatingRule
-from coldloop_optimizer_plc.scheme import BY_THE_RULE, Constants, begin_sent, plan, predict_played
-from coldloop_optimizer_plc.session_state import OptimizerState
+from coldloop_optimizer_plc.estimator import Belief, begin_at_rest, correct, forget
+from coldloop_optimizer_plc.plausibility import USED, suspects_of
+from coldloop_optimizer_plc.qp.costs import augmented_cost
+from coldloop_optimizer_plc.qp.problem import hold, shift, shifted
+from coldloop_optimizer_plc.qp.target import bounds_at, find_target, least_warm_load, loads_held
+from coldloop_optimizer_plc.rules import Assessment, Observation, UpdatingRule, assessed, decide_by
+from coldloop_optimizer_plc.scheme import (
+    LARGEST,
+    Constants,
+    Delivery,
+    OptimizerState,
+    idle_valve,
+    predict_played,
+    problem_at,
+    stands,
+    with_floor,
+)
 
 Array = NDArray[np.float64]
 
+BY_THE_RULE: Final = 0
+"""The q that `plan` is given when the rule is to decide it."""
 PROVEN: Final = 8
 """Answers in time, one after the other, after which the next is tried with half of what is allowed for late ones: where
 some ticks are needed for good, one answer in nine is late."""
@@ -54,6 +69,172 @@ class Starts(NamedTuple):
 
     first: int
     after_step: int
+
+
+@kernel
+def begin_sent(m: OptimizerState) -> None:
+    """Let the last answer be what is played: its sequence begins."""
+    copy_delivery(m.sent, m.playing)
+
+
+@kernel
+def copy_delivery(source: Delivery, target: Delivery) -> None:
+    """Make `target` the same as `source`."""
+    target.numbers[0] = source.numbers[0]
+    target.x[:], target.u_before[:], target.z[:] = source.x, source.u_before, source.z
+    target.rows[:] = source.rows
+
+
+@kernel
+def shortage(
+    c: Constants, x: Array, w: float, load: float, most_open: float, idle: int, at: float, before: float, none: float
+) -> float:  # fmt: skip
+    """Return what the load is above what can be held, W; negative: below what is needed; `none`, that is 0, otherwise.
+
+    The estimate w (a deviation) has what the plant lacks beside its model, so it is compared with what the model holds
+    at rest within the inputs' bounds and the limit of the feed, less a reserve, and with the least that it holds
+    without the turbine's outlet getting too cold, by the constant error of that. The load itself (W), where it is
+    measured, is compared with what the plant holds that is as its model. A shortage of the sign that was `before` ends
+    where the estimate has twice the reserve: noise does not end it and begin it anew.
+    """
+    if not c.target.limited:
+        return none
+    measured = load - c.estimator.w0 if c.estimator.load_known else w
+    low, high = bounds_at(c.target, x, most_open, idle, at)
+    _, most = loads_held(c.target, low, high)
+    more = c.reserve if before > none else none
+    less = c.reserve if before < none else none
+    too_much = max(w + c.reserve + more - most, measured - c.largest_load)
+    warm = least_warm_load(c.target, low, high) - c.least_load_error
+    too_little = min(w - warm - less, min(w, measured) - c.least_load)
+    return max(too_much, none) + min(too_little, none)
+
+
+@kernel
+def believed(c: Constants, belief: Belief, u: Array, y: Array, output: int) -> float:
+    """Return an output by the estimate, for inputs u (3,), deviations; by its reading where no constant is estimated.
+
+    One without a constant is as the model has it while its reading is left out.
+    """
+    e, reading = c.estimator, belief.readings[output]
+    if e.plausible.constants[output] < 0 and reading.state == USED and np.isfinite(y[output]):
+        shown: float = y[output]
+        return shown
+    maps = e.outputs
+    value: float = e.y0[output] + maps.F[0, output] * belief.numbers[0].w
+    for j in range(belief.x.shape[0]):
+        value += maps.A[j, output] * belief.x[j]
+    for j in range(u.shape[0]):
+        value += maps.B[j, output] * u[j]
+    return value
+
+
+@kernel
+def most_open(c: Constants, u: Array, approach: float) -> float:
+    """Return how far the feed may be opened, a scaled deviation, by inputs (3,), deviations, and an approach, K."""
+    feed = c.target.feed
+    limit: float = max(u[feed] + c.opening_per_k * (c.approach - approach), c.opening_from) / c.input_scale[feed]
+    return limit
+
+
+@kernel
+def limit_of_feed(c: Constants, m: OptimizerState, y: Array) -> float:
+    """Return `most_open` by the estimate, followed from that of the update before; y (22,) are the outputs."""
+    before, belief = m.numbers[0].most_open, m.belief
+    if np.isinf(c.approach):
+        return c.approach
+    warmer = believed(c, belief, m.u, y, c.feed_temperature) - believed(c, belief, m.u, y, c.temperature)
+    elapsed = y.dtype.type(belief.numbers[0].since) * c.estimator.tick_s
+    share = min(elapsed / c.following_s, y.dtype.type(1.0)) if m.numbers[0].planned else y.dtype.type(1.0)
+    moved = (most_open(c, m.u, warmer) - before) * share
+    if not np.isfinite(moved):  # by an estimate that leads to no answer
+        moved = y.dtype.type(0.0)
+    limit: float = max(before + moved, c.opening_from / c.input_scale[c.target.feed])
+    return limit
+
+
+@kernel
+def plan(
+    c: Constants,
+    rule: UpdatingRule,
+    m: OptimizerState,
+    wanted: int,
+    update: int,
+    tick: int,
+    u_before: Array,
+    load: float,
+    y: Array,
+    x: Array,
+) -> None:
+    """Take the update latched at `tick`, in physical units and the on-line type; decide the updating period.
+
+    `wanted` is its q, or BY_THE_RULE where what is played is the answer to the update before, in time. The program does
+    the same step by step where estimator or rule are not ours.
+    """
+    end_period(m)
+    correct(c.estimator, m.belief, u_before, load, y, x)
+    effective = judge_played(c, m, load, y)
+    if wanted == BY_THE_RULE:
+        o, a = assess_period(c, m, effective)
+        wanted = decide_by(rule, m.rule, o, a)
+    begin_period(c, m, wanted, update, tick, load, effective)
+
+
+@kernel
+def end_period(m: OptimizerState) -> None:
+    """Note the answer of the period that ends; nothing is known of how it went."""
+    now, real = m.numbers[0], m.belief.x.dtype.type
+    if now.solved:
+        now.sequences = max(now.sequences, m.sent.numbers[0].number)
+        now.guessed_before, now.delivered_before = m.sent.numbers[0].hot_start, m.sent.numbers[0].delivered
+        now.solved = False
+    now.efficiency = now.mismatch = now.contraction = real(1.0)
+    now.gamma = real(0.0)
+
+
+@kernel
+def judge_played(c: Constants, m: OptimizerState, load: float, y: Array) -> float:
+    """Return J of what is played at the state that is estimated now, and find limits and target there."""
+    now, played, real = m.numbers[0], m.playing.numbers[0], m.belief.x.dtype.type
+    w = m.belief.numbers[0].w
+    now.suspects = suspects_of(m.belief.readings)
+    if stands(c.turbine, y):
+        now.suspects += c.turbine.bit
+    idle = idle_valve(c.turbine, now.suspects)
+    at = m.u[max(idle, 0)] / c.input_scale[max(idle, 0)]
+    now.most_open = limit_of_feed(c, m, y)
+    now.shortage = shortage(c, m.belief.x, w, load, now.most_open, idle, at, now.shortage, real(0.0))
+    if not abs(now.shortage) <= real(LARGEST):  # by an estimate that leads to no answer
+        now.shortage = real(0.0)
+    find_target(c.target, m.belief.x, w, m.belief.numbers[0].mismatch, now.most_open, idle, at, m.target)
+    qp = problem_at(c, m.belief.x, w, m.playing.u_before, played.share, m.target, now.most_open, idle)
+    return with_floor(augmented_cost(qp, m.playing.z, c.alpha), qp.constant, c.floor)
+
+
+@kernel
+def assess_period(c: Constants, m: OptimizerState, effective: float) -> tuple[Observation, Assessment]:
+    """Return what a rule decides by, step (4): the costs of the period that ends, and what they say of it."""
+    now, played, real = m.numbers[0], m.playing.numbers[0], m.belief.x.dtype.type
+    o = Observation(
+        now.q, now.iterations, real(now.ticks) * c.estimator.tick_s, now.effective, played.hot_start,
+        played.last_but_one, played.delivered, effective,
+    )  # fmt: skip
+    a = assessed(o)
+    now.efficiency, now.mismatch, now.contraction, now.gamma = a.efficiency, a.mismatch, a.contraction, a.gamma
+    return o, a
+
+
+@kernel
+def begin_period(
+    c: Constants, m: OptimizerState, wanted: int, update: int, tick: int, load: float, effective: float
+) -> None:  # fmt: skip
+    """Begin the period of a q, step (5): its length, and what fits; then step (2), what was sent is played."""
+    now = m.numbers[0]
+    now.q = max(min(wanted, c.most), 1)  # costs that are no numbers lead a rule anywhere
+    adaptive = min(c.periods[now.q] + now.allowance, c.fitting.shape[0] - 1)
+    now.ticks = c.fixed_ticks if c.fixed_ticks > 0 else adaptive
+    now.iterations = c.fitting[max(now.ticks - now.allowance, 0)]  # where a period cannot grow, they are fewer
+    now.update, now.tick, now.load, now.effective, now.planned = update, tick, load, effective, True
 
 
 @kernel

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.first_use import kernels_of
-from coldloop.process.limits import InputLimits
+from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel
+from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import Plan, SequenceHeader, Update, Verdict
 from coldloop.registers.optimizer_plc import (
     INPUT_SAMPLES,
@@ -26,21 +27,16 @@ from coldloop.registers.optimizer_plc import (
 )
 from coldloop.safety.sequence import InputSequence, with_checksum
 from coldloop_optimizer_plc import decisions, scheme
-from coldloop_optimizer_plc.budget import PlcBudget
-from coldloop_optimizer_plc.computing_settings import Arithmetic
+from coldloop_optimizer_plc.computing_settings import Arithmetic, PlcBudget
 from coldloop_optimizer_plc.decisions import Latched, Starts
-from coldloop_optimizer_plc.entry_points import Part, in_its_name
 from coldloop_optimizer_plc.estimator import correct, estimator_of
-from coldloop_optimizer_plc.forecasts import Forecasts
-from coldloop_optimizer_plc.outside_estimator import OutsideEstimator
-from coldloop_optimizer_plc.qp.arithmetic import real_of
-from coldloop_optimizer_plc.qp.prediction import prediction_of
+from coldloop_optimizer_plc.outside import OutsideEstimator, Part, in_its_name
+from coldloop_optimizer_plc.qp.linear_algebra import real_of
+from coldloop_optimizer_plc.qp.prediction import prediction_of, rest_map
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
-from coldloop_optimizer_plc.qp.rest import rest_map
 from coldloop_optimizer_plc.qp.target import target_search
-from coldloop_optimizer_plc.rules import OutsideRule, UpdatingRule, make_rule
-from coldloop_optimizer_plc.rules.interface import decide_by
-from coldloop_optimizer_plc.session_state import empty_state
+from coldloop_optimizer_plc.rules import OutsideRule, UpdatingRule, decide_by, make_rule
+from coldloop_optimizer_plc.scheme import empty_state
 from coldloop_optimizer_plc.settings import ProgramSettings
 from coldloop_optimizer_plc.solvers import KernelSolver, make_solver
 
@@ -54,15 +50,12 @@ def _single(values: Sequence[float] | Array) -> list[float]:
     return single
 
 
-def _described(settings: ProgramSettings) -> str:
-    return f"the {settings.solver_name} solver{' in single precision' * (settings.arithmetic is Arithmetic.FLOAT32)}"
-
-
 class OptimizerProgram:
     """Estimator, problem, solver and updating rule, put together."""
 
     def __init__(self, model: LtiModel, settings: ProgramSettings, limits: InputLimits) -> None:
-        with kernels_of(_described(settings), about_s=15):
+        precision = " in single precision" * (settings.arithmetic is Arithmetic.FLOAT32)
+        with kernels_of(f"the {settings.solver_name} solver{precision}", about_s=15):
             self.settings, self.process = settings, settings.process
             self.model_digest = model.short_digest
             self._real = real_of(settings.arithmetic)
@@ -136,7 +129,10 @@ class OptimizerProgram:
 
     def plan(self, update: Update) -> Plan:
         """Take the update latched at t_i and decide the updating period that begins there."""
-        c, m, latched = self.constants, self.state, self._latched(update)
+        c, m = self.constants, self.state
+        u_before, u, y, x = (np.array(values, self._real) for values in (update.u_before, update.u, update.y, update.x))
+        load, ahead = self._real(update.load), self._ahead(update.tick)
+        latched = Latched(update.update, update.tick, update.playing, load, u_before, u, y, x, ahead)
         if self.plans_by_steps:
             load_step = self._plan_by_steps(latched)
         else:
@@ -147,11 +143,6 @@ class OptimizerProgram:
             update.update, update.tick + int(now["ticks"]), float(load_step), float(now["shortage"]),
             int(now["suspects"]),
         )  # fmt: skip
-
-    def _latched(self, update: Update) -> Latched:
-        u_before, u, y, x = (np.array(values, self._real) for values in (update.u_before, update.u, update.y, update.x))
-        load, ahead = self._real(update.load), self._ahead(update.tick)
-        return Latched(update.update, update.tick, update.playing, load, u_before, u, y, x, ahead)
 
     def _ahead(self, tick: int) -> Array:
         """Return what is forecast from a tick on."""
@@ -170,15 +161,15 @@ class OptimizerProgram:
             wanted = self.rule.first
         elif wanted == decisions.AFTER_A_STEP:
             wanted, load_step = self.rule.after_interruption(), 0.0
-        scheme.end_period(m)
+        decisions.end_period(m)
         if self._estimator is None:
             correct(c.estimator, m.belief, latched.u_before, latched.load, latched.y, latched.x)
         else:
             self._estimator.correct(c.estimator, m.belief, latched.u_before, latched.load, latched.y)
-        effective = scheme.judge_played(c, m, latched.load, latched.y)
-        if wanted == scheme.BY_THE_RULE:
-            wanted = decide_by(self.rule, m.rule, *scheme.assess_period(c, m, effective))
-        scheme.begin_period(c, m, wanted, latched.update, latched.tick, latched.load, effective)
+        effective = decisions.judge_played(c, m, latched.load, latched.y)
+        if wanted == decisions.BY_THE_RULE:
+            wanted = decide_by(self.rule, m.rule, *decisions.assess_period(c, m, effective))
+        decisions.begin_period(c, m, wanted, latched.update, latched.tick, latched.load, effective)
         return load_step
 
     # -- step (3): during the updating period -------------------------------------------------------------------------
@@ -285,3 +276,36 @@ class OptimizerProgram:
             load_mismatch=mismatch, j_effective=effective, j_hot_start=hot_start, j_delivered=delivered,
             **dict(zip((*of_sent, *of_now), others, strict=True)),
         )  # fmt: skip
+
+
+class Forecasts:
+    """Forecasts over plant time. Only their changes count: how large a disturbance is now is measured or estimated.
+
+    Args:
+        process: With its forecasts.
+        ends: Last samples of the parts of the horizon, rising.
+    """
+
+    def __init__(self, process: Process, ends: Sequence[int]) -> None:
+        self._edges = process.ticks_per_sample * np.array([0, *ends])
+        self._courses = []
+        for one in process.forecasts:
+            ticks, values = np.array(one.ticks, dtype=np.float64), np.array(one.values)
+            until = np.concatenate([[0.0], np.cumsum(np.diff(ticks) * values[:-1])])
+            self._courses.append((ticks, values, until))
+
+    def __len__(self) -> int:
+        return len(self._courses) * (len(self._edges) - 1)
+
+    def changes(self, tick: int) -> Array:
+        """Return for each forecast its mean over each part of a horizon that begins at `tick`, less what it is there.
+
+        Shape (forecasts x parts,), in the units of the disturbances.
+        """
+        parts = []
+        for ticks, values, until in self._courses:
+            at = tick + self._edges
+            step = np.searchsorted(ticks, at, side="right") - 1
+            integral = until[step] + values[step] * (at - ticks[step])
+            parts.append(np.diff(integral) / np.diff(self._edges) - values[step[0]])
+        return np.concatenate(parts)

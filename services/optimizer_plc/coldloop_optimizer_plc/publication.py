@@ -18,8 +18,8 @@ from coldloop.registers.optimizer_plc import (
     UpdatingRuleStatus,
 )
 from coldloop.service.journal import Journal, JournalPublication
-from coldloop.session.time_base import TimeBase
-from coldloop_optimizer_plc.budget import PlcBudget
+from coldloop.session.settings import TimeBase
+from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.control_link import ControlLink
 
 NO_UPDATE: Final = Optimization(*(0,) * len(Optimization._fields))

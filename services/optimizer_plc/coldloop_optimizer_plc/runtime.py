@@ -22,8 +22,8 @@ from coldloop.errors import (
     UnfitValueError,
 )
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel, load
+from coldloop.process.settings import InputLimits
 from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.control_plc import AwaitUpdate, Update, Verdict
 from coldloop.registers.maps import maps_of
@@ -32,8 +32,7 @@ from coldloop.safety.sequence import InputSequence
 from coldloop.service.metrics_server import MetricsServer
 from coldloop.service.start import SERVING
 from coldloop.service.telemetry import Telemetry
-from coldloop.session.settings import TimeMode
-from coldloop.session.time_base import TimeBase
+from coldloop.session.settings import TimeBase, TimeMode
 from coldloop_optimizer_plc.control_client import ControlClient
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.publication import OptimizerPublication

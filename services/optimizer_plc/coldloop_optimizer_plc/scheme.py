@@ -1,7 +1,7 @@
-"""The implementation scheme as kernels: steps (2) to (5) of the paper's section II on the state of a session.
+"""The optimiser in a session: its constants, its one state, and step (3) of the paper's section II on it, as kernels.
 
-`plan` are steps (4), (5) and (2); `solve`, which is `pose`, a solver and `deliver`, is step (3). They take single and
-double precision alike. Decisions outside the arithmetic are in `decisions.py`.
+`solve`, which is `pose`, a solver and `deliver`, is step (3): what is computed during an updating period. Steps (4),
+(5) and (2), at its ends, are in `decisions.py`. Kernels take single and double precision alike.
 """
 
 import math
@@ -11,27 +11,156 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
+from coldloop.process.declaration import Process
 from coldloop.registers.control_plc import SEQUENCE_ROWS
-from coldloop_optimizer_plc.budget import PlcBudget
-from coldloop_optimizer_plc.estimator import Belief, Estimator, begin_prediction, correct, predict
-from coldloop_optimizer_plc.idle_input import ROOM, TurbineWatch, idle_valve, stands, turbine_watch
-from coldloop_optimizer_plc.plausibility import USED, are_finite, suspects_of
-from coldloop_optimizer_plc.qp.costs import OutputMaps, augmented_cost, output_maps, predicted_indicators
-from coldloop_optimizer_plc.qp.instance import Maps, instance, keep_first_rate
-from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
-from coldloop_optimizer_plc.qp.profile import shifted, write_inputs
-from coldloop_optimizer_plc.qp.target import TargetSearch, bounds_at, find_target, least_warm_load, loads_held
-from coldloop_optimizer_plc.rules.assessment import Assessment, Observation, assessed
-from coldloop_optimizer_plc.rules.interface import UpdatingRule, decide_by
-from coldloop_optimizer_plc.session_state import Delivery, OptimizerState
+from coldloop_optimizer_plc.computing_settings import PlcBudget
+from coldloop_optimizer_plc.estimator import Belief, Estimator, begin_prediction, no_belief, predict
+from coldloop_optimizer_plc.plausibility import are_finite
+from coldloop_optimizer_plc.qp.costs import OutputMaps, output_maps, predicted_indicators
+from coldloop_optimizer_plc.qp.linear_algebra import Real
+from coldloop_optimizer_plc.qp.problem import (
+    Maps,
+    PredictiveProblem,
+    QuadraticProblem,
+    instance,
+    keep_first_rate,
+    shifted,
+    write_inputs,
+)
+from coldloop_optimizer_plc.qp.target import TargetSearch
+from coldloop_optimizer_plc.rules import MEMORY
 from coldloop_optimizer_plc.settings import ProgramSettings, RuleName
-from coldloop_optimizer_plc.solvers.interface import Answer, Costs
-from coldloop_optimizer_plc.solvers.kernel_solver import solve_by
+from coldloop_optimizer_plc.solvers.interface import Answer, Costs, solve_by
 
 Array = NDArray[np.float64]
 
-BY_THE_RULE: Final = 0
-"""The q that `plan` is given when the rule is to decide it."""
+SLOW: Final = 0.05
+"""Share of the turbine's speed at the operating point below which it may stand."""
+STANDSTILL_RATIO: Final = 1.1
+"""Of the pressures before and behind its nozzle, below which nothing flows; it is some ten in operation."""
+ROOM: Final = 1e-3
+"""Between a bound and an input that is held, scaled: methods of the interior need some. Sequences hold it exactly."""
+MOST_BITS: Final = 31
+"""Of the mask of suspects in an exported optimiser."""
+
+
+class TurbineWatch(NamedTuple):
+    """How a turbine that stands is known; kernels are shared by processes, and have no places of theirs in them."""
+
+    valve: int
+    """Input before the turbine; -1: neither speed nor pressures are measured."""
+    speed: int
+    """Output, ..."""
+    before: int
+    """... and those of the pressures before ..."""
+    behind: int
+    """... and behind it."""
+    slow: float
+    """Speed below which it may stand."""
+    ratio: float
+    """Of the pressures, below which nothing flows."""
+    bit: int
+    """Of the valve in the mask of suspects: it follows those of the outputs."""
+
+
+def turbine_watch(process: Process, y0: Array, real: Real) -> TurbineWatch:
+    """Return how the turbine of the process is watched, by its outputs (n_y,) at the operating point."""
+    bath, outputs = process.bath, process.output_names
+    if bath is None or not bath.turbine_speed or len(outputs) + len(process.inputs) > MOST_BITS:
+        return TurbineWatch(-1, 0, 0, 0, real(-math.inf), real(STANDSTILL_RATIO), 0)
+    valve, speed = process.input_names.index(bath.turbine_valve), outputs.index(bath.turbine_speed)
+    before, behind = map(outputs.index, bath.turbine_pressures)
+    bit = 1 << (len(outputs) + valve)
+    return TurbineWatch(valve, speed, before, behind, real(SLOW * y0[speed]), real(STANDSTILL_RATIO), bit)
+
+
+@kernel
+def stands(c: TurbineWatch, y: Array) -> bool:
+    """Return whether outputs (n_y,) say that the turbine stands; a reading that is no number says nothing."""
+    slow: bool = y[c.speed] < c.slow and y[c.before] < c.ratio * y[c.behind]
+    return slow
+
+
+@kernel
+def idle_valve(c: TurbineWatch, suspects: int) -> int:
+    """Return the input that has no effect by the mask of suspects, or -1."""
+    return c.valve if suspects >= c.bit else -1
+
+
+DELIVERY: Final = (
+    ("number", "i8"), ("first_tick", "i8"), ("length", "i8"), ("ticks", "i8"), ("iterations", "i8"), ("w", "real"),
+    ("share", "real"), ("hot_start", "real"), ("last_but_one", "real"), ("delivered", "real"), ("j_dev", "real"),
+    ("j_cst", "real"), ("violation", "real"),
+)  # fmt: skip
+"""number, first_tick, length: of the sequence; length 0 where there is none. ticks, w, share: updating period before
+the first tick, load (W, a deviation), share of the rate limit. iterations: done. hot_start, last_but_one, delivered:
+costs of the guess, after q - 1 and after q iterations. j_dev, j_cst, violation: indicators of the profile."""
+PERIOD: Final = (
+    ("update", "i8"), ("tick", "i8"), ("q", "i8"), ("iterations", "i8"), ("ticks", "i8"), ("sequences", "i8"),
+    ("allowance", "i8"), ("in_time", "i8"), ("planned", "?"), ("solved", "?"), ("load", "real"), ("effective", "real"),
+    ("efficiency", "real"), ("mismatch", "real"), ("contraction", "real"), ("gamma", "real"),
+    ("guessed_before", "real"), ("delivered_before", "real"), ("shortage", "real"), ("most_open", "real"),
+    ("suspects", "i8"),
+)  # fmt: skip
+"""update, tick, load: of the update under way. q, iterations, ticks, effective: q(t_k), what fits, tau_u and J_k.
+efficiency, mismatch, contraction, gamma: what q was decided by. sequences: number of the last sequence. allowance:
+ticks that adaptive periods are longer than the budget says. in_time: answers in a row that came in time. planned,
+solved: whether there is a period, and an answer to it. guessed_before, delivered_before: J+ and Jhat of the problem
+before, infinite where there was none. shortage: what the load is above what can be held (W); negative: below what is
+needed. most_open: limit of the feed, a scaled deviation. suspects: readings left out, bit i is output i; after
+those of the outputs comes the bit of an input that has no effect."""
+
+
+class Delivery(NamedTuple):
+    """A profile, the parameters it was computed for, and its rows for the control PLC."""
+
+    numbers: Any
+    """`DELIVERY`, shape (1,)."""
+    x: Array
+    """State of the problem, as a deviation, shape (n_x,)."""
+    u_before: Array
+    """Input before the first knot, as a deviation, shape (3,)."""
+    z: Array
+    """Shape (n,)."""
+    rows: NDArray[np.float32]
+    """Inputs as the link carries them, a row a tick, shape (240, 3)."""
+
+
+class OptimizerState(NamedTuple):
+    """State of the optimiser between two updates, and between a plan and its answer."""
+
+    numbers: Any
+    """`PERIOD`, shape (1,)."""
+    belief: Belief
+    playing: Delivery
+    """What the control PLC plays."""
+    sent: Delivery
+    """The last answer. An answer may be computed again from the same state, with the same bits."""
+    u: Array
+    """Input applied at the update under way, as a deviation, shape (3,): played on where no sequence is."""
+    target: Array
+    """Inputs that the plant should come to rest at, scaled deviations, shape (3,)."""
+    rule: Array
+    """What the rule of the updating period remembers, shape (1,)."""
+
+
+def empty_state(n_states: int, n_inputs: int, n_outputs: int, size: int, real: Real) -> OptimizerState:
+    """Return room for the state, for so many states, inputs and outputs of the model, and variables of the problem."""
+
+    def numbers(fields: tuple[tuple[str, str], ...]) -> Any:  # noqa: ANN401 a record
+        return np.zeros(1, [(name, real if kind == "real" else kind) for name, kind in fields])
+
+    def delivery() -> Delivery:
+        rows = np.zeros((SEQUENCE_ROWS, n_inputs), np.float32)
+        x, u, z = (np.zeros(n, real) for n in (n_states, n_inputs, size))
+        return Delivery(numbers(DELIVERY), x, u, z, rows)
+
+    return OptimizerState(
+        numbers(PERIOD), no_belief(n_states, n_outputs, real), delivery(), delivery(), np.zeros(n_inputs, real),
+        np.zeros(n_inputs, real), np.zeros(MEMORY, real),
+    )  # fmt: skip
+
+
 LARGEST: Final = 1e38
 """What registers carry, in single precision."""
 
@@ -184,9 +313,6 @@ def problem_at(
     return QuadraticProblem(c.Phi, phi, c.Gamma, gamma, low, high, constant)
 
 
-# -- step (3): during the updating period ------------------------------------------------------------------------------
-
-
 @kernel
 def predict_played(c: Constants, m: OptimizerState, ticks: int) -> Array:
     """Predict so many ticks on from the update under way under what is played; return the last input, (3,)."""
@@ -300,172 +426,3 @@ def write_rows(c: Constants, z: Array, ticks: int, rows: NDArray[np.float32]) ->
             for i in range(inputs.shape[1]):
                 rows[tick, i] = inputs[sample, i]
     return length
-
-
-# -- steps (4), (5) and (2): at an updating instant --------------------------------------------------------------------
-
-
-@kernel
-def begin_sent(m: OptimizerState) -> None:
-    """Let the last answer be what is played: its sequence begins."""
-    copy_delivery(m.sent, m.playing)
-
-
-@kernel
-def copy_delivery(source: Delivery, target: Delivery) -> None:
-    """Make `target` the same as `source`."""
-    target.numbers[0] = source.numbers[0]
-    target.x[:], target.u_before[:], target.z[:] = source.x, source.u_before, source.z
-    target.rows[:] = source.rows
-
-
-@kernel
-def shortage(
-    c: Constants, x: Array, w: float, load: float, most_open: float, idle: int, at: float, before: float, none: float
-) -> float:  # fmt: skip
-    """Return what the load is above what can be held, W; negative: below what is needed; `none`, that is 0, otherwise.
-
-    The estimate w (a deviation) has what the plant lacks beside its model, so it is compared with what the model holds
-    at rest within the inputs' bounds and the limit of the feed, less a reserve, and with the least that it holds
-    without the turbine's outlet getting too cold, by the constant error of that. The load itself (W), where it is
-    measured, is compared with what the plant holds that is as its model. A shortage of the sign that was `before` ends
-    where the estimate has twice the reserve: noise does not end it and begin it anew.
-    """
-    if not c.target.limited:
-        return none
-    measured = load - c.estimator.w0 if c.estimator.load_known else w
-    low, high = bounds_at(c.target, x, most_open, idle, at)
-    _, most = loads_held(c.target, low, high)
-    more = c.reserve if before > none else none
-    less = c.reserve if before < none else none
-    too_much = max(w + c.reserve + more - most, measured - c.largest_load)
-    warm = least_warm_load(c.target, low, high) - c.least_load_error
-    too_little = min(w - warm - less, min(w, measured) - c.least_load)
-    return max(too_much, none) + min(too_little, none)
-
-
-@kernel
-def believed(c: Constants, belief: Belief, u: Array, y: Array, output: int) -> float:
-    """Return an output by the estimate, for inputs u (3,), deviations; by its reading where no constant is estimated.
-
-    One without a constant is as the model has it while its reading is left out.
-    """
-    e, reading = c.estimator, belief.readings[output]
-    if e.plausible.constants[output] < 0 and reading.state == USED and np.isfinite(y[output]):
-        shown: float = y[output]
-        return shown
-    maps = e.outputs
-    value: float = e.y0[output] + maps.F[0, output] * belief.numbers[0].w
-    for j in range(belief.x.shape[0]):
-        value += maps.A[j, output] * belief.x[j]
-    for j in range(u.shape[0]):
-        value += maps.B[j, output] * u[j]
-    return value
-
-
-@kernel
-def most_open(c: Constants, u: Array, approach: float) -> float:
-    """Return how far the feed may be opened, a scaled deviation, by inputs (3,), deviations, and an approach, K."""
-    feed = c.target.feed
-    limit: float = max(u[feed] + c.opening_per_k * (c.approach - approach), c.opening_from) / c.input_scale[feed]
-    return limit
-
-
-@kernel
-def limit_of_feed(c: Constants, m: OptimizerState, y: Array) -> float:
-    """Return `most_open` by the estimate, followed from that of the update before; y (22,) are the outputs."""
-    before, belief = m.numbers[0].most_open, m.belief
-    if np.isinf(c.approach):
-        return c.approach
-    warmer = believed(c, belief, m.u, y, c.feed_temperature) - believed(c, belief, m.u, y, c.temperature)
-    elapsed = y.dtype.type(belief.numbers[0].since) * c.estimator.tick_s
-    share = min(elapsed / c.following_s, y.dtype.type(1.0)) if m.numbers[0].planned else y.dtype.type(1.0)
-    moved = (most_open(c, m.u, warmer) - before) * share
-    if not np.isfinite(moved):  # by an estimate that leads to no answer
-        moved = y.dtype.type(0.0)
-    limit: float = max(before + moved, c.opening_from / c.input_scale[c.target.feed])
-    return limit
-
-
-@kernel
-def plan(
-    c: Constants,
-    rule: UpdatingRule,
-    m: OptimizerState,
-    wanted: int,
-    update: int,
-    tick: int,
-    u_before: Array,
-    load: float,
-    y: Array,
-    x: Array,
-) -> None:
-    """Take the update latched at `tick`, in physical units and the on-line type; decide the updating period.
-
-    `wanted` is its q, or BY_THE_RULE where what is played is the answer to the update before, in time. The program does
-    the same step by step where estimator or rule are not ours.
-    """
-    end_period(m)
-    correct(c.estimator, m.belief, u_before, load, y, x)
-    effective = judge_played(c, m, load, y)
-    if wanted == BY_THE_RULE:
-        o, a = assess_period(c, m, effective)
-        wanted = decide_by(rule, m.rule, o, a)
-    begin_period(c, m, wanted, update, tick, load, effective)
-
-
-@kernel
-def end_period(m: OptimizerState) -> None:
-    """Note the answer of the period that ends; nothing is known of how it went."""
-    now, real = m.numbers[0], m.belief.x.dtype.type
-    if now.solved:
-        now.sequences = max(now.sequences, m.sent.numbers[0].number)
-        now.guessed_before, now.delivered_before = m.sent.numbers[0].hot_start, m.sent.numbers[0].delivered
-        now.solved = False
-    now.efficiency = now.mismatch = now.contraction = real(1.0)
-    now.gamma = real(0.0)
-
-
-@kernel
-def judge_played(c: Constants, m: OptimizerState, load: float, y: Array) -> float:
-    """Return J of what is played at the state that is estimated now, and find limits and target there."""
-    now, played, real = m.numbers[0], m.playing.numbers[0], m.belief.x.dtype.type
-    w = m.belief.numbers[0].w
-    now.suspects = suspects_of(m.belief.readings)
-    if stands(c.turbine, y):
-        now.suspects += c.turbine.bit
-    idle = idle_valve(c.turbine, now.suspects)
-    at = m.u[max(idle, 0)] / c.input_scale[max(idle, 0)]
-    now.most_open = limit_of_feed(c, m, y)
-    now.shortage = shortage(c, m.belief.x, w, load, now.most_open, idle, at, now.shortage, real(0.0))
-    if not abs(now.shortage) <= real(LARGEST):  # by an estimate that leads to no answer
-        now.shortage = real(0.0)
-    find_target(c.target, m.belief.x, w, m.belief.numbers[0].mismatch, now.most_open, idle, at, m.target)
-    qp = problem_at(c, m.belief.x, w, m.playing.u_before, played.share, m.target, now.most_open, idle)
-    return with_floor(augmented_cost(qp, m.playing.z, c.alpha), qp.constant, c.floor)
-
-
-@kernel
-def assess_period(c: Constants, m: OptimizerState, effective: float) -> tuple[Observation, Assessment]:
-    """Return what a rule decides by, step (4): the costs of the period that ends, and what they say of it."""
-    now, played, real = m.numbers[0], m.playing.numbers[0], m.belief.x.dtype.type
-    o = Observation(
-        now.q, now.iterations, real(now.ticks) * c.estimator.tick_s, now.effective, played.hot_start,
-        played.last_but_one, played.delivered, effective,
-    )  # fmt: skip
-    a = assessed(o)
-    now.efficiency, now.mismatch, now.contraction, now.gamma = a.efficiency, a.mismatch, a.contraction, a.gamma
-    return o, a
-
-
-@kernel
-def begin_period(
-    c: Constants, m: OptimizerState, wanted: int, update: int, tick: int, load: float, effective: float
-) -> None:  # fmt: skip
-    """Begin the period of a q, step (5): its length, and what fits; then step (2), what was sent is played."""
-    now = m.numbers[0]
-    now.q = max(min(wanted, c.most), 1)  # costs that are no numbers lead a rule anywhere
-    adaptive = min(c.periods[now.q] + now.allowance, c.fitting.shape[0] - 1)
-    now.ticks = c.fixed_ticks if c.fixed_ticks > 0 else adaptive
-    now.iterations = c.fitting[max(now.ticks - now.allowance, 0)]  # where a period cannot grow, they are fewer
-    now.update, now.tick, now.load, now.effective, now.planned = update, tick, load, effective, True

@@ -10,18 +10,17 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationInfo, 
 from coldloop.config import as_toml, flattened
 from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, Endpoint
 from coldloop.modbus.settings import ServerSettings
-from coldloop.process.limits import InputLimits
 from coldloop.process.sections import FURTHEST_WEIGHT
-from coldloop.process.settings import ProcessSettings, RootSettings, declared, settings_process, within
+from coldloop.process.settings import InputLimits, ProcessSettings, RootSettings, declared, settings_process, within
 from coldloop.process.updating_periods import SHORTEST_TICKS, TOLERANCE, whole_ticks
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop.service.metrics_settings import MetricsSettings
 from coldloop.service.telemetry_settings import TelemetrySettings
 from coldloop.session.settings import SessionSettings
-from coldloop_optimizer_plc.budget import BudgetSettings
 from coldloop_optimizer_plc.computing_settings import (
     Arithmetic,
+    BudgetSettings,
     DaqpSettings,
     EstimatorKind,
     EstimatorSettings,
@@ -34,11 +33,14 @@ from coldloop_optimizer_plc.computing_settings import (
     PlausibilitySettings,
     QpoasesSettings,
 )
-from coldloop_optimizer_plc.qp.design import SCALES, WEIGHTS, ColdEndSettings, ControlDesign
-from coldloop_optimizer_plc.qp.penalties import (
+from coldloop_optimizer_plc.qp.design import (
     OF_ALPHA,
     OF_PRESETS,
+    SCALES,
     UNMEASURED,
+    WEIGHTS,
+    ColdEndSettings,
+    ControlDesign,
     PenaltySettings,
     Preset,
     alpha_of,
@@ -51,8 +53,6 @@ SHOWN: Final = ("limits", "optimizer_plc.program")
 ADAPTIVE = 0
 LARGEST: Final = 1e18
 """Of a number in the program's settings."""
-
-
 WITH_ALPHA: Final = ("ode", "qpoases", "osqp", "fast_gradient", "interior_point", "daqp", "outside")
 """Sections that have a weight of broken constraints."""
 

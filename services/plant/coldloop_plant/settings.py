@@ -9,9 +9,9 @@ from pydantic import Field, FiniteFloat, field_validator
 
 from coldloop.modbus.endpoints import PLANT_PORT
 from coldloop.modbus.settings import ServerSettings
-from coldloop.process.limits import InputLimits
 from coldloop.process.sections import Section
 from coldloop.process.settings import (
+    InputLimits,
     PerInput,
     ProcessSettings,
     RootSettings,

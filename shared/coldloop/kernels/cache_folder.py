@@ -49,13 +49,14 @@ class CacheFolder:
         """Return the content of a file, and note that it is used; None where there is none, or a damaged one."""
         path = self.path / name
         try:
-            checksum, content = _split(path.read_bytes())
+            found = path.read_bytes()
         except OSError:
             return None
         with contextlib.suppress(OSError):  # another user's
             if time.time() - path.stat().st_mtime > DAY_S:
                 path.touch()
-        return content if zlib.crc32(content) == checksum else None
+        checksum, content = found[:CHECKSUM_BYTES], found[CHECKSUM_BYTES:]
+        return content if zlib.crc32(content).to_bytes(CHECKSUM_BYTES, "big") == checksum else None
 
     def has(self, name: str) -> bool:
         """Return whether there is a file, damaged or not."""
@@ -102,10 +103,6 @@ class CacheFolder:
                     path.unlink()
 
 
-def _split(content: bytes) -> tuple[int, bytes]:
-    return int.from_bytes(content[:CHECKSUM_BYTES], "big"), content[CHECKSUM_BYTES:]
-
-
 def find_cache_folder(name: str = NAME) -> Path:
     """Return a folder for a cache that only this user can write to: its files are loaded as code.
 
@@ -142,7 +139,8 @@ def find_cache_folder(name: str = NAME) -> Path:
 
 
 def _usual_roots() -> list[Path]:
-    roots = [Path(tempfile.gettempdir()) / f"coldloop-cache-{_user()}"]
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    roots = [Path(tempfile.gettempdir()) / f"coldloop-cache-{user}"]
     with contextlib.suppress(RuntimeError):  # a user without a home
         roots.insert(0, Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "coldloop")
     return roots
@@ -154,10 +152,6 @@ def _lets_others_write() -> bool:
         mask = os.umask(0o077)
         os.umask(mask)
     return not mask & stat.S_IWOTH
-
-
-def _user() -> int:
-    return os.getuid() if hasattr(os, "getuid") else 0
 
 
 def _is_closed(folder: Path, *, sticky: bool = False) -> bool:

@@ -25,24 +25,20 @@ import llvmlite  # type: ignore[import-untyped]
 import numba
 import numpy as np
 from numba.core import compiler, sigutils, types
-from numba.core.caching import _Cache
 from numba.core.errors import NumbaWarning
 from numba.core.serialize import dumps
 from numpy.typing import NDArray
 
 from coldloop.kernels.cache_folder import CacheFolder, find_cache_folder
 from coldloop.kernels.first_use import needs_compiling
-from coldloop.kernels.ownership import label
-from coldloop.kernels.reach import digest
+from coldloop.kernels.reach import digest, label
 
 P = ParamSpec("P")
 R = TypeVar("R")
 V = TypeVar("V", bound=tuple[Any, ...])
-
 VERSIONS: Final = (numba.__version__, llvmlite.__version__, np.__version__, sys.implementation.cache_tag)
 LONGEST_NAME: Final = 120
 """Characters of a kernel's name that the name of its file has."""
-
 cache_folder = CacheFolder(find_cache_folder())
 """Where this process keeps its kernels."""
 
@@ -121,8 +117,8 @@ def _in_turn(dispatcher: Any) -> Any:  # noqa: ANN401
     return dispatcher
 
 
-class KernelCache(_Cache):
-    """The cache of one kernel, a file for each signature, locked by the process that compiles it until it is saved.
+class KernelCache:
+    """The cache of one kernel, as numba calls one: a file for each signature, locked until it is saved.
 
     Without the lock two processes compile the same kernel. Locks are taken from callers to what they call, so no two
     processes wait for each other.
@@ -135,7 +131,6 @@ class KernelCache(_Cache):
         self._dispatcher = dispatcher
         self._names: dict[Any, str] = {}
         self._locked: set[Any] = set()
-        self._enabled = True
 
     @property
     def cache_path(self) -> str:
@@ -144,8 +139,6 @@ class KernelCache(_Cache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:  # noqa: ANN401
         """Return the kernel for a signature; None, with the lock, when this process is to compile it."""
-        if not self._enabled:
-            return None
         target_context.refresh()
         found = self._load(sig, target_context)
         if found is None:
@@ -167,8 +160,6 @@ class KernelCache(_Cache):
 
     def save_overload(self, sig: Any, data: Any) -> None:  # noqa: ANN401
         """Save a kernel that has been compiled for a signature."""
-        if not self._enabled:
-            return
         if data.lifted or data.library.has_dynamic_globals:
             name = label(self._dispatcher.py_func)
             warnings.warn(
@@ -195,14 +186,6 @@ class KernelCache(_Cache):
         if sig in self._locked:
             self._locked.discard(sig)
             cache_folder.unlock(self._names[sig])
-
-    def enable(self) -> None:
-        """Use the cache."""
-        self._enabled = True
-
-    def disable(self) -> None:
-        """Compile without the cache."""
-        self._enabled = False
 
     def flush(self) -> None:
         """Do nothing: no file is out of date."""

@@ -1,7 +1,7 @@
-"""Announces that numerical kernels are being compiled, which takes long and happens once.
+"""What a program does before it uses kernels: announce that they are compiled, load numba without what it takes along.
 
-A user of kernels names their owner with `kernels_of`; the cache of kernels reports each one that it does not have
-to `needs_compiling`. Nothing is announced if all are cached.
+Compiling takes long and happens once. A user of kernels names their owner with `kernels_of`; the cache of kernels
+reports each one that it does not have to `needs_compiling`. Nothing is announced if all are cached.
 """
 
 import contextlib
@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass
+from typing import Final
 
 
 @dataclass
@@ -70,3 +71,33 @@ def needs_compiling() -> None:
     if needed is not None and needed.owner not in _announced:
         _announced.add(needed.owner)
         _announce(needed)
+
+
+TAKEN_ALONG: Final = ("cffi", "coverage", "scipy", "yaml")
+"""Packages that numba imports wherever they are installed, in a third of its time; our kernels have no use for them."""
+
+
+def load_numba_alone() -> None:
+    """Import numba, and what it needs to load a compiled kernel; what is hidden from it can be imported afterwards.
+
+    Others may have kernels that need it: this is for processes that are Coldloop's alone.
+    """
+    with _hidden(*TAKEN_ALONG):
+        import numba  # noqa: F401, PLC0415
+
+        with contextlib.suppress(ImportError, AttributeError):  # elsewhere: the first kernel does it
+            from numba.core.registry import cpu_target  # noqa: PLC0415
+
+            cpu_target.target_context.refresh()
+
+
+@contextlib.contextmanager
+def _hidden(*packages: str) -> Iterator[None]:
+    """Let imports of packages that are not loaded yet fail."""
+    names = [name for name in packages if name not in sys.modules]
+    sys.modules.update(dict.fromkeys(names))  # type: ignore[arg-type] # None is a module that cannot be had
+    try:
+        yield
+    finally:
+        for name in names:
+            del sys.modules[name]

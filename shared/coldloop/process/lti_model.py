@@ -1,6 +1,6 @@
 """The linear model of the plant, all that the optimiser knows of it: made off line, loaded like a PLC download."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -8,29 +8,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import ModelFileError
-from coldloop.process.cold_box import COLD_BOX as THE_COLD_BOX
-from coldloop.process.declaration import Process
 from coldloop.process.model_file import (
     COLD_BOX,
     FORMAT,
     REMEDY,
     VECTORS,
+    ModelDescription,
     declared_process,
     digest_of,
     header_of,
     read_document,
-    short_digest_of,
     write_document,
 )
 
 RealArray: TypeAlias = NDArray[np.float64]
-
 UNNAMED: dict[str, Any] = {
     "plant": COLD_BOX, "note": "", "plant_parameters": {}, "plant_rest": {}, "process": {}, "declaration_digest": "",
 }  # fmt: skip
 """What a model file leaves out."""
 MATRICES = ("A", "B", "F", "C", "D", "G", "A_tick", "B_tick", "F_tick")
-
 HALVINGS = 20
 LARGEST_DIFFERENCE = 1e-6
 """Between A_tick and what A says of a tick; another tick differs by more."""
@@ -51,7 +47,7 @@ class DiscreteModel:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LtiModel:
+class LtiModel(ModelDescription):
     """dx/dt = A x + B u + F w, y = C x + D u + G w, in deviations from the operating point (x0, u0, w0, y0).
 
     n states, m inputs, p outputs, one load; physical units throughout, time in seconds. The arrays are read-only.
@@ -82,32 +78,8 @@ class LtiModel:
     """Shape (n,)."""
     u0: RealArray
     """Shape (m,)."""
-    w0: float
-    """The load at the operating point."""
     y0: RealArray
     """Shape (p,)."""
-    state_names: tuple[str, ...]
-    state_units: tuple[str, ...]
-    input_names: tuple[str, ...]
-    input_units: tuple[str, ...]
-    output_names: tuple[str, ...]
-    output_units: tuple[str, ...]
-    load_name: str
-    load_unit: str
-    parameters_digest: str
-    """SHA-256 of the plant's parameters and property tables."""
-    plant: str = COLD_BOX
-    """Which plant it is the model of."""
-    note: str = ""
-    """Where it comes from, if not from the plant's equations."""
-    plant_parameters: dict[str, Any] = field(default_factory=dict)
-    """The plant's parameters by section, as in a plant file; none are those of the reference plant."""
-    process: dict[str, Any] = field(default_factory=dict)
-    """`coldloop.process.declaration.Process` as plain data; none is the cold box."""
-    plant_rest: dict[str, Any] = field(default_factory=dict)
-    """Where a refrigerator is at rest, and the gains of its pressure controller; none are those that are shipped."""
-    declaration_digest: str = ""
-    """SHA-256 of the process file that it was made from, and of the files that this names; empty: of none."""
 
     def __post_init__(self) -> None:
         n, m, p = len(self.state_names), len(self.input_names), len(self.output_names)
@@ -143,18 +115,9 @@ class LtiModel:
         return digest_of(self._document())
 
     @property
-    def declared(self) -> Process:
-        """The process that the plant is.
-
-        Raises:
-            KeyError, TypeError, ValueError: The model says something else there.
-        """
-        return Process.model_validate(self.process) if self.process else THE_COLD_BOX
-
-    @property
     def short_digest(self) -> int:
-        """What services compare: the first 32 bits of the declaration's digest, or of the model's where it has none."""
-        return short_digest_of(self.declaration_digest or self.digest)
+        """What services compare."""
+        return self.short_digest_of(self.digest)
 
     def save(self, path: Path) -> None:
         """Write the model as JSON with its digest; the file appears whole or not at all (OSError if it cannot)."""

@@ -16,8 +16,7 @@ from coldloop.errors import ModelFileError
 from coldloop.parsing import parsed_json
 from coldloop.process.cold_box import COLD_BOX as THE_COLD_BOX
 from coldloop.process.declaration import Process
-from coldloop.text_file import read_bytes
-from coldloop.whole_file import whole_text
+from coldloop.text_file import read_bytes, whole_text
 
 FORMAT = 1
 REMEDY = "make a new one with `python -m coldloop_plant.cold_box.model FILE`"
@@ -26,14 +25,12 @@ COLD_BOX = "cold-box"
 """The plant of a model file that names none."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ModelHeader:
-    """What a model file says about itself, without its matrices."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ModelDescription:
+    """What a model file says about its model, without operating point and matrices."""
 
-    digest: str
-    """SHA-256 of the content, in hexadecimal."""
     parameters_digest: str
-    """The same for the plant's parameters and property tables that the model was made from."""
+    """SHA-256 of the plant's parameters and property tables that the model was made from, in hexadecimal."""
     state_names: tuple[str, ...]
     state_units: tuple[str, ...]
     input_names: tuple[str, ...]
@@ -42,14 +39,8 @@ class ModelHeader:
     output_units: tuple[str, ...]
     load_name: str
     load_unit: str
-    x0: tuple[float, ...]
-    """State at the operating point, in `state_units`."""
-    u0: tuple[float, ...]
-    """Inputs at the operating point, in `input_units`."""
     w0: float
     """Load at the operating point, in `load_unit`."""
-    y0: tuple[float, ...]
-    """Outputs at the operating point, in `output_units`."""
     plant: str = COLD_BOX
     """Which plant the model was made of."""
     note: str = ""
@@ -57,9 +48,7 @@ class ModelHeader:
     plant_parameters: dict[str, Any] = field(default_factory=dict)
     """The plant's parameters by section, as in a plant file; none are those of the reference plant."""
     process: dict[str, Any] = field(default_factory=dict)
-    """The process that the plant is; none is the cold box."""
-    file: Path = Path()
-    """Where it was read from."""
+    """`coldloop.process.declaration.Process` as plain data; none is the cold box."""
     plant_rest: dict[str, Any] = field(default_factory=dict)
     """Where a refrigerator is at rest, and the gains of its pressure controller; none are those that are shipped."""
     declaration_digest: str = ""
@@ -74,10 +63,30 @@ class ModelHeader:
         """
         return Process.model_validate(self.process) if self.process else THE_COLD_BOX
 
+    def short_digest_of(self, digest: str) -> int:
+        """Return the first 32 bits of the declaration's digest, or of the model's own where it has none."""
+        return int((self.declaration_digest or digest)[:8], 16)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelHeader(ModelDescription):
+    """What a model file says about itself, without its matrices."""
+
+    digest: str
+    """SHA-256 of the content, in hexadecimal."""
+    x0: tuple[float, ...]
+    """State at the operating point, in `state_units`."""
+    u0: tuple[float, ...]
+    """Inputs at the operating point, in `input_units`."""
+    y0: tuple[float, ...]
+    """Outputs at the operating point, in `output_units`."""
+    file: Path = Path()
+    """Where it was read from."""
+
     @property
     def short_digest(self) -> int:
-        """What services compare: the first 32 bits of the declaration's digest, or of the model's where it has none."""
-        return short_digest_of(self.declaration_digest or self.digest)
+        """What services compare."""
+        return self.short_digest_of(self.digest)
 
 
 def read_header(path: Path) -> ModelHeader:
@@ -186,11 +195,6 @@ def digest_of(document: dict[str, Any]) -> str:
     content = {name: value for name, value in document.items() if name != "digest"}
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(canonical.encode()).hexdigest()
-
-
-def short_digest_of(digest: str) -> int:
-    """Return the first 32 bits of a hexadecimal digest."""
-    return int(digest[:8], 16)
 
 
 def _refuse(constant: str) -> float:

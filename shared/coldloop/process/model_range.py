@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.range_bits import ModelRange
-from coldloop.process.station import STATION_SIGNAL_NAMES
+from coldloop.process.station import STATION_SIGNAL_NAMES, ModelRange
 
 SATURATION_BAR: Final = (0.3, 2.25)
 """Of bath and return; helium's critical point is at 2.28 bar."""
@@ -22,7 +21,6 @@ WARMEST_BATH_M3: Final = -6.37
 """V_l of a dry bath that is at 310 K."""
 COLD_BOX_BAR: Final = (16.0, 1.05)
 """Supply and return of a cold box alone; those of a plant file are within the same ranges."""
-
 FIRST_CELL: Final = [state.name for state in COLD_BOX.states].index("T_nef1_1")
 COLDEST_CELLS_K: Final = np.array([2.5] * (len(COLD_BOX.states) - FIRST_CELL - 1) + [5.3])
 """Shape (26,); the last is before the turbine, whose table of entropy ends at 6.1 kJ/kg: 5.3 K at 5 bar, 3.9 at 16."""

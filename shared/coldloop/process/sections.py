@@ -16,6 +16,7 @@ from pydantic import (
     FiniteFloat,
     NonNegativeFloat,
     PositiveFloat,
+    field_validator,
     model_validator,
 )
 
@@ -27,7 +28,6 @@ FURTHEST_WEIGHT: Final = 1e5
 With `violation_weight` 1e6 times as large J of the cold box is 1.4 times as large, with 1e10 its inputs do not move:
 the other terms of the cost are below the 7 digits of single precision.
 """
-
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}$")]
 Range = tuple[FiniteFloat, FiniteFloat]
 Limits = tuple[int | FiniteFloat, int | FiniteFloat]
@@ -396,6 +396,13 @@ class Forecast(Section):
     """From each tick on."""
 
 
+def rising_instants(instants: tuple[int, ...]) -> tuple[int, ...]:
+    """Return instants of a prediction, which are sampling periods, if they rise from 1 on."""
+    if not instants or instants[0] < 1 or list(instants) != sorted(set(instants)):
+        raise ValueError("give rising numbers of sampling periods, from 1")
+    return instants
+
+
 class Instants(Section):
     """Decision and constraint instants, in sampling periods, and where the model is from, if not from the plant."""
 
@@ -406,12 +413,10 @@ class Instants(Section):
     constraint_instants: tuple[Annotated[int, Field(ge=1, le=400)], ...] = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 44, 60)
     """At which bands and setpoints count, rising, within the horizon; `coldloop design` compares sets."""
 
+    _rising = field_validator("decision_instants", "constraint_instants")(rising_instants)
+
     @model_validator(mode="after")
-    def _rising(self) -> Self:
-        for name in ("decision_instants", "constraint_instants"):
-            instants = getattr(self, name)
-            if not instants or list(instants) != sorted(set(instants)):
-                raise ValueError(f"prediction.{name}: give rising numbers of sampling periods, from 1")
+    def _within_the_horizon(self) -> Self:
         if self.constraint_instants[-1] > self.decision_instants[-1]:
             raise ValueError("prediction: the last decision instant is the horizon; constraints end within it")
         return self

@@ -1,4 +1,4 @@
-"""Settings that follow from the process, and the model file that says which process it is.
+"""Settings that follow from the process, the model file that says which process it is, and the limits of its inputs.
 
 A section that has defaults or bounds of its process is a `ProcessSettings`. The whole of a configuration is a
 `RootSettings`: its `model.file` decides the process, and all its sections are read for that one. A section that is made
@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from enum import StrEnum
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
@@ -70,10 +71,6 @@ def model_named(file: Path) -> Iterator[None]:
 def settings_process() -> Process:
     """Return the process that settings are made for here."""
     return _PROCESS.get()
-
-
-def _named_model() -> Path:
-    return _MODEL.get()
 
 
 def made_by(make: Callable[[], Any]) -> Any:  # noqa: ANN401 the default of any field
@@ -170,6 +167,57 @@ class ProcessSettings(BaseModel):
         return self._process
 
 
+LARGEST: Final = 1e38
+"""Of a bound."""
+
+
+class RateReference(StrEnum):
+    """What the rate limit of an update is measured against; the paper leaves it open (`report/slips.md`, 15)."""
+
+    PER_UPDATE = "per-update"
+    """The full limit of a sampling period of 5 s at each update, however soon the next one follows."""
+    ELAPSED = "elapsed"
+    """The limit scaled by the time since the update before, tau_u / 5 s."""
+
+
+class InputLimits(ProcessSettings):
+    """Bounds and rates of the inputs, in their order: of the cold box CV155 %, NCR22_A W, CV156 % (paper, table I)."""
+
+    low: PerInput = declared(lambda process: tuple(one.low for one in process.inputs))
+    """Least value."""
+    high: PerInput = declared(lambda process: tuple(one.high for one in process.inputs))
+    """Largest value."""
+    rate: PerInput = declared(lambda process: tuple(one.rate for one in process.inputs))
+    """Largest change in one sampling period, up or down."""
+    rate_reference: RateReference = RateReference.PER_UPDATE
+    slew_s: Annotated[float, within(lambda process: (process.tick_s, process.sampling_period_s))] = declared(
+        lambda process: 2 * process.tick_s
+    )
+    """Absolute slew limit, however often updates follow one another: within any time shorter than this an input moves
+    by at most `rate`. The default is the shortest updating period that there is: it never binds on our optimiser."""
+
+    @property
+    def slew_ticks(self) -> int:
+        """That time, in ticks."""
+        return max(1, round(self.slew_s / self.process.tick_s))
+
+    def rate_share(self, elapsed_ticks: int) -> float:
+        """Return the share of `rate` that an update may use, `elapsed_ticks` ticks after the one before."""
+        if self.rate_reference is RateReference.PER_UPDATE:
+            return 1.0
+        return min(1.0, elapsed_ticks / self.process.ticks_per_sample)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if max(map(abs, (*self.low, *self.high))) > LARGEST:
+            raise ValueError(f"a low or high beyond {LARGEST:g}: it does not cross the link, in single precision")
+        if any(low >= high for low, high in zip(self.low, self.high, strict=True)):
+            raise ValueError("each low must be below its high")
+        if min(self.rate) <= 0:
+            raise ValueError("each rate must be positive")
+        return self
+
+
 def _named(value: object) -> object:
     return SHIPPED_MODELS.get(value, value) if isinstance(value, str) else value
 
@@ -179,7 +227,7 @@ class ModelSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    file: Annotated[Path, BeforeValidator(_named)] = made_by(_named_model)
+    file: Annotated[Path, BeforeValidator(_named)] = made_by(_MODEL.get)
     """A file, or `cold-box` or `refrigerator` for one that is shipped. It says which process it is."""
 
 

@@ -1,5 +1,6 @@
-"""Signals of the compression station and of the nitrogen pre-cooler, where the plant is the whole refrigerator."""
+"""Signals of the compression station and of the nitrogen pre-cooler of a refrigerator; bits of its model's range."""
 
+from enum import IntFlag
 from typing import Final
 
 STATION_VALVE_NAMES: Final = ("CV956", "CV952", "CV953", "CV167")
@@ -17,3 +18,14 @@ P11, T11: low-pressure line; P12, M12: high-pressure line, and its flow to the c
 NEF6; M_NC, E_NC, Q_NC: compressors' flow, electrical power, heat to the surroundings; M_out: relief valves and leak;
 L_N2, M_GN2: level and boil-off of the nitrogen bath; helium, lost: in the circuit, and gone from it.
 """
+
+
+class ModelRange(IntFlag):
+    """What of the simulation is outside its property tables, one bit each."""
+
+    BATH_PRESSURE = 1
+    SUPPLY_PRESSURE = 2
+    RETURN_PRESSURE = 4
+    COLD_CELL = 8
+    WARM_CELL = 16
+    WARM_BATH = 32

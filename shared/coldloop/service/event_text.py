@@ -12,7 +12,7 @@ from functools import cache
 from typing import Final, NamedTuple
 
 from coldloop.process.declaration import Process
-from coldloop.process.range_bits import ModelRange
+from coldloop.process.station import ModelRange
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.common import TimeBaseKind
 from coldloop.registers.control_plc import (

@@ -1,7 +1,7 @@
-"""A session: one run of the rig from tick 0, in lock-step or in real time."""
+"""A session: one run of the rig from tick 0, in lock-step or in real time, and its time base."""
 
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -25,3 +25,13 @@ class SessionSettings(BaseModel):
     mode: TimeMode = TimeMode.LOCKSTEP
     factor: Annotated[float, Field(ge=0.01, le=10_000)] = 1.0
     """Seconds of plant time in one second of real time, in real time."""
+
+
+class TimeBase(NamedTuple):
+    """In lock-step the factor has no meaning."""
+
+    realtime: bool
+    factor: float
+    """Seconds of plant time in one second of real time."""
+    paused: bool = False
+    """In real time: plant time is stopped until it is resumed."""

@@ -28,9 +28,8 @@ from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.process_file.making import made_from
 from coldloop_rig.results.indicators import Indicators, RunEvaluation
-from coldloop_rig.results.recording import PLANT, MemorySink
+from coldloop_rig.results.recording import CONTROL, PLANT, MemorySink, Recorder
 from coldloop_rig.settings import Settings
-from coldloop_rig.studies.paper.updating_period import CONTROL
 from tests.harness.configurations import lively
 from tests.harness.process_configurations import load_of_shares
 from tests.harness.process_files import PROCESSES
@@ -38,7 +37,6 @@ from tests.harness.traces.checks import Group, Table, checked
 from tests.harness.traces.configurations import COLD_BOX, CONFIGURATIONS, LIVELY, Configuration
 from tests.harness.traces.judge import Left, Names
 from tests.harness.traces.record import Found, Platform
-from tests.optimizer_plc.conftest import Recorder
 
 SEED: Final = 3
 SERVICES: Final = (CONTROL, PLANT)

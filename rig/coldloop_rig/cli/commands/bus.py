@@ -20,6 +20,7 @@ from coldloop_rig.cli.commands.options import (
     HostPort,
     add_rig_options,
     endpoint,
+    number_within,
     operator_settings,
     port_base,
     rig_endpoints,
@@ -254,9 +255,7 @@ def _host(text: str) -> str:
 
 
 def _days(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= 3650:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number of days from 1 to 3650")
-    return int(text)
+    return number_within(text, 1, 3650, "a number of days from 1 to 3650")
 
 
 def execute_certificates(options: argparse.Namespace) -> int:

@@ -5,6 +5,7 @@ These names are written down, so that they can be offered without importing what
 """
 
 import argparse
+import math
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -102,11 +103,16 @@ def _period(text: str, what: str) -> float:
     return float(text)
 
 
+def number_within(text: str, least: int, most: float, what: str) -> int:
+    """Return a whole number of an option; `what` is what the text is not where it is none."""
+    if not text.isdecimal() or not least <= int(text) <= most:
+        raise argparse.ArgumentTypeError(f"'{text}' is not {what}")
+    return int(text)
+
+
 def positive_count(text: str) -> int:
     """Return a number of things of an option, 1 at least."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least 1")
-    return int(text)
+    return number_within(text, 1, math.inf, "a whole number of at least 1")
 
 
 def check_load(name: str | None) -> None:
@@ -136,9 +142,7 @@ def endpoint(text: str) -> HostPort:
 
 def port_base(text: str) -> int:
     """Return the first of three ports in a row."""
-    if not text.isdecimal() or not 1 <= int(text) <= 0xFFFF - 2:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a port from 1 to {0xFFFF - 2}")
-    return int(text)
+    return number_within(text, 1, 0xFFFF - 2, f"a port from 1 to {0xFFFF - 2}")
 
 
 def add_rig_options(parser: argparse.ArgumentParser, *, again: bool = False) -> None:

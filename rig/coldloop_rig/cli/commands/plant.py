@@ -34,7 +34,7 @@ def _declare_new(parser: argparse.ArgumentParser) -> None:
 def execute_new(options: argparse.Namespace) -> int:
     """A folder with a process file and a plant to begin with, commented, or with an example."""
     from coldloop.errors import UsageError
-    from coldloop.whole_file import whole_text
+    from coldloop.text_file import whole_text
 
     folder: Path = options.folder
     texts = _template() if options.example is None else _example(options.example)
@@ -82,7 +82,7 @@ def execute_process(options: argparse.Namespace) -> int:
     """A process file checked, linearised and judged, and made into the model file of all programs."""
     from coldloop.errors import UsageError
     from coldloop.process.declaration import Process
-    from coldloop.whole_file import require_regular_file
+    from coldloop.text_file import require_regular_file
     from coldloop_rig.cli.listings import key_listing
     from coldloop_rig.process_file.judgement import described
     from coldloop_rig.process_file.making import made_from
@@ -137,7 +137,7 @@ def execute_import(options: argparse.Namespace) -> int:
     from zoneinfo import available_timezones
 
     from coldloop.errors import UsageError
-    from coldloop.whole_file import require_regular_file, whole_text
+    from coldloop.text_file import require_regular_file, whole_text
     from coldloop_rig.process_file.historian import Request, record_of
     from coldloop_rig.results.folders import writing
 
@@ -171,7 +171,7 @@ def execute_model(options: argparse.Namespace) -> int:
     """The plant at its operating point, and its linear model as both PLCs run it."""
     from coldloop.errors import UsageError
     from coldloop.process.lti_model import load
-    from coldloop.whole_file import require_regular_file
+    from coldloop.text_file import require_regular_file
     from coldloop_plant.cold_box.plant_file import PlantFile
     from coldloop_plant.equilibrium import NoEquilibriumError
     from coldloop_plant.refrigerator.plant_file import RefrigeratorPlantFile, read_plant_file
@@ -221,7 +221,7 @@ def _declare_design(parser: argparse.ArgumentParser) -> None:
 def execute_design(options: argparse.Namespace) -> int:
     """Which decision and constraint instants the problem needs, by what each set costs in the loop."""
     from coldloop.errors import UsageError
-    from coldloop.whole_file import require_regular_file, whole_text
+    from coldloop.text_file import require_regular_file, whole_text
     from coldloop_rig.cli.commands.options import FIGURE_FORMATS
     from coldloop_rig.progress import make_console
     from coldloop_rig.results.folders import writing
@@ -272,7 +272,7 @@ def execute_identify(options: argparse.Namespace) -> int:
     """
     from coldloop.errors import UsageError
     from coldloop.process.lti_model import load
-    from coldloop.whole_file import require_regular_file
+    from coldloop.text_file import require_regular_file
     from coldloop_rig.results.folders import writing
     from coldloop_rig.results.run_folder import RunFolder
     from coldloop_rig.runs.identification import describe, identify, note_of, read_record, scaled

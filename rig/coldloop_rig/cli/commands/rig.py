@@ -34,7 +34,7 @@ from coldloop_rig.text_tables import coloured, cut, fitted, width
 
 if TYPE_CHECKING:
     from coldloop.process.declaration import Process
-    from coldloop.process.limits import InputLimits
+    from coldloop.process.settings import InputLimits
     from coldloop_rig.live.status import Work
     from coldloop_rig.settings import Settings
 

@@ -1,6 +1,7 @@
 """Commands about a run: done, recorded, repeated, drawn, compared."""
 
 import argparse
+import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +23,7 @@ from coldloop_rig.cli.commands.options import (
     configuration,
     endpoint,
     exported,
+    number_within,
     plans,
     refuse_ineffective,
     rig_endpoints,
@@ -59,7 +61,7 @@ def execute_run(options: argparse.Namespace) -> int:
 
     with FigureProcess(options.figures) as figure:
         if options.in_process:
-            from coldloop.kernels.lean_numba import load_numba_alone
+            from coldloop.kernels.first_use import load_numba_alone
 
             figure.start()  # a short run would wait for matplotlib
             load_numba_alone()
@@ -241,7 +243,7 @@ def _declare_report(parser: argparse.ArgumentParser) -> None:
 
 def execute_report(options: argparse.Namespace) -> int:
     """One HTML page of a recorded run, with interactive plots, alarms and settings."""
-    from coldloop.whole_file import require_regular_file, whole_text
+    from coldloop.text_file import require_regular_file, whole_text
     from coldloop_rig.report.run_page import run_page
     from coldloop_rig.results.folders import writing
 
@@ -296,9 +298,7 @@ def _declare_chaos(parser: argparse.ArgumentParser) -> None:
 
 
 def _seed(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least 0")
-    return int(text)
+    return number_within(text, 0, math.inf, "a whole number of at least 0")
 
 
 def execute_chaos(options: argparse.Namespace) -> int:

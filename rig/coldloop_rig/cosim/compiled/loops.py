@@ -10,14 +10,13 @@ from typing import Any, Final
 import numpy as np
 
 import coldloop_rig.cosim.compiled.portable  # noqa: F401 it lets kernels call what is plain Python
-from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import inlined, kernel
+from coldloop.kernels.intrinsics import borrowed
 from coldloop.registers.plant import MAX_STATE
 from coldloop_control_plc.output_limits import admit, copy_state, in_range, judge
 from coldloop_control_plc.sensors import are_inside, count_unchanged, have_moved, is_frozen, is_to_move, note_moves
-from coldloop_optimizer_plc import scheme
-from coldloop_optimizer_plc.scheme import BY_THE_RULE
-from coldloop_optimizer_plc.session_state import OptimizerState
+from coldloop_optimizer_plc import decisions, scheme
+from coldloop_optimizer_plc.scheme import OptimizerState
 from coldloop_rig.cosim.compiled.plants import advance_plant
 from coldloop_rig.cosim.compiled.records import NOT, Alarms, Array, Optimizer, PlantState, Reports, Trace, World
 
@@ -217,7 +216,7 @@ def answer(
 @kernel
 def begin_sequence(s: Any, rows: Array, m: OptimizerState) -> None:  # noqa: ANN401
     """Let the answer be what is played."""
-    scheme.begin_sent(m)
+    decisions.begin_sent(m)
     playing = m.playing.numbers[0]
     rows[0, : playing.length] = rows[1, : playing.length]
     s.number, s.first_tick, s.length, s.tau_u = playing.number, s.tick, playing.length, playing.ticks
@@ -236,7 +235,7 @@ def latch(
     for i in range(m.u.shape[0]):
         m.u[i] = real(trace.u[row, i]) - o.constants.estimator.u0[i]
     before, y, x = measured(u_before, m), measured(trace.y[row], m), measured(trace.x[row], m)
-    scheme.plan(o.constants, o.rule, m, BY_THE_RULE, s.updates, tick, before, real(trace.load[row]), y, x)
+    decisions.plan(o.constants, o.rule, m, decisions.BY_THE_RULE, s.updates, tick, before, real(trace.load[row]), y, x)
     s.updates += 1
     s.next_update, s.load_step = tick + m.numbers[0].ticks, w.load_step
     trigger(w, s, tick + 1)

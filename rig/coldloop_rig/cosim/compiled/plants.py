@@ -8,7 +8,7 @@ from typing import Any, Final, Protocol, TypeVar
 
 from numba.extending import overload
 
-from coldloop.kernels.implementations import Implementations
+from coldloop.kernels.intrinsics import Implementations
 from coldloop_plant.program import PlantProgram
 from coldloop_rig.cosim.compiled.records import Array, PlantState
 

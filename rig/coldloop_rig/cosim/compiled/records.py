@@ -9,8 +9,7 @@ from coldloop.process.declaration import Process
 from coldloop_control_plc.output_limits import Limits
 from coldloop_control_plc.sensors import Kinds
 from coldloop_optimizer_plc.rules import UpdatingRule
-from coldloop_optimizer_plc.scheme import Constants
-from coldloop_optimizer_plc.session_state import OptimizerState
+from coldloop_optimizer_plc.scheme import Constants, OptimizerState
 
 Array = NDArray[np.float64]
 

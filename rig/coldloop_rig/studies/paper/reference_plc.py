@@ -11,13 +11,12 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.settings import SHIPPED_MODELS
+from coldloop.process.settings import SHIPPED_MODELS, InputLimits
 from coldloop_optimizer_plc.computing_settings import Arithmetic, EstimatorSettings
 from coldloop_optimizer_plc.qp import linear_algebra
-from coldloop_optimizer_plc.qp.arithmetic import real_of
 from coldloop_optimizer_plc.qp.design import ControlDesign, trivial_design
+from coldloop_optimizer_plc.qp.linear_algebra import real_of
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem
 from coldloop_optimizer_plc.settings import SolverName

@@ -289,9 +289,7 @@ def _both(load: Load, period_s: float) -> Sequence[RunRequest]:
 
 PLC_2H = ExperimentStudy("plc-2h", "Two hours on the bus at tau_u = 5 s (figure scenario_exp)", (("5 s", 5.0),))
 ADAPTIVE_2H = ExperimentStudy(
-    "adaptive-2h",
-    "Two hours on the bus, 2.5 s against adaptive (figure diff_upt)",
-    (("2.5 s", 2.5), ("adaptive", 0.0)),
+    "adaptive-2h", "Two hours on the bus, 2.5 s against adaptive (figure diff_upt)", (("2.5 s", 2.5), ("adaptive", 0.0))
 )
 
 

@@ -1,19 +1,31 @@
-"""Dense linear algebra as plain loops: the same bits on every processor, in single or double precision.
+"""The floating-point type of what is computed on line, and dense linear algebra in it as plain loops.
 
-The inner loops run along rows, so that they vectorise without changing the order of any sum.
-Constants and sums have the type of the arrays: a double constant would make numba compute in double.
+The PLC of the paper has single precision only. What is computed off line (maps, gains, transitions) is computed in
+double precision and rounded once; everything that depends on a measurement is computed in the chosen type.
+
+Loops give the same bits on every processor. The inner ones run along rows, so that they vectorise without changing the
+order of any sum. Constants and sums have the type of the arrays: a double constant would make numba compute in double.
 Indices that begin elsewhere than at 0 are unsigned: numba then knows that they do not count from the end.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
+from coldloop_optimizer_plc.computing_settings import Arithmetic
 
+Real: TypeAlias = type[np.float64]
+"""The scalar type in use. Annotations say double for either type: kernels are compiled for the type they are given."""
+DOUBLE: Real = np.float64
 Array = NDArray[np.float64]
 Indices = NDArray[np.uint64]
+
+
+def real_of(arithmetic: Arithmetic) -> Real:
+    """Return the scalar type of an arithmetic."""
+    return cast("Real", np.float32) if arithmetic is Arithmetic.FLOAT32 else DOUBLE
 
 
 class Columns(NamedTuple):

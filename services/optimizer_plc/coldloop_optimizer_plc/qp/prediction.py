@@ -1,4 +1,4 @@
-"""The discrete prediction model, at the sampling period and at every updating period.
+"""The discrete prediction model, at the sampling period and at every updating period, and where it rests.
 
 One matrix triple for a tick comes with the model file; those of longer periods are its powers, so no matrix
 exponential is needed on line.
@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from coldloop.errors import ConfigurationError
 from coldloop.process.lti_model import LtiModel
-from coldloop_optimizer_plc.qp.arithmetic import DOUBLE, Real
 from coldloop_optimizer_plc.qp.design import ControlDesign
-from coldloop_optimizer_plc.qp.linear_algebra import multiply
+from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real, multiply
 
 Array = NDArray[np.float64]
 
@@ -29,9 +29,7 @@ class Transition(NamedTuple):
     def then(self, later: "Transition") -> "Transition":
         """Return the transition over this period followed by `later`, under the same inputs."""
         return Transition(
-            multiply(later.A, self.A),
-            multiply(later.A, self.B) + later.B,
-            multiply(later.A, self.F) + later.F,
+            multiply(later.A, self.A), multiply(later.A, self.B) + later.B, multiply(later.A, self.F) + later.F
         )
 
     def transposed(self) -> "Transition":
@@ -210,3 +208,37 @@ def state_weights(model: LtiModel, design: ControlDesign) -> Array:
         share = 1.0 / len(bath.temperature_states)
         weights[process.state_names.index(name)] = design.state_weight * share / design.temperature_scale**2
     return weights
+
+
+def rest_map(prediction: PredictionModel, real: Real = DOUBLE) -> Array:
+    """Return what states and load mismatch are at rest, as a map (n + 1, inputs + 2): all deviations.
+
+    It is one of the inputs, of the load, and of the level where there is a bath. There it integrates: any rests, and
+    with the inputs and the load that are given only one mismatch lets it. Elsewhere there is no mismatch at rest, and
+    where the states do not rest they are those that move least. What inputs and load do not move, as disturbances
+    beside the load, is 0 at rest.
+
+    Raises:
+        ConfigurationError: With another model, none does.
+    """
+    n = len(prediction.model.x0)
+    A, B, F = (M[:n] for M in prediction.sample)
+    moved = prediction.model.moved
+    A, B, F = A[np.ix_(moved, moved)], B[moved], F[moved]
+    zeros = np.zeros((len(moved), 1))
+    found = np.zeros((n + 1, B.shape[1] + 2))
+    process = prediction.process
+    if process.bath is None:
+        found[moved] = np.linalg.pinv(np.eye(len(moved)) - A) @ np.hstack([B, F, zeros])
+        return found.astype(real, copy=False)
+    level = [process.output_names.index(process.bath.level)]
+    C, D, G = (M[level] for M in (prediction.C, prediction.D, prediction.G))
+    left = np.block([[np.eye(len(moved)) - A, -F], [C[:, moved], G]])
+    right = np.block([[B, F, zeros], [-D, -G, np.ones((1, 1))]])
+    try:
+        found[[*moved, n]] = np.linalg.solve(left, right)
+    except np.linalg.LinAlgError as error:
+        raise ConfigurationError(
+            "model.file: with constant inputs no load lets the model's states and the level rest; name another model"
+        ) from error
+    return found.astype(real, copy=False)

@@ -1,8 +1,12 @@
 """The condensed quadratic problem: min z' Phi z + z' phi under Gamma z <= gamma and low <= z <= high.
 
-z holds, knot by knot, the inputs (deviations from the operating point over `input_scale`) and then, knot by knot, the
-slacks of the output bands. phi and gamma are affine in the predicted state, the load and the input applied
-before the first knot; Phi and Gamma are constant. There is no factor 1/2 before Phi (`report/slips.md`, 11).
+z (n,) holds, knot by knot, the inputs (deviations from the operating point over `input_scale`) and then, knot by knot,
+the slacks of the output bands, two each. It parametrises the input profile U_pwc(p), piecewise affine between the
+decision instants and constant before the first. Instants count sampling periods: u_j holds during the j-th one, from
+(j - 1) to j periods ahead.
+
+The state and the load are stacked as s = (x, w), shape (n_x + 1,). phi and gamma are affine in s and in the input
+applied before the first knot; Phi and Gamma are constant. There is no factor 1/2 before Phi (`report/slips.md`, 11).
 """
 
 from typing import Final, NamedTuple
@@ -10,20 +14,364 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.limits import InputLimits
-from coldloop.process.settings import settings_of
-from coldloop_optimizer_plc.qp.arithmetic import DOUBLE, Real
-from coldloop_optimizer_plc.qp.condensing import Condensed, condense, transposed
-from coldloop_optimizer_plc.qp.constraints import OutputRows, RateRows, output_rows, rate_rows
-from coldloop_optimizer_plc.qp.design import ControlDesign, Target
-from coldloop_optimizer_plc.qp.instance import Maps, instance, keep_first_rate
-from coldloop_optimizer_plc.qp.linear_algebra import add_transposed_product
-from coldloop_optimizer_plc.qp.penalties import PenaltySettings
-from coldloop_optimizer_plc.qp.prediction import PredictionModel
-from coldloop_optimizer_plc.qp.profile import hold, inputs_of, interpolation, shift, shifted
+from coldloop.kernels.compiled import kernel
+from coldloop.process.settings import InputLimits, settings_of
+from coldloop_optimizer_plc.qp.design import ControlDesign, PenaltySettings, Target
+from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real, add_transposed_product, multiply
+from coldloop_optimizer_plc.qp.prediction import PredictionModel, state_cost
 from coldloop_optimizer_plc.qp.target import rest_of
 
 Array = NDArray[np.float64]
+
+
+def interpolation(knots: tuple[int, ...], at: Array) -> Array:
+    """Return the matrix (len(at), len(knots)) whose product with the knots' values is the profile at `at`."""
+    positions = np.asarray(knots, dtype=float)
+    clamped = np.clip(np.asarray(at, dtype=float), positions[0], positions[-1])
+    weights = np.zeros((len(clamped), len(positions)))
+    for row, position in enumerate(clamped):
+        right = min(int(np.searchsorted(positions, position, side="right")), len(positions) - 1)
+        left = max(right - 1, 0)
+        span = positions[right] - positions[left]
+        share = (position - positions[left]) / span if span > 0 else 0.0
+        weights[row, left] += 1.0 - share
+        weights[row, right] += share
+    return weights
+
+
+@kernel
+def shifted(S: Array, z: Array, n_inputs: int) -> Array:
+    """Return the profile z (n,) whose values at the knots are combined by S (knots, knots), inputs and slacks alike.
+
+    The first `n_inputs` variables are inputs at all knots.
+    """
+    result = np.zeros_like(z)
+    knots, start = S.shape[0], 0
+    for part in range(2):
+        width = (n_inputs if part == 0 else z.shape[0] - n_inputs) // knots
+        for old in range(knots):
+            for new in range(knots):
+                if S[new, old] != z.dtype.type(0.0):
+                    for i in range(width):
+                        result[start + width * new + i] += S[new, old] * z[start + width * old + i]
+        start += width * knots
+    return result
+
+
+@kernel
+def shift(knots: Array, periods: float) -> Array:
+    """Return the matrix that shifts a profile by `periods` sampling periods: the standard hot start.
+
+    It has the floating-point type of the knots. The value behind the horizon is the last knot's.
+    """
+    one, last = knots.dtype.type(1.0), knots.shape[0] - 1
+    S = np.zeros((last + 1, last + 1), knots.dtype)
+    for new in range(last + 1):
+        position, right = min(max(knots[new] + periods, knots[0]), knots[last]), 0
+        while right < last and knots[right] <= position:
+            right += 1
+        left = max(right - 1, 0)
+        span = knots[right] - knots[left]
+        share = (position - knots[left]) / span if span > 0 else knots.dtype.type(0.0)
+        S[new, left] += one - share
+        S[new, right] += share
+    return S
+
+
+@kernel
+def hold(u: Array, scale: Array, n_inputs: int, z: Array) -> None:
+    """Make z (n,) the profile that keeps the input deviation u (3,), without slack."""
+    z[:] = z.dtype.type(0.0)
+    for k in range(n_inputs):
+        i = k % scale.shape[0]
+        z[k] = u[i] / scale[i]
+
+
+@kernel
+def inputs_of(weights: Array, z: Array, scale: Array, u0: Array, rate: Array) -> Array:
+    """Return the inputs (samples, 3) of a profile z (n,), for the knots' weights (samples, knots) in each sample."""
+    u = np.empty((weights.shape[0], scale.shape[0]), z.dtype)
+    write_inputs(weights, z, scale, u0, rate, weights.shape[0], u)
+    return u
+
+
+@kernel
+def write_inputs(weights: Array, z: Array, scale: Array, u0: Array, rate: Array, samples: int, u: Array) -> None:
+    """Write the inputs of the first samples into u (at least as many, 3).
+
+    They are in physical units, `u0` + `scale` z, and from one sample to the next within `rate`.
+    """
+    m = scale.shape[0]
+    for sample in range(samples):
+        for i in range(m):
+            value = z.dtype.type(0.0)
+            for knot in range(weights.shape[1]):
+                value += weights[sample, knot] * z[m * knot + i]
+            u[sample, i] = value * scale[i] + u0[i]
+            if sample > 0:
+                u[sample, i] = min(max(u[sample, i], u[sample - 1, i] - rate[i]), u[sample - 1, i] + rate[i])
+
+
+class Condensed(NamedTuple):
+    """J_0 = z' Phi z + (phi_map' s)' z + s' constant_map s, and the constrained outputs of the N samples.
+
+    J_0 is about the state at rest and the inputs that keep it there under the estimated disturbances.
+    """
+
+    Phi: Array
+    """Shape (n, n), with the weights of the slacks."""
+    phi_map: Array
+    """Shape (n_x + 1, n)."""
+    constant_map: Array
+    """Shape (n_x + 1, n_x + 1)."""
+    outputs_z: Array
+    """Outputs with a band at the end of each sample, as deviations, shape (N, bands, n)."""
+    outputs_s: Array
+    """Shape (N, bands, n_x + 1)."""
+
+
+def condense(prediction: PredictionModel, design: ControlDesign, weights: Array) -> Condensed:
+    """Return the condensed cost and outputs; `weights` (N, knots) are those of the knots in each sample."""
+    n, nx = (design.n_inputs + design.n_slacks) * weights.shape[1], prediction.n_states
+    A, B, F = prediction.sample
+    to_z = np.zeros((nx, n))
+    to_s = np.hstack([np.eye(nx), np.zeros((nx, 1))])
+    Q, n_x = np.zeros((nx, nx)), len(prediction.model.x0)  # disturbances weigh nothing
+    Q[:n_x, :n_x] = state_cost(prediction.model, design)
+    R = np.asarray(design.input_weight)
+    resting = np.hstack([prediction.resting_inputs, np.zeros((design.n_inputs, 1))])
+    weighted_resting = multiply(transposed(resting), np.diag(R))
+    C, D, G = (matrix[list(prediction.constrained)] for matrix in (prediction.C, prediction.D, prediction.G))
+    Phi, cross, constant = np.zeros((n, n)), np.zeros((nx + 1, n)), np.zeros((nx + 1, nx + 1))
+    outputs_z, outputs_s = [], []
+    for sample, of_knots in enumerate(weights, 1):
+        u_of_z = input_map(of_knots, design)
+        ahead = [one for one in prediction.ahead if one.first <= sample <= one.last]
+        to_z = multiply(A, to_z) + multiply(B, u_of_z)
+        to_s = multiply(A, to_s)
+        to_s[:, -1] += F[:, 0]
+        for one in ahead:
+            to_s[:, one.place] += one.states
+        weighted_z, weighted_s = multiply(Q, to_z), multiply(Q, to_s)
+        Phi += multiply(transposed(to_z), weighted_z) + multiply(transposed(u_of_z), R[:, None] * u_of_z)
+        cross += 2.0 * (multiply(transposed(to_s), weighted_z) - multiply(weighted_resting, u_of_z))
+        constant += multiply(transposed(to_s), weighted_s) + multiply(weighted_resting, resting)
+        outputs_z.append(multiply(C, to_z) + multiply(D, u_of_z))
+        through_w = multiply(C, to_s)
+        through_w[:, -1] += G[:, 0]
+        for one in ahead:
+            through_w[:, one.place] += one.outputs[list(prediction.constrained)]
+        outputs_s.append(through_w)
+    Phi = np.ascontiguousarray(Phi + _slack_weights(weights, design))
+    return Condensed(Phi, cross, constant, np.array(outputs_z), np.array(outputs_s))
+
+
+def input_map(of_knots: Array, design: ControlDesign) -> Array:
+    """Return the matrix (inputs, n) from z to the input deviation at a sample with these knot weights (knots,)."""
+    u_of_z = np.zeros((design.n_inputs, (design.n_inputs + design.n_slacks) * len(of_knots)))
+    for knot, weight in enumerate(of_knots):
+        for i in range(design.n_inputs):
+            u_of_z[i, design.n_inputs * knot + i] = weight * design.input_scale[i]
+    return u_of_z
+
+
+def slack_map(of_knots: Array, design: ControlDesign) -> Array:
+    """Return the matrix (slacks, n) from z to the slacks at a sample with these knot weights (knots,)."""
+    n_inputs = design.n_inputs * len(of_knots)
+    slack_of_z = np.zeros((design.n_slacks, n_inputs + design.n_slacks * len(of_knots)))
+    for knot, weight in enumerate(of_knots):
+        for i in range(design.n_slacks):
+            slack_of_z[i, n_inputs + design.n_slacks * knot + i] = weight
+    return slack_of_z
+
+
+def _slack_weights(weights: Array, design: ControlDesign) -> Array:
+    rho = np.repeat(design.violation_weight, 2)
+    n = (design.n_inputs + design.n_slacks) * weights.shape[1]
+    total = np.zeros((n, n))
+    for of_knots in weights:
+        slack_of_z = slack_map(of_knots, design)
+        total += multiply(transposed(slack_of_z), rho[:, None] * slack_of_z)
+    return total
+
+
+def transposed(M: Array) -> Array:
+    """Return M' with its rows contiguous."""
+    return np.ascontiguousarray(M.T)
+
+
+class OutputRows(NamedTuple):
+    """Rows -y_j - s <= -low and y_j - s <= high at each constraint instant, output by output."""
+
+    Gamma: Array
+    """Shape (rows, n)."""
+    bounds: Array
+    """gamma at the operating point, shape (rows,)."""
+    states: Array
+    """How gamma depends on s = (x, w), shape (n_x + 1, rows)."""
+    gains: Array
+    """What the rows were multiplied by, shape (rows,): 1 for the output of the larger rho."""
+
+
+class RateRows(NamedTuple):
+    """Rows +-(u_b - u_a) <= (b - a) rate for each interval between decision instants, unless always true.
+
+    The first interval starts at the input applied before the first knot.
+    """
+
+    Gamma: Array
+    """Shape (rows, n)."""
+    bounds: Array
+    """gamma with no input before, shape (rows,)."""
+    first: Array
+    """1.0 for the rows of the first interval, shape (rows,)."""
+    before: Array
+    """How gamma depends on the input before, shape (inputs, rows)."""
+    gains: Array
+    """What the rows were multiplied by, shape (rows,)."""
+
+
+def output_rows(condensed: Condensed, design: ControlDesign, weights: Array, y0: Array) -> OutputRows:
+    """Return the rows of the bands; `weights` (N, knots) are those of the knots, `y0` the outputs at rest."""
+    rho = np.array(design.violation_weight)
+    rows, states, bounds, gains = [], [], [], []
+    for instant in design.constraint_instants:
+        slack_of_z = slack_map(weights[instant - 1], design)
+        for output in range(len(rho)):
+            y_z, y_s = condensed.outputs_z[instant - 1][output], condensed.outputs_s[instant - 1][output]
+            margin = design.band_margin[output]
+            low = design.output_low[output] + margin - y0[output]
+            high = design.output_high[output] - margin - y0[output]
+            rows += [-y_z - slack_of_z[2 * output], y_z - slack_of_z[2 * output + 1]]
+            states += [y_s, -y_s]
+            bounds += [-low, high]
+            gains += 2 * [np.sqrt(rho[output] / rho.max())]
+    gain = np.array(gains)
+    return OutputRows(
+        Gamma=np.array(rows) * gain[:, None],
+        bounds=np.array(bounds) * gain,
+        states=np.ascontiguousarray((np.array(states) * gain[:, None]).T),
+        gains=gain,
+    )
+
+
+def rate_rows(design: ControlDesign, limits: InputLimits, penalties: PenaltySettings) -> RateRows:
+    """Return the rows of the rates, scaled by what breaking them costs; there may be none."""
+    ranges = np.asarray(limits.high) - np.asarray(limits.low)
+    n_inputs = design.n_inputs
+    size = (n_inputs + design.n_slacks) * len(design.decision_instants)
+    gains_of_inputs = np.sqrt(penalties.rate_rows) / np.array(design.input_scale)
+    rows, bounds, before, first, gained = [], [], [], [], []
+    starts = (design.decision_instants[0] - 1, *design.decision_instants[:-1])
+    for knot, (start, end) in enumerate(zip(starts, design.decision_instants, strict=True)):
+        for i in range(n_inputs):
+            limit = (end - start) * limits.rate[i]
+            if limit >= ranges[i]:
+                continue
+            row = np.zeros(size)
+            row[n_inputs * knot + i] = design.input_scale[i]
+            if knot:
+                row[n_inputs * (knot - 1) + i] = -design.input_scale[i]
+            for sign in (1.0, -1.0):
+                rows.append(sign * row)
+                bounds.append(limit)
+                first.append(float(knot == 0))
+                before.append(sign * np.eye(n_inputs)[i] * (knot == 0))
+                gained.append(gains_of_inputs[i])
+    gains = np.array(gained)
+    return RateRows(
+        Gamma=np.reshape(rows, (-1, size)) * gains[:, None],
+        bounds=np.array(bounds) * gains,
+        first=np.array(first),
+        before=np.ascontiguousarray((np.reshape(before, (-1, n_inputs)) * gains[:, None]).T),
+        gains=gains,
+    )
+
+
+class Maps(NamedTuple):
+    """How an instance follows from the parameters; the state and the load are stacked as s = (x, w)."""
+
+    phi: Array
+    """Shape (n_s, n)."""
+    constant: Array
+    """Shape (n_s, n_s)."""
+    outputs: Array
+    """Shape (n_s, 56)."""
+    output_bounds: Array
+    rate_bounds: Array
+    rate_first: Array
+    """1.0 for the rows of the interval before the first knot."""
+    rate_before: Array
+    """Shape (3, 38)."""
+    low: Array
+    high: Array
+    first_rate: Array
+    """Rates of the inputs, scaled, where they bound the first knot as a box; infinite where they do not."""
+    input_scale: Array
+    rest: Array
+    """s at rest by the target, scaled inputs, shape (3, n_s); (0, n_s) where the target is the operating point."""
+    holding: Array
+    """2 Phi times a profile that holds an input, shape (3, n), or (0, n)."""
+
+
+@kernel
+def first_knot_range(maps: Maps, rate: Array, u_before: Array, share: float, i: int) -> tuple[float, float]:
+    """Return the range of input i at the first knot, within a share of its rate (3,) of the input before it, scaled."""
+    start = u_before[i] / maps.input_scale[i]
+    reach = rate[i] * share
+    return min(max(start - reach, maps.low[i]), maps.high[i]), min(max(start + reach, maps.low[i]), maps.high[i])
+
+
+@kernel
+def keep_first_rate(maps: Maps, rate: Array, u_before: Array, share: float, z: Array) -> None:
+    """Move the inputs of the first knot of z (n,) to within their rate (3,), scaled, of the input before it (3,)."""
+    for i in range(u_before.shape[0]):
+        low, high = first_knot_range(maps, rate, u_before, share, i)
+        z[i] = min(max(z[i], low), high)
+
+
+@kernel
+def instance(
+    maps: Maps, x: Array, w: float, u_before: Array, share: float, target: Array
+) -> tuple[Array, Array, Array, Array, float]:  # fmt: skip
+    """Return phi, gamma, low, high and the constant of the cost, which is about a target (3,) of scaled inputs.
+
+    With its states at rest taken from s, and its inputs from z, the cost is as about the operating point.
+    """
+    zero, one, half = x.dtype.type(0.0), x.dtype.type(1.0), x.dtype.type(0.5)
+    s = np.empty(x.shape[0] + 1, x.dtype)
+    for i in range(x.shape[0]):
+        s[i] = x[i]
+    s[x.shape[0]] = w
+    deviation = s.copy()
+    add_transposed_product(maps.rest, -target, deviation)
+    phi = np.zeros(maps.phi.shape[1], x.dtype)
+    add_transposed_product(maps.phi, deviation, phi)
+    about_rest = phi.copy()
+    add_transposed_product(maps.holding, -target, phi)
+    outputs, rates = maps.output_bounds.shape[0], maps.rate_bounds.shape[0]
+    gamma = np.empty(outputs + rates, x.dtype)
+    for r in range(outputs):
+        gamma[r] = maps.output_bounds[r]
+    for r in range(rates):
+        gamma[outputs + r] = maps.rate_bounds[r] * (share if maps.rate_first[r] > zero else one)
+    add_transposed_product(maps.outputs, s, gamma[:outputs])
+    add_transposed_product(maps.rate_before, u_before, gamma[outputs:])
+    low, high = maps.low.copy(), maps.high.copy()
+    for i in range(u_before.shape[0]):
+        low[i], high[i] = first_knot_range(maps, maps.first_rate, u_before, share, i)
+    weighted = np.zeros(s.shape[0], x.dtype)
+    add_transposed_product(maps.constant, deviation, weighted)
+    constant = zero
+    for i in range(s.shape[0]):
+        constant += deviation[i] * weighted[i]
+    inputs = 0
+    while inputs < phi.shape[0] and np.isfinite(maps.high[inputs]):  # slacks have no upper bound
+        inputs += 1
+    for i in range(maps.holding.shape[0]):
+        for j in range(i, inputs, u_before.shape[0]):
+            constant -= half * (about_rest[j] + phi[j]) * target[i]
+    return phi, gamma, low, high, constant
 
 
 LONG_AGO: Final = 2**15

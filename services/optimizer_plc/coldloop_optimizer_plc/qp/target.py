@@ -16,19 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.limits import InputLimits
 from coldloop.process.sections import Bath
-from coldloop_optimizer_plc.qp.arithmetic import DOUBLE, Real
+from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.qp.design import ControlDesign, Target
-from coldloop_optimizer_plc.qp.prediction import PredictionModel, state_cost
-from coldloop_optimizer_plc.qp.rest import rest_map
+from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real
+from coldloop_optimizer_plc.qp.prediction import PredictionModel, rest_map, state_cost
 
 Array = NDArray[np.float64]
 
 TOLERANCES = {8: 1e-8, 4: 1e-4}
 """What a bound may be missed by, scaled, by the bytes of a number: in single precision a corner of bounds is met no
 better than within 1e-5."""
-
 NO_EFFECT = 1e-9
 """K of the turbine's outlet per W held: an input that warms it by less does so by rounding, whose sign is another on
 another machine."""

@@ -3,22 +3,17 @@
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from coldloop_optimizer_plc.solvers.daqp import DaqpSolver
 from coldloop_optimizer_plc.solvers.fast_gradient import fast_gradient_solver
 from coldloop_optimizer_plc.solvers.hybrid import hybrid_solver
-from coldloop_optimizer_plc.solvers.interface import Answer, Solver, judged
+from coldloop_optimizer_plc.solvers.interface import Answer, KernelSolver, OutsideSolver, Solver, judged
 from coldloop_optimizer_plc.solvers.interior_point import interior_point_solver
-from coldloop_optimizer_plc.solvers.kernel_solver import KernelSolver
 from coldloop_optimizer_plc.solvers.ode import ode_solver
-from coldloop_optimizer_plc.solvers.osqp import OsqpSolver
-from coldloop_optimizer_plc.solvers.outside import OutsideSolver
-from coldloop_optimizer_plc.solvers.qpoases import QpoasesSolver
+from coldloop_optimizer_plc.solvers.outside_libraries import DaqpSolver, OsqpSolver, QpoasesSolver
 
 if TYPE_CHECKING:
     from coldloop_optimizer_plc.settings import ProgramSettings
 
 __all__ = ["Answer", "KernelSolver", "Solver", "judged", "make_solver"]
-
 _MAKERS: "dict[str, Callable[[ProgramSettings], Solver]]" = {
     "ode": lambda settings: ode_solver(settings.ode, settings.penalties),
     "qpoases": lambda settings: QpoasesSolver(settings.qpoases),

@@ -19,8 +19,7 @@ from coldloop.kernels.compiled import kernel
 from coldloop_optimizer_plc.computing_settings import FastGradientSettings
 from coldloop_optimizer_plc.qp.costs import Matrices, augmented_cost, gradient, matrices_of
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
-from coldloop_optimizer_plc.solvers.interface import Answer, Costs
-from coldloop_optimizer_plc.solvers.kernel_solver import KernelSolver, solves_by
+from coldloop_optimizer_plc.solvers.interface import Answer, Costs, KernelSolver, solves_by
 
 Array = NDArray[np.float64]
 

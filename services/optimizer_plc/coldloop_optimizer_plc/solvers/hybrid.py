@@ -21,11 +21,10 @@ from numpy.typing import NDArray
 from coldloop.kernels.compiled import kernel
 from coldloop_optimizer_plc.computing_settings import HybridSettings, InteriorPointSettings, OdeSettings
 from coldloop_optimizer_plc.qp.costs import matrices_of
-from coldloop_optimizer_plc.qp.penalties import PenaltySettings
+from coldloop_optimizer_plc.qp.design import PenaltySettings
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers import interior_point, ode
-from coldloop_optimizer_plc.solvers.interface import Answer, Costs
-from coldloop_optimizer_plc.solvers.kernel_solver import KernelSolver, solves_by
+from coldloop_optimizer_plc.solvers.interface import Answer, Costs, KernelSolver, solves_by
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.int64]

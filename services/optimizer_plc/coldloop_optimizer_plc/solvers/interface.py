@@ -1,14 +1,25 @@
-"""The one protocol of all solvers: a problem, a guess and counts of iterations in; the answer and its costs out."""
+"""The one protocol of all solvers: a problem, a guess and counts of iterations in; the answer and its costs out.
 
-from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+A solver of our own is a NamedTuple of its constants, its method, and a kernel `solve` that is registered for it and
+takes single and double precision alike: one object serves all of them, and `solve_by` calls the right kernel within
+kernels. Somebody else's is a class without arguments that follows `OutsideMethod`, by an entry point of the group
+`coldloop.solvers`; `docs/extending.md` has one of a few lines.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from typing import Any, Final, NamedTuple, Protocol, TypeVar
 
 import numpy as np
+from numba.extending import overload
 from numpy.typing import NDArray
 
-from coldloop_optimizer_plc.qp.costs import augmented_cost
+from coldloop.kernels.intrinsics import Implementations
+from coldloop_optimizer_plc.computing_settings import OutsideSettings
+from coldloop_optimizer_plc.outside import Part, in_its_name, made
+from coldloop_optimizer_plc.qp.costs import Solution, augmented_cost, judge, penalty_multipliers
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
-from coldloop_optimizer_plc.qp.solution import Solution, judge, penalty_multipliers
 
 Array = NDArray[np.float64]
 
@@ -85,3 +96,119 @@ def judged(problem: QuadraticProblem, answer: Answer, alpha: float) -> Solution:
     """Return the last point of an answer with its residuals."""
     z, multipliers = answer.z, answer.multipliers
     return judge(problem, z, alpha, multipliers if multipliers.size else penalty_multipliers(problem, z, alpha))
+
+
+Kernel = Callable[[Any, QuadraticProblem, Array, NDArray[np.int64], Costs], Answer]
+K = TypeVar("K", bound=Callable[..., Answer])
+KERNELS: Final[Implementations[Kernel]] = Implementations("solve_by")
+"""The kernel of each method."""
+
+
+def solves_by(method: type) -> Callable[[K], K]:
+    """Register a kernel as what solves problems by this method."""
+
+    def register(kernel: K) -> K:
+        KERNELS[method] = kernel
+        return kernel
+
+    return register
+
+
+def solve_by(method: Any, qp: QuadraticProblem, guess: Array, counts: NDArray[np.int64], before: Costs) -> Answer:  # noqa: ANN401
+    """Return the answer of the kernel that is registered for a method; `before` is of the problem before."""
+    return KERNELS[type(method)](method, qp, guess, counts, before)
+
+
+@overload(solve_by, jit_options={"error_model": "numpy"}, strict=False)
+def _solve_by(method: Any, qp: Any, guess: Any, counts: Any, before: Any) -> Any:  # noqa: ANN401, ARG001 types of numba
+    solve = KERNELS[method.instance_class]
+    return lambda method, qp, guess, counts, before: solve(method, qp, guess, counts, before)  # noqa: PLW0108
+
+
+class KernelSolver:
+    """A solver of our own.
+
+    Args:
+        method_of: Makes the method for problems with the matrices of this one.
+        alpha: Penalty weight.
+        tau_1_s: Time of an iteration.
+        floor: Constant that J has besides that of the problem.
+    """
+
+    def __init__(
+        self, method_of: Callable[[QuadraticProblem], Any], alpha: float, tau_1_s: float, floor: float = 1.0
+    ) -> None:
+        self.alpha, self.tau_1_s = alpha, tau_1_s
+        self._method_of, self._floor = method_of, floor
+        self._source: tuple[Array, Array] | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the problem before."""
+        self.before = Costs(math.inf, math.inf)
+
+    def method(self, problem: QuadraticProblem) -> Any:  # noqa: ANN401 a method that a kernel is registered for
+        """Return the method for problems with these matrices, in their floating-point type."""
+        if self._source is None or problem.Phi is not self._source[0] or problem.Gamma is not self._source[1]:
+            self._source, self._method = (problem.Phi, problem.Gamma), self._method_of(problem)
+        return self._method
+
+    def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
+        """Return the answer after each count."""
+        real = problem.phi.dtype.type
+        before = Costs(*map(real, self.before))
+        answer = solve_by(self.method(problem), problem, guess, np.array(counts, np.int64), before)
+        rest, floor = real(problem.constant) + real(self._floor), real(self._floor)
+        self.before = Costs(*(float(max(real(cost) + rest, floor)) for cost in (answer.guessed, answer.costs[-1])))
+        return answer
+
+
+class OutsideMethod(Protocol):
+    """What an entry point makes: min z' Phi z + z' phi under Gamma z <= gamma and low <= z <= high, cut off anywhere.
+
+    There is no factor 1/2 before Phi. The same problem, guess and count give the same bits. If it has an attribute
+    `alpha`, that is set to the weight of broken rows that its answers are judged with.
+    """
+
+    def solve(self, problem: QuadraticProblem, guess: Array, iterations: int) -> tuple[Array, int]:
+        """Return the point (n,) after so many iterations from `guess` (n,), and how many were done; 0 is the guess."""
+
+
+class OutsideSolver:
+    """One of these as a solver, given copies: its answer is checked, put into the box, judged by the augmented cost."""
+
+    def __init__(self, settings: OutsideSettings) -> None:
+        self.alpha = settings.alpha
+        self.tau_1_s = settings.tau_1_s
+        self.name = settings.solver
+        self._method: OutsideMethod = made(Part.SOLVER, settings.solver)
+        with in_its_name(Part.SOLVER, self.name):
+            if hasattr(self._method, "alpha"):
+                self._method.alpha = settings.alpha
+
+    def reset(self) -> None:
+        """Forget earlier problems, where the method has something to forget."""
+        with in_its_name(Part.SOLVER, self.name):
+            getattr(self._method, "reset", dict)()
+
+    def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
+        """Return the answer after each count; a point that is no profile, or not finite, is as good as the guess.
+
+        Raises:
+            ConfigurationError: The method raises, or returns something else than a point and a count.
+        """
+        guess = np.clip(guess, problem.low, problem.high)
+        answers = [self._point(problem, guess, int(count)) for count in counts]
+        points, done = [point for point, _ in answers], [count for _, count in answers]
+        return collected(problem, self.alpha, guess, points, done, np.zeros_like(problem.gamma))
+
+    def _point(self, problem: QuadraticProblem, guess: Array, count: int) -> tuple[Array, int]:
+        if not count:
+            return guess, 0
+        with in_its_name(Part.SOLVER, self.name):
+            point, done = self._method.solve(deepcopy(problem), guess.copy(), count)
+            found = np.array(point, dtype=np.float64)
+            done = max(0, min(int(done), count))
+        if found.shape != guess.shape or not np.isfinite(found).all():
+            return guess, done
+        return np.clip(found, problem.low, problem.high), done

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from coldloop_optimizer_plc.computing_settings import OdeSettings
-from coldloop_optimizer_plc.qp.arithmetic import Real
 from coldloop_optimizer_plc.qp.costs import (
     Matrices,
     cost_with_excess,
@@ -21,11 +20,10 @@ from coldloop_optimizer_plc.qp.costs import (
     gradient_with_excess,
     matrices_of,
 )
-from coldloop_optimizer_plc.qp.linear_algebra import cholesky, cholesky_solve
-from coldloop_optimizer_plc.qp.penalties import PenaltySettings
+from coldloop_optimizer_plc.qp.design import PenaltySettings
+from coldloop_optimizer_plc.qp.linear_algebra import Real, cholesky, cholesky_solve
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
-from coldloop_optimizer_plc.solvers.interface import Answer, Costs
-from coldloop_optimizer_plc.solvers.kernel_solver import KernelSolver, solves_by
+from coldloop_optimizer_plc.solvers.interface import Answer, Costs, KernelSolver, solves_by
 
 Array = NDArray[np.float64]
 
@@ -35,7 +33,6 @@ C1 = 1.0 / (G * (2.0 - G))
 C0 = (1.0 - G) ** 2 * C1
 D = G / 2.0
 ERROR_CONSTANT = (-3.0 * G * G + 4.0 * G - 2.0) / (12.0 * (2.0 - G))
-
 STATIONARITY = 1e-6
 """A step that lowers J by no more than this share of |J| has stalled."""
 STALLED_STEPS = 20

@@ -1,7 +1,8 @@
-"""Clarabel, PIQP and QPALM as outside solvers: entry points of these names; each library is an extra of that name.
+"""Solvers of other projects: qpOASES, OSQP and DAQP by their names, Clarabel, PIQP and QPALM as outside solvers.
 
-They get J itself: each row may be broken, and by how much is a variable t >= 0 that costs alpha t^2. So there always is
-a point that keeps all rows, and an answer is judged by what was minimised.
+The last three are entry points, and each library is an extra of that name. They get J itself: each row may be broken,
+and by how much is a variable t >= 0 that costs alpha t^2. So there always is a point that keeps all rows, and an answer
+is judged by what was minimised.
 
 - All three are throttled: they count iterations and hand out the iterate at their limit. Each count is a solve of its
   own, with the library's own settings but for tolerances: nothing is kept.
@@ -13,18 +14,276 @@ a point that keeps all rows, and an answer is judged by what was minimised.
   with a status of failure the answer is the guess.
 """
 
+import importlib
+import io
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from functools import cache
 from importlib import import_module
-from typing import Any, ClassVar, Final, NamedTuple
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 
+import daqp
 import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
-from coldloop_optimizer_plc.computing_settings import PENALTY_WEIGHT
+from coldloop_optimizer_plc.computing_settings import PENALTY_WEIGHT, DaqpSettings, OsqpSettings, QpoasesSettings
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
+from coldloop_optimizer_plc.solvers.interface import Answer, collected
 
 Array = NDArray[np.float64]
+
+SOLVED, ON_THE_WAY = "SOLVER_RET_SUCCESS", "SOLVER_RET_LIMITED"
+FIRST_SOLVE_LIMIT = 10_000
+"""Steps after which the first problem of a chain is given up; it takes some tens."""
+
+
+def is_well_posed(problem: QuadraticProblem) -> bool:
+    """Return whether the vectors of a problem are finite, and no lower bound is above the upper one."""
+    vectors = (problem.phi, problem.gamma, problem.low)
+    return all(np.isfinite(vector).all() for vector in vectors) and bool((problem.low <= problem.high).all())
+
+
+class QpoasesSolver:
+    """Throttled qpOASES (Ferreau et al., 2014): the online active-set method, cut off after q working-set changes.
+
+    qpOASES moves along the line from the previous problem to the present one and stops where the working set changes.
+    It is the qpOASES inside CasADi; its CPU-time limit is not used, since it would make runs irreproducible.
+
+    - An iteration is one step of that homotopy. The limit nWSR of a CasADi object is fixed when it is made, so ours is
+      1 and an iteration is a call: another call with the same data continues along the same line, and a steps and then
+      b are a + b steps to the bit. One object with nWSR = q gives the same points to rounding until, at some harsh
+      load jumps, it takes another path (ramping restarts at each call); neither is better on average.
+    - A truncated answer is the optimum of an intermediate problem. It may violate the box and the rows of the present
+      one; it is projected into the box. J is not monotonic (Definition 1 of the paper): see `docs/solvers.md`.
+    - The guess is the answer until the first iteration. The method itself continues from where it stopped before.
+    - A chain begins at an optimum, as `qpOASES_sequence` is begun by 'i' before it is hot-started: the first problem of
+      a session is solved to the end, whatever the count.
+    """
+
+    def __init__(self, settings: QpoasesSettings) -> None:
+        self.alpha = settings.alpha
+        self.tau_1_s = settings.tau_1_s
+        self._casadi = load_casadi()
+        self._chain: _Chain | None = None
+
+    def reset(self) -> None:
+        """Drop the chain: the next problem begins a new one."""
+        self._chain = None
+
+    def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
+        """Go along the homotopy to this problem, or up to its end; the guess is the answer until the first step."""
+        guess = np.clip(guess, problem.low, problem.high)
+        z, multipliers, done = guess, np.zeros_like(problem.gamma), 0
+        status = ON_THE_WAY if is_well_posed(problem) else "ill-posed data"
+        if status == ON_THE_WAY:  # other data never reach the chain, which they would end
+            self._begin_or_continue(problem)
+        points, iterations = [], []
+        for count in counts:
+            before = done
+            while done < count and self._chain is not None and status == ON_THE_WAY:
+                status = self._chain.step()
+                done += 1
+            if self._chain is not None and done > before:
+                if status in (SOLVED, ON_THE_WAY):
+                    z = np.clip(self._chain.z, problem.low, problem.high)
+                    multipliers = np.maximum(self._chain.multipliers, 0.0)
+                else:  # a chain that broke stays broken; the answer is the last one that was good
+                    self._chain = None
+            points.append(z)
+            iterations.append(done)
+        return collected(problem, self.alpha, guess, points, iterations, multipliers)
+
+    def _begin_or_continue(self, problem: QuadraticProblem) -> None:
+        fresh = self._chain is None
+        if self._chain is None:
+            self._chain = _Chain(self._casadi, problem)
+        self._chain.set_target(problem)
+        if fresh:
+            for _ in range(FIRST_SOLVE_LIMIT):
+                if self._chain.step() != ON_THE_WAY:
+                    break
+
+
+class _Chain:
+    """A CasADi object with nWSR = 1: one chain of hot starts. Its arguments and results are arrays shared with it."""
+
+    def __init__(self, casadi: ModuleType, problem: QuadraticProblem) -> None:
+        m, n = problem.Gamma.shape
+        shapes = {"h": casadi.Sparsity.dense(n, n), "a": casadi.Sparsity.dense(m, n)}
+        options = {"nWSR": 1, "printLevel": "none", "error_on_fail": False}
+        with redirect_stdout(io.StringIO()):  # each object prints a banner
+            self._conic: Any = casadi.conic("qp", "qpoases", shapes, options)
+            self._buffer, self._evaluate = self._conic.buffer()
+        self._inputs = {name: np.zeros(self._conic.numel_in(name)) for name in self._conic.name_in()}
+        self._outputs = {name: np.zeros(self._conic.numel_out(name)) for name in self._conic.name_out()}
+        for i, array in enumerate(self._inputs.values()):
+            self._buffer.set_arg(i, array.data)
+        for i, array in enumerate(self._outputs.values()):
+            self._buffer.set_res(i, array.data)
+        self._inputs["lba"][:] = -np.inf
+
+    def set_target(self, problem: QuadraticProblem) -> None:
+        """Say where the homotopy leads to."""
+        self._inputs["h"][:] = 2.0 * problem.Phi.ravel()
+        self._inputs["a"][:] = problem.Gamma.ravel(order="F")
+        for name, value in (("g", problem.phi), ("uba", problem.gamma), ("lbx", problem.low), ("ubx", problem.high)):
+            self._inputs[name][:] = value
+
+    def step(self) -> str:
+        """Go one step; return CasADi's status."""
+        with redirect_stdout(io.StringIO()):  # failures are printed whatever the print level
+            self._evaluate()
+        return str(self._buffer.stats()["unified_return_status"])
+
+    @property
+    def z(self) -> Array:
+        return self._outputs["x"]
+
+    @property
+    def multipliers(self) -> Array:
+        return self._outputs["lam_a"]
+
+
+@cache
+def load_casadi() -> ModuleType:
+    """Import CasADi, which is large and optional.
+
+    Raises:
+        ConfigurationError: It is not installed, or has no qpOASES.
+    """
+    try:
+        casadi = importlib.import_module("casadi")
+    except ImportError:
+        raise ConfigurationError(
+            "optimizer_plc.program.solver: qpoases needs CasADi, which is not installed here: "
+            "install coldloop[qpoases], or choose another solver"
+        ) from None
+    if not casadi.has_conic("qpoases"):
+        raise ConfigurationError(
+            f"optimizer_plc.program.solver: CasADi {casadi.__version__} was built without qpOASES: "
+            "install CasADi from its wheel, or choose another solver"
+        )
+    return casadi
+
+
+if TYPE_CHECKING:
+    from osqp import OSQP
+
+
+NEVER = 1e-15
+"""Tolerance that does not end the iterations: they are counted."""
+
+
+class OsqpSolver:
+    """OSQP (Stellato et al., 2020): the alternating direction method of multipliers, cut off after q iterations.
+
+    The matrices are scaled and factorised once, with a fixed rho; from problem to problem only vectors change.
+
+    - An iteration is one of ADMM: a solve with the factors, and a projection of the rows. Calls continue where the last
+      one stopped; OSQP keeps its multipliers, and begins each problem at the guess.
+    - A truncated answer is near the problem's rows and box without keeping them; it is projected into the box. J is not
+      monotonic (Definition 1 of the paper): see `docs/solvers.md`.
+    """
+
+    def __init__(self, settings: OsqpSettings) -> None:
+        self.alpha = settings.alpha
+        self.tau_1_s = settings.tau_1_s
+        self._settings = settings
+        self._osqp: OSQP | None = None
+
+    def reset(self) -> None:
+        """Drop the object with its factors and multipliers."""
+        self._osqp = None
+
+    def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
+        """Iterate from the guess and the last multipliers."""
+        guess = np.clip(guess, problem.low, problem.high)
+        z, multipliers, done = guess, np.zeros_like(problem.gamma), 0
+        osqp = self._prepared(problem, guess)
+        points, iterations = [], []
+        for count in counts:
+            if osqp is not None and count > done:
+                osqp.update_settings(max_iter=count - done)
+                result = osqp.solve(raise_error=False)
+                z, done = np.clip(result.x, problem.low, problem.high), count
+                multipliers = np.maximum(result.y[len(z) :], 0.0)
+            points.append(z)
+            iterations.append(done)
+        return collected(problem, self.alpha, guess, points, iterations, multipliers)
+
+    def _prepared(self, problem: QuadraticProblem, guess: Array) -> "OSQP | None":
+        """Return the object with the next problem; None if its data are no numbers, which it would never forget."""
+        if not (np.isfinite(problem.phi).all() and np.isfinite(problem.gamma).all()):
+            return None
+        lower = np.concatenate([problem.low, np.full(len(problem.gamma), -np.inf)])
+        upper = np.concatenate([problem.high, problem.gamma])
+        if self._osqp is None:
+            self._osqp = self._set_up(problem, lower, upper)
+        else:
+            self._osqp.update(q=problem.phi, l=lower, u=upper)
+        self._osqp.warm_start(x=guess)
+        return self._osqp
+
+    def _set_up(self, problem: QuadraticProblem, lower: Array, upper: Array) -> "OSQP":
+        from osqp import OSQP  # noqa: PLC0415 with scipy.sparse, a fifth of what the optimiser loads at its start
+        from scipy import sparse  # noqa: PLC0415
+
+        solver = OSQP()
+        P = sparse.csc_matrix(np.triu(2.0 * problem.Phi))
+        A = sparse.csc_matrix(np.vstack([np.eye(len(problem.phi)), problem.Gamma]))
+        solver.setup(
+            P, problem.phi, A, lower, upper,
+            rho=self._settings.rho, alpha=self._settings.relaxation, adaptive_rho=False, check_termination=0,
+            eps_abs=NEVER, eps_rel=0.0, eps_prim_inf=NEVER, eps_dual_inf=NEVER, verbose=False,
+        )  # fmt: skip
+        return solver
+
+
+class DaqpSolver:
+    """DAQP (Arnstrom et al., 2022): a dual active-set method that solves the problem exactly. An oracle, and an option.
+
+    - An iteration is a complete solve, always from cold: the iterates of a dual method are infeasible until the last,
+      and DAQP hands none out. So nothing is ever truncated, `tau_1_s` is a whole updating period, and more iterations
+      change nothing.
+    - J of the answer is that of the hard-constrained optimum, whatever the guess: after a guess that breaks rows a
+      little to its advantage, J may rise (Definition 1 of the paper does not hold to the letter).
+    """
+
+    def __init__(self, settings: DaqpSettings) -> None:
+        self.alpha = settings.alpha
+        self.tau_1_s = settings.tau_1_s
+        self._tolerance = settings.primal_tolerance
+
+    def reset(self) -> None:
+        """Nothing is kept from one problem to the next."""
+
+    def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
+        """Solve the problem, once; the guess is the answer until then, and if there is no optimum."""
+        guess = np.clip(guess, problem.low, problem.high)
+        z, multipliers = guess, np.zeros_like(problem.gamma)
+        solvable = bool(np.isfinite(problem.phi).all() and np.isfinite(problem.gamma).all())
+        if solvable and max(counts) > 0:
+            z, multipliers = self._optimum(problem, guess)
+        points, done = [z if count else guess for count in counts], [int(solvable and count > 0) for count in counts]
+        return collected(problem, self.alpha, guess, points, done, multipliers)
+
+    def _optimum(self, qp: QuadraticProblem, guess: Array) -> tuple[Array, Array]:
+        """Return the optimum and the multipliers of its rows; the guess and zeros if there is none."""
+        n = len(guess)
+        lower = np.full(n + len(qp.gamma), -UNBOUNDED)
+        lower[:n] = np.maximum(qp.low, -UNBOUNDED)
+        upper = np.minimum(np.concatenate([qp.high, qp.gamma]), UNBOUNDED)
+        z, _, flag, info = daqp.solve(
+            2.0 * qp.Phi, qp.phi.copy(), qp.Gamma, upper, lower, np.zeros(len(upper), np.int32),
+            primal_tol=self._tolerance,
+        )  # fmt: skip
+        if flag != 1:
+            return guess, np.zeros_like(qp.gamma)
+        return np.clip(z, qp.low, qp.high), np.maximum(info["lam"][n:], 0.0)
+
 
 UNBOUNDED: Final = 1e30
 TOLERANCE: Final = 1e-9
@@ -74,8 +333,7 @@ class Library(ABC):
 
     def solve(self, problem: QuadraticProblem, guess: Array, iterations: int) -> tuple[Array, int]:
         """Return the point after so many iterations, fewer at the optimum, and their number; or the guess."""
-        finite = all(np.isfinite(vector).all() for vector in (problem.phi, problem.gamma, problem.low))
-        if not (iterations and finite and (problem.low <= problem.high).all()):
+        if not (iterations and is_well_posed(problem)):
             return guess, 0
         excess = np.maximum(problem.Gamma @ guess - problem.gamma, 0.0)
         x, done = self.iterated(softened(problem, self.alpha), np.concatenate([guess, excess]), iterations)

@@ -13,9 +13,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import inlined, kernel
-from coldloop.kernels.named import named
+from coldloop.kernels.intrinsics import borrowed, named
 from coldloop.process import cold_box
 from coldloop_plant.components.heat_exchanger import (
     COARSE,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from coldloop.kernels.named import plain_tuples
+from coldloop.kernels.intrinsics import plain_tuples
 from coldloop.process.cold_box import L1, TICK_S
 from coldloop.process.model_range import model_range
 from coldloop_plant.cold_box.physics import ColdBox, advance_and_read, outputs

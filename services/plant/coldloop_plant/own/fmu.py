@@ -20,8 +20,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from coldloop.errors import ColdloopError, ModelFileError
-from coldloop.foreign import foreign
+from coldloop.errors import ColdloopError, ModelFileError, foreign
 from coldloop.process.declaration import Process
 from coldloop_plant.numeric import RealArray
 from coldloop_plant.own.plants import NO_DISTURBANCES, Disturbances, DisturbedPlant

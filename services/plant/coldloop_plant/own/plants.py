@@ -19,8 +19,7 @@ from typing import Any, Final, NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.errors import ColdloopError, ModelFileError
-from coldloop.foreign import foreign
+from coldloop.errors import ColdloopError, ModelFileError, foreign
 from coldloop.kernels.compiled import inlined, kernel
 from coldloop.kernels.first_use import kernels_of
 from coldloop.process.declaration import Process

@@ -11,8 +11,7 @@ from typing import Final, NamedTuple
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import LAST_TICK, Process
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.range_bits import ModelRange
-from coldloop.process.station import STATION_SIGNAL_NAMES
+from coldloop.process.station import STATION_SIGNAL_NAMES, ModelRange
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import Caller
 from coldloop.registers.common import pace_subject
@@ -34,7 +33,7 @@ from coldloop.registers.plant import (
 )
 from coldloop.safety.watchdog import Watchdog
 from coldloop.service.journal import Journal
-from coldloop.session.time_base import TimeBase
+from coldloop.session.settings import TimeBase
 from coldloop_plant.program import HeatLoad, PlantProgram
 from coldloop_plant.rack.faults import SensorFaults
 from coldloop_plant.rack.load_schedule import LoadSchedule

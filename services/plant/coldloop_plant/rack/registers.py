@@ -35,8 +35,7 @@ from coldloop.registers.safety import LeaseEvent, LeaseStatus, WatchdogStatus, W
 from coldloop.registers.text import from_words
 from coldloop.safety.lease import WriterLease
 from coldloop.service.journal import Journal, JournalPublication
-from coldloop.session.settings import TimeMode
-from coldloop.session.time_base import TimeBase
+from coldloop.session.settings import TimeBase, TimeMode
 from coldloop_plant.load import find_load
 from coldloop_plant.rack.faults import HEALTHY
 from coldloop_plant.rack.outputs import next_generation

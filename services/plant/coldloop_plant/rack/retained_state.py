@@ -12,7 +12,7 @@ from coldloop.registers.common import SessionPace
 from coldloop.registers.domain import DomainError
 from coldloop.registers.plant import LoadStep, plant_map
 from coldloop.safety.retained import RetainedFile, RetainedStateError
-from coldloop.session.time_base import TimeBase
+from coldloop.session.settings import TimeBase
 
 log = logging.getLogger("coldloop.plant")
 

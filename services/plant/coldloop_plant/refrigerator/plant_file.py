@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final
 
 from coldloop.config import load_configuration
 from coldloop.errors import ConfigurationError
-from coldloop.process.limits import InputLimits
+from coldloop.process.settings import InputLimits
 from coldloop_plant.cold_box.plant_file import (
     LISTING,
     BoxParameters,

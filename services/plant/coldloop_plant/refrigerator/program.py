@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coldloop.config import explained
 from coldloop.errors import ModelFileError
-from coldloop.kernels.named import plain_tuples
+from coldloop.kernels.intrinsics import plain_tuples
 from coldloop.process.model_file import FORMAT, read_document, write_document
 from coldloop.process.model_range import model_range
 from coldloop.registers.plant import StationAlarm, StationMode, StationSample, StationStatus, Surroundings

@@ -10,9 +10,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
-from coldloop.kernels.named import named
+from coldloop.kernels.intrinsics import borrowed, named
 from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, P1, TICK_S, V1
 from coldloop_plant.cold_box.physics import ColdBox
 from coldloop_plant.components.heat_exchanger import HeatExchanger

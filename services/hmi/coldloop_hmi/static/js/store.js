@@ -2,76 +2,159 @@
 import { fixedText, numberText, timeText } from "./numbers.js";
 import { isListed, qualityIn, worse } from "./quality.js";
 
-export const state = { catalog: null, me: null, values: {}, services: {}, stale: [], quality: {}, commands: 0, alarms: [], update: null, plant: { kind: "" }, deviation: "", tick: 0, heard: 0, refused: "" };
+/** @type {PageState} */
+export const state = /** @type {any} */ ({
+  catalog: null,
+  me: null,
+  values: {},
+  services: {},
+  stale: [],
+  quality: {},
+  commands: 0,
+  alarms: [],
+  update: null,
+  plant: { kind: "" },
+  deviation: "",
+  tick: 0,
+  heard: 0,
+  refused: "",
+});
+/** @type {((what: Change) => void)[]} */
 const listeners = [];
-const SILENT_MS = 1500, GIVEN_UP_MS = 5000, SEND_MS = 20000;
+const SILENT_MS = 1500,
+  GIVEN_UP_MS = 5000,
+  SEND_MS = 20000;
 
-export function onChange(listener) { listeners.push(listener); }
+/** @param {(what: Change) => void} listener */
+export function onChange(listener) {
+  listeners.push(listener);
+}
 
 // Changes are drawn once a frame: a slow browser takes all that has come and shows the newest, instead of each late.
-let changed = null, isBuilt = false;
-export function drawAll() { isBuilt = true; tell({ names: null, alarms: true, update: true }); }
+/** @type {Change | null} */
+let changed = null,
+  isBuilt = false;
+export function drawAll() {
+  isBuilt = true;
+  tell({ names: null, alarms: true, update: true });
+}
+/** @param {Change} what */
 function tell({ names, alarms, update }) {
   if (!isBuilt) return;
   if (changed === null) {
     changed = { names: new Set(), alarms: false, update: false };
-    if (document.hidden) setTimeout(draw); else requestAnimationFrame(draw);
+    if (document.hidden) setTimeout(draw);
+    else requestAnimationFrame(draw);
   }
   changed.names = names === null || changed.names === null ? null : new Set([...changed.names, ...names]);
-  changed.alarms ||= alarms; changed.update ||= update;
+  changed.alarms ||= alarms;
+  changed.update ||= update;
 }
 function draw() {
   const what = changed;
+  if (!what) return;
   changed = null;
-  if (state.heard) document.body.dataset.tick = state.tick;
+  if (state.heard) document.body.dataset.tick = String(state.tick);
   for (const listener of listeners) listener(what);
 }
 
+/** @param {Record<string, any>} message */
 export function take(message) {
   const reset = message.whole;
   if (reset) state.values = {};
   Object.assign(state.values, message.values);
-  Object.assign(state, { services: message.services, plant: message.plant, deviation: message.deviation, stale: message.stale, quality: message.quality, commands: message.commands, tick: message.tick, heard: performance.now() });
+  Object.assign(state, {
+    services: message.services,
+    plant: message.plant,
+    deviation: message.deviation,
+    stale: message.stale,
+    quality: message.quality,
+    commands: message.commands,
+    tick: message.tick,
+    heard: performance.now(),
+  });
   if ("alarms" in message) state.alarms = message.alarms;
   if ("update" in message) state.update = message.update;
   if ("replay" in message) state.replay = message.replay;
   answered();
-  tell({ names: reset ? null : new Set(Object.keys(message.values)), alarms: "alarms" in message, update: "update" in message });
+  tell({
+    names: reset ? null : new Set(Object.keys(message.values)),
+    alarms: "alarms" in message,
+    update: "update" in message,
+  });
 }
 
 // The page itself is silent: nothing of what it shows is current.
-export function pageIsSilent() { return performance.now() - state.heard > SILENT_MS; }
+export function pageIsSilent() {
+  return performance.now() - state.heard > SILENT_MS;
+}
 
-export function isStale(name) { return pageIsSilent() || isListed(state.stale, name); }
-export function qualityOf(name) { return worse(qualityIn(state.quality, name), pageIsSilent() ? "stale" : "good"); }
+/** @param {string} name */
+export function isStale(name) {
+  return pageIsSilent() || isListed(state.stale, name);
+}
+/** @param {string} name */
+export function qualityOf(name) {
+  return worse(qualityIn(state.quality, name), pageIsSilent() ? "stale" : "good");
+}
 
-// The title of the tab: what an operator has to know who looks at another one.
+/**
+ * The title of the tab: what an operator has to know who looks at another one.
+ * @param {{alarms: Alarm[], stale: boolean, mode: string}} now
+ */
 export function titleOf({ alarms, stale, mode }) {
   const active = alarms.filter((one) => one.active && ["unacknowledged", "acknowledged"].includes(one.state)).length;
-  const parts = [stale ? "NOT CURRENT" : "", active ? `${active} alarm${active === 1 ? "" : "s"}` : "", !stale && mode !== "MPC" ? mode : ""];
+  const parts = [
+    stale ? "NOT CURRENT" : "",
+    active ? `${active} alarm${active === 1 ? "" : "s"}` : "",
+    !stale && mode !== "MPC" ? mode : "",
+  ];
   return [...parts.filter(Boolean), "Coldloop"].join(" · ");
 }
 
-export function signal(name) { return state.catalog.signals[name] || null; }
+/**
+ * @param {string} name
+ * @returns {SignalAbout | null}
+ */
+export function signal(name) {
+  return state.catalog.signals[name] || null;
+}
 
 // Why there is no stream: an answer that says so is the server's, such as an expired login.
 async function why() {
-  state.refused = await ask("api/state").then(() => "", (error) => (error.status ? `The page's own server refuses: ${error.message}` : ""));
+  state.refused = await ask("api/state").then(
+    () => "",
+    (error) => (error.status ? `The page's own server refuses: ${error.message}` : ""),
+  );
   answered();
 }
-let answered = null;
-const answer = new Promise((resolve) => { answered = resolve; });
+/** @type {(value?: unknown) => void} */
+let answered = () => {};
+const answer = new Promise((resolve) => {
+  answered = resolve;
+});
 
 // A connection that has gone silent, as after a server's loss of power, reports no error: it is closed. Ends with the
 // first message, or an error.
 export function connect() {
-  let source = null, begun = 0;
+  let /** @type {any} */ source = null,
+    begun = 0;
   const open = () => {
     begun = performance.now();
     source = new EventSource("api/stream");
-    const own = source, again = () => { own.close(); if (own === source) { source = null; setTimeout(open, 500); } };
+    const own = source,
+      again = () => {
+        own.close();
+        if (own === source) {
+          source = null;
+          setTimeout(open, 500);
+        }
+      };
     own.onmessage = (event) => take(JSON.parse(event.data));
-    own.onerror = () => { again(); why(); };
+    own.onerror = () => {
+      again();
+      why();
+    };
     own.giveUp = again;
   };
   open();
@@ -82,25 +165,45 @@ export function connect() {
   return answer;
 }
 
+/**
+ * @param {string} name
+ * @param {string} [as]
+ * @returns {string}
+ */
 export function valueText(name, as) {
-  const value = state.values[name], about = signal(name);
+  const value = state.values[name],
+    about = signal(name);
   if (value === undefined || value === null) return "–";
   const tick = state.catalog.tick_s;
   if (as === "time") return timeText(value * tick);
   if (as === "ticks") return `${fixedText(value * tick, 2)} s`;
   if (as === "pace") return paceText(value);
-  if (about && about.words[value] !== undefined) return as === "mode" ? about.words[value].toUpperCase() : about.words[value];
-  if (about && about.counts) return about.counts === "time" ? `${timeText(value * tick)} (tick ${value})` : `${fixedText(value * tick, 2)} s (${value} ticks)`;
+  if (about && about.words[value] !== undefined)
+    return as === "mode" ? about.words[value].toUpperCase() : about.words[value];
+  if (about?.counts)
+    return about.counts === "time"
+      ? `${timeText(value * tick)} (tick ${value})`
+      : `${fixedText(value * tick, 2)} s (${value} ticks)`;
   const text = signalText(value, about);
-  return about && about.unit ? `${text} ${about.unit}` : text;
+  return about?.unit ? `${text} ${about.unit}` : text;
 }
 
-// A value with the digits of its signal, without its unit.
+/**
+ * A value with the digits of its signal, without its unit.
+ * @param {any} value
+ * @param {SignalAbout | null} about
+ * @returns {string}
+ */
 export function signalText(value, about) {
   if (typeof value !== "number" || !about) return String(value);
-  return about.decimals !== null ? fixedText(value, about.decimals) : about.digits ? numberText(value, about.digits) : String(value);
+  return about.decimals !== null
+    ? fixedText(value, about.decimals)
+    : about.digits
+      ? numberText(value, about.digits)
+      : String(value);
 }
 
+/** @param {number} value */
 function paceText(value) {
   const factor = numberText(value);
   if (!state.values["plant.pace.session"]) return "no session";
@@ -108,6 +211,10 @@ function paceText(value) {
   return state.values["plant.pace.paused"] ? `paused (× ${factor})` : `× ${factor}`;
 }
 
+/**
+ * @param {string} path
+ * @returns {Promise<any>}
+ */
 export async function ask(path) {
   const answer = await fetch(path);
   const document_ = await answer.json();
@@ -115,33 +222,23 @@ export async function ask(path) {
   return document_;
 }
 
+/**
+ * @param {string} path
+ * @param {object} body
+ * @returns {Promise<any>}
+ */
 export async function send(path, body) {
-  const answer = await fetch(path, { method: "POST", signal: AbortSignal.timeout(SEND_MS), headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+  const answer = await fetch(path, {
+    method: "POST",
+    signal: AbortSignal.timeout(SEND_MS),
+    headers: { "Content-Type": "application/json" },
+    body: JSON.stringify(body),
+  });
   const document_ = await answer.json();
-  if (!answer.ok) throw Object.assign(new Error(document_.error || answer.statusText), { status: answer.status, preview: document_.token ? document_ : null });
+  if (!answer.ok)
+    throw Object.assign(new Error(document_.error || answer.statusText), {
+      status: answer.status,
+      preview: document_.token ? document_ : null,
+    });
   return document_;
-}
-
-export function element(name, attributes = {}, ...children) {
-  const made = document.createElement(name);
-  for (const [key, value] of Object.entries(attributes)) {
-    if (key === "text") made.textContent = value; else if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
-    else if (value === true) made.setAttribute(key, ""); else if (value !== false && value !== undefined) made.setAttribute(key, value);
-  }
-  made.append(...children);
-  return made;
-}
-
-const SVG = "http://www.w3.org/2000/svg";
-export function shape(name, attributes = {}, text) {
-  const made = document.createElementNS(SVG, name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  if (text !== undefined) made.textContent = text;
-  return made;
-}
-
-// Text in which "tau_u" and "q_min" are set with an index.
-export function indexed(text) {
-  return text.replaceAll("tau_u", "τ_u").split(/(_\{[^}]*\}|(?<=[A-Za-zτĴ⁺])_[A-Za-z]+)/).filter(Boolean).map((part) =>
-    part[0] === "_" ? element("sub", { text: part.slice(1).replace(/[{}]/g, "") }) : part);
 }

@@ -1,0 +1,373 @@
+"""Rules of the updating period: what they decide by, the three of ours, somebody else's, and which one is used.
+
+A rule decides q(t_{k+1}), the number of the next period in the ladder of periods; `PlcBudget` knows the ladder, and how
+many iterations of the solver fit into each. A rule is a NamedTuple of its parameters and a kernel that is registered
+for it, which takes single and double precision alike.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Final, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+from numba.extending import overload
+from numpy.typing import NDArray
+
+from coldloop.kernels.compiled import kernel
+from coldloop.kernels.intrinsics import Implementations
+from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
+from coldloop_optimizer_plc.computing_settings import PlcBudget
+from coldloop_optimizer_plc.outside import Part, in_its_name, made
+from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real
+from coldloop_optimizer_plc.settings import ProgramSettings
+
+Array = NDArray[np.float64]
+
+MEMORY: Final = 1
+"""Numbers that a rule may remember from one period to the next, in an array that begins with zeros."""
+
+
+# -- what rules decide by: section II of the paper ---------------------------------------------------------------------
+
+
+class Observation(NamedTuple):
+    """What is known at t_{k+1} of the period that ends there; costs are positive (Assumption 1 of the paper)."""
+
+    q: int
+    """q(t_k), the number of the period in the ladder."""
+    iterations: int
+    """Those that it held: for the increments per iteration."""
+    period_s: float
+    """t_{k+1} - t_k."""
+    effective_before: float
+    """J_k: p(t_k) at the state reached at t_k."""
+    hot_start: float
+    """J+_k: the shifted profile at the state predicted for t_{k+1}."""
+    last_but_one: float
+    """J after all iterations but one, at the predicted state."""
+    delivered: float
+    """Ĵ_{k+1}: after all iterations, at the predicted state."""
+    effective: float
+    """J_{k+1}: p(t_{k+1}) at the state reached at t_{k+1}."""
+
+
+class Assessment(NamedTuple):
+    """The quantities of Algorithm 1. `gamma` is the gradient whose sign decides; n are iterations, the paper's q."""
+
+    efficiency: float
+    """E^r."""
+    mismatch: float
+    """D^r."""
+    contraction: float
+    """K^r = E^r D^r."""
+    mismatch_increment: float
+    """Delta D^r / Delta n."""
+    efficiency_increment: float
+    """Delta E^r / Delta n."""
+    contraction_increment: float
+    """Delta K^r / Delta n."""
+    response_increment: float
+    """Delta t_r / Delta n; infinite at K^r = 1, where the response time is."""
+    gamma: float
+
+
+def assess(observation: Observation) -> Assessment:
+    """Compute the quantities of Algorithm 1 as printed, in the floating-point type of the costs."""
+    o = observation
+    real = type(o.effective)
+    zero, one, n = real(0.0), real(1.0), real(o.iterations)
+    E = o.delivered / o.hot_start
+    D = (o.effective * o.hot_start) / (o.delivered * o.effective_before)
+    K = E * D
+    dD = (D - one) / n
+    dE = (o.delivered - o.last_but_one) / o.hot_start
+    dK = E * dD + D * dE
+    log_K = real(math.log(K))
+    dt_r = (-log_K + n / K * dK) / (log_K * log_K) if log_K != zero else real(math.copysign(real(math.inf), dK))
+    return Assessment(E, D, K, dD, dE, dK, dt_r, dK if one <= K else dt_r)
+
+
+assessed = kernel(assess)
+
+
+# -- what a rule is ----------------------------------------------------------------------------------------------------
+
+
+class UpdatingRule(Protocol):
+    """Parameters of a rule; a kernel is registered for their type."""
+
+    @property
+    def first(self) -> int:
+        """q(t_0)."""
+
+    @property
+    def status(self) -> UpdatingRuleStatus:
+        """The rule and its parameters, as registers show them."""
+
+    def after_interruption(self) -> int:
+        """Return the q of the period that begins with a load step."""
+
+
+Decision = Callable[[Any, Array, Observation, Assessment], int]
+D = TypeVar("D", bound=Decision)
+DECISIONS: Final[Implementations[Decision]] = Implementations("decide_by")
+"""The kernel of each rule."""
+
+
+def decides_by(rule: type) -> Callable[[D], D]:
+    """Register a kernel as what decides by rules of this type."""
+
+    def register(decision: D) -> D:
+        DECISIONS[rule] = decision
+        return decision
+
+    return register
+
+
+def decide_by(rule: Any, memory: Array, observation: Observation, assessment: Assessment) -> int:  # noqa: ANN401
+    """Return q(t_{k+1}) by the kernel that is registered for a rule, which may overwrite its memory (1,)."""
+    return DECISIONS[type(rule)](rule, memory, observation, assessment)
+
+
+@overload(decide_by, jit_options={"error_model": "numpy"}, strict=False)
+def _decide_by(rule: Any, memory: Any, observation: Any, assessment: Any) -> Any:  # noqa: ANN401, ARG001 types of numba
+    decide = DECISIONS[rule.instance_class]
+    return lambda rule, memory, observation, assessment: decide(rule, memory, observation, assessment)  # noqa: PLW0108
+
+
+# -- the rules ---------------------------------------------------------------------------------------------------------
+
+
+class FixedPeriod(NamedTuple):
+    """Always the same q: what adaptive periods are compared with."""
+
+    q: int
+
+    @property
+    def first(self) -> int:
+        """The fixed one."""
+        return self.q
+
+    @property
+    def status(self) -> UpdatingRuleStatus:
+        """The fixed one."""
+        return UpdatingRuleStatus(UpdatingRuleKind.FIXED, self.q, self.q, self.q)
+
+    def after_interruption(self) -> int:
+        """Return the fixed one."""
+        return self.q
+
+
+@decides_by(FixedPeriod)
+@kernel
+def decide_fixed_period(rule: FixedPeriod, memory: Array, o: Observation, a: Assessment) -> int:  # noqa: ARG001
+    """Return the fixed one."""
+    return rule.q
+
+
+class Algorithm1(NamedTuple):
+    """The paper's rule as printed (section II): one step of `delta` down Gamma, projected on {q_min, ..., q_max}."""
+
+    q_first: int
+    q_min: int
+    q_max: int
+    delta: int
+
+    @property
+    def first(self) -> int:
+        """q(t_0)."""
+        return self.q_first
+
+    @property
+    def status(self) -> UpdatingRuleStatus:
+        """Its four parameters."""
+        return UpdatingRuleStatus(UpdatingRuleKind.ALGORITHM_1, self.q_first, self.q_min, self.q_max, self.delta)
+
+    def after_interruption(self) -> int:
+        """Return q(t_0): what was learnt of the problem before the step says nothing of the one after."""
+        return self.q_first
+
+
+@decides_by(Algorithm1)
+@kernel
+def decide_algorithm_1(rule: Algorithm1, memory: Array, o: Observation, a: Assessment) -> int:  # noqa: ARG001
+    """Return max(q_min, min(q_max, q - delta sign(Gamma)))."""
+    zero = type(a.gamma)(0.0)
+    sign = int(a.gamma > zero) - int(a.gamma < zero)
+    return max(rule.q_min, min(rule.q_max, o.q - rule.delta * sign))
+
+
+USUAL: Final = 0
+"""Place of the usual size of |ln K| in the memory."""
+
+
+class ContractionRule(NamedTuple):
+    """Algorithm 1 with a dead band, that rests at its shortest period; the default of the cold box.
+
+    The cost contracts from J_k to J_{k+1} by K. Where |ln K| is within `band` times its usual size, it says nothing,
+    and q goes down by one to `q_rest`. Beyond that, q goes up by one where the gradient Gamma of the response time asks
+    for a longer period, and down by one where it does not. The usual size is the median of |ln K|, followed by small
+    steps up and down: in quiet it is the noise of the measured contraction (`docs/updating-period.md`). The last three
+    parameters have the floating-point type of the costs.
+    """
+
+    q_rest: int
+    q_max: int
+    band: float
+    """Usual sizes of |ln K| up to which it says nothing."""
+    least: float
+    """Least usual size, where it begins."""
+    change: float
+    """Share by which the usual size changes in a period."""
+
+    @property
+    def first(self) -> int:
+        """The largest q."""
+        return self.q_max
+
+    @property
+    def status(self) -> UpdatingRuleStatus:
+        """The two numbers that q moves between."""
+        return UpdatingRuleStatus(UpdatingRuleKind.CONTRACTION, self.q_max, self.q_rest, self.q_max)
+
+    def after_interruption(self) -> int:
+        """Return the largest q: a new load is answered by one longer solve."""
+        return self.q_max
+
+
+@decides_by(ContractionRule)
+@kernel
+def decide_contraction(rule: ContractionRule, memory: Array, o: Observation, a: Assessment) -> int:
+    """Return q(t_{k+1}): about a dozen operations, one of them a logarithm."""
+    zero, one = memory.dtype.type(0.0), memory.dtype.type(1.0)
+    usual = max(memory[USUAL], rule.least)
+    size = abs(math.log(o.effective / o.effective_before))
+    memory[USUAL] = usual * (one + rule.change) if size > usual else usual * (one - rule.change)
+    longer = size > rule.band * usual and a.gamma < zero
+    return min(o.q + 1, rule.q_max) if longer else max(min(o.q - 1, rule.q_max), rule.q_rest)
+
+
+class OutsideDecision(Protocol):
+    """What an entry point of the group `coldloop.rules` makes for each session; it is deterministic.
+
+    It may have `after_interruption()`, too: the q of a period that begins with a load step, which else is the first.
+    """
+
+    def __init__(self, periods: Sequence[int]) -> None:
+        """Begin with the ladder: updating periods in ticks, rising. Their numbers q count from 1."""
+
+    def first(self) -> int:
+        """Return q(t_0)."""
+
+    def decide(self, observation: Observation, assessment: Assessment) -> int:
+        """Return q(t_{k+1})."""
+
+
+class OutsideRule:
+    """One of these as a rule: what is no number of a period leaves q as it is, at a beginning at the longest."""
+
+    def __init__(self, name: str, budget: PlcBudget) -> None:
+        self.name, self._most = name, len(budget.ladder)
+        self._rule: OutsideDecision = made(Part.RULE, name, budget.ladder)
+        self.first = self._asked("first", otherwise=self._most)
+
+    @property
+    def status(self) -> UpdatingRuleStatus:
+        """The ladder that it may use."""
+        return UpdatingRuleStatus(UpdatingRuleKind.OUTSIDE, self.first, 1, self._most)
+
+    def after_interruption(self) -> int:
+        """Return the q of the period that begins with a load step."""
+        return self._asked("after_interruption", "first", otherwise=self._most)
+
+    def decide(self, o: Observation, a: Assessment) -> int:
+        """Return q(t_{k+1}).
+
+        Raises:
+            ConfigurationError: The rule raises, or returns no number.
+        """
+        return self._asked("decide", given=(o, a), otherwise=o.q)
+
+    def _asked(self, *names: str, given: Sequence[object] = (), otherwise: int) -> int:
+        """Return what the first method says that there is; to look for it runs code of others, too."""
+        with in_its_name(Part.RULE, self.name):
+            name = next((each for each in names if hasattr(self._rule, each)), names[-1])
+            q = float(getattr(self._rule, name)(*given))
+        return int(q) if q.is_integer() and 1 <= q <= self._most else otherwise
+
+
+@decides_by(OutsideRule)
+def decide_outside(rule: OutsideRule, memory: Array, o: Observation, a: Assessment) -> int:  # noqa: ARG001 it has its own
+    """Return q(t_{k+1})."""
+    return rule.decide(o, a)
+
+
+# -- which one is used -------------------------------------------------------------------------------------------------
+
+
+FIXED_PERIOD: Final = int(UpdatingRuleKind.FIXED)
+ALGORITHM_1: Final = int(UpdatingRuleKind.ALGORITHM_1)
+
+
+class Rule(NamedTuple):
+    """The rules in the order of `UpdatingRuleKind`, of which one decides: what is compiled for one serves all."""
+
+    kind: int
+    """An `UpdatingRuleKind`."""
+    fixed_period: FixedPeriod
+    algorithm_1: Algorithm1
+    contraction: ContractionRule
+
+    @property
+    def chosen(self) -> UpdatingRule:
+        """The rule that decides."""
+        rules: tuple[UpdatingRule, ...] = self[1:]
+        return rules[self.kind]
+
+    @property
+    def first(self) -> int:
+        """q(t_0)."""
+        return self.chosen.first
+
+    @property
+    def status(self) -> UpdatingRuleStatus:
+        """The rule and its parameters, as registers show them."""
+        return self.chosen.status
+
+    def after_interruption(self) -> int:
+        """Return the q of the period that begins with a load step."""
+        return self.chosen.after_interruption()
+
+
+@decides_by(Rule)
+@kernel
+def decide_chosen(rule: Rule, memory: Array, o: Observation, a: Assessment) -> int:
+    """Return q(t_{k+1})."""
+    if rule.kind == FIXED_PERIOD:
+        return rule.fixed_period.q
+    if rule.kind == ALGORITHM_1:
+        return decide_algorithm_1(rule.algorithm_1, memory, o, a)
+    return decide_contraction(rule.contraction, memory, o, a)
+
+
+def make_rule(settings: ProgramSettings, budget: PlcBudget, fixed_ticks: int, real: Real = DOUBLE) -> UpdatingRule:
+    """Return the rule that the settings name.
+
+    Args:
+        settings: Of the program.
+        budget: Knows the q of a fixed period.
+        fixed_ticks: Fixed updating period; 0 is adaptive.
+        real: Floating-point type of the costs.
+
+    Raises:
+        ConfigurationError: There is no such rule, or it cannot be made.
+    """
+    if settings.outside.rule and not fixed_ticks:
+        return OutsideRule(settings.outside.rule, budget)
+    adaptive, own = settings.adaptive, settings.adaptive.contraction
+    return Rule(
+        FIXED_PERIOD if fixed_ticks else int(UpdatingRuleKind[adaptive.rule.name]),  # one type, compiled once
+        FixedPeriod(budget.q(fixed_ticks)),
+        Algorithm1(adaptive.q_first, adaptive.q_min, adaptive.q_max, adaptive.delta),
+        ContractionRule(own.q_rest, own.q_max, real(own.band), real(own.least), real(own.change)),
+    )
