@@ -10,7 +10,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 
 from coldloop_rig.figures.plot import COLOURS, DASHES, legend_above
-from coldloop_rig.studies.drawing import panels
+from coldloop_studies.drawing import panels
 
 PANELS = (
     ("temperature (K)", ("T1", "T2", "T5", "T6", "T9"), (3.0, 400.0)),

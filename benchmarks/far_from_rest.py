@@ -21,7 +21,7 @@ from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.program import PlantProgram
 from coldloop_plant.settings import PlantSettings
 from coldloop_rig.figures.plot import COLOURS
-from coldloop_rig.studies.drawing import panels
+from coldloop_studies.drawing import panels
 
 HEADER = own_header(DEFAULT_MODEL_FILE)
 COLUMNS = ("minute", "L1", "T1", "T5", "P12", "P11", "lost", "imbalance")

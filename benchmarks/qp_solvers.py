@@ -27,7 +27,7 @@ from coldloop_plant.load import find_load
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.results.recording import Recorder
-from coldloop_rig.studies.settings import settings_of
+from coldloop_studies.settings import settings_of
 
 Array = NDArray[np.float64]
 

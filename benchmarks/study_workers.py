@@ -7,10 +7,10 @@ from pathlib import Path
 
 from coldloop.process.cold_box import TICK_S
 from coldloop_rig.durations import duration
-from coldloop_rig.studies import STUDIES
-from coldloop_rig.studies.execution import Workers
-from coldloop_rig.studies.results import conduct
-from coldloop_rig.studies.study import StudyOptions
+from coldloop_studies.catalogue import STUDIES
+from coldloop_studies.execution import Workers
+from coldloop_studies.results import conduct
+from coldloop_studies.study import StudyOptions
 
 
 def seconds(workers: int, options: StudyOptions) -> float:

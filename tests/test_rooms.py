@@ -14,8 +14,8 @@ FLOORS = {
     "services/plant/coldloop_plant": [["helium"], ["components"], ["cold_box"], ["refrigerator", "rack"], ["own"]],
     "services/optimizer_plc/coldloop_optimizer_plc": [["qp"], ["solvers"]],
     "rig/coldloop_rig": [
-        ["results"], ["figures", "cosim"], ["plc_sizing"], ["runs", "plc_export"], ["studies", "chaos", "process_file"],
-        ["live"], ["testing", "report"], ["cli"],
+        ["results"], ["figures", "cosim"], ["plc_sizing"], ["runs"], ["chaos", "process_file"], ["live"], ["testing"],
+        ["cli"],
     ],
 }  # fmt: skip
 """Rooms from the ground up. A room uses those below it; files beside the rooms are not looked at."""

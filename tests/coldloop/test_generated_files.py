@@ -15,8 +15,8 @@ from coldloop.registers.common import IDENTITY_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, f32
 from coldloop.table import TIME, read_table
 from coldloop.text_file import held_file, read_text
+from coldloop_export.st_printer import LONGEST, Names
 from coldloop_rig.cli.registers import exported
-from coldloop_rig.plc_export.st_printer import LONGEST, Names
 
 one_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 ENCODINGS: Final = {

@@ -47,7 +47,7 @@ def test_the_table_of_paths_is_what_the_parsers_say() -> None:
 
 def test_the_map_from_the_paper_to_the_code_names_what_is_there() -> None:
     rows = re.findall(r"^\| I{1,3}.*|^\| [IV]+-.*", (ROOT / "docs" / "science.md").read_text("utf-8"), re.MULTILINE)
-    named = [path for row in rows for path in re.findall(r"`((?:services|shared|rig|tests)/[^`]+)`", row)]
+    named = [path for row in rows for path in re.findall(r"`((?:services|shared|rig|beside|tests)/[^`]+)`", row)]
     assert len(named) > 30
     assert [path for path in named if not (ROOT / path).exists()] == []
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from coldloop_rig.cli import COMMANDS, USES, make_parser
+from coldloop_rig.cli import USES, command_names, make_parser
 from coldloop_rig.cli.listings import _subparsers
 from coldloop_rig.text_tables import markdown_table
 
@@ -47,7 +47,7 @@ class PathOption(NamedTuple):
 
 def path_options() -> list[PathOption]:
     """Return all of them; those that subcommands accept again are of the command."""
-    return [each for name in COMMANDS for each in _of(_subparsers(make_parser(name))[name], (name,))]
+    return [each for name in command_names() for each in _of(_subparsers(make_parser(name))[name], (name,))]
 
 
 def _of(parser: argparse.ArgumentParser, command: tuple[str, ...]) -> Iterator[PathOption]:

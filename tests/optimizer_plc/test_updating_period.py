@@ -174,7 +174,7 @@ def test_multiplying_all_costs_by_a_constant_changes_nothing(observation: Observ
 
 @given(observation=observations)
 def test_the_response_increment_is_the_derivative_of_the_response_time(observation: Observation) -> None:
-    """t_r(q) = -q / log K(q), with K moving at its increment (`rig/coldloop_rig/report/slips.md`, ruling 10)."""
+    """t_r(q) = -q / log K(q), with K moving at its increment (`studies/slips.md`, ruling 10)."""
     a, q = assess(observation), observation.iterations
     if not 1e-6 < a.contraction < 0.99:
         return

@@ -3,7 +3,7 @@
 import pytest
 
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop_rig.plc_export.golden import GoldenVectors, paper_settings, record
+from coldloop_export.golden import GoldenVectors, paper_settings, record
 
 
 @pytest.fixture(scope="package")

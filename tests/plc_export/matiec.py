@@ -9,7 +9,7 @@ from typing import Final
 
 import pytest
 
-from coldloop_rig.plc_export.tree import filled
+from coldloop_export.tree import filled
 
 COMPILER: Final = shutil.which("iec2c")
 MAIN: Final = """

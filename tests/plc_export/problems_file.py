@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop_rig.plc_export.c_files import OdeExport
-from coldloop_rig.plc_export.golden import ITERATIONS, GoldenVector, paper_settings, record
-from coldloop_rig.plc_export.kernels import PER_PROBLEM
+from coldloop_export.c_files import OdeExport
+from coldloop_export.golden import ITERATIONS, GoldenVector, paper_settings, record
+from coldloop_export.kernels import PER_PROBLEM
 
 GIVEN = (*PER_PROBLEM, "guess")
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from coldloop.config import load_configuration
 from coldloop.registers.control_plc import Update
-from coldloop_rig.plc_export.golden import SINGLE, GoldenUpdate, UpdateRecorder
+from coldloop_export.golden import SINGLE, GoldenUpdate, UpdateRecorder
 from coldloop_rig.settings import Settings
 from tests.harness.records import as_transmitted
 

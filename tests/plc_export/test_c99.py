@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from coldloop_export.c_files import OdeExport
+from coldloop_export.golden import ITERATIONS, GoldenVector, GoldenVectors
+from coldloop_export.kernels import PER_PROBLEM
 from coldloop_optimizer_plc.qp.costs import matrices_of
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.interface import Costs
 from coldloop_optimizer_plc.solvers.ode import Flow, OdeMethod, solve
-from coldloop_rig.plc_export.c_files import OdeExport
-from coldloop_rig.plc_export.golden import ITERATIONS, GoldenVector, GoldenVectors
-from coldloop_rig.plc_export.kernels import PER_PROBLEM
 from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, compiled, output
 
 REAL = re.compile(r"(?<=[ {])-?\d\.\d{9}e[+-]\d\df")

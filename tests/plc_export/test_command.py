@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from coldloop_export import folder as plc_folder
 from coldloop_rig import cli
-from coldloop_rig.plc_export import folder as plc_folder
 from tests.harness.processes import Processes
 from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, compiled, output
 from tests.plc_export.st_interpreter import Machine

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from coldloop_rig.plc_export.golden import GoldenVectors
-from coldloop_rig.plc_export.st_files import StructuredTextExport
+from coldloop_export.golden import GoldenVectors
+from coldloop_export.st_files import StructuredTextExport
 from tests.plc_export.matiec import NEEDS_MATIEC, self_test
 
 

@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coldloop.config import load_configuration
+from coldloop_export.counting import CountedProgram, Counter, counted_iterations, counted_updates, counter_of
+from coldloop_export.golden import ITERATIONS, SINGLE, GoldenVectors
+from coldloop_export.kernels import OdeProgram
 from coldloop_optimizer_plc.computing_settings import OdeSettings
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.ode import ode_solver
-from coldloop_rig.plc_export.counting import CountedProgram, Counter, counted_iterations, counted_updates, counter_of
-from coldloop_rig.plc_export.golden import ITERATIONS, SINGLE, GoldenVectors
-from coldloop_rig.plc_export.kernels import OdeProgram
 from coldloop_rig.plc_sizing import operations
 from coldloop_rig.plc_sizing.budget import problem_of
 from coldloop_rig.plc_sizing.exported import cost_text, misfits, read_cost

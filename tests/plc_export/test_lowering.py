@@ -12,12 +12,12 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop_rig.plc_export.kernels import leaves
-from coldloop_rig.plc_export.st_lowering import Lowering, Record
-from coldloop_rig.plc_export.st_pausing import one_iteration_a_call
-from coldloop_rig.plc_export.st_printer import StructuredTextPrinter, block_name, memory
-from coldloop_rig.plc_export.statements import Program
-from coldloop_rig.plc_export.tree import RecordType, UnfitKernelError, type_of
+from coldloop_export.kernels import leaves
+from coldloop_export.st_lowering import Lowering, Record
+from coldloop_export.st_pausing import one_iteration_a_call
+from coldloop_export.st_printer import StructuredTextPrinter, block_name, memory
+from coldloop_export.statements import Program
+from coldloop_export.tree import RecordType, UnfitKernelError, type_of
 from tests.plc_export.st_interpreter import Machine
 
 Array = NDArray[np.float32]
@@ -113,9 +113,7 @@ class Exported:
             listed = ", ".join(map(printer.number, constants["scale", "weights"]))
             values["cl_weights"] = f"cl_reals_{N} := [{listed}]"
         globals_ = "".join(f"{name} : {value};" for name, value in values.items())
-        functions = (
-            files("coldloop_rig.plc_export").joinpath("structured_text/functions.st").read_text(encoding="ascii")
-        )
+        functions = files("coldloop_export").joinpath("structured_text/functions.st").read_text(encoding="ascii")
         configuration = f"CONFIGURATION c VAR_GLOBAL {globals_} END_VAR END_CONFIGURATION"
         self.machine = Machine(printer.types(), functions, blocks, configuration)
         self.instance = self.machine.instance(block_name(self.block))

@@ -18,11 +18,11 @@ from coldloop.process.settings import InputLimits, RateReference
 from coldloop.registers.control_plc import Verdict
 from coldloop_control_plc.guard import OutputGuard
 from coldloop_control_plc.output_limits import begin
-from coldloop_rig.plc_export.c_files import GuardExport
-from coldloop_rig.plc_export.counting import counted_guard, counted_longest
-from coldloop_rig.plc_export.golden import Call, GoldenCall, Judgement, golden_calls
-from coldloop_rig.plc_export.kernels import GuardKernels
-from coldloop_rig.plc_export.st_files import GuardText
+from coldloop_export.c_files import GuardExport
+from coldloop_export.counting import counted_guard, counted_longest
+from coldloop_export.golden import Call, GoldenCall, Judgement, golden_calls
+from coldloop_export.kernels import GuardKernels
+from coldloop_export.st_files import GuardText
 from tests.harness.records import Row
 from tests.plc_export import matiec
 from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, SANITIZED, STRICT, compiled, output, write

@@ -7,14 +7,14 @@ from hypothesis import strategies as st
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
-from coldloop_rig.plc_export import st_pausing
-from coldloop_rig.plc_export.golden import GoldenVector, GoldenVectors, answered
-from coldloop_rig.plc_export.st_files import WORK, OptimizerText, StructuredTextExport
-from coldloop_rig.plc_export.st_lowering import GIVEN, Lowering
-from coldloop_rig.plc_export.st_pausing import BUSY, PIECE, Pausing
-from coldloop_rig.plc_export.st_printer import StructuredTextPrinter, block_name, interface_names
-from coldloop_rig.plc_export.statements import Program
-from coldloop_rig.plc_export.tree import UnfitKernelError, template, type_of
+from coldloop_export import st_pausing
+from coldloop_export.golden import GoldenVector, GoldenVectors, answered
+from coldloop_export.st_files import WORK, OptimizerText, StructuredTextExport
+from coldloop_export.st_lowering import GIVEN, Lowering
+from coldloop_export.st_pausing import BUSY, PIECE, Pausing
+from coldloop_export.st_printer import StructuredTextPrinter, block_name, interface_names
+from coldloop_export.statements import Program
+from coldloop_export.tree import UnfitKernelError, template, type_of
 from tests.plc_export.paused_kernels import KERNELS, S, Z, five_hundred
 from tests.plc_export.recorded_optimizers import recorded_updates, recorder
 from tests.plc_export.st_interpreter import Machine

@@ -5,8 +5,8 @@ import re
 import numpy as np
 
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop_rig.plc_export.folder import problem_layout
-from coldloop_rig.plc_export.golden import paper_settings
+from coldloop_export.folder import problem_layout
+from coldloop_export.golden import paper_settings
 from coldloop_rig.plc_sizing.budget import problem_of
 
 PROBLEM, PREDICTION = problem_of(paper_settings(DEFAULT_MODEL_FILE))

@@ -14,10 +14,10 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop_rig.plc_export import st_printer
-from coldloop_rig.plc_export.st_files import state_types
-from coldloop_rig.plc_export.st_lowering import Lowering, Record
-from coldloop_rig.plc_export.st_printer import (
+from coldloop_export import st_printer
+from coldloop_export.st_files import state_types
+from coldloop_export.st_lowering import Lowering, Record
+from coldloop_export.st_printer import (
     Constants,
     StructuredTextPrinter,
     configuration,
@@ -26,8 +26,8 @@ from coldloop_rig.plc_export.st_printer import (
     section,
     types_in,
 )
-from coldloop_rig.plc_export.statements import Program
-from coldloop_rig.plc_export.tree import UnfitKernelError, template, type_of
+from coldloop_export.statements import Program
+from coldloop_export.tree import UnfitKernelError, template, type_of
 from tests.plc_export.st_interpreter import Machine
 
 Array = NDArray[np.float32]

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop_rig.plc_export import st_printer
-from coldloop_rig.plc_export.golden import ITERATIONS, GoldenVector, GoldenVectors
-from coldloop_rig.plc_export.kernels import PER_PROBLEM
-from coldloop_rig.plc_export.st_files import WORK, StructuredTextExport, sum_of
-from coldloop_rig.plc_export.st_printer import LONGEST, Names, StructuredTextPrinter, identifier
-from coldloop_rig.plc_export.tree import UnfitKernelError
+from coldloop_export import st_printer
+from coldloop_export.golden import ITERATIONS, GoldenVector, GoldenVectors
+from coldloop_export.kernels import PER_PROBLEM
+from coldloop_export.st_files import WORK, StructuredTextExport, sum_of
+from coldloop_export.st_printer import LONGEST, Names, StructuredTextPrinter, identifier
+from coldloop_export.tree import UnfitKernelError
 from tests.plc_export.st_interpreter import Machine
 
 NUMBER = re.compile(r"(REAL#|-)\d\.\d{9}E[+-]\d\d")

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coldloop_rig.plc_export.statements import Program
-from coldloop_rig.plc_export.tree import UnfitKernelError, type_of
+from coldloop_export.statements import Program
+from coldloop_export.tree import UnfitKernelError, type_of
 
 HEAD = """
 import math

@@ -13,9 +13,9 @@ from coldloop.config import load_configuration
 from coldloop.errors import UsageError
 from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, Update
+from coldloop_export.c_files import OptimizerExport
+from coldloop_export.golden import SINGLE, UpdateRecorder
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_rig.plc_export.c_files import OptimizerExport
-from coldloop_rig.plc_export.golden import SINGLE, UpdateRecorder
 from coldloop_rig.settings import Settings
 from tests.harness.records import as_transmitted
 from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, SANITIZED, compiled, output, write

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from coldloop.process.settings import InputLimits
+from coldloop_export.golden import golden_calls, integers_of
+from coldloop_export.kernels import GuardKernels
+from coldloop_export.plcopen import plcopen_xml
+from coldloop_export.st_files import GuardText, OptimizerText, register_table
+from coldloop_export.st_printer import LARGEST_LIST, StructuredTextPrinter
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_rig.plc_export.golden import golden_calls, integers_of
-from coldloop_rig.plc_export.kernels import GuardKernels
-from coldloop_rig.plc_export.plcopen import plcopen_xml
-from coldloop_rig.plc_export.st_files import GuardText, OptimizerText, register_table
-from coldloop_rig.plc_export.st_printer import LARGEST_LIST, StructuredTextPrinter
 from tests.harness.records import CONTROL_MAP
 from tests.plc_export.matiec import NEEDS_MATIEC, joined, self_test
 from tests.plc_export.recorded_optimizers import OPTIMISERS, disturbed_updates, recorded_updates, recorder

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from coldloop.errors import StudyError
 from coldloop_optimizer_plc.qp.design import ControlDesign
-from coldloop_rig.studies.adaptive_gain import over_best_fixed
-from coldloop_rig.studies.instants import Judged, candidates, drawn, losses, proposed, spread
+from coldloop_rig.plc_sizing.adaptive_gain import over_best_fixed
+from coldloop_studies.instants import Judged, candidates, drawn, losses, proposed, spread
 
 
 @given(st.integers(1, 30), st.integers(1, 400))

@@ -18,11 +18,12 @@ from coldloop_optimizer_plc.qp.design import Preset
 from coldloop_optimizer_plc.settings import SolverName
 from coldloop_plant.load import NAMED
 from coldloop_rig.chaos.plan import shipped_plans
-from coldloop_rig.cli import COMMANDS, EXTRAS, make_parser
+from coldloop_rig.cli import EXTRAS, command_names, make_parser
 from coldloop_rig.cli.commands import options
 from coldloop_rig.cli.commands.rig import COMMANDS as RIG_COMMANDS
 from coldloop_rig.cli.registers import EXPORTS, FORMATS
-from coldloop_rig.studies import APART, STUDIES
+from coldloop_studies import commands
+from coldloop_studies.catalogue import APART, STUDIES
 from tests.harness.processes import Ended, Processes
 from tests.harness.records import MAPS
 
@@ -56,7 +57,7 @@ def test_the_names_that_are_offered_are_those_that_exist() -> None:
     assert sorted(options.SERVICES) == sorted(MAPS)
     assert sorted(options.REGISTER_FORMATS) == sorted(FORMATS)
     assert sorted(options.TAG_FORMATS) == sorted(EXPORTS)
-    assert (*STUDIES, *APART) == options.STUDIES
+    assert (*STUDIES, *APART) == commands.STUDIES
     assert options.plans() == [plan.name for plan in shipped_plans()]
 
 
@@ -73,7 +74,7 @@ for words in json.loads(sys.argv[1]):
 
 
 def test_help_imports_nothing_that_takes_time(python: Python) -> None:
-    commands = [["--help"], *([command, "--help"] for command in COMMANDS)]
+    commands = [["--help"], *([command, "--help"] for command in command_names())]
     done = python("-c", ONE_AFTER_THE_OTHER, json.dumps(commands))
     assert done.out.count("usage: coldloop") == done.out.count("ended 0") == len(commands)
     of_the_process = commands.index(["set", "--help"])  # its inputs are those of the process, a validated model
@@ -284,5 +285,7 @@ def test_a_device_as_the_place_for_results_is_refused_and_stays(command: str, co
 
 
 def test_a_parser_is_made_for_each_command() -> None:
-    for command in COMMANDS:
-        assert f"{command} " in make_parser(command).format_help()
+    overview = make_parser(None).format_help()
+    for command in command_names():
+        assert f"\n  {command} " in overview
+        assert make_parser(command).format_help()

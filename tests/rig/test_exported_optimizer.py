@@ -19,13 +19,13 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity
 from coldloop.registers.safety import LeaseState, LeaseStatus
+from coldloop_export import exported_optimizer
+from coldloop_export.folder import export_plc
+from coldloop_export.golden import SINGLE
 from coldloop_rig import cli
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.cosim.session import SessionClient
 from coldloop_rig.cosim.wiring import REQUIRED
-from coldloop_rig.plc_export import exported_optimizer
-from coldloop_rig.plc_export.folder import export_plc
-from coldloop_rig.plc_export.golden import SINGLE
 from coldloop_rig.settings import Settings
 from tests.conftest import Coldloop
 from tests.harness.processes import Processes, environment

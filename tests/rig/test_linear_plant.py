@@ -13,7 +13,7 @@ from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.results.recording import Recorder, Recording
 from coldloop_rig.settings import Settings
-from coldloop_rig.studies.settings import settings_of
+from coldloop_studies.settings import settings_of
 
 pytestmark = pytest.mark.usefixtures("compiles")
 

@@ -14,8 +14,8 @@ from matplotlib.text import Text
 from coldloop.process.cold_box import COLD_BOX, INPUT_NAMES
 from coldloop_rig.figures.plot import Bounds, RunCurves, curves_of, draw_run, label_marks, labels_of
 from coldloop_rig.results.run_folder import RunFolder, _in_force
-from coldloop_rig.studies.drawing import _updates
-from coldloop_rig.studies.request import Outcome
+from coldloop_studies.drawing import _updates
+from coldloop_studies.request import Outcome
 from tests.conftest import Coldloop
 
 TICKS = 4000

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop_rig.studies import APART, STUDIES
+from coldloop_studies.catalogue import APART, STUDIES
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop

@@ -21,7 +21,7 @@ from coldloop_rig.plc_sizing.certification import (
     scenario_needs,
     scenario_problems,
 )
-from coldloop_rig.studies.settings import settings_of
+from coldloop_studies.settings import settings_of
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop

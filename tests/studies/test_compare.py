@@ -10,9 +10,9 @@ import pytest
 
 from coldloop.errors import ColdloopError
 from coldloop_optimizer_plc.computing_settings import OutsideSettings
-from coldloop_rig.studies.beyond.any_process import CompareStudy
-from coldloop_rig.studies.settings import _digest, outside_digests
-from coldloop_rig.studies.study import StudyOptions, read_variants
+from coldloop_studies.beyond.any_process import CompareStudy
+from coldloop_studies.settings import _digest, outside_digests
+from coldloop_studies.study import StudyOptions, read_variants
 
 if TYPE_CHECKING:
     from tests.studies.conftest import Conducted, MakeOutcome

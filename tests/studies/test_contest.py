@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop_rig.studies.beyond.contest import REFERENCE, SOLVERS, WAYS, ContestStudy
-from coldloop_rig.studies.request import Outcome, RunRequest
-from coldloop_rig.studies.settings import settings_of
-from coldloop_rig.studies.study import StudyOptions
+from coldloop_studies.beyond.contest import REFERENCE, SOLVERS, WAYS, ContestStudy
+from coldloop_studies.request import Outcome, RunRequest
+from coldloop_studies.settings import settings_of
+from coldloop_studies.study import StudyOptions
 from tests.studies.conftest import NOTHING
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ import pytest
 from distributed import Future
 
 from coldloop.errors import StudyError, UsageError
-from coldloop_rig.studies.execution import Store, Workers, perform_all
-from coldloop_rig.studies.request import perform
+from coldloop_studies.execution import Store, Workers, perform_all
+from coldloop_studies.request import perform
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -75,7 +75,7 @@ def test_a_run_that_fails_is_one_line_and_loses_nothing(requests: "Requests", st
 def test_a_scheduler_that_is_not_there_is_one_line(
     requests: "Requests", store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("coldloop_rig.studies.execution.CONNECT_PATIENCE_S", 0.1)
+    monkeypatch.setattr("coldloop_studies.execution.CONNECT_PATIENCE_S", 0.1)
     with pytest.raises(UsageError, match=r"--scheduler tcp://127\.0\.0\.1:1: .*; name one that is up"):
         perform_all(requests(1), store, Workers(1, scheduler="tcp://127.0.0.1:1"), "test")
 

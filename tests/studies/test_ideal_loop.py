@@ -13,9 +13,9 @@ from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_rig.cosim.ideal_loop import Solved, run_ideal_loop
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.results.recording import Recorder, Recording
-from coldloop_rig.studies.request import Outcome, perform
-from coldloop_rig.studies.settings import settings_of
-from coldloop_rig.studies.study import Load
+from coldloop_studies.request import Outcome, perform
+from coldloop_studies.settings import settings_of
+from coldloop_studies.study import Load
 
 Array = NDArray[np.float64]
 SETTINGS = settings_of(())

@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-import coldloop_rig.studies.execution
-from coldloop_rig.studies.execution import (
+import coldloop_studies.execution
+from coldloop_studies.execution import (
     Store,
     Workers,
     families,
@@ -14,9 +14,9 @@ from coldloop_rig.studies.execution import (
     perform_all,
     same_run,
 )
-from coldloop_rig.studies.paper.solver_comparison import throttled
-from coldloop_rig.studies.request import Outcome, RunRequest, perform
-from coldloop_rig.studies.study import Load, StudyOptions, draw_of
+from coldloop_studies.paper.solver_comparison import throttled
+from coldloop_studies.request import Outcome, RunRequest, perform
+from coldloop_studies.study import Load, StudyOptions, draw_of
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -85,14 +85,14 @@ def test_identical_runs_are_done_once(
     powers = (25.0, 1.0, 15.0, 7.0)
     asked = [throttled(load, "qpoases", power) for power in powers]
     begun: list[RunRequest] = []
-    do = coldloop_rig.studies.execution._done  # noqa: SLF001 what goes to the workers
+    do = coldloop_studies.execution._done  # noqa: SLF001 what goes to the workers
 
     def watched(*arguments: object) -> object:
         for request in do(*arguments):  # type: ignore[arg-type]
             begun.append(request)
             yield request
 
-    monkeypatch.setattr(coldloop_rig.studies.execution, "_done", watched)
+    monkeypatch.setattr(coldloop_studies.execution, "_done", watched)
     outcomes = perform_all(asked, store, Workers(1, scheduler=client.scheduler.address), "test")
     assert begun == [asked[0], asked[1]]
     assert [outcomes[request].to_json() for request in asked] == [perform(request) for request in asked]

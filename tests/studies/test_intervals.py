@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coldloop_rig.studies.intervals import (
+from coldloop_rig.plc_sizing.intervals import (
     Interval,
     interval_of_mean,
     interval_of_share,

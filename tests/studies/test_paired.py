@@ -19,9 +19,8 @@ from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
 from coldloop_optimizer_plc.solvers import make_solver
 from coldloop_plant.load import find_load
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.studies import STUDIES
-from coldloop_rig.studies.intervals import watch
-from coldloop_rig.studies.paired_run import (
+from coldloop_studies.catalogue import STUDIES
+from coldloop_studies.paired_run import (
     PlayedProfiles,
     ProblemSequence,
     equal_counts,
@@ -30,7 +29,8 @@ from coldloop_rig.studies.paired_run import (
     paired_run,
     problem_sequence,
 )
-from coldloop_rig.studies.paper.solver_comparison import (
+from coldloop_studies.paired_sums import watch
+from coldloop_studies.paper.solver_comparison import (
     LABELS,
     harsh_request,
     harsh_table,
@@ -40,8 +40,8 @@ from coldloop_rig.studies.paper.solver_comparison import (
     paired_request,
     powers_of,
 )
-from coldloop_rig.studies.request import Outcome, perform
-from coldloop_rig.studies.study import StudyOptions, draw_of
+from coldloop_studies.request import Outcome, perform
+from coldloop_studies.study import StudyOptions, draw_of
 
 if TYPE_CHECKING:
     from pathlib import Path

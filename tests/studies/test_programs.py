@@ -15,10 +15,10 @@ import pytest
 
 from coldloop.kernels.reach import is_decisive_module, reached
 from coldloop_rig.cosim.compiled.cold_box_plants import advance_box
-from coldloop_rig.studies.request import Procedure, RunRequest, perform, programs, programs_digest
+from coldloop_studies.request import Procedure, RunRequest, perform, programs, programs_digest
 
 ROOT = Path(__file__).parents[2]
-DIGEST = "from coldloop_rig.studies.request import programs_digest; print(programs_digest())"
+DIGEST = "from coldloop_studies.request import programs_digest; print(programs_digest())"
 SHORT = RunRequest("", (0, 30), (400.0, 300.0), 60, 0.5)
 
 

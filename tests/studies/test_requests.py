@@ -4,9 +4,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.errors import ConfigurationError
-from coldloop_rig.studies.request import Outcome, perform
-from coldloop_rig.studies.settings import settings_of
-from coldloop_rig.studies.study import NOISE, StudyOptions, draw_of, loads
+from coldloop_studies.request import Outcome, perform
+from coldloop_studies.settings import settings_of
+from coldloop_studies.study import NOISE, StudyOptions, draw_of, loads
 
 if TYPE_CHECKING:
     from tests.studies.conftest import Requests

@@ -5,7 +5,7 @@ import pytest
 
 from coldloop.config import load_configuration
 from coldloop_rig.settings import Settings
-from coldloop_rig.studies.beyond.robustness import (
+from coldloop_studies.beyond.robustness import (
     CONTROLLER_CONDITIONS,
     CONTROLLERS,
     DEFAULT,
@@ -18,8 +18,8 @@ from coldloop_rig.studies.beyond.robustness import (
     holding,
     over_own,
 )
-from coldloop_rig.studies.settings import settings_of
-from coldloop_rig.studies.study import StudyOptions
+from coldloop_studies.settings import settings_of
+from coldloop_studies.study import StudyOptions
 
 PAPER, FIXED = "paper, Algorithm 1", "tuned, fixed 2.5 s"
 HOURS = StudyOptions(ticks=60, loads=("a", "c"), seeds=1)

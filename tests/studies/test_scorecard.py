@@ -16,7 +16,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from coldloop_rig.report.reproduction import (
+from coldloop_rig.plc_sizing.intervals import crossing
+from coldloop_studies import published as paper
+from coldloop_studies.catalogue import STUDIES
+from coldloop_studies.paper.solver_comparison import measures
+from coldloop_studies.paper.trajectories import response
+from coldloop_studies.reproduction import (
     EXPLANATIONS,
     FROM_POINTS,
     PLACEHOLDER,
@@ -44,12 +49,7 @@ from coldloop_rig.report.reproduction import (
     verdict_counts,
     withdrawn,
 )
-from coldloop_rig.studies import STUDIES
-from coldloop_rig.studies import published as paper
-from coldloop_rig.studies.intervals import crossing
-from coldloop_rig.studies.paper.solver_comparison import measures
-from coldloop_rig.studies.paper.trajectories import response
-from coldloop_rig.studies.study import StudyOptions
+from coldloop_studies.study import StudyOptions
 
 ROOT = Path(__file__).parents[2]
 FIRST = Path(__file__).with_name("tolerances-before-the-first-report.toml")
@@ -147,11 +147,11 @@ def git(*arguments: str) -> str:
 @pytest.mark.skipif(not (ROOT / ".git").exists(), reason="an unpacked source distribution has no history")
 def test_each_change_in_the_history_of_the_file_was_dated_when_it_was_made() -> None:
     """From the version before the first report on; a clone without its whole history shows what it has."""
-    log = git("log", "--reverse", "--format=%H %as", "--", "rig/coldloop_rig/report/tolerances.toml").split()
+    place = "beside/studies/coldloop_studies/tolerances.toml"
+    log = git("log", "--follow", "--format=%H %as", "--name-only", "--", place).split()
     versions = [
-        (git("show", f"{commit}:rig/coldloop_rig/report/tolerances.toml"), day)
-        for commit, day in zip(log[::2], log[1::2], strict=True)
-    ]
+        (git("show", f"{commit}:{path}"), day) for commit, day, path in zip(log[::3], log[1::3], log[2::3], strict=True)
+    ][::-1]
     shallow = git("rev-parse", "--is-shallow-repository").strip() == "true"
     assert shallow or FIRST.read_text("utf-8") in [text for text, _ in versions], "the first version is what it was"
     versions.append((TOLERANCES.read_text("utf-8"), versions[-1][1]))

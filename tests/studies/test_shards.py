@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-import coldloop_rig.studies.execution
+import coldloop_studies.execution
 from coldloop.errors import ResultsError, StudyError, UsageError
-from coldloop_rig.studies import STUDIES
-from coldloop_rig.studies.execution import Store, StoredOutcomes, Workers, perform_all
-from coldloop_rig.studies.request import RunRequest, perform
-from coldloop_rig.studies.results import Shard, conduct, conduct_shard, merge
-from coldloop_rig.studies.study import RUNS, StudyOptions
+from coldloop_studies.catalogue import STUDIES
+from coldloop_studies.execution import Store, StoredOutcomes, Workers, perform_all
+from coldloop_studies.request import RunRequest, perform
+from coldloop_studies.results import Shard, conduct, conduct_shard, merge
+from coldloop_studies.study import RUNS, StudyOptions
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -221,7 +221,7 @@ def test_a_folder_that_the_workers_do_not_have_is_one_line(
 def test_a_file_that_a_worker_wrote_elsewhere_is_one_line(
     requests: "Requests", running: Workers, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(coldloop_rig.studies.execution, "FILE_PATIENCE_S", 0.0)
+    monkeypatch.setattr(coldloop_studies.execution, "FILE_PATIENCE_S", 0.0)
     monkeypatch.setattr(Store, "find", lambda *_: None)
     with pytest.raises(StudyError, match=r"a worker has written it, and it is not here; name an --out"):
         perform_all(requests(1), store, running, "test")

@@ -5,16 +5,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop_rig.studies import STUDIES
-from coldloop_rig.studies.paper.trajectories import held_periods, response, response_table
-from coldloop_rig.studies.paper.updating_period import FEW, POLICIES
-from coldloop_rig.studies.study import StudyOptions
+from coldloop_studies.catalogue import STUDIES
+from coldloop_studies.paper.trajectories import held_periods, response, response_table
+from coldloop_studies.paper.updating_period import FEW, POLICIES
+from coldloop_studies.study import StudyOptions
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from coldloop_rig.studies.request import Outcome
-    from coldloop_rig.studies.study import Load
+    from coldloop_studies.request import Outcome
+    from coldloop_studies.study import Load
     from tests.studies.conftest import MakeOutcome
 
 NAMES = [policy.label for policy in POLICIES]

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
@@ -112,7 +113,6 @@ GROUPS: Final = {
         "plot": "draw a recorded run again, as PNG, PDF or SVG",
         "report": "one HTML page of a recorded run, with interactive plots",
         "compare": "a table and a figure of several recorded runs",
-        "export": "a run as CSV, MATLAB or HDF5; the optimiser as C99 or Structured Text",
         "chaos": "a run with injected faults, and its evaluation",
     },
     "a rig that stays up": {
@@ -134,13 +134,8 @@ GROUPS: Final = {
         "import": "a historian's export made into a record for a process file",
         "budget": "what a PLC can compute, and whether an adaptive period pays there",
         "model": "the prediction model",
-        "design": "which decision and constraint instants the problem needs",
         "identify": "how much the gains of the model should be scaled to predict a run",
         "exergy": "where a refrigerator loses the exergy that it is given",
-    },
-    "studies": {
-        "study": "do the runs of a study and draw its figure",
-        "reproduce": "all studies of the paper, one report and a scorecard",
     },
     "help and settings": {
         "docs": "the pages of the documentation, one of them or a section",
@@ -153,8 +148,7 @@ MODULES: Final = {
     "runs": ("run", "record", "rerun", "plot", "report", "compare", "chaos"),
     "rig": ("up", "down", "status", "set", "fault", "page"),
     "bus": ("events", "proxy", "certificates", "registers"),
-    "plant": ("new", "process", "import", "model", "design", "identify", "exergy"),
-    "studies": ("study", "reproduce"),
+    "plant": ("new", "process", "import", "model", "identify", "exergy"),
     "help": ("docs", "config", "completion"),
 }
 MODULE_OF: Final = {name: module for module, names in MODULES.items() for name in names}
@@ -195,14 +189,15 @@ class OneLineParser(argparse.ArgumentParser):
 def make_parser(chosen: str | None) -> argparse.ArgumentParser:
     """Return the parser of all commands, with the options of the chosen one; other commands are not imported."""
     parser = OneLineParser(
-        prog="coldloop", description=QUESTION, epilog=_by_group(), formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+        prog="coldloop", description=QUESTION, epilog="" if chosen in COMMANDS else _by_group(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
     parser.add_argument("--version", action="version", version=_version())
     parser.add_argument(OPTION, metavar="FILE", help="another process than the cold box: a process file, or a"
                         " model file made from one")  # fmt: skip
     parser.set_defaults(execute=None)
     commands = parser.add_subparsers(metavar="COMMAND", parser_class=OneLineParser, help="one of those below")
-    for name in COMMANDS:
+    for name in COMMANDS if chosen in COMMANDS else command_names():
         command = commands.add_parser(name)
         if name == chosen:
             declare, execute, command.description = _command(name)
@@ -215,21 +210,44 @@ def make_parser(chosen: str | None) -> argparse.ArgumentParser:
 
 def _command(name: str) -> tuple[Any, Any, str]:
     """Return what declares the options of a command, what does it, and what describes it."""
-    module = import_module(f"coldloop_rig.cli.commands.{MODULE_OF.get(name, name)}")
-    if name not in MODULE_OF:
+    if name not in COMMANDS:
+        module = _beside()[name].load()
+    else:
+        module = import_module(f"coldloop_rig.cli.commands.{MODULE_OF.get(name, name)}")
+    if name in COMMANDS and name not in MODULE_OF:
         return module.declare, module.execute, str(module.__doc__)
     declare, execute = module.COMMANDS[name]
     said = str(execute.__doc__)
     return declare, execute, f"`coldloop {name}`: {said[0].lower()}{said[1:]}"
 
 
+def _beside() -> dict[str, EntryPoint]:
+    """Return the entry points of commands that are not the rig's own: modules with `GROUP`, `SAID` and `COMMANDS`."""
+    return {point.name: point for point in entry_points(group="coldloop.commands")}
+
+
+def command_names() -> list[str]:
+    """Return the names of all commands, also of those that other packages bring."""
+    return [*COMMANDS, *(name for name in _beside() if name not in COMMANDS)]
+
+
+def command_groups() -> dict[str, dict[str, str]]:
+    """Return the commands by what they are for, with a line about each; those of other packages, too."""
+    groups = {group: dict(commands) for group, commands in GROUPS.items()}
+    for name, point in _beside().items():
+        if name not in COMMANDS:
+            module = point.load()
+            groups.setdefault(module.GROUP[name], {})[name] = module.SAID[name]
+    return groups
+
+
 def _by_group() -> str:
-    """Return the commands by what they are for."""
-    width = max(map(len, COMMANDS)) + 2
+    groups = command_groups()
+    width = max(len(name) for commands in groups.values() for name in commands) + 2
     return (
         "\n".join(
             f"{group}:\n" + "".join(f"  {name:{width}}{said}\n" for name, said in commands.items())
-            for group, commands in GROUPS.items()
+            for group, commands in groups.items()
         )
         + "\ncoldloop COMMAND --help shows the options of one."
     )
@@ -302,7 +320,7 @@ def _complete() -> NoReturn:
     from argcomplete import autocomplete  # noqa: PLC0415 only a shell needs it
 
     words = os.environ.get("COMP_LINE", "").split()
-    parser = make_parser(words[1] if len(words) > 1 and words[1] in COMMANDS else None)
+    parser = make_parser(words[1] if len(words) > 1 and words[1] in command_names() else None)
     autocomplete(parser)
     sys.exit(0)
 

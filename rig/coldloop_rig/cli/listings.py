@@ -17,7 +17,7 @@ from typing import Any, Final, get_args
 from pydantic import BaseModel
 
 from coldloop.config import as_toml
-from coldloop_rig.cli import GROUPS, make_parser
+from coldloop_rig.cli import command_groups, make_parser
 from coldloop_rig.text_tables import markdown_table
 
 Schema = Mapping[str, Any]
@@ -152,7 +152,7 @@ OPTION_HEADER: Final = ("option", "meaning")
 def command_listing() -> str:
     """Return a section for each group of commands, with a table of the options of each."""
     parts = []
-    for group, commands in GROUPS.items():
+    for group, commands in command_groups().items():
         parts.append(f"## {group[0].upper()}{group[1:]}\n")
         for name in commands:
             parts += _of_command(_subparsers(make_parser(name))[name], f"coldloop {name}", "###")

@@ -1,7 +1,7 @@
 """Settings of what the optimiser computes with: arithmetic, power, estimator, solvers. Nothing slow is imported.
 
 The reference PLC (P = 1) is the Schneider TSX P574634M of the paper: one ODE iteration in a slot of 0.25 s, and one
-slot for the preparation of the problem, hence 4 tau_u - 1 iterations (section VI; `report/slips.md`, 7).
+slot for the preparation of the problem, hence 4 tau_u - 1 iterations (section VI; `studies/slips.md`, 7).
 """
 
 from bisect import bisect_right

@@ -1,7 +1,7 @@
 """Digests of code by what it reaches: the functions, classes and data that it names, recursively.
 
 Kernels, gains and outcomes of studies are kept under such digests (`coldloop.kernels.compiled`,
-`coldloop_rig.studies.request`).
+`coldloop_studies.request`).
 A digest is the same in every process and wherever the files are; it changes with whatever may change what the code
 does, and not with code that is not reached. Code counts by its instructions and constants, not by its text: docstrings,
 comments, line numbers and the names of local variables do not count. Data count by value, a file by its content, and
@@ -47,6 +47,8 @@ PROJECT: Final = frozenset(
         "coldloop_optimizer_plc",
         "coldloop_hmi",
         "coldloop_rig",
+        "coldloop_export",
+        "coldloop_studies",
         "tests",
     }
 )

@@ -172,7 +172,7 @@ LARGEST: Final = 1e38
 
 
 class RateReference(StrEnum):
-    """What the rate limit of an update is measured against; the paper leaves it open (`report/slips.md`, 15)."""
+    """What the rate limit of an update is measured against; the paper leaves it open (`studies/slips.md`, 15)."""
 
     PER_UPDATE = "per-update"
     """The full limit of a sampling period of 5 s at each update, however soon the next one follows."""

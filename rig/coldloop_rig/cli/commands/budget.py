@@ -3,6 +3,7 @@
 import argparse
 import math
 import sys
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import UsageError
@@ -131,9 +132,10 @@ def _tables(options: argparse.Namespace) -> str:
 
 
 def _executed(problem: "PredictiveProblem", program: "ProgramSettings") -> str:
-    from coldloop_rig.plc_export.counting import counter_of
-
-    counter = counter_of(problem, program)
+    counters = entry_points(group="coldloop.counters", name="ode")
+    if not counters:
+        return ""
+    counter = counters["ode"].load()(problem, program)
     return (
         f"ode as exported, an iteration a call, executed: {counter.unconstrained():,} operations with no row active, "
         f"{counter.worst():,} in the worst case (every row active, a bound cuts the step)\n"
@@ -143,8 +145,8 @@ def _executed(problem: "PredictiveProblem", program: "ProgramSettings") -> str:
 def _costs(settings: "Settings", options: argparse.Namespace) -> str:
     if not options.loads:
         return ""
+    from coldloop_rig.plc_sizing.adaptive_gain import adaptive_gain
     from coldloop_rig.progress import make_console
-    from coldloop_rig.studies.adaptive_gain import adaptive_gain
 
     with make_console().status("") as status:
         return adaptive_gain(

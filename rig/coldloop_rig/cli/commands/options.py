@@ -9,6 +9,7 @@ import math
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from importlib.metadata import entry_points
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -34,11 +35,6 @@ WITHOUT: Final = ("optimizer",)
 REGISTER_FORMATS: Final = ("csv", "json", "markdown", "table")
 TAG_FORMATS: Final = ("fuxa", "grafana", "ignition", "node-red", "telegraf")
 FIGURE_FORMATS: Final = ("png", "pdf", "svg")
-STUDIES: Final = (
-    "cholesky", "unlimited", "limited", "solver-comparison", "trajectories", "updating-period", "plc-2h", "adaptive-2h",
-    "trade-off", "classical", "single-precision", "coupling", "disturbances",
-    "robustness", "contest", "penalties", "periods", "compare",
-)  # fmt: skip
 
 
 def plans() -> list[str]:
@@ -197,9 +193,13 @@ def exported(given: str | None, settings: "Settings") -> tuple[str, ...]:
     """
     if given is None:
         return ()
-    from coldloop_rig.plc_export.exported_optimizer import exported_optimizer
-
-    return exported_optimizer(given, settings)
+    kind = given.partition(":")[0]
+    known = entry_points(group="coldloop.optimizers")
+    if kind not in known.names:
+        kinds = " or ".join(f"{name}:FOLDER" for name in sorted(known.names))
+        raise UsageError(f"--optimizer {given}: give {kinds}; `coldloop docs plc-export` says more")
+    program: tuple[str, ...] = known[kind].load()(given, settings)
+    return program
 
 
 def say(line: str) -> None:

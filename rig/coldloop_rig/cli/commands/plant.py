@@ -2,18 +2,16 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from coldloop.service.command_line import add_configuration_options
-from coldloop_rig.cli.commands.options import Command, check_load, configuration, positive_count
+from coldloop_rig.cli.commands.options import Command, configuration, positive_count
 from coldloop_rig.text_tables import fitted, width
 
 if TYPE_CHECKING:
     from coldloop_plant.refrigerator.exergy import ExergyBalance
-    from coldloop_rig.studies.instants import Judged
 
 
 FILES: Final = ("process.toml", "my_plant.py")
@@ -209,55 +207,6 @@ def execute_model(options: argparse.Namespace) -> int:
     return 0
 
 
-def _declare_design(parser: argparse.ArgumentParser) -> None:
-    add_configuration_options(parser)
-    parser.add_argument("--load", type="name", dest="loads", nargs="+", metavar="LOAD", default=["a"],
-                        help="loads to compare them under: names or CSV files (default: a)")  # fmt: skip
-    parser.add_argument("--figure", type="write", metavar="FILE",
-                        help="draw loss and iterations over the number of variables: .png, .pdf or .svg")  # fmt: skip
-    parser.add_argument("--out", type="write", metavar="FILE", help="write the proposed set as a configuration (TOML)")
-
-
-def execute_design(options: argparse.Namespace) -> int:
-    """Which decision and constraint instants the problem needs, by what each set costs in the loop."""
-    from coldloop.errors import UsageError
-    from coldloop.text_file import require_regular_file, whole_text
-    from coldloop_rig.cli.commands.options import FIGURE_FORMATS
-    from coldloop_rig.progress import make_console
-    from coldloop_rig.results.folders import writing
-    from coldloop_rig.studies import instants
-
-    for name in options.loads:
-        check_load(name)
-    for path in filter(None, (options.figure, options.out)):
-        require_regular_file(path)
-    if options.figure and options.figure.suffix.removeprefix(".") not in FIGURE_FORMATS:
-        raise UsageError(f"--figure {options.figure}: name a .png, .pdf or .svg file")
-    settings = configuration(options).settings
-    with make_console().status("") as status:
-        found = instants.judged(
-            settings, options.loads, lambda done, of: status.update(f"{done} of {of} sets of instants")
-        )
-    sys.stdout.write(instants.table(found, options.loads))
-    if options.figure is not None:
-        _draw(found, options.loads, options.figure)
-    if options.out is not None:
-        with writing(options.out):
-            whole_text(options.out, instants.configuration(found))
-        sys.stdout.write(f"written to {options.out}\n")
-    return 0
-
-
-def _draw(found: "Sequence[Judged]", loads: Sequence[str], path: Path) -> None:
-    from coldloop_rig.figures.plot import save_figure
-    from coldloop_rig.results.folders import writing
-    from coldloop_rig.studies.instants import drawn
-
-    with writing(path, "choose another --figure"):
-        save_figure(drawn(found, loads), path)
-    sys.stdout.write(f"figure in {path}\n")
-
-
 def _declare_identify(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type="folder", metavar="RUN", help="folder of a run, of half an hour or more")
     parser.add_argument("--model", type="read", metavar="FILE", help="model file (default: that of the run)")
@@ -355,7 +304,6 @@ COMMANDS: Final = {
     "process": Command(_declare_process, execute_process),
     "import": Command(_declare_import, execute_import),
     "model": Command(_declare_model, execute_model),
-    "design": Command(_declare_design, execute_design),
     "identify": Command(_declare_identify, execute_identify),
     "exergy": Command(_declare_exergy, execute_exergy),
 }

@@ -244,7 +244,7 @@ def _declare_report(parser: argparse.ArgumentParser) -> None:
 def execute_report(options: argparse.Namespace) -> int:
     """One HTML page of a recorded run, with interactive plots, alarms and settings."""
     from coldloop.text_file import require_regular_file, whole_text
-    from coldloop_rig.report.run_page import run_page
+    from coldloop_rig.figures.run_page import run_page
     from coldloop_rig.results.folders import writing
 
     path: Path = options.out or options.run / "report.html"

@@ -6,7 +6,7 @@ decision instants and constant before the first. Instants count sampling periods
 (j - 1) to j periods ahead.
 
 The state and the load are stacked as s = (x, w), shape (n_x + 1,). phi and gamma are affine in s and in the input
-applied before the first knot; Phi and Gamma are constant. There is no factor 1/2 before Phi (`report/slips.md`, 11).
+applied before the first knot; Phi and Gamma are constant. There is no factor 1/2 before Phi (`studies/slips.md`, 11).
 """
 
 from typing import Final, NamedTuple

@@ -1,0 +1,279 @@
+"""Solver, whole optimiser and output guard as folders of C99: sources, constants, golden vectors, self-tests."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from coldloop.process.updating_periods import SHORTEST_TICKS
+from coldloop.registers.control_plc import SEQUENCE_ROWS
+from coldloop_export import tree
+from coldloop_export.c_printer import (
+    GENERATED,
+    Array,
+    ConstantRecords,
+    KernelFiles,
+    Printer,
+    golden_files,
+    identifier,
+)
+from coldloop_export.golden import GoldenCall, GoldenUpdate, GoldenVector, arrays_in, tables_of, update_tables
+from coldloop_export.kernels import PER_PROBLEM, GuardKernels, OdeProgram, OptimizerKernels, crc, leaves
+from coldloop_export.tree import (
+    ArrayType,
+    Function,
+    Invoke,
+    Kind,
+    RecordType,
+    StructType,
+    Type,
+    filled,
+    template,
+    walk,
+)
+from coldloop_optimizer_plc.program import OptimizerProgram
+from coldloop_optimizer_plc.qp.problem import QuadraticProblem
+from coldloop_optimizer_plc.solvers.interface import Costs
+from coldloop_optimizer_plc.solvers.ode import OdeMethod
+
+
+class OdeExport:
+    """The solver for the matrices of one problem, with an answer after each of some counts of iterations, as C99."""
+
+    def __init__(self, method: OdeMethod, problem: QuadraticProblem, counts: Array) -> None:
+        self.method, self.problem, self.counts = method, problem, counts
+        self.program = OdeProgram(method, problem, counts)
+        self.printer = Printer(problem.phi.dtype.type)
+        self.real = self.printer.scalars[Kind.REAL]
+        self.entry = self.program.entry
+        self.kernels = KernelFiles(self.printer, self.program.functions, [self.entry], "solver", self._constants())
+
+    # -- files ---------------------------------------------------------------------------------------------------------
+
+    def write(self, folder: Path, vectors: Iterable[GoldenVector]) -> list[Path]:
+        """Write the files, with some golden vectors, into a folder that is made; return their paths."""
+        folder.mkdir(parents=True, exist_ok=True)
+        files = self.files(vectors)
+        for name, text in files.items():
+            (folder / name).write_text(text, encoding="ascii")
+        return [folder / name for name in files]
+
+    def files(self, vectors: Iterable[GoldenVector]) -> dict[str, str]:
+        """Return the texts of the files by their names, with some golden vectors."""
+        header = {"N": len(self.problem.phi), "M": len(self.problem.gamma), "K": len(self.counts),
+                  "FIRST": self.counts[0], "LAST": self.counts[-1]}  # fmt: skip
+        constants = self._constants().items()
+        declared = "".join(f"extern const {self.printer.scalar(values)} {name}[{values.size}];\n"
+                           for name, values in constants)  # fmt: skip
+        sum_ = crc(np.array([float(each.rstrip("f")) for each in self.printer.literals], self.problem.phi.dtype))
+        for _, values in constants:
+            sum_ = crc(values, sum_)
+        return {
+            **self.kernels.texts(), "problem.h": self._filled("problem.h", header), "problem.c": self._problem(),
+            "tables.h": self._filled("tables.h", {"DECLARED": declared, "SUM": sum_}), "tables.c": self._tables(),
+            **self._golden(list(vectors)), "self_test.c": self._filled("self_test.c", {}),
+        }  # fmt: skip
+
+    def sizes(self, vectors: Iterable[GoldenVector]) -> dict[str, int]:
+        """Return the bytes of what a PLC needs; the stack is that of the deepest calls, without what compilers add."""
+        word = self.problem.phi.itemsize
+        constants = word * len(self.printer.literals) + sum(
+            values.size * (word if values.dtype.kind == "f" else 4) for values in self._constants().values()
+        )
+        golden = sum(word * sum(values.size for values in arrays_in(each).values()) for each in vectors)
+        return {"constants": constants, "stack of `solve_problem`, arrays and numbers": stack(self.entry, word),
+                "self-test and golden vectors": golden}  # fmt: skip
+
+    def _constants(self) -> dict[str, Array]:
+        """Return the constant arrays by name."""
+        real = self.problem.phi.dtype
+        flow = np.array([float(each) for each in self.method.flow], real)
+        matrices = {"_".join(path): values for path, values in leaves(("matrices",), self.method.matrices).items()}
+        return {"Phi": self.problem.Phi, "Gamma": self.problem.Gamma, "counts": self.counts, **matrices, "flow": flow}
+
+    def _problem(self) -> str:
+        constants = self._constants()
+        sums = "\n".join(
+            f"    sum = sum_of_{'reals' if values.dtype.kind == 'f' else 'integers'}(sum, {name}, {values.size});"
+            for name, values in constants.items()
+        )
+        flow = [f"flow[{place}] != {self.printer.number(0.0)}" if isinstance(each, bool) else f"flow[{place}]"
+                for place, each in enumerate(self.method.flow)]  # fmt: skip
+        settings = "\n".join(
+            f"    method.flow.{identifier(name)} = {value};"
+            for name, value in zip(self.method.flow._fields, flow, strict=True)
+        )
+        matrices = "\n".join(
+            f"    method.{name.replace('_', '.', 2)} = {name};" for name in constants if name.startswith("matrices_")
+        )
+        none = "\n".join(f"    before.{name} = INFINITY;" for name in Costs._fields)
+        vectors = "\n".join(f"    qp.{identifier(name)} = {identifier(name)};" for name in PER_PROBLEM)
+        body = {"SUMS_OF_BYTES": template("c/sums.c"), "SUMS": sums, "METHOD": f"{matrices}\n{settings}",
+                "BEFORE": none, "VECTORS": vectors}  # fmt: skip
+        return self._filled("problem.c", body)
+
+    def _tables(self) -> str:
+        arrays = "\n".join(self.printer.array(name, values, "") for name, values in self._constants().items())
+        return f'{GENERATED}#include <math.h>\n\n#include "tables.h"\n\n{self.kernels.literals()}\n{arrays}'
+
+    def _golden(self, vectors: list[GoldenVector]) -> dict[str, str]:
+        """Return the files of the golden vectors: inputs and results of all in a row."""
+        stacked = {
+            **{name: np.array([getattr(each.problem, name) for each in vectors]) for name in PER_PROBLEM},
+            "guess": np.array([each.guess for each in vectors]),
+            "guessed": np.array([each.answer.guessed for each in vectors], self.problem.phi.dtype),
+            "points": np.array([each.answer.points for each in vectors]),
+            "costs": np.array([each.answer.costs for each in vectors]),
+            "iterations": np.array([each.answer.iterations for each in vectors]),
+        }  # fmt: skip
+        sum_ = 0
+        for values in stacked.values():
+            sum_ = crc(values, sum_)
+        declared = {f"golden_{name}[{values.size}]": values.ravel() for name, values in stacked.items()}
+        return golden_files(self.printer, sum_, declared, N_GOLDEN=len(vectors))
+
+    def _filled(self, name: str, parts: Mapping[str, object]) -> str:
+        bits = ("uint32_t", "4", "FLT_MIN") if self.printer.single else ("uint64_t", "8", "DBL_MIN")
+        of_type = dict(zip(("BITS", "BYTES", "SMALLEST"), bits, strict=True))
+        texts = {each: str(part) for each, part in parts.items()}
+        return _filled(name, {**texts, "REAL": self.real, **of_type})
+
+
+def _filled(name: str, parts: Mapping[str, str]) -> str:
+    return filled(template(f"c/{name}"), {**parts, "GENERATED": GENERATED.rstrip()})
+
+
+def stack(function: Function, word: int) -> int:
+    """Return the bytes of a function's variables and of the deepest calls in it."""
+    nodes = list(walk(function.body))
+    own = sum(word * (node.variable.type.size if isinstance(node.variable.type, ArrayType) else 1)
+              for node in nodes if isinstance(node, tree.Declare))  # fmt: skip
+    called = {node.function.name: node.function for node in nodes if isinstance(node, Invoke | tree.Invocation)}
+    return own + max((stack(each, word) for each in called.values()), default=0)
+
+
+TABLES: Final = ("constants", "method", "rules", "starts")
+
+
+class OptimizerExport:
+    """The optimiser of some settings as C99, with golden updates."""
+
+    def __init__(self, optimizer: OptimizerProgram, golden: Sequence[GoldenUpdate]) -> None:
+        self.kernels, self._golden, self._state = OptimizerKernels(optimizer), golden, optimizer.state
+        self._process, self.printer = optimizer.process, Printer(np.float32)
+        functions = self.kernels.functions
+        made = (kind for each in functions for kind in self.printer.made_in(each))
+        self._kernels = KernelFiles(self.printer, functions, self.kernels.entries, "optimizer", TABLES, made)
+        self.state_type = next(each for each in self._kernels.records if each.name == "OptimizerState")
+        self.constants = ConstantRecords(self.printer)
+        self._initial = {name: self.constants.printed(name, record) for name, record in self._leading()}
+
+    def _leading(self) -> Iterator[tuple[str, Any]]:
+        yield from self.kernels.constants.items()
+        for ticks, (rule, starts) in enumerate(zip(self.kernels.rules, self.kernels.starts, strict=True)):
+            yield f"rules[{ticks}]", rule
+            yield f"starts[{ticks}]", starts
+
+    # -- files ---------------------------------------------------------------------------------------------------------
+
+    def files(self) -> dict[str, str]:
+        """Return the texts of the files by their names."""
+        process = self._process
+        sizes = {"INPUTS": len(process.inputs), "OUTPUTS": len(process.outputs), "STATES": len(process.states),
+                 "ROWS": SEQUENCE_ROWS, "LONGEST": process.ticks_per_sample, "SHORTEST": SHORTEST_TICKS,
+                 "TICK_S": process.tick_s}  # fmt: skip
+        parts = {**self._constants(), **{name: str(size) for name, size in sizes.items()}}
+        names = ("optimizer.h", "optimizer.c", "self_test.c")
+        constants, own = (
+            {name: _filled(f"optimizer/{name}", parts) for name in each}
+            for each in (("constants.h", "constants.c"), names)
+        )
+        return {**self._kernels.texts(), **constants, **self._golden_files(), **own}
+
+    def sizes(self) -> dict[str, int]:
+        """Return the bytes of what a PLC needs; the stack is that of the deepest calls, without what compilers add."""
+        return {"constants": self.constants.bytes(), "state": size_of(self.state_type),
+                "stack, arrays and numbers": max(stack(each, 4) for each in self.kernels.entries)}  # fmt: skip
+
+    # -- constants -----------------------------------------------------------------------------------------------------
+
+    def _constants(self) -> dict[str, str]:
+        """Return the parts of the files of constants."""
+        kernels, initial = self.kernels, self._initial
+        tables = {
+            f"OF_{of.upper()}": ",\n".join(f"    {text}" for name, text in initial.items() if name.startswith(f"{of}["))
+            for of in ("rules", "starts")
+        }
+        kinds = {"RULE": kernels.rules[0], "BEGIN": kernels.starts[0], "METHOD": kernels.constants["method"]}
+        return {
+            **{name: type(each).__name__ for name, each in kinds.items()}, **tables, "COUNT": str(len(kernels.rules)),
+            "OF_CONSTANTS": initial["constants"], "OF_METHOD": initial["method"],
+            **self.constants.parts(self._kernels),
+        }  # fmt: skip
+
+    # -- golden updates ------------------------------------------------------------------------------------------------
+
+    def _golden_files(self) -> dict[str, str]:
+        integers, reals = update_tables(self._golden).values()
+        rows = np.array([row for each in self._golden if each.sequence for row in each.sequence.rows], np.float32)
+        sum_ = crc(rows, crc(reals, crc(integers)))
+        declared = {
+            f"golden_integers[{len(integers)}][GOLDEN_INTEGERS]": integers,
+            f"golden_reals[{len(reals)}][GOLDEN_REALS]": reals,
+            f"golden_rows[{len(rows)}][{rows.shape[1]}]": rows,
+        }
+        return golden_files(self.printer, sum_, declared, N_GOLDEN=len(integers), N_GOLDEN_ROWS=len(rows),
+                            GOLDEN_INTEGERS=integers.shape[1], GOLDEN_REALS=reals.shape[1])  # fmt: skip
+
+
+def size_of(kind: Type, real: int = 4) -> int:
+    """Return the bytes of a state, of whose numbers with a point each has `real`."""
+    if isinstance(kind, RecordType | StructType):
+        return sum(size_of(each, real) for _, each in kind.fields)
+    if isinstance(kind, tree.RowsType):
+        return size_of(kind.struct, real) * kind.length
+    scalar, count = (kind.kind, kind.size) if isinstance(kind, ArrayType) else (kind, 1)
+    return (real if scalar is Kind.REAL else 4) * count
+
+
+class GuardExport:
+    """The output guard for some limits as C99, with golden calls."""
+
+    def __init__(self, kernels: GuardKernels, golden: Sequence[GoldenCall], tick_s: float) -> None:
+        self._inputs, self._tick_s = len(kernels.limits.low), tick_s
+        self._printer, self._tables = Printer(np.float64), tables_of(golden)
+        self._kernels = KernelFiles(self._printer, kernels.functions, kernels.entries, "guard", ["limits"])
+        self.constants = ConstantRecords(self._printer)
+        self._limits = self.constants.printed("limits", kernels.limits)
+
+    def files(self) -> dict[str, str]:
+        """Return the texts of the files by their names."""
+        sizes = {"INPUTS": self._inputs, "ROWS": SEQUENCE_ROWS, "TICK_S": self._tick_s}
+        parts = {**{name: str(size) for name, size in sizes.items()}, "LIMITS": self._limits,
+                 **self.constants.parts(self._kernels)}  # fmt: skip
+        names = ("output_guard.h", "output_guard.c", "self_test.c")
+        limits, own = (
+            {name: _filled(f"output_guard/{name}", parts) for name in each}
+            for each in (("limits.h", "limits.c"), names)
+        )
+        return {**self._kernels.texts(), **limits, **self._golden_files(), **own}
+
+    def sizes(self) -> dict[str, int]:
+        """Return the bytes of what a PLC needs."""
+        state = next(each for each in self._kernels.records if each.name == "GuardState")
+        rows = 2 * 8 * self._inputs * SEQUENCE_ROWS
+        golden = sum(values.nbytes for values in self._tables.values())
+        judged = 2 * size_of(state, 8) + rows
+        return {"constants": self.constants.bytes(), "state and rows that are judged, about": judged,
+                "self-test and golden calls": golden}  # fmt: skip
+
+    def _golden_files(self) -> dict[str, str]:
+        sum_ = 0
+        for values in self._tables.values():
+            sum_ = crc(values.view(np.int32), sum_)
+        declared = {f"golden_{name}[{len(values)}][{values.shape[1]}]": values
+                    for name, values in self._tables.items()}  # fmt: skip
+        integers, _, rows = self._tables.values()
+        return golden_files(Printer(np.float32), sum_, declared, N_GOLDEN=len(integers), N_GOLDEN_ROWS=len(rows),
+                            GOLDEN_INTEGERS=integers.shape[1])  # fmt: skip

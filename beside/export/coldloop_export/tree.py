@@ -1,0 +1,475 @@
+"""The typed tree between the kernels' Python and what is printed from it: functions of fixed shapes, no Python left."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from enum import Enum
+from importlib.resources import files
+from math import prod
+from typing import TypeAlias
+
+import numpy as np
+
+from coldloop.errors import UsageError
+
+
+def template(name: str) -> str:
+    """Return a file of this package, by its path in it."""
+    return files("coldloop_export").joinpath(name).read_text(encoding="ascii")
+
+
+def filled(text: str, parts: Mapping[str, str]) -> str:
+    """Return a template with its parts."""
+    for name, part in parts.items():
+        text = text.replace(f"@{name}@", part)
+    return text
+
+
+class Kind(Enum):
+    """Types of scalars."""
+
+    REAL = "real"
+    """The on-line type, single or double precision."""
+    INT = "int"
+    UNSIGNED = "unsigned"
+    """An index that does not count from the end."""
+    BOOL = "bool"
+
+
+@dataclass(frozen=True)
+class ArrayType:
+    """An array whose shape is known when it is printed."""
+
+    kind: Kind
+    shape: tuple[int, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        return prod(self.shape)
+
+
+@dataclass(frozen=True)
+class StructType:
+    """A record of numbers, all of which may be written to: an element of a structured array."""
+
+    name: str
+    fields: tuple[tuple[str, Kind], ...]
+
+
+@dataclass(frozen=True)
+class RowsType:
+    """An array of such records."""
+
+    struct: StructType
+    length: int
+
+
+@dataclass(frozen=True)
+class RecordType:
+    """A NamedTuple: constant, and so are its arrays, unless it is a state. Or a dataclass, which is one."""
+
+    name: str
+    fields: tuple[tuple[str, "Type"], ...]
+    state: bool = False
+    """It has arrays of records of numbers, or is a dataclass: all of its arrays are its own, and may be written to."""
+    mutable: bool = False
+    """A dataclass: so may its numbers."""
+
+
+Type: TypeAlias = Kind | ArrayType | StructType | RowsType | RecordType
+
+# -- expressions -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Literal:
+    """A number of a stated type."""
+
+    type: Kind
+    value: float
+
+
+@dataclass(frozen=True)
+class Name:
+    """A parameter or a variable."""
+
+    type: Type
+    name: str
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field of a record."""
+
+    type: Type
+    record: "Name | Field"
+    name: str
+
+
+@dataclass(frozen=True)
+class View:
+    """A part of an array in a row, from the element `offset` on; all dimensions counted."""
+
+    type: ArrayType
+    array: "Name | Field"
+    offset: "Expression"
+
+
+@dataclass(frozen=True)
+class Item:
+    """A record of numbers in an array of them."""
+
+    type: StructType
+    rows: "Name | Field"
+    index: "Expression"
+
+
+@dataclass(frozen=True)
+class Member:
+    """A number of a record of numbers."""
+
+    type: Kind
+    struct: "Item | Name"
+    name: str
+
+
+@dataclass(frozen=True)
+class Element:
+    """An element of an array."""
+
+    type: Kind
+    array: "Name | Field | View"
+    indices: tuple["Expression", ...]
+
+
+@dataclass(frozen=True)
+class Operation:
+    """An operator with one or two operands, in Python's spelling; or the name of a function, such as sqrt."""
+
+    type: Kind
+    operator: str
+    operands: tuple["Expression", ...]
+
+
+@dataclass(frozen=True)
+class Select:
+    """The one or the other; only that one is computed."""
+
+    type: Kind
+    condition: "Expression"
+    one: "Expression"
+    other: "Expression"
+
+
+@dataclass(frozen=True)
+class Convert:
+    """A number or a truth value as another type."""
+
+    type: Kind
+    operand: "Expression"
+
+
+@dataclass(frozen=True)
+class Invocation:
+    """The result of a function with one scalar result that writes to no argument."""
+
+    type: Kind
+    function: "Function"
+    arguments: tuple["Expression", ...]
+
+
+Place: TypeAlias = Name | Field | View | Item | Member | Element
+Expression: TypeAlias = Literal | Place | Operation | Select | Convert | Invocation
+Storage: TypeAlias = Name | Field | View | Item
+Target: TypeAlias = Name | Element | Member | Field
+
+# -- statements --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Declare:
+    """A new variable; without a value it is zero everywhere."""
+
+    variable: Name
+    value: Expression | None = None
+
+
+@dataclass(frozen=True)
+class Assign:
+    """A new value of a variable, of an element or of a number in a record."""
+
+    target: Target
+    value: Expression
+
+
+@dataclass(frozen=True)
+class Point:
+    """A name for a part of an array, or for a record in one."""
+
+    variable: Name
+    part: View | Item
+    constant: bool
+
+
+@dataclass(frozen=True)
+class Make:
+    """A new constant record, of numbers and of arrays that have names."""
+
+    variable: Name
+    parts: tuple[tuple[str, Expression], ...]
+
+
+@dataclass(frozen=True)
+class Copy:
+    """All numbers of a record become those of another."""
+
+    target: Item | Name
+    source: Item | Name
+
+
+@dataclass(frozen=True)
+class Invoke:
+    """A call for what it writes; results go to variables."""
+
+    function: "Function"
+    arguments: tuple[Expression, ...]
+    results: tuple[Name, ...]
+
+
+@dataclass(frozen=True)
+class For:
+    """A counted loop; bounds are computed once."""
+
+    variable: Name
+    start: Expression
+    stop: Expression
+    step: int
+    body: tuple["Statement", ...]
+
+
+@dataclass(frozen=True)
+class While:
+    """A loop."""
+
+    condition: Expression
+    body: tuple["Statement", ...]
+
+
+@dataclass(frozen=True)
+class If:
+    """A decision."""
+
+    condition: Expression
+    body: tuple["Statement", ...]
+    other: tuple["Statement", ...]
+
+
+@dataclass(frozen=True)
+class Return:
+    """The end of a function, with its value where it has one that is not a result parameter."""
+
+    value: Expression | None = None
+
+
+@dataclass(frozen=True)
+class Count:
+    """A counted loop that includes its last value; only in blocks (`lowering.py`)."""
+
+    variable: Name
+    first: Expression
+    last: Expression
+    step: int
+    body: tuple["Statement", ...]
+
+
+@dataclass(frozen=True)
+class Call:
+    """A call of a block, with its arguments by name and the variables that get its outputs; only in blocks."""
+
+    block: "Block"
+    arguments: tuple[tuple[Name, Expression], ...]
+    results: tuple[tuple[Name, Name], ...]
+    """Variable, output."""
+
+
+@dataclass(frozen=True)
+class PausingCall:
+    """A call of a block that may pause: its outputs are taken, and what follows is done, once it is no longer busy."""
+
+    call: Call
+    anew: Name
+    """The variable that says that it begins: false from then on."""
+    busy: Name
+    """Its output that says that it has paused."""
+    following: tuple["Statement", ...]
+
+
+@dataclass(frozen=True)
+class Switch:
+    """What is done for each value of a number; only in blocks that pause (`pausing.py`)."""
+
+    number: Name
+    cases: tuple[tuple[int, tuple["Statement", ...]], ...]
+
+
+Statement: TypeAlias = (
+    Declare | Assign | Point | Make | Copy | Invoke | For | While | If | Return | Count | Call | PausingCall | Switch
+)
+
+# -- results -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Group:
+    """Results that belong together: a tuple, or a NamedTuple of this name with its fields."""
+
+    name: str
+    parts: tuple[tuple[str, "Name | Field | Group"], ...]
+    """Results of the function, or fields of its parameters."""
+
+
+@dataclass
+class Function:
+    """A kernel for arguments of certain types.
+
+    One scalar result is returned by value; arrays, and results that are several, are parameters behind the others.
+    """
+
+    name: str
+    source: str
+    """File and line of the kernel."""
+    summary: str
+    """What it does, in a sentence."""
+    parameters: tuple[Name, ...]
+    written: set[str] = field(default_factory=set)
+    """Parameters that it writes to: arrays and states."""
+    used: set[str] = field(default_factory=set)
+    results: tuple[Name, ...] = ()
+    returned: Name | Field | Group | None = None
+    """How they belong together."""
+    value: Kind | None = None
+    body: tuple[Statement, ...] = ()
+
+
+Path: TypeAlias = tuple[str, ...]
+"""A record's field: the names from the first record to it."""
+
+
+@dataclass(eq=False)
+class Block:
+    """A function without records, whose every call is a statement: what a function block is printed from."""
+
+    name: str
+    source: str
+    summary: str
+    inputs: tuple[Name, ...]
+    """Numbers."""
+    shared: tuple[Name, ...]
+    """Arrays of the caller, read or written."""
+    outputs: tuple[Name, ...]
+    variables: tuple[Name, ...]
+    constants: tuple[Path, ...]
+    """What it has of constants and of the state."""
+    body: tuple[Statement, ...]
+
+    @property
+    def called(self) -> list["Block"]:
+        """Blocks that it calls, each once."""
+        return list(dict.fromkeys(node.block for node in walk(self.body) if isinstance(node, Call)))
+
+
+def walk(node: object) -> Iterator[object]:
+    """Yield a node and those below it; not what is called."""
+    yield node
+    if isinstance(node, tuple):
+        parts: Iterator[object] = iter(node)
+    elif is_dataclass(node):
+        parts = (getattr(node, each.name) for each in fields(node))
+    else:
+        return
+    for part in parts:
+        if not isinstance(part, Function | Block):
+            yield from walk(part)
+
+
+KINDS = {"f": Kind.REAL, "i": Kind.INT, "u": Kind.UNSIGNED, "b": Kind.BOOL}
+
+
+class UnfitKernelError(UsageError):
+    """A kernel uses what is not in the subset."""
+
+
+def rows_of(name: str, value: object) -> RowsType | None:
+    """Return the type of a structured array, whose records get this name; of anything else None."""
+    if not (isinstance(value, np.ndarray) and value.dtype.fields):
+        return None
+    numbers = tuple((field, KINDS[kind.kind]) for field, (kind, *_) in value.dtype.fields.items())
+    return RowsType(StructType(name, numbers), len(value))
+
+
+def type_of(value: object) -> Type:  # noqa: PLR0911 one case a type
+    """Return the type of an argument: an array, numbers in a row, a NamedTuple, a dataclass, or a number.
+
+    Raises:
+        UnfitKernelError: It is something else.
+    """
+    if isinstance(value, np.ndarray) and value.dtype.kind in KINDS and value.ndim:
+        return ArrayType(KINDS[value.dtype.kind], value.shape)
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        own = type(value).__name__
+        parts = tuple((name, rows_of(f"{own}{name.capitalize()}", part) or type_of(part))
+                      for name, part in zip(value._fields, value, strict=True))  # fmt: skip
+        state = any(isinstance(kind, RowsType) or (isinstance(kind, RecordType) and kind.state) for _, kind in parts)
+        return RecordType(own, parts, state)
+    if is_dataclass(value) and not isinstance(value, type):
+        parts = tuple((each.name, type_of(getattr(value, each.name))) for each in fields(value))
+        return RecordType(type(value).__name__, parts, state=True, mutable=True)
+    if isinstance(value, list | tuple) and (numbers := np.array(value)).dtype.kind in KINDS:
+        return ArrayType(KINDS[numbers.dtype.kind], numbers.shape)
+    if isinstance(value, bool | np.bool_):
+        return Kind.BOOL
+    if isinstance(value, int | np.integer):
+        return Kind.INT
+    if isinstance(value, float | np.floating):
+        return Kind.REAL
+    raise UnfitKernelError(f"an argument of type {type(value).__name__} cannot be exported: arrays, records, numbers")
+
+
+class TreePrinter:
+    """Prints expressions of the tree for one floating-point type.
+
+    Numbers with a point are elements of a constant array, which the self-test sums up with the other constants.
+    """
+
+    table: str
+    """Name of that array."""
+
+    def __init__(self, real: type[np.floating]) -> None:
+        self.single = real is np.float32
+        self.literals: list[str] = []
+
+    def number(self, value: float) -> str:
+        """Return a number with a point such that it is read back with the same bits."""
+        raise NotImplementedError
+
+    def expression(self, expression: Expression) -> str:
+        """Return an expression."""
+        raise NotImplementedError
+
+    def literal(self, value: float) -> str:
+        """Return the element of the table that has this value."""
+        text = self.number(value)
+        if text not in self.literals:
+            self.literals.append(text)
+        return f"{self.table}[{self.literals.index(text)}]"
+
+    def place(self, element: Element) -> str:
+        """Return the index of an element in its array, which is stored row by row."""
+        assert isinstance(element.array.type, ArrayType)  # noqa: S101 by construction
+        place = ""
+        for index, length in zip(element.indices, element.array.type.shape, strict=True):
+            place = f"{place} * {length} + {self.expression(index)}" if place else self.expression(index)
+            place = f"({place})" if index is not element.indices[-1] and place.count(" ") else place
+        if isinstance(element.array, View) and element.array.offset != Literal(Kind.INT, 0):
+            return f"{self.expression(element.array.offset)} + {place}"
+        return place

@@ -1,0 +1,237 @@
+"""Studies of any process: variants of one's own over a reference, and whether an adaptive updating period pays.
+
+The best fixed period of a regime is chosen on the first draw of each load and judged on the others: chosen on the loads
+that it is judged by, the best of several is too good by chance.
+"""
+
+from typing import Final
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from coldloop.process.cold_box import COLD_BOX
+from coldloop.process.declaration import Process
+from coldloop_rig.figures.plot import COLOURS
+from coldloop_rig.plc_sizing.adaptive_gain import ADAPTIVE, fixed_periods, over_best_fixed, pays, require_costs
+from coldloop_rig.plc_sizing.intervals import Interval, geometric_mean, mean_ratio
+from coldloop_rig.text_tables import markdown_table
+from coldloop_studies.drawing import legend_outside, panels, ratio_rows, ratio_scale, spans_decade
+from coldloop_studies.request import Outcome, RunRequest
+from coldloop_studies.settings import settings_of
+from coldloop_studies.study import NOISE, PROGRAM, TUNED, Load, Outcomes, StudyOptions, StudyResult, Variant, loads
+
+Array = NDArray[np.float64]
+
+VARIANT_COLUMNS: Final = ("variant", "load", "mean tau_u (s)", "J_BF", "J_BF over the reference")
+
+
+class CompareStudy:
+    """Variants of a file under the same draws; the first is the reference."""
+
+    name = "compare"
+    title = "Variants of one's own (--variants FILE), paired over draws"
+
+    def requests(self, options: StudyOptions) -> list[RunRequest]:
+        """Return every variant under every draw."""
+        drawn = loads(options, *options.hours)
+        return [_variant_run(load, variant) for variant in options.variants for load in drawn]
+
+    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+        """Compare the cost of each variant with that of the first, draw by draw, and say what leaves its band."""
+        drawn, variants = loads(options, *options.hours), options.variants
+        shares = tuple(f"{one.name} outside (%)" for one in options.process.banded)
+        result = StudyResult((*VARIANT_COLUMNS, *shares), [], {})
+        found = [[outcomes[_variant_run(load, variant)].indicators for load in drawn] for variant in variants]
+        costs = np.array([[run.J_BF for run in runs] for runs in found])
+        ratios = over_reference(costs)
+        reference, summary = variants[0].name, []
+        for variant, runs, over, ratio in zip(variants, found, costs / costs[0], ratios, strict=True):
+            outside = np.array([[*run.outside_band_pct.values()] for run in runs])
+            result.rows += [
+                (variant.name, load.name, run.tau_u_mean, run.J_BF, float(one), *map(float, each))
+                for load, run, one, each in zip(drawn, runs, over, outside, strict=True)
+            ]
+            means = (f"{share:.3g}" for share in outside.mean(axis=0))
+            is_reference = variant is variants[0]
+            said = ("1", "the reference") if is_reference else (ratio.text(), in_words(ratio))
+            summary.append((variant.name, *said, *means))
+            if not is_reference:
+                what = f"J_BF of {variant.name} over that of {reference} {ratio.text()}, {in_words(ratio)}; by draw"
+                result.values[what] = over.tolist()
+        header = ("variant", f"J_BF over that of {reference}", "in words", *shares)
+        caption = (
+            f"Geometric mean of {len(drawn)} paired runs with its 95 % interval; shares of the time outside, their mean"
+        )
+        result.remarks += [markdown_table(header, summary, caption), _settings_table(variants)]
+        result.figures["variants over the reference"] = _variants_figure(variants, ratios, costs / costs[0])
+        return result
+
+
+def over_reference(costs: Array) -> list[Interval]:
+    """Return the geometric mean of each row of J_BF over the first, paired by column (a draw), with its interval.
+
+    Raises:
+        StudyError: A loop costs nothing.
+    """
+    require_costs(costs)
+    return [mean_ratio(row, costs[0]) for row in costs]
+
+
+def in_words(ratio: Interval) -> str:
+    """Return what an interval of a ratio of costs shows."""
+    return ratio.in_words("costs less", "costs more", "one draw has no interval")
+
+
+def _variant_run(load: Load, variant: Variant) -> RunRequest:
+    period_s = settings_of((*load.settings, *variant.assignments)).optimizer_plc.program.updating_period_s
+    return load.request(period_s, *variant.assignments)
+
+
+def _settings_table(variants: tuple[Variant, ...]) -> str:
+    rows = [(variant.name, ", ".join(f"`{one}`" for one in variant.assignments[1:]) or "defaults")
+            for variant in variants]  # fmt: skip
+    return markdown_table(("variant", "settings"), rows, "What each variant changes of the defaults")
+
+
+def _variants_figure(variants: tuple[Variant, ...], ratios: list[Interval], by_draw: Array) -> Figure:
+    """Draw a row for each variant: its mean with the interval, and each draw."""
+    label = "geometric mean, 95 % interval"
+    rows = {variant.name: ratio for variant, ratio in zip(variants[1:], ratios[1:], strict=True)}
+    height_in = 1.2 + 0.35 * len(rows)
+    figure = ratio_rows(
+        {label: rows}, f"J_BF over that of {variants[0].name} (1); a mark for each draw", height_in, 0.25, 1
+    )
+    place = figure.axes[0]
+    if not spans_decade(by_draw):
+        place.set_xscale("linear")
+    for number, over in enumerate(by_draw[1:]):
+        place.plot(over, np.full(len(over), number + 0.2), "|", color="#888888", markersize=5)
+    return figure
+
+
+NOMINAL: Final = "as its model"
+OF_COLD_BOX: Final = {
+    "noisy sensors": NOISE,
+    "near the capacity": ("plant.mismatch.heat_transfer=0.9",),
+    "rate limits by elapsed time": ("limits.rate_reference=elapsed",),
+}
+"""What differs; with exchangers 10 % worse the plant holds 513 W, and the hours d to f have up to 585 W."""
+COLUMNS: Final = ("regime", "load", "tau_u (s)", "mean tau_u (s)", "J_BF")
+SUMMARY: Final = ("regime", "mean of adaptive (s)", "best fixed (s)", "adaptive over it", "in words")
+
+
+def _regimes(process: Process) -> dict[str, tuple[str, ...]]:
+    return {NOMINAL: (), **(OF_COLD_BOX if process == COLD_BOX else {})}
+
+
+def _other_rule(process: Process) -> tuple[str, str]:
+    """Return the rule that is not the default: its name in the settings, and in words."""
+    return ("algorithm-1", "Algorithm 1") if process.tuned.get("adaptive") else ("contraction", "contraction rule")
+
+
+def periods(process: Process) -> tuple[float, ...]:
+    """Return the updating periods that are compared, s, the adaptive one first."""
+    return (ADAPTIVE, *fixed_periods(process))
+
+
+class PeriodsStudy:
+    """Closed-loop cost against the updating period, fixed and adaptive."""
+
+    name = "periods"
+    title = "Cost against updating period of any process, fixed and adaptive"
+
+    def requests(self, options: StudyOptions) -> list[RunRequest]:
+        """Return every period under every draw, in each regime, and the rule that is not the default."""
+        return [
+            run
+            for regime in _regimes(options.process).values()
+            for load in loads(options, *"abcdef")
+            for run in (*_runs(load, options.process, regime), _other(load, options.process, regime))
+        ]
+
+    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+        """Compare the adaptive period, in each regime, with the best fixed one of other draws, if there are any."""
+        process, drawn, summary = options.process, loads(options, *"abcdef"), []
+        result = StudyResult((*COLUMNS, *(f"{one.name} outside (%)" for one in process.banded)), [], {})
+        tried, named = periods(process), _other_rule(process)[1]
+        costs, means, training = {}, {}, np.array([load.draw == 1 for load in drawn])
+        for regime, settings in _regimes(process).items():
+            found = [[outcomes[run] for run in _runs(load, process, settings)] for load in drawn]
+            for load, some in zip(drawn, found, strict=True):
+                result.rows += [_row(regime, load.name, *one) for one in zip(tried, some, strict=True)]
+            other = [outcomes[_other(load, process, settings)] for load in drawn]
+            result.rows += [_row(regime, load.name, named, run) for load, run in zip(drawn, other, strict=True)]
+            costs[regime] = np.array([[one.indicators.J_BF for one in some] for some in found]).T
+            means[regime] = float(np.mean([some[0].indicators.tau_u_mean for some in found]))
+            best, ratio = judged(costs[regime], training)
+            of_other = judged(np.vstack(([run.indicators.J_BF for run in other], costs[regime][1:])), training)[1]
+            result.note(f"{regime}: J_BF of the adaptive period over fixed {tried[best]:g} s", ratio.value)
+            cells = f"{means[regime]:.2f}", f"{tried[best]:g}", ratio.text(), pays(ratio), of_other.text()
+            summary.append((regime, *cells))
+        fresh = _has_others(training)
+        chosen = "on the first draws, judged on the others" if fresh else "on the same, which favours it"
+        title = f"J_BF of the adaptive period over the best fixed one, chosen {chosen}"
+        result.remarks.append(markdown_table((*SUMMARY, f"{named} over it"), summary, title))
+        result.remarks.append(
+            markdown_table(result.columns, [tuple(map(_text, row)) for row in result.rows], "All runs")
+        )
+        result.figures["cost against period"] = _periods_figure(costs, means, tried[1:])
+        return result
+
+
+def judged(costs: Array, training: NDArray[np.bool_]) -> tuple[int, Interval]:
+    """Return which fixed period is the best, and the cost of the adaptive one over its.
+
+    Args:
+        costs: A row for each of `periods`, a column for each load.
+        training: Which loads it is chosen on; judged on the others, or on the same where there are no others.
+
+    Raises:
+        StudyError: A loop costs nothing.
+    """
+    require_costs(costs)
+    if not _has_others(training):
+        return over_best_fixed(costs)
+    best, _ = over_best_fixed(costs[:, training])
+    return best, mean_ratio(costs[0, ~training], costs[best, ~training])
+
+
+def _has_others(training: NDArray[np.bool_]) -> bool:
+    return bool(training.any() and not training.all())
+
+
+def _runs(load: Load, process: Process, settings: tuple[str, ...]) -> list[RunRequest]:
+    return [load.request(period, TUNED, *settings) for period in periods(process)]
+
+
+def _other(load: Load, process: Process, settings: tuple[str, ...]) -> RunRequest:
+    return load.request(ADAPTIVE, TUNED, f"{PROGRAM}adaptive.rule={_other_rule(process)[0]}", *settings)
+
+
+def _row(regime: str, name: str, period_s: float | str, outcome: Outcome) -> tuple[str | float, ...]:
+    run = outcome.indicators
+    period = "adaptive" if period_s == ADAPTIVE else period_s
+    return (regime, name, period, run.tau_u_mean, run.J_BF, *run.outside_band_pct.values())
+
+
+def _text(cell: str | float) -> str:
+    return cell if isinstance(cell, str) else f"{cell:.4g}"
+
+
+def _periods_figure(costs: dict[str, Array], means: dict[str, float], fixed_s: tuple[float, ...]) -> Figure:
+    """Draw, for each regime, each fixed period's cost over that of the adaptive one, and their geometric mean."""
+    beside = min(2, len(costs))
+    with panels(len(costs) // beside, beside, 2.6 if beside == 1 else 4.4) as (figure, places):
+        for place, (regime, by_period) in zip(places, costs.items(), strict=True):
+            over = by_period[1:] / by_period[0]
+            place.plot(fixed_s, over, "-", color=COLOURS[0], alpha=0.25, linewidth=0.8)
+            place.plot(fixed_s, [geometric_mean(one) for one in over], ".-", color=COLOURS[0], label="geometric mean")
+            place.plot(means[regime], 1.0, "*", color=COLOURS[1], markersize=9, label="adaptive, at its mean period")
+            place.axhline(1.0, color=COLOURS[1], linewidth=0.8)
+            ratio_scale(place, "y", over)
+            place.set_title(regime)
+        figure.supxlabel("fixed period (s)", fontsize=8)
+        figure.supylabel("$J^{BF}$ over that of the adaptive period (1)", fontsize=8)
+        legend_outside(figure, places[0])
+    return figure

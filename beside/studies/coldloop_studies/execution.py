@@ -1,0 +1,351 @@
+"""How the runs of a study are done: by Dask workers, each run once, what is done already being read back.
+
+Results do not depend on the number of workers: a run is a function of its request. A worker that dies costs only the
+runs it had in hand, which others do again; a stopped study resumes where it was. Workers write outcomes to the store
+themselves, a file each, named by the digest of its request: only requests go through the scheduler.
+"""
+
+import contextlib
+import logging
+import os
+import signal
+import time
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from distributed import Client, LocalCluster, as_completed
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from coldloop.errors import ColdloopError, ResultsError, StudyError, UsageError
+from coldloop.text_file import whole_text
+from coldloop_optimizer_plc.computing_settings import BudgetSettings, PlcBudget
+from coldloop_optimizer_plc.solvers import make_solver
+from coldloop_rig.interruption import INTERRUPTION
+from coldloop_rig.progress import make_console
+from coldloop_rig.results.folders import prepare_folder, writing
+from coldloop_studies.request import (
+    Outcome,
+    Procedure,
+    RunRequest,
+    check,
+    decisive_digest,
+    perform,
+    programs_digest,
+)
+from coldloop_studies.settings import settings_of
+from coldloop_studies.study import RUNS, Study, StudyOptions
+
+REMEMBERED: Final = 64
+"""Outcomes kept in memory: some MB each when they have a trace."""
+
+
+class Store:
+    """Outcomes by the digest of their request."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def path(self, request: RunRequest) -> Path:
+        """Return where an outcome is kept."""
+        return self.folder / f"{request.digest}.json"
+
+    def text(self, request: RunRequest) -> str | None:
+        """Return the file of a request if it is there and whole."""
+        try:
+            text = self.path(request).read_text(encoding="utf-8")
+            Outcome.from_json(text)
+        except (OSError, ValueError):
+            return None
+        return text
+
+    def find(self, request: RunRequest) -> Outcome | None:
+        """Return the outcome of a request if it is there and whole."""
+        text = self.text(request)
+        return None if text is None else Outcome.from_json(text)
+
+    def keep(self, request: RunRequest, outcome: str) -> None:
+        """Keep an outcome. Raises ResultsError if it cannot be written."""
+        path = self.path(request)
+        with writing(path, "what was done before is kept: make room, or choose another --out"):
+            whole_text(path, outcome)
+
+
+class StoredOutcomes(Mapping[RunRequest, Outcome]):
+    """The outcomes of some requests, read when they are wanted: a large study has more than memory holds."""
+
+    def __init__(self, store: Store, requests: Sequence[RunRequest]) -> None:
+        self._store = store
+        self._requests = dict.fromkeys(requests)
+        self._recent: OrderedDict[RunRequest, Outcome] = OrderedDict()
+
+    def __getitem__(self, request: RunRequest) -> Outcome:
+        """Return an outcome. Raises ResultsError if its file is gone, or is not whole any more."""
+        if request not in self._requests:
+            raise KeyError(request)
+        if request not in self._recent:
+            outcome = self._store.find(request)
+            if outcome is None:
+                raise ResultsError(f"{self._store.path(request)}: gone or damaged since it was written; do it again")
+            self._recent[request] = outcome
+            if len(self._recent) > REMEMBERED:
+                self._recent.popitem(last=False)
+        self._recent.move_to_end(request)
+        return self._recent[request]
+
+    def __iter__(self) -> Iterator[RunRequest]:
+        """Go through the requests, in the order in which they were given."""
+        return iter(self._requests)
+
+    def __len__(self) -> int:
+        """Return how many requests there are."""
+        return len(self._requests)
+
+
+def iteration_limit(request: RunRequest) -> int | None:
+    """Return the iterations that fit into the updating period of a run, if power enters it by that number alone.
+
+    In a networked run the time of an answer counts as well, with an adaptive period the number is the rule's, and a
+    period that a load step cuts off leaves no record of its iterations.
+    """
+    program = settings_of(request.assignments).optimizer_plc.program
+    in_one_process = request.procedure is Procedure.CONFIGURED and not request.networked
+    if not in_one_process or not request.updating_period_s or program.interrupting_load_step_w:
+        return None
+    budget = PlcBudget(program.budget, make_solver(program).tau_1_s)
+    return budget.iterations(round(request.updating_period_s / program.process.tick_s))
+
+
+def never_cut_off(outcome: Outcome, limit: int) -> bool:
+    """Return whether each solve of a run ended by itself before `limit` iterations."""
+    return max(outcome.updates["iterations"], default=limit) < limit
+
+
+def families(requests: Iterable[RunRequest]) -> list[list[RunRequest]]:
+    """Return the requests in groups that differ by their limit of iterations only, the largest limit first."""
+    groups: dict[str, list[tuple[int, RunRequest]]] = {}
+    for request in dict.fromkeys(requests):
+        limit = iteration_limit(request)
+        key = request.digest if limit is None else _digest_without_budget(request)
+        groups.setdefault(key, []).append((limit or 0, request))
+    return [
+        [request for _, request in sorted(group, key=lambda one: one[0], reverse=True)] for group in groups.values()
+    ]
+
+
+def same_run(
+    request: RunRequest, done: Sequence[RunRequest], outcomes: Mapping[RunRequest, Outcome]
+) -> RunRequest | None:
+    """Return which of the requests `done` of its family had the outcome that `request` would have, if one is known."""
+    limit = iteration_limit(request)
+    if limit is None:
+        return None
+    for other in done:
+        if iteration_limit(other) == limit or never_cut_off(outcomes[other], limit):
+            return other
+    return None
+
+
+def _digest_without_budget(request: RunRequest) -> str:
+    return decisive_digest(request, settings_of(request.assignments).with_program(budget=BudgetSettings()))
+
+
+CONNECT_PATIENCE_S: Final = 10
+FINISHED: Final = "finished"
+"""State of a future whose task has ended well; one without a scheduler is cancelled, and has no exception either."""
+FILE_PATIENCE_S: Final = 60.0
+"""Time after which a file that a worker has written on a file system that is shared is seen here too."""
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Who does the runs."""
+
+    count: int
+    """Workers of a local cluster; its runs share nothing."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler that exists, instead."""
+
+    @contextlib.contextmanager
+    def connected(self) -> Iterator[Client]:
+        """Connect to the workers for a while. Raises UsageError if the scheduler does not answer."""
+        for name in ("distributed", "distributed.client"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # their import has set them to less
+        # an end at once, by a signal, leaves semaphores to a process that removes them, and need not warn of it
+        os.environ.setdefault("PYTHONWARNINGS", "ignore::UserWarning:multiprocessing.resource_tracker")
+        with contextlib.ExitStack() as stack:
+            address: str | LocalCluster
+            if self.scheduler is None:
+                address = stack.enter_context(
+                    LocalCluster(  # type: ignore[no-untyped-call]
+                        n_workers=self.count, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
+                        memory_limit=0, silence_logs=50,
+                    )
+                )  # fmt: skip
+            else:
+                address = self.scheduler
+            try:
+                client = stack.enter_context(Client(address, timeout=CONNECT_PATIENCE_S))  # type: ignore[no-untyped-call]
+            except (OSError, ValueError) as error:
+                reason = _first_line(error)
+                raise UsageError(f"--scheduler {self.scheduler}: {reason}; name one that is up") from None
+            yield client
+
+
+def checked_requests(study: Study, options: StudyOptions, folder: Path) -> Sequence[RunRequest]:
+    """Return the runs of a study, all of which can be done, and make its folders.
+
+    Raises:
+        UsageError: A run is too short, a solver is not there, or the folders cannot be written to.
+    """
+    requests = study.requests(options)
+    for request in requests:
+        check(request)
+    for name in (study.name, RUNS):
+        prepare_folder(folder / name)
+    return requests
+
+
+def perform_all(requests: Sequence[RunRequest], store: Store, workers: Workers, title: str) -> StoredOutcomes:
+    """Do what is missing; return the outcome of every request.
+
+    Raises:
+        StudyError: A run failed, or a worker runs other programs than we do, or writes to another folder.
+        ResultsError: An outcome cannot be written.
+    """
+    outcomes = StoredOutcomes(store, requests)
+    agenda = _Agenda(store, outcomes)
+    first = agenda.next()
+    if first:
+        with workers.connected() as client, INTERRUPTION.passed_to(_end_workers), _bar(title, len(outcomes)) as bar:
+            task = bar.task_ids[0]
+            bar.update(task, completed=agenda.done)
+            for request in _done(client, store, agenda, first):
+                agenda.note(request)
+                bar.update(task, completed=agenda.done)
+    return outcomes
+
+
+class _Agenda:
+    """Remaining runs: of each family the run with the largest limit, then those that it does not determine."""
+
+    def __init__(self, store: Store, outcomes: StoredOutcomes) -> None:
+        self._store = store
+        self._outcomes = outcomes
+        self._families = families(outcomes)
+        self._family = {request: family for family in self._families for request in family}
+        self._done = {request for request in outcomes if store.find(request) is not None}
+        self._begun: set[RunRequest] = set()
+
+    @property
+    def done(self) -> int:
+        """Number of requests whose outcome is there."""
+        return len(self._done)
+
+    def note(self, request: RunRequest) -> None:
+        """Note that a run was done."""
+        self._done.add(request)
+
+    def next(self, after: RunRequest | None = None) -> list[RunRequest]:
+        """Return what may be begun now that `after` was done, or at all; outcomes that are known are copied."""
+        found = self._families if after is None else [self._family[after]]
+        wanted = [request for family in found for request in self._of_family(family)]
+        self._begun.update(wanted)
+        return wanted
+
+    def _of_family(self, family: list[RunRequest]) -> list[RunRequest]:
+        known = [request for request in family if request in self._done]
+        missing = [request for request in family if request not in self._done | self._begun]
+        if known[:1] != family[:1]:
+            return [request for request in missing if request is family[0]]
+        return [request for request in missing if not self._copied(request, known)]
+
+    def _copied(self, request: RunRequest, known: list[RunRequest]) -> bool:
+        """Keep the outcome of the same run as this one's too, if there is one; or it has the same name already."""
+        if self._store.find(request) is None:
+            other = same_run(request, known, self._outcomes)
+            text = self._store.text(other) if other is not None else None
+            if text is None:
+                return False
+            self._store.keep(request, text)
+        self._done.add(request)
+        return True
+
+
+def _end_workers(_: signal.Signals) -> None:
+    """Unwind, so that the workers of a local cluster end; this thread only waits for them."""
+    raise KeyboardInterrupt
+
+
+def _done(client: Client, store: Store, agenda: _Agenda, first: Sequence[RunRequest]) -> Iterator[RunRequest]:
+    """Yield each request whose outcome a worker has written."""
+    folder, programs = str(store.folder.resolve()), programs_digest()
+    futures = {}
+
+    def submit(requests: Sequence[RunRequest]) -> list[object]:
+        new = {
+            client.submit(perform_and_keep, request, folder, programs, key=f"run-{request.digest}"): request
+            for request in requests
+        }
+        futures.update(new)
+        return list(new)
+
+    under_way = as_completed(submit(first))  # type: ignore[no-untyped-call]
+    for future in under_way:
+        request = futures.pop(future)
+        error = future.exception()
+        if isinstance(error, ColdloopError):
+            raise error
+        if error is not None:
+            reason = _first_line(error)
+            raise StudyError(f"a run under load {request.load} failed: {reason}; what was done before is kept")
+        if future.status != FINISHED:
+            raise StudyError("the scheduler is gone, or has given up a run; what was done before is kept: do it again")
+        _await_file(store, request)
+        yield request
+        under_way.update(submit(agenda.next(request)))  # type: ignore[no-untyped-call]
+        future.release()
+
+
+def perform_and_keep(request: RunRequest, folder: str, programs: str) -> None:
+    """Do a run and write its outcome, in a worker.
+
+    Raises:
+        StudyError: This is not the version of Coldloop that asks.
+        ResultsError: The folder is not there, or cannot be written.
+    """
+    if programs != programs_digest() or replace(request).digest != request.digest:
+        raise StudyError("a worker runs another version of Coldloop, or of a package of yours: install the same on all")
+    store = Store(Path(folder))
+    if not store.folder.is_dir():
+        raise ResultsError(f"{folder}: a worker has no such folder; {_SHARED}")
+    store.keep(request, perform(request))
+
+
+_SHARED: Final = "name an --out that all machines share, or do shards and merge them (`coldloop docs studies`)"
+
+
+def _await_file(store: Store, request: RunRequest) -> None:
+    """Wait until the file that a worker has written is seen here."""
+    deadline = time.monotonic() + FILE_PATIENCE_S
+    while store.find(request) is None:
+        if time.monotonic() >= deadline:
+            raise StudyError(f"{store.path(request)}: a worker has written it, and it is not here; {_SHARED}")
+        time.sleep(0.5)
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+@contextlib.contextmanager
+def _bar(title: str, total: int) -> Iterator[Progress]:
+    columns = (
+        TextColumn("{task.description}"), BarColumn(bar_width=32), MofNCompleteColumn(), TextColumn("runs"),
+        TimeElapsedColumn(), TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=make_console(), refresh_per_second=2) as bar:
+        bar.add_task(title, total=total)
+        yield bar

@@ -1,0 +1,365 @@
+"""Costs of throttled solvers against the computing power of the PLC (paper, figure `solv_cmp`).
+
+The paper compares 20 iterations of the ODE-based solver with 10 of qpOASES: 5 s over tau_1, without a slot for the
+preparation (section V), so that slot is left out here. Paired, every solver at every power has the same problems and is
+judged by what would be played; harsh problems show what solvers make of the same bad guess in the same PLC time.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import product
+from typing import Final
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from coldloop_plant.load import HOUR_TICKS
+from coldloop_rig.figures.plot import COLOURS
+from coldloop_rig.plc_sizing.intervals import crossing
+from coldloop_rig.text_tables import Cell, markdown_table
+from coldloop_studies import published
+from coldloop_studies.drawing import above_lowest, legend_outside, panels, paper, spans_decade, spread
+from coldloop_studies.paired_run import HARSH, INTERIOR_POINT_ITERATIONS
+from coldloop_studies.paired_sums import PairedSums, watch
+from coldloop_studies.request import Procedure, RunRequest, Series
+from coldloop_studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
+
+PERIOD_S = 5.0
+UNLIMITED = 50.0
+"""Power at which qpOASES makes 526 recalculations in a period: more than any problem takes."""
+
+
+def throttled(
+    load: Load, solver: str, power: float, trace_ticks: int = 0, procedure: Procedure = Procedure.CONFIGURED
+) -> RunRequest:
+    """Return the run of a solver at a power, relative to the PLC of the paper."""
+    return load.request(
+        PERIOD_S,
+        f"{PROGRAM}solver={solver}",
+        f"{PROGRAM}budget.power={power}",
+        f"{PROGRAM}budget.preparation_slots=0",
+        trace_ticks=trace_ticks,
+        procedure=procedure,
+    )
+
+
+PAIRED_DRAWS: Final = 10
+"""Of the eight hours' families, an hour each, unless another number is asked for."""
+FEW_POWERS: Final = (0.2, 0.6, 1.0, 2.0, 4.0, 10.0)
+QUICK_POWERS: Final = (0.2, 1.0, 25.0)
+LABELS: Final = {
+    "ode": "ODE", "qpoases": "qpOASES", "interior-point": "interior point", "osqp": "OSQP",
+    "fast-gradient": "fast gradient", "daqp": "DAQP, one solve",
+}  # fmt: skip
+
+
+def _paper_powers(options: StudyOptions) -> tuple[float, ...]:
+    return QUICK_POWERS if options.quick else tuple(published.solver_comparison()["ode"]["normalized_power"].tolist())
+
+
+def powers_of(solver: str, options: StudyOptions) -> tuple[float, ...]:
+    """Return the powers at which a solver is compared."""
+    if solver in ("ode", "qpoases") or options.quick:
+        return _paper_powers(options)
+    return (1.0,) if solver == "daqp" else FEW_POWERS
+
+
+def paired_loads(options: StudyOptions) -> list[Load]:
+    """Return the draws, an hour of each."""
+    return loads(options, "8h", usual=PAIRED_DRAWS, longest_ticks=HOUR_TICKS)
+
+
+def paired_request(load: Load, solver: str, power: float) -> RunRequest:
+    """Return the request for one solver at one power on the problems of a load."""
+    return throttled(load, solver, power, procedure=Procedure.PAIRED_PROBLEMS)
+
+
+def _paired_requests(options: StudyOptions) -> list[RunRequest]:
+    """Return all of them, load by load: a worker has the problems of a load at hand."""
+    return [
+        paired_request(load, solver, power)
+        for load in paired_loads(options)
+        for solver in LABELS
+        for power in powers_of(solver, options)
+    ]
+
+
+OpenLoop = PairedSums[str]
+
+
+def open_loop(options: StudyOptions, outcomes: Outcomes) -> OpenLoop:
+    """Gather the outcomes. Raises StudyError if a profile costs less than the optimum."""
+    powers = {solver: powers_of(solver, options) for solver in LABELS}
+    return PairedSums(paired_loads(options), powers, paired_request, str, outcomes)
+
+
+def open_loop_table(found: OpenLoop) -> str:
+    """Return total costs over the lowest with their intervals, and where solvers cross, as Markdown."""
+    some = [power for power in FEW_POWERS if any(power in powers for powers in found.powers.values())]
+    caption = (
+        f"**Paired, open loop**: total cost of all draws ({len(found.loads)}) over the lowest cost of any profile "
+        "that can be played [95 % interval over the draws]. All solvers have the same problems, each with "
+        "its own hot starts, and are judged by what the control PLC would play; no ratio can be below 1."
+    )
+    rows = []
+    for solver, powers in found.powers.items():
+        cells = [found.interval(solver, power).brief(4) if power in powers else "" for power in some]
+        rows.append((LABELS[solver], *cells))
+    table = markdown_table(("solver", *(f"P = {power:g}" for power in some)), rows, caption)
+    parts = [table]
+    for other in ("ode", "interior-point"):
+        power = found.crossing("qpoases", other)
+        parts.append(
+            f"At no power does qpOASES cost as little as {LABELS[other]}, all draws together."
+            if np.isnan(power.value)
+            else f"qpOASES costs no more than {LABELS[other]} from P = {power.brief()} on."
+        )
+    return "\n\n".join(parts)
+
+
+def _open_loop_figure(found: OpenLoop) -> Figure:
+    with panels(1, 1, 3.0) as (figure, (place,)):
+        for (solver, powers), colour in zip(found.powers.items(), COLOURS, strict=False):
+            intervals = [found.interval(solver, power) for power in powers]
+            above_lowest(place, powers, intervals, colour, LABELS[solver])
+        legend_outside(figure, place)
+    return figure
+
+
+HARSH_DRAWS: Final = 3
+"""Of six hours: they have more than 300 harsh problems."""
+
+
+def _harsh_loads(options: StudyOptions) -> list[Load]:
+    return loads(options, *"abcdef", usual=HARSH_DRAWS)
+
+
+def _solvers() -> list[str]:
+    return [name for name in LABELS if name != "daqp"]  # one solve of DAQP is longer than all of these times
+
+
+def harsh_request(load: Load, solver: str) -> RunRequest:
+    """Return the request for one solver on the harsh problems of a load, at P = 1."""
+    return throttled(load, solver, 1.0, procedure=Procedure.HARSH_PROBLEMS)
+
+
+def _harsh_requests(options: StudyOptions) -> list[RunRequest]:
+    return [harsh_request(load, solver) for load in _harsh_loads(options) for solver in _solvers()]
+
+
+def harsh_ratios(options: StudyOptions, outcomes: Outcomes) -> dict[str, dict[int, Series]]:
+    """Return the costs of all harsh problems over the lowest: by solver and by iterations of the interior-point solver.
+
+    Raises:
+        StudyError: A profile costs less than the optimum.
+    """
+    found = {}
+    for solver in _solvers():
+        runs = [outcomes[harsh_request(load, solver)] for load in _harsh_loads(options)]
+        for run, k in product(runs, INTERIOR_POINT_ITERATIONS):
+            watch(run, "lowest", run.column(f"after_{k}"), f"harsh problems, {solver}")
+        found[solver] = {
+            k: np.concatenate([run.column(f"after_{k}") / run.column("lowest") for run in runs])
+            for k in INTERIOR_POINT_ITERATIONS
+        }
+    return found
+
+
+def harsh_values(ratios: Mapping[str, Mapping[int, Series]]) -> dict[str, list[float]]:
+    """Return median and worst by name, and how many problems there were."""
+    values: dict[str, list[float]] = {}
+    for solver, by_count in ratios.items():
+        for k, found in by_count.items():
+            if len(found):
+                name = f"{LABELS[solver]}, in the time of {k} interior-point iterations"
+                values[f"J over the lowest of harsh problems, median: {name}"] = [float(np.median(found))]
+                values[f"J over the lowest of harsh problems, worst: {name}"] = [float(found.max())]
+    counts = [len(found) for found in next(iter(ratios.values())).values()]
+    values["number of harsh problems"] = [float(counts[0])]
+    return values
+
+
+def harsh_table(options: StudyOptions, outcomes: Outcomes) -> str:
+    """Return medians and worst ratios of every solver, with its number of iterations, as Markdown."""
+    ratios = harsh_ratios(options, outcomes)
+    number = len(next(iter(ratios.values()))[INTERIOR_POINT_ITERATIONS[0]])
+    if not number:
+        return "No problem was harsh."
+    first = _harsh_loads(options)
+    caption = (
+        f"**Harsh problems**: {number} problems of {len(first)} hours whose guess, the shifted profile of the "
+        f"converged loop, costs more than {HARSH:g} times the lowest; cost over the lowest, median (worst), after the "
+        "PLC time of so many iterations of the interior-point solver; in brackets each solver's own iterations."
+    )
+    rows = []
+    for solver, by_count in ratios.items():
+        counts = _counts(outcomes, first, solver)
+        cells = [
+            f"{np.median(found):.4g} ({found.max():.3g}) [{counts[k]:.0f}]" for k, found in by_count.items()
+        ]  # fmt: skip
+        rows.append((LABELS[solver], *cells))
+    return markdown_table(("solver", *(f"time of {k}" for k in INTERIOR_POINT_ITERATIONS)), rows, caption)
+
+
+def _counts(outcomes: Outcomes, drawn: list[Load], solver: str) -> dict[int, float]:
+    with_some = next(run for load in drawn if len((run := outcomes[harsh_request(load, solver)]).column("lowest")))
+    return {k: float(with_some.column(f"count_{k}")[0]) for k in INTERIOR_POINT_ITERATIONS}
+
+
+Table = Mapping[str, Mapping[str, Series]]
+"""Values against power, by solver and indicator."""
+
+SOLVERS: Final = {"ode": "ODE", "qpoases": "qpOASES"}
+INDICATORS: Final = ("J_dev", "J_cst", "J_total", "c1", "c2", "J_BF")
+CLOSED_DRAWS: Final = 6
+CLOSED_TICKS: Final = 2 * HOUR_TICKS
+"""Of the eight hours, in the closed loop: six draws of two hours say more than one and a half of eight."""
+COLUMNS: Final = ("part", "load", "solver", "power", *INDICATORS, "J_total over the lowest")
+
+
+class SolverComparison:
+    """Open loop, paired, and closed loop, two solvers at 18 powers and the others at some; harsh problems."""
+
+    name = "solver-comparison"
+    title = "Solvers against computing power (figure solv_cmp)"
+
+    def requests(self, options: StudyOptions) -> list[RunRequest]:
+        """Return the problems of all solvers, then every solver of the paper in the closed loop, long runs first."""
+        closed = [
+            throttled(load, solver, power)
+            for power in sorted(_paper_powers(options), reverse=True)
+            for solver in SOLVERS
+            for load in _closed_loads(options)
+        ]
+        return [*_paired_requests(options), *_harsh_requests(options), *closed]
+
+    @np.errstate(divide="ignore", invalid="ignore")  # under a load that never steps nothing costs anything
+    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+        """Compare costs with those of converged qpOASES, with the lowest there are, and with the paper's."""
+        powers = np.array(_paper_powers(options))
+        paired = open_loop(options, outcomes)
+        tables: list[Table] = [paired.table(draw) for draw in range(len(paired.loads))]
+        closed = [_closed_table(load, powers, outcomes) for load in _closed_loads(options)]
+        result = StudyResult(COLUMNS, [], {
+            "indicators": _figure(powers, tables, closed),
+            "paired open loop": _open_loop_figure(paired),
+        })  # fmt: skip
+        for load, table in zip(paired.loads, tables, strict=True):
+            result.rows += _open_rows(load, table, paired.powers)
+            _gather(result, _open_loop_measures(powers, table))
+        for load, table in zip(_closed_loads(options), closed, strict=True):
+            result.rows += [
+                (
+                    "closed",
+                    load.name,
+                    solver,
+                    power,
+                    *(np.nan,) * (len(INDICATORS) - 1),
+                    table[solver]["J_BF"][i],
+                    np.nan,
+                )
+                for solver in SOLVERS
+                for i, power in enumerate(powers.tolist())
+            ]
+            _gather(result, _closed_loop_measures(powers, table))
+        result.values |= harsh_values(harsh_ratios(options, outcomes))
+        result.remarks += [open_loop_table(paired), harsh_table(options, outcomes)]
+        return result
+
+
+def _gather(result: StudyResult, values: Mapping[str, float]) -> None:
+    for claim, value in values.items():
+        result.note(claim, value)
+
+
+def _open_rows(
+    load: Load, table: Mapping[str, Mapping[str, Series]], powers: Mapping[str, Sequence[float]]
+) -> list[tuple[Cell, ...]]:
+    return [
+        ("paired", load.name, solver, power, *(columns[name][i] for name in INDICATORS[:-1]), np.nan,
+         columns["J_total"][i] / columns["lowest"][i])
+        for solver, columns in table.items()
+        for i, power in enumerate(powers[solver])
+    ]  # fmt: skip
+
+
+def _closed_loads(options: StudyOptions) -> list[Load]:
+    return loads(options, "8h", usual=CLOSED_DRAWS, longest_ticks=CLOSED_TICKS)
+
+
+def _closed_table(load: Load, powers: Series, outcomes: Outcomes) -> Table:
+    return {
+        solver: {"J_BF": np.array([outcomes[throttled(load, solver, p)].indicators.J_BF for p in powers.tolist()])}
+        for solver in SOLVERS
+    }
+
+
+def measures(powers: Series, table: Table) -> dict[str, float]:
+    """Return what the claims are judged by, of points that have both parts: the paper's own."""
+    return {**_open_loop_measures(powers, table), **_closed_loop_measures(powers, table)}
+
+
+def _open_loop_measures(powers: Series, table: Table) -> dict[str, float]:
+    ode, qpoases = table["ode"], table["qpoases"]
+    converged = qpoases["J_total"][-1]
+    relative = qpoases["J_total"] / converged
+    distance = np.abs(relative - 1)
+    one, fifth = _place(powers, 1.0), _place(powers, 0.2)
+    return {
+        "qpOASES over converged at P = 1": float(relative[one]),
+        "qpOASES over converged at P = 0.2": float(relative[fifth]),
+        "qpOASES from P = 10 on, largest distance from converged": _largest(distance[:-1], powers[:-1] >= 10),
+        "qpOASES, largest rise of total cost with P": float((relative[1:] / relative[:-1] - 1).max()),
+        "ODE over converged, largest from P = 0.6 on": float((ode["J_total"][powers >= 0.6] / converged).max()),
+        "qpOASES over ODE in total cost at P = 1": float(qpoases["J_total"][one] / ode["J_total"][one]),
+        "crossing in total cost": crossing(powers, qpoases["J_total"], ode["J_total"]),
+        "c1 of qpOASES at P = 1": float(qpoases["c1"][one]),
+        "c2 of qpOASES at P = 1": float(qpoases["c2"][one]),
+        "c1 of ODE at P = 1": float(ode["c1"][one]),
+        "c2 of ODE at P = 1": float(ode["c2"][one]),
+    }
+
+
+def _closed_loop_measures(powers: Series, table: Table) -> dict[str, float]:
+    ode, qpoases = table["ode"]["J_BF"], table["qpoases"]["J_BF"]
+    one = _place(powers, 1.0)
+    return {
+        "qpOASES over ODE in J_BF at P = 1": float(qpoases[one] / ode[one]),
+        "crossing in J_BF": crossing(powers, qpoases, ode),
+        "crossing in J_BF within 2 %": crossing(powers, qpoases, 1.02 * ode),
+    }
+
+
+def _place(powers: Series, power: float) -> int:
+    return int(np.argmin(np.abs(powers - power)))
+
+
+def _largest(values: Series, which: "NDArray[np.bool_]") -> float:
+    return float(values[which].max()) if which.any() else float("nan")
+
+
+def _figure(powers: Series, paired: Sequence[Table], closed: Sequence[Table]) -> Figure:
+    """Draw ours and the paper's, each relative to its own qpOASES at the largest power where units differ."""
+    labels = {
+        "J_dev": "(a) $J^{dev}$, relative (1)",
+        "J_cst": "(b) $J^{cst}$, relative (1)", "J_total": "(c) total, relative (1)",
+        "c1": "(d) $c_1$ (%, K)", "c2": "(e) $c_2$ (%, K)", "J_BF": "(f) $J^{BF}$, relative (1)",
+    }  # fmt: skip
+    theirs = published.solver_comparison()
+    with panels(3, 2, 7.5, sharex=True) as (figure, axes):
+        for place, name in zip(axes, INDICATORS, strict=True):
+            relative, tables = name.startswith("J"), closed if name == "J_BF" else paired
+            for solver, colour in zip(SOLVERS, COLOURS, strict=False):
+                ours = [table[solver][name] / (table["qpoases"][name][-1] if relative else 1.0) for table in tables]
+                spread(place, powers, ours, colour, f"{SOLVERS[solver]}, here")
+                base = theirs["qpoases"][name][-1] if relative else 1.0
+                paper(place, theirs[solver]["normalized_power"], theirs[solver][name] / base, colour,
+                      f"{SOLVERS[solver]}, paper")  # fmt: skip
+            place.set_xscale("log")
+            place.set_ylabel(labels[name])
+            if spans_decade(np.concatenate([np.ravel(line.get_ydata()) for line in place.lines])):
+                place.set_yscale("log")
+        legend_outside(figure, axes[0])
+        for place in axes[-2:]:
+            place.set_xlabel("normalised power $P$ (1)")
+    return figure

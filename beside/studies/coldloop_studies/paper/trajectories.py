@@ -1,0 +1,391 @@
+"""Runs against time, and what happens after load steps: the paper's figures of time courses, and its section II.
+
+Figures `working_mpc`, `not_working_mpc`, `mult_solv`, `scenario_exp`, `diff_upt`, `compareSf`. A mean of the updating
+period over updates counts short periods too often: in the same time there are ten of 0.5 s for one of 5 s. Here every
+tick has the period that is in force then, and counts once.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from coldloop.process.cold_box import COLD_BOX, SAMPLING_PERIOD_S, TICK_S
+from coldloop_rig.figures.plot import COLOURS, DASHES, legend_above
+from coldloop_rig.text_tables import markdown_table
+from coldloop_studies.drawing import legend_outside, panels, spread, time_panels
+from coldloop_studies.paper.solver_comparison import UNLIMITED, throttled
+from coldloop_studies.request import Outcome, RunRequest, Series
+from coldloop_studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
+
+TRACE_TICKS = 4
+AFTER_STEP_S = 30.0
+"""A problem that follows a load step by less than this belongs to the load event."""
+QUIET_S = 120.0
+"""Without a load step for this long it is quiet."""
+BANDS = tuple((band.low, band.high) for band in COLD_BOX.bands)
+
+UNLIMITED_QPOASES = ("qpOASES, unlimited", "qpoases", UNLIMITED)
+THROTTLED_QPOASES = ("qpOASES, 10 iterations", "qpoases", 1.0)
+THROTTLED_ODE = ("ODE, 20 iterations", "ode", 1.0)
+
+
+@dataclass(frozen=True)
+class TrajectoryStudy:
+    """Runs of several solvers under the same load, drawn over each other."""
+
+    name: str
+    title: str
+    cases: tuple[tuple[str, str, float], ...]
+    """Label, solver, power."""
+
+    def requests(self, options: StudyOptions) -> list[RunRequest]:
+        """Return a run of every case under every draw."""
+        return [request for load in loads(options, "d") for request in self._runs(load)]
+
+    def _runs(self, load: Load) -> list[RunRequest]:
+        return [throttled(load, solver, power, TRACE_TICKS) for _, solver, power in self.cases]
+
+    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+        """Compare closed-loop costs, bands and iterations."""
+        result = StudyResult(
+            ("load", "case", "J_BF", "L1 outside (%)", "T5 outside (%)", "furthest outside", "iterations after a step",
+             "iterations in quiet"), [], {},
+        )  # fmt: skip
+        for load in loads(options, "d"):
+            runs = [outcomes[request] for request in self._runs(load)]
+            labelled = [(label, run) for (label, _, _), run in zip(self.cases, runs, strict=True)]
+            if not result.figures:
+                result.figures["time courses"] = time_panels(labelled, BANDS)
+            for label, run in labelled:
+                after, quiet = iterations_by_event(run, load)
+                result.rows.append(
+                    (load.name, label, run.indicators.J_BF, *run.indicators.outside_band_pct.values(),
+                     furthest_outside(run), after, quiet)
+                )  # fmt: skip
+            self._judge(result, load, runs)
+        return result
+
+    def _judge(self, result: StudyResult, load: Load, runs: Sequence[Outcome]) -> None:
+        reference = runs[-1]
+        outside = tuple(reference.indicators.outside_band_pct.values())
+        after, quiet = iterations_by_event(reference, load)
+        values: dict[str, float] = {}
+        if len(runs) == 1:
+            values["furthest outside"] = furthest_outside(reference)
+            values["time outside"] = max(outside)
+            values["iterations"] = after / quiet if quiet else float("nan")
+        if len(runs) > 1:
+            values["J_BF"] = runs[0].indicators.J_BF / reference.indicators.J_BF
+        if len(runs) > 2:
+            values["J_BF of qpOASES over ODE"] = runs[1].indicators.J_BF / runs[0].indicators.J_BF
+        for what, value in values.items():
+            result.note(f"{self.name}: {what}", value)
+
+
+def furthest_outside(run: Outcome) -> float:
+    """Return the largest violation of a band, in % of level or K."""
+    return max(
+        float(np.max(np.maximum(low - run.series(name), run.series(name) - high), initial=0.0))
+        for name, (low, high) in zip(("L1", "T5"), BANDS, strict=True)
+    )
+
+
+def iterations_by_event(run: Outcome, load: Load) -> tuple[float, float]:
+    """Return the mean number of iterations just after load steps, and in quiet."""
+    since = _seconds_since_step(run, load)
+    iterations = run.column("iterations")
+    after, quiet = iterations[since < AFTER_STEP_S], iterations[since >= QUIET_S]
+    return (float(after.mean()) if len(after) else np.nan, float(quiet.mean()) if len(quiet) else np.nan)
+
+
+def load_steps(load: Load) -> Series:
+    """Return the ticks at which the load changes, after one before all time."""
+    changes = [
+        tick
+        for tick, before, watts in zip(load.profile.times[1:], load.profile.watts, load.profile.watts[1:], strict=False)
+        if watts != before
+    ]
+    return np.array([-np.inf, *changes])
+
+
+def _steps_before(ticks: Series, load: Load) -> "NDArray[np.intp]":
+    return np.searchsorted(load_steps(load), ticks, side="right") - 1
+
+
+def _seconds_since_step(run: Outcome, load: Load) -> Series:
+    """Return for each update the plant time since the last load step, which begins at the first one."""
+    ticks = run.column("tick")
+    last = load_steps(load)[_steps_before(ticks, load)]
+    since: Series = (ticks - last) * TICK_S
+    return since
+
+
+UNLIMITED_STUDY = TrajectoryStudy(
+    "unlimited", "The scheme with qpOASES and no limit of iterations (figure working_mpc)", (UNLIMITED_QPOASES,)
+)
+LIMITED_STUDY = TrajectoryStudy(
+    "limited", "qpOASES limited to 10 iterations (figure not_working_mpc)", (THROTTLED_QPOASES, UNLIMITED_QPOASES)
+)
+TRAJECTORIES_STUDY = TrajectoryStudy(
+    "trajectories",
+    "The ODE-based solver, limited qpOASES and unlimited qpOASES (figure mult_solv)",
+    (THROTTLED_ODE, THROTTLED_QPOASES, UNLIMITED_QPOASES),
+)
+
+
+SOON_S: Final = (0.0, 30.0)
+"""The window after a load step by which the response is judged."""
+QUIET_SPAN_S: Final = (60.0, np.inf)
+EDGES_S: Final = np.array([0.0, 2.5, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0, 300.0, np.inf])
+DRAWN_TO_S: Final = 400.0
+"""Where the last window, which has no end, ends in the figure."""
+
+Run = tuple[Outcome, Load]
+
+
+class HeldPeriods(NamedTuple):
+    """Ticks that have an updating period and a load step before them, of several runs."""
+
+    since_s: Series
+    """Time since the last load step."""
+    tau_u_s: Series
+    """The period in force."""
+
+    def mean(self, span: tuple[float, float]) -> float:
+        """Return the mean period (s) in a window of time since the step; NaN if no tick is in it."""
+        chosen = self.tau_u_s[(span[0] <= self.since_s) & (self.since_s < span[1])]
+        return float(chosen.mean()) if len(chosen) else np.nan
+
+    def share_of_longest(self, span: tuple[float, float]) -> float:
+        """Return the share of a window's time that has the longest period; NaN if no tick is in it."""
+        chosen = self.tau_u_s[(span[0] <= self.since_s) & (self.since_s < span[1])]
+        return float((chosen == SAMPLING_PERIOD_S).mean()) if len(chosen) else np.nan
+
+
+def held_periods(runs: Sequence[Run]) -> HeldPeriods:
+    """Return the periods of runs, tick by tick; a period is held until the next update whose sequence is played."""
+    since, held = [np.empty(0)], [np.empty(0)]
+    for run, load in runs:
+        start, tau = run.column("tick"), run.column("tau_u")
+        if not len(start):
+            continue
+        ticks = np.arange(start[0], start[-1] + tau[-1])
+        steps = load_steps(load)
+        after = ticks - steps[np.searchsorted(steps, ticks, side="right") - 1]
+        known = np.isfinite(after)
+        since.append(after[known] * TICK_S)
+        held.append(tau[np.searchsorted(start, ticks, side="right") - 1][known] * TICK_S)
+    return HeldPeriods(np.concatenate(since), np.concatenate(held))
+
+
+def contractions(runs: Sequence[Run]) -> tuple[Series, Series]:
+    """Return for all updates but the first of each run K = J_{k+1} / J_k, and the time since the load step (s)."""
+    K, since = [np.empty(0)], [np.empty(0)]
+    for run, load in runs:
+        effective = run.column("j_effective")
+        K.append(effective[1:] / effective[:-1])
+        since.append(_seconds_since_step(run, load)[1:])
+    return np.concatenate(K), np.concatenate(since)
+
+
+def response(runs: Sequence[Run], policy: str) -> dict[str, float]:
+    """Return what is claimed of the response of a policy, and the quantities that explain it."""
+    held = held_periods(runs)
+    K, since = contractions(runs)
+    quiet = held.mean(QUIET_SPAN_S)
+    return {
+        f"tau_u 0 to 30 s after a load step over that in quiet, by time, {policy}": held.mean(SOON_S) / quiet,
+        f"tau_u in quiet (s), by time, {policy}": quiet,
+        f"tau_u 0 to 30 s after a load step (s), by time, {policy}": held.mean(SOON_S),
+        f"share of the quiet time at the longest period, {policy}": held.share_of_longest(QUIET_SPAN_S),
+        f"median of |K - 1| in quiet, {policy}": _median_distance(K[since >= QUIET_SPAN_S[0]]),
+        f"median of |K - 1| 0 to 30 s after a load step, {policy}": _median_distance(K[since < SOON_S[1]]),
+    }
+
+
+def _median_distance(K: Series) -> float:
+    return float(np.median(np.abs(K - 1.0))) if len(K) else np.nan
+
+
+def response_table(runs_of: Mapping[str, Sequence[Run]]) -> str:
+    """Return the mean period of each policy in each window, as Markdown."""
+    spans = list(pairwise(EDGES_S.tolist()))
+    names = [f"{low:g}-{high:g} s" if np.isfinite(high) else f"from {low:g} s on" for low, high in spans]
+    caption = "**Mean updating period (s) against the time since the load step**, weighted by time, all hours together."
+    rows = []
+    for policy, runs in runs_of.items():
+        means = [held_periods(runs).mean(span) for span in spans]
+        rows.append((policy, *("" if np.isnan(mean) else f"{mean:.2f}" for mean in means)))
+    return markdown_table(("policy", *names), rows, caption)
+
+
+def response_figure(runs_of: Mapping[str, Sequence[Run]]) -> Figure:
+    """Draw the mean period of each policy in each window."""
+    edges = np.where(np.isfinite(EDGES_S), EDGES_S, DRAWN_TO_S)
+    with panels(1, 1, 2.8) as (figure, (place,)):
+        for (policy, runs), colour in zip(runs_of.items(), COLOURS, strict=False):
+            means = [held_periods(runs).mean(span) for span in pairwise(EDGES_S.tolist())]
+            place.stairs(means, edges, color=colour, linestyle=DASHES[colour], baseline=None, label=policy)
+        place.set_xlabel(f"time since the load step (s); the last is from {EDGES_S[-2]:g} s on")
+        place.set_ylabel("mean updating period (s), by time")
+        place.set_ylim(bottom=0)
+        legend_outside(figure, place)
+    return figure
+
+
+@dataclass(frozen=True)
+class ExperimentStudy:
+    """Runs on the bus, three services and Modbus/TCP, each repeated in one process."""
+
+    name: str
+    title: str
+    cases: tuple[tuple[str, float], ...]
+    """Label and updating period, s; 0 is adaptive."""
+
+    def requests(self, options: StudyOptions) -> list[RunRequest]:
+        """Return each case on the bus and in one process, under the first draw."""
+        return [request for load in self._loads(options) for _, period in self.cases for request in _both(load, period)]
+
+    def _loads(self, options: StudyOptions) -> list[Load]:
+        return [load for load in loads(options, "2h") if load.draw == 1]
+
+    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+        """Compare traces, bands and updating periods."""
+        result = StudyResult(
+            ("load", "case", "rig", "J_BF", "L1 outside (%)", "T5 outside (%)", "tau_u mean (s)",
+             "tau_u mean per update (s)", "trace"), [], {},
+        )  # fmt: skip
+        for load in self._loads(options):
+            labelled = []
+            for label, period in self.cases:
+                networked, alone = (outcomes[request] for request in _both(load, period))
+                labelled.append((label, networked))
+                for rig, run in (("networked", networked), ("one process", alone)):
+                    i = run.indicators
+                    result.rows.append(
+                        (load.name, label, rig, i.J_BF, *i.outside_band_pct.values(), i.tau_u_mean,
+                         i.tau_u_mean_per_update, run.trace_sha256)
+                    )  # fmt: skip
+                same = networked.trace_sha256 == alone.trace_sha256
+                result.note(f"{self.name}: same trace, {label}", same)
+                outside = max(networked.indicators.outside_band_pct.values())
+                result.note(f"{self.name}: time outside the bands, {label}", outside)
+                if not period:
+                    for what, value in response([(networked, load)], label).items():
+                        result.note(f"{self.name}: {what}", value)
+            if not result.figures:
+                result.figures["time courses"] = time_panels(labelled, BANDS)
+        return result
+
+
+def _both(load: Load, period_s: float) -> Sequence[RunRequest]:
+    return [load.request(period_s, networked=networked, trace_ticks=TRACE_TICKS) for networked in (True, False)]
+
+
+PLC_2H = ExperimentStudy("plc-2h", "Two hours on the bus at tau_u = 5 s (figure scenario_exp)", (("5 s", 5.0),))
+ADAPTIVE_2H = ExperimentStudy(
+    "adaptive-2h", "Two hours on the bus, 2.5 s against adaptive (figure diff_upt)", (("2.5 s", 2.5), ("adaptive", 0.0))
+)
+
+
+PERIODS_S: Final = (1.0, 2.0, 3.0, 4.0, 5.0)
+SOLVERS: Final = {"ode": "ODE", "qpoases": "qpOASES", "fast-gradient": "fast gradient", "osqp": "OSQP"}
+
+
+COLUMNS: Final = ("load", "solver", "tau_u (s)", "E", "D", "share of load steps with E > D")
+
+
+class TradeOff:
+    """E for each solver and D, against tau_u, in the first period after load steps."""
+
+    name = "trade-off"
+    title = "What a period wins and loses (figures compareSf and twocases)"
+
+    def requests(self, options: StudyOptions) -> list[RunRequest]:
+        """Return every solver at every period."""
+        return [
+            _request(load, solver, period)
+            for load in loads(options, "c")
+            for solver in SOLVERS
+            for period in _periods(options)
+        ]
+
+    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+        """Average E and D over the events of each run."""
+        periods = _periods(options)
+        result = StudyResult(COLUMNS, [], {})
+        curves: dict[str, list[list[tuple[float, float]]]] = {solver: [] for solver in SOLVERS}
+        for load in loads(options, "c"):
+            for solver, label in SOLVERS.items():
+                points = [won_and_lost(outcomes[_request(load, solver, period)], load) for period in periods]
+                curves[solver].append(points)
+                result.rows += [
+                    (load.name, label, period, won, lost, share_falling(outcomes[_request(load, solver, period)], load))
+                    for period, (won, lost) in zip(periods, points, strict=True)
+                ]
+            for what, value in _discriminating(load, periods, outcomes).items():
+                result.note(what, value)
+        result.figures["efficiency and degradation"] = _trade_off_figure(periods, curves)
+        return result
+
+
+def _periods(options: StudyOptions) -> tuple[float, ...]:
+    return (1.0, 2.5, 5.0) if options.quick else PERIODS_S
+
+
+def _request(load: Load, solver: str, period_s: float) -> RunRequest:
+    return load.request(period_s, f"{PROGRAM}solver={solver}")
+
+
+def _after_steps(run: Outcome, load: Load) -> tuple[Series, Series]:
+    played, hot_start, delivered = (run.column(name) for name in ("j_effective", "j_hot_start", "j_delivered"))
+    event = np.diff(_steps_before(run.column("tick"), load), prepend=0) > 0  # the first one after a load step
+    return (hot_start - delivered)[event], (hot_start - played)[event]
+
+
+def won_and_lost(run: Outcome, load: Load) -> tuple[float, float]:
+    """Return the mean of E_k and of D_k over the first updates after load steps."""
+    won, lost = _after_steps(run, load)
+    return (float(won.mean()), float(lost.mean())) if len(won) else (float("nan"), float("nan"))
+
+
+def share_falling(run: Outcome, load: Load) -> float:
+    """Return after which share of the load steps E_k > D_k: the cost falls in the first period."""
+    won, lost = _after_steps(run, load)
+    return float((won > lost).mean()) if len(won) else float("nan")
+
+
+def _discriminating(load: Load, periods: tuple[float, ...], outcomes: Outcomes) -> dict[str, float]:
+    """Return how solvers and periods differ in the share of load steps after which the cost falls at once."""
+    share = {
+        (solver, period): share_falling(outcomes[_request(load, solver, period)], load)
+        for solver in ("ode", "qpoases")
+        for period in (periods[0], periods[-1])
+    }
+    short, long = f"{periods[0]:g} s", f"{periods[-1]:g} s"
+    return {
+        f"share of load steps after which E > D at {short}: ODE less qpOASES":
+            share["ode", periods[0]] - share["qpoases", periods[0]],
+        f"share of load steps after which E > D at {long} less that at {short}: qpOASES":
+            share["qpoases", periods[-1]] - share["qpoases", periods[0]],
+    }  # fmt: skip
+
+
+def _trade_off_figure(periods: tuple[float, ...], curves: dict[str, list[list[tuple[float, float]]]]) -> Figure:
+    with panels(2, 2, 5.0, sharex=True) as (figure, axes):
+        for place, (solver, draws), colour in zip(axes, curves.items(), COLOURS, strict=False):
+            values = np.array(draws)
+            spread(place, periods, values[:, :, 0], colour, "$E$: won by the solver")
+            spread(place, periods, values[:, :, 1], "#888888", "$D$: lost by shift and mismatch")
+            place.set_title(SOLVERS[solver], loc="left", pad=18)
+            place.set_ylabel("cost a period (1)")
+            place.yaxis.set_major_formatter(lambda value, _: f"{value:g}")  # the power of ten at each mark
+            legend_above(place)
+        for place in axes[-2:]:
+            place.set_xlabel("updating period (s)")
+    return figure

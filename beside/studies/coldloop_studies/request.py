@@ -1,0 +1,274 @@
+"""One run of a study: request and outcome. Both travel between processes as plain data."""
+
+import asyncio
+import hashlib
+import json
+import sys
+import tempfile
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from functools import cached_property, lru_cache
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.errors import UsageError
+from coldloop.kernels.reach import digest
+from coldloop.parsing import parsed_json
+from coldloop.process.cold_box import COLD_BOX, L1, T5, TICK_S
+from coldloop.process.load_profile import LoadProfile
+from coldloop.process.lti_model import load as load_model
+from coldloop.process.station import STATION_SIGNAL_NAMES
+from coldloop.service.start import main as start_service
+from coldloop_optimizer_plc.solvers import make_solver
+from coldloop_rig.cosim.linear_plant import LinearRig
+from coldloop_rig.cosim.local_services import run_on_localhost
+from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.cosim.scenario import Scenario
+from coldloop_rig.cosim.wiring import SERVICES
+from coldloop_rig.results.folders import installed_version
+from coldloop_rig.results.indicators import Indicators, StageCost, evaluate, has_no_answer
+from coldloop_rig.results.recording import Recorder, Recording
+from coldloop_rig.settings import Settings
+from coldloop_studies.paired_run import harsh_run, paired_indicators, paired_run, problem_sequence
+from coldloop_studies.settings import outside_digests, settings_of
+
+Series = NDArray[np.float64]
+
+PACKAGES_WITH_DATA = ("coldloop", "coldloop_plant", "coldloop_control_plc", "coldloop_optimizer_plc")
+DATA_SUFFIXES = (".json", ".npz", ".csv")
+T9 = [one.name for one in COLD_BOX.outputs].index("T9")
+DECISIVE = {"limits", "model", "session", "plant", "control_plc", "optimizer_plc"}
+"""Sections of the configuration that a run reads."""
+LIBRARIES = ("casadi", "clarabel", "daqp", "numba", "numpy", "osqp", "piqp", "qpalm")
+UPDATE_COLUMNS = (
+    "tick", "tau_u", "iterations", "j_effective", "j_hot_start", "j_delivered", "j_dev", "j_cst", "violation",
+)  # fmt: skip
+
+
+class Procedure(StrEnum):
+    """Who decides in a run."""
+
+    CONFIGURED = "configured"
+    """The three programs, as they are configured."""
+    PAIRED_PROBLEMS = "paired problems"
+    """No loop: the configured solver solves the problems of a converged loop (`coldloop_studies.paired_run`)."""
+    HARSH_PROBLEMS = "harsh problems"
+    """The same, and only those count whose guess is far from the optimum, each solver beginning at the same one."""
+    LINEAR_PLANT = "linear plant"
+    """The optimiser and the control PLC with the linear model for a plant (`coldloop_rig.cosim.linear_plant`)."""
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """A run that any worker can do, and that is done once: its digest names its result."""
+
+    load: str
+    """Name of the load, for people."""
+    times: tuple[int, ...]
+    watts: tuple[float, ...]
+    ticks: int
+    updating_period_s: float
+    """0 is adaptive."""
+    assignments: tuple[str, ...] = ()
+    """Configuration that differs from the paper's preset, as `section.key=value`."""
+    draw: int = 1
+    """Which draw of a named load this is; of a load file, which draw of the sensors' noise."""
+    networked: bool = False
+    """Three services on the bus instead of one process."""
+    trace_ticks: int = 0
+    """Every so many ticks of the trace are kept; 0 is none."""
+    procedure: Procedure = Procedure.CONFIGURED
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest of all that decides the outcome: the same for requests that ask for the same run in other words."""
+        return decisive_digest(self, settings_of(self.assignments))
+
+
+class Happening(NamedTuple):
+    """An event of a journal, without who caused it."""
+
+    service: str
+    tick: int
+    kind: int
+    subject: int
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run left behind."""
+
+    programs: str
+    """Digest of the programs that did it."""
+    indicators: Indicators
+    trace_sha256: str
+    deadline_misses: int
+    updates: dict[str, list[float]]
+    """Columns of the updates, by name."""
+    trace: dict[str, list[float]]
+    """Columns of the trace, by name; empty unless it was asked for."""
+    events: list[Happening] = field(default_factory=list)
+    """What the journals say, if the trace was asked for."""
+    failed_updates: int = 0
+    """Updates that had no answer."""
+
+    def column(self, name: str) -> Series:
+        """Return a column of the updates."""
+        return np.asarray(self.updates[name], dtype=float)
+
+    def series(self, name: str) -> Series:
+        """Return a column of the trace."""
+        return np.asarray(self.trace[name], dtype=float)
+
+    def to_json(self) -> str:
+        """Return the outcome as one JSON document."""
+        return json.dumps({**asdict(self), "indicators": self.indicators._asdict()})
+
+    @classmethod
+    def from_json(cls, text: str) -> "Outcome":
+        """Return the outcome of a document. Raises ValueError if it is not one."""
+        try:
+            content = parsed_json(text)
+            events = [Happening(*event) for event in content["events"]]
+            return cls(**{**content, "indicators": Indicators(**content["indicators"]), "events": events})
+        except (TypeError, KeyError) as error:
+            raise ValueError(str(error)) from None
+
+
+def decisive_digest(request: RunRequest, settings: Settings) -> str:
+    """Return a digest of the load, of the settings that have an effect on a run, and of the programs that do it."""
+    asked = asdict(request)
+    for name in ("load", "assignments"):
+        del asked[name]
+    configured = _plain(settings.model_dump(include=DECISIVE))
+    outside = outside_digests(settings.optimizer_plc.program.outside)
+    content = json.dumps([asked, configured, programs_digest(), outside], sort_keys=True, default=str)
+    return hashlib.sha256(content.encode()).hexdigest()[:20]
+
+
+def _plain(value: object) -> object:
+    """Return settings as plain data; a file counts by what is in it, wherever it is."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, Path):
+        return _file_digest(value)
+    return value
+
+
+@lru_cache(maxsize=16)
+def _file_digest(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return str(path)  # the run will say what is wrong with it
+
+
+def programs() -> tuple[Any, ...]:
+    """Return what does a run: `perform`, and the services that it may start, which it knows by name."""
+    services = (import_module(f"coldloop_{service}.runtime").serve for service in SERVICES)
+    return (perform, start_service, *services)
+
+
+@lru_cache(maxsize=1)
+def programs_digest() -> str:
+    """Return a digest of all that decides what a run gives: code, data files, versions of Python and of libraries."""
+    folders = (Path(folder) for name in PACKAGES_WITH_DATA for folder in import_module(name).__path__)
+    files = [file for folder in folders for file in sorted(folder.rglob("*")) if file.suffix in DATA_SUFFIXES]
+    versions = [(library, installed_version(library)) for library in LIBRARIES]
+    return digest(programs(), files, versions, sys.implementation.cache_tag)[:16]
+
+
+SHORTEST_TICKS = 60
+"""Three of the longest updating periods: with less, no update ever takes effect."""
+
+
+def check(request: RunRequest) -> None:
+    """Find out, before any run is done, what would make one fail.
+
+    Raises:
+        UsageError: A run is too short, or a solver is not there.
+    """
+    program = settings_of(request.assignments).optimizer_plc.program
+    if request.ticks < SHORTEST_TICKS:
+        duration_s, least_s = (ticks * program.process.tick_s for ticks in (request.ticks, SHORTEST_TICKS))
+        raise UsageError(f"{duration_s:g} s are too short for a study: choose a --duration of {least_s:g} s or more")
+    make_solver(program)
+
+
+def perform(request: RunRequest) -> str:
+    """Do a run; return its outcome as JSON."""
+    settings = settings_of(request.assignments)
+    scenario = Scenario(
+        request.ticks, LoadProfile(request.times, request.watts), request.updating_period_s, request.draw
+    )
+    recorder = Recorder(request.ticks)
+    match request.procedure:
+        case Procedure.PAIRED_PROBLEMS | Procedure.HARSH_PROBLEMS:
+            return _of_problems(request, settings, scenario).to_json()
+        case Procedure.LINEAR_PLANT:
+            LinearRig(settings).run(scenario, recorder)
+        case Procedure.CONFIGURED if request.networked:
+            with tempfile.TemporaryDirectory(prefix="coldloop-logs-") as logs:
+                asyncio.run(run_on_localhost(settings, scenario, recorder, Path(logs)))
+        case Procedure.CONFIGURED:
+            _rig(request.assignments).run(scenario, recorder)
+    return _outcome(recorder.recording(), settings, request.trace_ticks).to_json()
+
+
+@lru_cache(maxsize=1)
+def _rig(assignments: tuple[str, ...]) -> OneProcessRig:
+    return OneProcessRig(settings_of(assignments))
+
+
+def _of_problems(request: RunRequest, settings: Settings, scenario: Scenario) -> Outcome:
+    sequence, program = problem_sequence(scenario, request.assignments), settings.optimizer_plc.program
+    run = paired_run if request.procedure is Procedure.PAIRED_PROBLEMS else harsh_run
+    columns = run(sequence, program)
+    indicators = paired_indicators(columns, request.updating_period_s)
+    return Outcome(programs_digest(), indicators, "", 0, columns, {})
+
+
+def _outcome(recording: Recording, settings: Settings, trace_ticks: int) -> Outcome:
+    model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
+    trace_sha256 = recording.trace_sha256
+    sensors, gauge = settings.plant.sensors, settings.plant.mismatch.level_gauge
+    if any(sensors.biases) or gauge != 1.0:  # costs are those of what was reached, not of what was shown
+        true_y = recording.y - np.array(sensors.biases, dtype=np.float32)
+        true_y[:, L1] /= gauge
+        recording = recording._replace(y=true_y)
+    return Outcome(
+        programs=programs_digest(),
+        indicators=evaluate(recording, model, design),
+        trace_sha256=trace_sha256,
+        deadline_misses=recording.link.deadline_misses,
+        updates={name: [float(getattr(row, name)) for row in recording.updates] for name in UPDATE_COLUMNS},
+        trace=_trace(recording, StageCost(model, design).of(recording.block), trace_ticks) if trace_ticks else {},
+        events=[Happening(service, event.tick, event.kind, event.subject) for service, event in recording.events]
+        if trace_ticks
+        else [],
+        failed_updates=sum(map(has_no_answer, recording.updates)),
+    )
+
+
+def _trace(recording: Recording, cost: Series, every: int) -> dict[str, list[float]]:
+    kept: dict[str, Any] = {
+        "time_s": np.arange(len(recording.load)) * TICK_S,
+        "load": recording.load,
+        "L1": recording.y[:, L1],
+        "T5": recording.y[:, T5],
+        "T9": recording.y[:, T9],
+        "CV155": recording.u[:, 0],
+        "NCR22_A": recording.u[:, 1],
+        "CV156": recording.u[:, 2],
+        "cost": cost,
+    }
+    if recording.station.size:
+        kept |= dict(zip((*STATION_SIGNAL_NAMES, "mode", "alarms"), recording.station.T, strict=True))
+    return {name: [float(value) for value in column[::every]] for name, column in kept.items()}

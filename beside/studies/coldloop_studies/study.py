@@ -1,0 +1,269 @@
+"""A study: its extent, its loads, its runs, and the evaluation of their outcomes."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, NamedTuple, Protocol
+
+from matplotlib.figure import Figure
+
+from coldloop.config import MOST_BYTES, as_toml, flattened, load_configuration
+from coldloop.errors import ConfigurationError, UsageError
+from coldloop.parsing import parsed_toml
+from coldloop.process.declaration import Process
+from coldloop.process.load_profile import LoadProfile
+from coldloop.process.lti_model import load as load_model
+from coldloop.text_file import read_text
+from coldloop_plant.load import find_load, named_families
+from coldloop_rig.cosim.scenario import natural_ticks
+from coldloop_rig.settings import Settings
+from coldloop_rig.text_tables import Cell
+from coldloop_studies.request import Outcome, Procedure, RunRequest
+from coldloop_studies.settings import PAPER, outside_digests, settings_of
+
+Outcomes = Mapping[RunRequest, Outcome]
+USUAL_DRAWS = 3
+"""Of each load, unless the study or the command sets another number."""
+RUNS = "runs"
+"""Folder, beside those of the studies, in which runs are kept: studies share them."""
+QUICK_TICKS = 2400
+"""Longest run of a quick study: ten minutes."""
+
+
+def noise(factor: float) -> tuple[str, ...]:
+    """Return measurement noise of so many times the size that the Kalman filter reckons with."""
+    sizes = {"level": 0.01, "speed": 1.0, "temperature": 0.02, "pressure": 0.001}
+    return tuple(f"plant.sensors.{name}={factor * size:g}" for name, size in sizes.items())
+
+
+NOISE = noise(1.0)
+PROGRAM = "optimizer_plc.program."
+TUNED: Final = f"{PROGRAM}preset=tuned"
+"""What `coldloop run` has by default."""
+
+
+class Variant(NamedTuple):
+    """What the study `compare` sets beside others."""
+
+    name: str
+    assignments: tuple[str, ...]
+    """`section.key=value`, from the preset `paper` on."""
+
+
+@dataclass(frozen=True)
+class StudyOptions:
+    """Extent of a study."""
+
+    seeds: int | None = None
+    """Draws of each named load, if not the study's own number; of a load file, draws of the sensors' noise."""
+    ticks: int | None = None
+    """Length of each run, if not that of its load."""
+    loads: tuple[str, ...] = ()
+    """Names or files, instead of the study's own."""
+    quick: bool = False
+    """One seed, ten minutes, fewer points: to see that it works."""
+    variants: tuple[Variant, ...] = ()
+    """Of the study `compare`; the first is the reference."""
+    settings: tuple[str, ...] = ()
+    """Of all runs, as `section.key=value`: `model.file` of another process than the cold box."""
+
+    @property
+    def process(self) -> Process:
+        """The process of all runs."""
+        return settings_of(self.settings).process
+
+    @property
+    def draws(self) -> range:
+        """Default numbers of the draws."""
+        return self.drawn(USUAL_DRAWS)
+
+    def drawn(self, usual: int) -> range:
+        """Return the numbers of the draws of a study, or of a part of it, that has so many of its own."""
+        return range(1, (1 if self.quick else self.seeds or usual) + 1)
+
+    @property
+    def hours(self) -> str:
+        """The families of hours of a study that compares periods."""
+        return "ace" if self.quick else "abcdef"
+
+
+@dataclass(frozen=True)
+class Load:
+    """One draw of a load, and how long it is run."""
+
+    name: str
+    draw: int
+    profile: LoadProfile
+    ticks: int
+    settings: tuple[str, ...] = ()
+    """Of its runs: those of the study, and noise."""
+
+    def request(
+        self,
+        updating_period_s: float,
+        *assignments: str,
+        networked: bool = False,
+        trace_ticks: int = 0,
+        procedure: Procedure = Procedure.CONFIGURED,
+    ) -> RunRequest:
+        """Return the request for a run under this load."""
+        return RunRequest(
+            self.name, self.profile.times, self.profile.watts, self.ticks, updating_period_s,
+            (*self.settings, *assignments), self.draw, networked, trace_ticks, procedure,
+        )  # fmt: skip
+
+
+def draw_of(name: str, draw: int, options: StudyOptions) -> Load:
+    """Return a draw of a load; the draws of a file differ by their noise, which there is when there are several."""
+    named = named_families(name) is not None
+    drawn = f"{name}@{draw}" if named and draw > 1 else name
+    settings = settings_of(options.settings)
+    profile = find_load(drawn, load_model(settings.model.file).w0, settings.process)
+    ticks = options.ticks or natural_ticks(drawn, profile)
+    if options.quick:
+        ticks = min(ticks, QUICK_TICKS)
+    noise = NOISE if not named and len(options.draws) > 1 else ()
+    return Load(drawn if named or draw == 1 else f"{name}#{draw}", draw, profile, ticks, options.settings + noise)
+
+
+def loads(options: StudyOptions, *names: str, usual: int = USUAL_DRAWS, longest_ticks: int | None = None) -> list[Load]:
+    """Return the draws of the loads asked for, or else of these; a name such as a@2 is one draw.
+
+    Without a length asked for, no load is longer than `longest_ticks`.
+    """
+    drawn = [
+        draw_of(name, draw, options)
+        for name in dict.fromkeys(options.loads or names)
+        for draw in (range(1, 2) if "@" in name else options.drawn(usual))
+    ]
+    longest = options.ticks or longest_ticks
+    return [replace(load, ticks=min(load.ticks, longest)) for load in drawn] if longest else drawn
+
+
+TUNING_DRAWS = (11, 12)
+"""Draws that constants of solvers and rules were chosen on; those of the contraction rule on 101 to 103."""
+
+
+def first_and_fresh(hours: Iterable[Load], first: str = "hours") -> dict[str, list[Load]]:
+    """Return the first draw of each load, and those of other draws that nothing was tuned on; by title."""
+    hours = list(hours)
+    groups = {
+        first: [load for load in hours if load.draw == 1],
+        "fresh hours": [load for load in hours if load.draw not in (1, *TUNING_DRAWS)],
+    }
+    return {title: some for title, some in groups.items() if some}
+
+
+@dataclass
+class StudyResult:
+    """What a study found."""
+
+    columns: tuple[str, ...]
+    rows: list[tuple[Cell, ...]]
+    figures: dict[str, Figure]
+    """By name; drawn in the manner of the paper's."""
+    values: dict[str, list[float]] = field(default_factory=dict)
+    """What the claims are judged by: one value for each draw, by claim."""
+    remarks: list[str] = field(default_factory=list)
+    """Paragraphs for the report."""
+    always_shown: bool = False
+    """Whether the report has all rows, however many there are."""
+    failed_runs: int = 0
+    """Runs in which updates had no answer."""
+
+    def note(self, claim: str, value: float) -> None:
+        """Add the value of one more draw."""
+        self.values.setdefault(claim, []).append(float(value))
+
+
+class Study(Protocol):
+    """A question, its runs, and its answer."""
+
+    @property
+    def name(self) -> str:
+        """What the command calls it."""
+
+    @property
+    def title(self) -> str:
+        """Heading of its section in the report."""
+
+    def requests(self, options: StudyOptions) -> Sequence[RunRequest]:
+        """Return the runs that are needed."""
+
+    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+        """Return what the outcomes say."""
+
+
+OWN: Final = "studies run in one process, in lock-step; leave it out"
+INEFFECTIVE: Final = {
+    "plant.load": "give it with --load",
+    "plant.seed": "each draw has its own seed; say how many with --draws",
+    **dict.fromkeys(
+        (
+            "session", "telemetry", "rig", "hmi", "plant.server", "control_plc.server", "control_plc.plant",
+            "optimizer_plc.server", "optimizer_plc.control_plc",
+        ),
+        OWN,
+    ),
+}  # fmt: skip
+"""Keys and sections that do not act on a run of a study, and what to do instead."""
+LONGEST_NAME: Final = 40
+LAST_LETTER: Final = "\u04ff"
+"""Of those that the font of the figures has throughout: Latin, Greek, Cyrillic."""
+NOT_IN_NAMES: Final = frozenset("$|\\")
+"""Characters that figures and Markdown tables read as marks."""
+
+
+def read_variants(file: Path, own: tuple[str, ...] = ()) -> tuple[Variant, ...]:
+    """Return the variants of a file, two or more; the first is the reference.
+
+    A variant changes the preset `tuned`, which is the default of `coldloop run`, and the settings `own` of the study.
+    The environment has no influence.
+
+    Raises:
+        UsageError: The file cannot be read, or a variant is none: one line with the file, the variant and the remedy.
+        ConfigurationError: A key or its value is wrong, or an entry point is not installed.
+    """
+    remedy = "name a TOML file with a table for each variant (`coldloop docs compare`)"
+    try:
+        content = parsed_toml(read_text(file, remedy, UsageError, MOST_BYTES))
+    except ValueError as error:
+        raise UsageError(f"{file}: not TOML: {error}; {remedy}") from None
+    variants = tuple(_variant(file, name, table, own) for name, table in content.items())
+    if len(variants) < 2:
+        raise UsageError(f"{file}: {len(variants)} variant{'s' if not variants else ''}; write the table of the "
+                         "reference first, then one for each variant to compare")  # fmt: skip
+    same = {variant.assignments: variant.name for variant in reversed(variants)}
+    for variant in variants:
+        if (first := same[variant.assignments]) != variant.name:
+            raise UsageError(f"{file} [{variant.name}]: has the settings of [{first}]; leave one of them out")
+    return variants
+
+
+def _variant(file: Path, name: str, table: Any, own: tuple[str, ...]) -> Variant:  # noqa: ANN401 what a user wrote
+    place = f"{file} [{name}]"
+    if not isinstance(table, Mapping):
+        raise UsageError(f"{file}: {name} is not in the table of a variant; write [NAME] above it")
+    if not 0 < len(name) <= LONGEST_NAME or any(map(_is_unsuitable, name)):
+        raise UsageError(
+            f"{file} [{name[:LONGEST_NAME]!a}]: name it with 1 to {LONGEST_NAME} printable Latin, Greek or Cyrillic "
+            "characters other than $, | and \\"
+        )
+    settings = {key: value for key, value in flattened(table).items() if value != {}}
+    for key in settings:
+        for ineffective, instead in INEFFECTIVE.items():
+            if f"{key}.".startswith(f"{ineffective}."):
+                raise UsageError(f"{place}: {key}: has no effect on this study: {instead}")
+    options = {key: (value, place) for key, value in settings.items()}
+    try:
+        effective = load_configuration(Settings, environment={}, assignments=(*PAPER, *own, TUNED), options=options)
+        outside_digests(effective.settings.optimizer_plc.program.outside)
+    except ConfigurationError as error:
+        said = str(error).removeprefix(f"{place}: ")
+        raise ConfigurationError(f"{place}: {said}") from None
+    return Variant(name, (TUNED, *(f"{key}={as_toml(value)}" for key, value in sorted(settings.items()))))
+
+
+def _is_unsuitable(character: str) -> bool:
+    """Return whether a character cannot be in a name: figures have no letter for it, or read it as a mark."""
+    return not character.isprintable() or character in NOT_IN_NAMES or character > LAST_LETTER

@@ -1,1 +1,0 @@
-"""The solver for a PLC: kernels read from their Python sources, printed as C99 or Structured Text, with a self-test."""

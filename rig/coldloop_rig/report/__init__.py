@@ -1,1 +1,0 @@
-"""The report: every claim of the paper with our result and the verdict."""
