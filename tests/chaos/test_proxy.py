@@ -9,9 +9,8 @@ import pytest
 
 from coldloop.errors import PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
-from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
-from coldloop.modbus.settings import ServerSettings
+from coldloop.modbus.settings import Endpoint, ServerSettings
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import Grant

@@ -11,8 +11,7 @@ from typing import Any
 
 import pytest
 
-from coldloop.service.line_writer import CAPACITY
-from coldloop.service.logs import JsonFormatter, QueueingHandler, dropped, end_logs, set_up_logs
+from coldloop.service.logs import CAPACITY, JsonFormatter, QueueingHandler, dropped, end_logs, set_up_logs
 from tests.harness.processes import END_S, Processes
 
 

@@ -4,9 +4,8 @@ import zlib
 
 import pytest
 
-from coldloop.registers.codec import WordOrder, codec_of
+from coldloop.registers.codec import CRC_BYTES, Seal, WordOrder, codec_of, seal_of, sealed_bytes
 from coldloop.registers.plant import Actuators, Measurement
-from coldloop.registers.seal import CRC_BYTES, Seal, seal_of, sealed_bytes
 from tests.harness.records import PLANT_MAP, sealed
 
 MEASUREMENT = PLANT_MAP.block_of(Measurement)

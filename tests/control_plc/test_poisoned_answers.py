@@ -3,6 +3,7 @@
 `POISON_EXAMPLES=100000 pytest tests/control_plc/test_poisoned_answers.py` tries more of them.
 """
 
+import asyncio
 import os
 from collections.abc import Iterator
 from itertools import pairwise
@@ -16,12 +17,11 @@ from coldloop.errors import ImplausibleAnswerError
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.bank import ANYBODY, RefusedAccessError
-from coldloop.registers.codec import codec_of
-from coldloop.registers.control_plc import Operator, OperatorMode, PlantLinkState
+from coldloop.registers.codec import DomainError, codec_of, sealed_bytes
+from coldloop.registers.control_plc import LadderStatus, Operator, OperatorMode, PlantLinkState, PlantLinkStatus, Status
 from coldloop.registers.declaration import Block, Role
-from coldloop.registers.domain import DomainError
 from coldloop.registers.plant import Measurement
-from coldloop.registers.seal import sealed_bytes
+from coldloop.registers.safety import LeaseStatus
 from coldloop.safety.lease import SIMPLE_CLIENT
 from coldloop.service.journal import Journal
 from coldloop_control_plc.plant_link import PlantLink
@@ -204,8 +204,13 @@ def test_nothing_that_an_optimiser_writes_ends_the_control_plc(plc: ControlPlc, 
         (written,) = plc.bank.write(block.address, raw)
     except RefusedAccessError:
         return
-    waiting: Any = plc.clients.on_write(written, ANYBODY)
-    if waiting is not None:
-        waiting.close()
-    plc.publication.status()
+
+    async def take() -> None:
+        waiting: Any = plc.clients.on_write(written, ANYBODY)
+        if waiting is not None:
+            waiting.cancel()
+
+    asyncio.run(take())
+    for shown in (Status, LadderStatus, PlantLinkStatus, LeaseStatus):
+        plc.bank.get(shown)
     plc.publication.safety()

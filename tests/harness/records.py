@@ -4,7 +4,7 @@ from typing import Any, Final, NamedTuple, TypeVar, cast
 
 from coldloop.kernels.single_precision import single
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.registers import codec, seal
+from coldloop.registers import codec
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.maps import maps_of
 
@@ -36,4 +36,4 @@ def as_transmitted(record: R) -> R:
 
 def sealed(record: R) -> R:
     """Return a record with its CRC."""
-    return seal.sealed(record, map_of(type(record)))
+    return codec.sealed(record, map_of(type(record)))

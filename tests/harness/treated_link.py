@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Callable
 from typing import Self
 
-from coldloop.modbus.endpoints import Endpoint
+from coldloop.modbus.settings import Endpoint
 from coldloop_rig.chaos.faults import Direction
 from coldloop_rig.chaos.proxy import LinkProxy, Mangler, reset
 

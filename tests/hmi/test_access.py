@@ -17,8 +17,7 @@ from aiohttp.http_exceptions import BadStatusLine
 from aiohttp.test_utils import make_mocked_request
 
 from coldloop.errors import ConfigurationError, UsageError
-from coldloop.modbus.endpoints import Endpoint
-from coldloop.modbus.settings import TlsSettings
+from coldloop.modbus.settings import Endpoint, TlsSettings
 from coldloop.process.cold_box import COLD_BOX
 from coldloop_hmi.audit import Audit
 from coldloop_hmi.guard import Connections, Guard, host_of, is_own_origin, port_of, told_in_a_line

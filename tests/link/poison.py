@@ -7,9 +7,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any, Final
 
-from coldloop.registers.codec import RecordCodec, codec_of
+from coldloop.registers.codec import RecordCodec, Seal, codec_of, seal_of, sealed_bytes
 from coldloop.registers.declaration import Block, Field, Kind, RegisterMap
-from coldloop.registers.seal import Seal, seal_of, sealed_bytes
 from coldloop_rig.chaos.faults import Direction
 from tests.harness.records import map_of
 

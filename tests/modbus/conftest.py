@@ -14,13 +14,11 @@ from typing import Any
 
 import pytest
 
-from coldloop.modbus.connection import Connection
-from coldloop.modbus.refusals import RefusalLog
+from coldloop.modbus.connection import Connection, RefusalLog, Turns
 from coldloop.modbus.requests import RequestHandler
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, OnWrite, ServerSettings
 from coldloop.modbus.settings import TlsSettings
 from coldloop.modbus.tls import client_context
-from coldloop.modbus.turns import Turns
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity

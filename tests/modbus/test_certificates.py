@@ -11,8 +11,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 
 from coldloop.errors import ConfigurationError, PeerUnreachableError, UntrustedPeerError
 from coldloop.modbus.client import RegisterClient
-from coldloop.modbus.endpoints import Endpoint
-from coldloop.modbus.settings import TlsSettings
+from coldloop.modbus.settings import Endpoint, TlsSettings
 from coldloop.modbus.tls import certificate_days_left, first_expiry, server_context
 from coldloop_rig.cli.certificates import Authority, Pair, revoked_now
 from tests.harness.records import CONTROL_MAP

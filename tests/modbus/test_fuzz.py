@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coldloop.modbus.identification import DeviceIdentity
-from coldloop.modbus.refusals import RefusalLog
-from coldloop.modbus.requests import RequestHandler, Written
+from coldloop.modbus.connection import RefusalLog
+from coldloop.modbus.requests import DeviceIdentity, RequestHandler, Written
 from coldloop.registers.bank import Caller, RefusedAccessError, RegisterBank
 from coldloop.registers.declaration import Role
 from tests.harness.records import MAPS

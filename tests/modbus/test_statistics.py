@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.modbus.client import RegisterClient
-from coldloop.modbus.refusals import ErrorCounters
+from coldloop.modbus.connection import ErrorCounters
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import STATISTICS_BLOCK, Identity, ServerStatistics
 from coldloop.registers.declaration import RegisterMap

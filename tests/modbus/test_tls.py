@@ -11,8 +11,7 @@ from cryptography.hazmat.primitives.serialization import BestAvailableEncryption
 from coldloop.errors import ConfigurationError, PeerUnreachableError, RequestRefusedError, UntrustedPeerError
 from coldloop.modbus.access import decoded_role, encoded_role
 from coldloop.modbus.client import RegisterClient
-from coldloop.modbus.endpoints import Endpoint
-from coldloop.modbus.settings import TlsSettings
+from coldloop.modbus.settings import Endpoint, TlsSettings
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import AwaitUpdate, Grant, SequenceRow
 from coldloop_rig.cli.certificates import Authority

@@ -9,11 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.modbus import connection, rate_limit, turns
-from coldloop.modbus.rate_limit import rate_limit_of
-from coldloop.modbus.refusals import RefusalLog
+from coldloop.modbus import connection
+from coldloop.modbus.connection import REQUESTS_AT_ONCE, TURN_S, RefusalLog, Turns, rate_limit_of
 from coldloop.modbus.settings import ServerSettings
-from coldloop.modbus.turns import REQUESTS_AT_ONCE, TURN_S, Turns
 from coldloop.registers.bank import RegisterBank
 from tests.harness.records import PLANT_MAP
 
@@ -41,8 +39,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    for module in (turns, connection, rate_limit):
-        monkeypatch.setattr(module, "monotonic", clock)
+    monkeypatch.setattr(connection, "monotonic", clock)
     return clock
 
 
@@ -154,7 +151,7 @@ def test_whatever_is_asked_is_served_and_no_turn_takes_much_longer_than_its_time
 ) -> None:
     async def story() -> None:
         clock, shared = Clock(), Turns()
-        turns.monotonic = clock  # type: ignore[attr-defined, assignment] # what the module reads the time with
+        connection.monotonic = clock  # type: ignore[attr-defined, assignment] # what the module reads the time with
         workers = [Worker(shared, clock, count, has_role=has_role) for count, has_role in roles]
         arriving = deque(late)
         while arriving or any(worker.requests for worker in workers):
@@ -164,11 +161,11 @@ def test_whatever_is_asked_is_served_and_no_turn_takes_much_longer_than_its_time
             if arriving:
                 workers.append(Worker(shared, clock, arriving.popleft(), has_role=False))
 
-    original = turns.monotonic  # type: ignore[attr-defined]
+    original = connection.monotonic  # type: ignore[attr-defined]
     try:
         asyncio.run(story())
     finally:
-        turns.monotonic = original  # type: ignore[attr-defined]
+        connection.monotonic = original  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(

@@ -15,13 +15,12 @@ from hypothesis import strategies as st
 
 from coldloop.errors import DamagedAnswerError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
-from coldloop.modbus.refusals import RefusalLog
+from coldloop.modbus.connection import RefusalLog
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
-from coldloop.registers.codec import WordOrder, codec_of
+from coldloop.registers.codec import Seal, WordOrder, codec_of, seal_of
 from coldloop.registers.control_plc import Heartbeat
 from coldloop.registers.declaration import Block, Field, Kind, Register, RegisterMap
 from coldloop.registers.plant import Actuators, Measurement, PlantSession
-from coldloop.registers.seal import Seal, seal_of
 from tests.harness.records import CONTROL_MAP, MAPS, PLANT_MAP, sealed
 
 if TYPE_CHECKING:

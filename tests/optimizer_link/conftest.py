@@ -127,7 +127,11 @@ class PlayedControlPlc:
     def _judge(self, header: SequenceHeader) -> None:
         rows = [self.bank.get(SequenceRow, row).u for row in range(header.length)]
         intact = checksum(*InputSequence(header, rows)) == header.crc
-        verdict = self.verdicts.pop(0) if self.verdicts else Verdict.ACCEPTED if intact else Verdict.BAD_CRC
+        verdict = Verdict.ACCEPTED if intact else Verdict.BAD_CRC
+        if header.update not in {plan.update for plan in self.plans}:
+            verdict = Verdict.WRONG_UPDATE
+        if self.verdicts:
+            verdict = self.verdicts.pop(0)
         self.headers.append(header)
         self.bank.put(sealed(Acknowledgement(header.number, verdict)))
         if self.latches_on and verdict is Verdict.ACCEPTED:

@@ -7,17 +7,15 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 import pytest
 
-from coldloop.modbus.identification import DeviceIdentity
-from coldloop.modbus.requests import RequestHandler, Written
+from coldloop.modbus.requests import DeviceIdentity, RequestHandler, Written
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.audit import EVENT_ROWS, Event, EventKind
 from coldloop.registers.bank import ALL_ROLES, Caller, RefusedAccessError
-from coldloop.registers.codec import codec_of
+from coldloop.registers.codec import Seal, codec_of, seal_of
 from coldloop.registers.declaration import Role
 from coldloop.registers.plant import Actuators, Measurement
-from coldloop.registers.seal import Seal, seal_of
 from coldloop_plant.cold_box.physics import ColdBox, advance, derivative, outputs
 from coldloop_plant.cold_box.plant_file import REFERENCE
 from coldloop_plant.helium.properties import Helium, load_helium

@@ -305,7 +305,7 @@ def test_a_rig_that_answers_slowly_is_given_up(ask: "Callable[..., Outcome]", mo
         await asyncio.sleep(30)
         return []
 
-    monkeypatch.setattr("coldloop.modbus.transport.Transport.transact", late)
+    monkeypatch.setattr("coldloop.modbus.client.Transport.transact", late)
     for command in (*COMMANDS[:8], ("run",)):
         assert_one_line(ask(*command), "takes longer than")
 

@@ -12,8 +12,8 @@ from types import TracebackType
 from typing import Final, NamedTuple, Self
 
 from coldloop.errors import UsageError
-from coldloop.modbus.endpoints import Endpoint
-from coldloop.modbus.framing import MalformedFrameError, next_frame
+from coldloop.modbus.requests import MalformedFrameError, next_frame
+from coldloop.modbus.settings import Endpoint
 from coldloop_rig.chaos import faults
 from coldloop_rig.chaos.plan import LinkPlan
 from coldloop_rig.cosim.local_services import LocalServices

@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any, Final, NamedTuple
 
-from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
 from coldloop.modbus.requests import MAX_READ_WORDS
+from coldloop.modbus.settings import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
 from coldloop.process.declaration import Process
 from coldloop.registers.control_plc import Operator
 from coldloop.registers.declaration import Block, Kind, Register, RegisterMap

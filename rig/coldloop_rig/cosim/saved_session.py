@@ -6,10 +6,10 @@ from typing import NamedTuple
 from coldloop.errors import LinkError
 from coldloop.operating.execution import LoadStream, lead_ticks, write_pace
 from coldloop.process.load_profile import LoadProfile
+from coldloop.registers.codec import sealed
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Operator, OperatorMode
 from coldloop.registers.plant import LOAD_ROWS, LiveLoad, LoadStatus, LoadStep, PlantSession
-from coldloop.registers.seal import sealed
 from coldloop_rig.cosim.session import SessionClient
 
 log = logging.getLogger("coldloop.rig")

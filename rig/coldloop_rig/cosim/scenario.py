@@ -8,7 +8,7 @@ from typing import Final
 
 from coldloop.config import Configuration
 from coldloop.errors import RunInterruptedError
-from coldloop.modbus.endpoints import Endpoint
+from coldloop.modbus.settings import Endpoint
 from coldloop.process.load_profile import LoadProfile
 from coldloop.table import TIME
 from coldloop.text_file import whole_text

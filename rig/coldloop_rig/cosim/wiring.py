@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from coldloop.errors import PeerUnreachableError
-from coldloop.modbus.endpoints import PLANT_PORT, Endpoint
+from coldloop.modbus.settings import PLANT_PORT, Endpoint
 from coldloop.safety.retained import RetainSettings
 from coldloop_rig.settings import Settings
 

@@ -25,7 +25,7 @@ from typing import IO, Annotated, Final, NamedTuple, Self
 from pydantic import Field, TypeAdapter, ValidationError
 
 from coldloop.errors import ColdloopError, UsageError
-from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
+from coldloop.modbus.settings import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
 from coldloop_rig import PYTHON
 from coldloop_rig.cosim.wiring import REQUIRED, RigEndpoints
 from coldloop_rig.interruption import INTERRUPTION

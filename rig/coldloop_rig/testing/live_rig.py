@@ -15,7 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from coldloop.errors import LinkError, PeerUnreachableError, UnfitValueError, UsageError
 from coldloop.modbus.client import RegisterClient
-from coldloop.modbus.endpoints import Endpoint
+from coldloop.modbus.settings import Endpoint
 from coldloop.process.settings import settings_of
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap

@@ -60,12 +60,12 @@ class Clients:
         sessions: Sessions,
     ) -> None:
         self._program = program
-        self._limits = limits
+        self._limits, self._tick_s = limits, limits.process.tick_s
         self._bank = bank
         self._publication = publication
         self._sessions = sessions
-        self._news = asyncio.Event()
-        self._waits = 0
+        self._waiting: dict[asyncio.Future[None], tuple[int, int]] = {}
+        """Requests that wait for an update: the update, and the session in which they were made."""
         self._begun = 0
         """Sessions that have begun."""
         self.lease = WriterLease("the optimiser's registers", self._silence_s, self._note_lease, shared=True)
@@ -77,7 +77,8 @@ class Clients:
         self.pending_time_base: TimeBase | None = None
         """A time base that the session under way is to have."""
         publication.lease = self.lease
-        bank.judged_by(self._judge_optimizer, AwaitUpdate, Plan, Heartbeat, SequenceHeader, SequenceRow)
+        bank.judged_by(self._judge_optimizer, AwaitUpdate, Plan, Heartbeat, SequenceHeader)
+        bank.judged_by(self._judge_optimizer, SequenceRow, every_row=False)
         bank.judged_by(self._judge_operator, Operator)
         bank.put_sealed(Plan(0, 0))
         bank.judged_by(self._judge_pace, SessionPace)
@@ -89,7 +90,7 @@ class Clients:
         pace, watchdog = self._sessions.pace, self._program.watchdog
         if not watchdog.time:
             return UNWATCHED_S
-        return watchdog.time * self._limits.process.tick_s / (pace.factor if pace.realtime else 1.0)
+        return watchdog.time * self._tick_s / (pace.factor if pace.realtime else 1.0)
 
     def _judge_optimizer(self, record: tuple[object, ...], _row: int, caller: Caller) -> None:
         try:
@@ -127,14 +128,16 @@ class Clients:
     @property
     def optimizer_waits(self) -> bool:
         """An optimiser waits for an update: its silence is no failure."""
-        return self._waits > 0
+        return bool(self._waiting)
 
     def tell(self, update: Update) -> None:
         """Show a new update, and answer who waits for it."""
         self._bank.put_sealed(update)
         self._bank.put_sealed(LatchedUpdate(update.session, update.update, update.tick))
-        self._news.set()
-        self._news = asyncio.Event()
+        for answer, (wanted, begun) in self._waiting.items():
+            # one of a session that has begun since, which counts from 0 again, will do
+            if not answer.done() and (update.update >= wanted or begun != self._begun):
+                answer.set_result(None)
 
     def on_write(self, block: Block, caller: Caller) -> Awaitable[None] | None:
         """Take what a client has written; an awaitable lets its answer wait."""
@@ -221,12 +224,11 @@ class Clients:
         self._program.journal.note(now, kind, subject, cause, value=value, who=who)
 
     def _offer(self, header: SequenceHeader) -> None:
-        rows = [self._bank.get(SequenceRow, row).u for row in range(header.length)]
+        rows = [row.u for row in self._bank.get_rows(SequenceRow, header.length)]
         answer = self._program.offer(InputSequence(header, rows))
         self._bank.put_sealed(answer)
         if answer.verdict != Verdict.ACCEPTED:
             self._publication.safety()
-        self._publication.status()
 
     def _await_update(self, asked: AwaitUpdate) -> Awaitable[None] | None:
         """Let the answer wait for the update asked for; one who asks out of session gets the next fresh one."""
@@ -249,20 +251,19 @@ class Clients:
         latched = self._program.player.update
         return latched is not None and latched.update >= wanted
 
-    async def _wait_for(self, wanted: int) -> None:
-        """Wait for an update; one of a session that has begun since, which counts from 0 again, will do."""
-        begun = self._begun
-        self._waits += 1
-        try:
-            async with asyncio.timeout(LONGEST_WAIT_S):
-                while not self._latched(wanted):
-                    await self._news.wait()
-                    if self._begun != begun:
-                        return
-        except TimeoutError:
-            return
-        finally:
-            self._waits -= 1
+    def _wait_for(self, wanted: int) -> asyncio.Future[None]:
+        """Return what is done when an update is latched, or has been waited for long enough."""
+        loop = asyncio.get_running_loop()
+        answer: asyncio.Future[None] = loop.create_future()
+        self._waiting[answer] = wanted, self._begun
+        timer = loop.call_later(LONGEST_WAIT_S, _answer_anyway, answer)
+
+        def end(_: asyncio.Future[None]) -> None:
+            timer.cancel()
+            del self._waiting[answer]
+
+        answer.add_done_callback(end)
+        return answer
 
     def on_departure(self, role: Role) -> None:
         """The last client of this role has disconnected: do not wait for an optimiser."""
@@ -279,3 +280,8 @@ class Clients:
         """A server has refused a client's request."""
         if kind == "access_refused":
             self._program.alarms.pulse(AlarmKind.ACCESS_REFUSED)
+
+
+def _answer_anyway(waiting: asyncio.Future[None]) -> None:
+    if not waiting.done():
+        waiting.set_result(None)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.control_plc import LadderStatus, PlantLinkStatus, ProcessNow, Status
-from coldloop.registers.safety import AlarmState
+from coldloop.registers.safety import AlarmState, LeaseStatus, WatchdogStatus
 from coldloop.safety.lease import WriterLease
 from coldloop.service.event_text import alarm_word, log_event
 from coldloop.service.journal import JournalPublication
@@ -21,7 +21,7 @@ log = logging.getLogger("coldloop.control_plc")
 
 
 class ControlPublication:
-    """Puts the program's state into the registers.
+    """Shows the program's state in the registers: most of it when it is read, alarms and events when they change.
 
     `keep` is called with new events, so that no number of an event is given out twice, and what an operator has said
     is retained also while no scans are made.
@@ -53,6 +53,13 @@ class ControlPublication:
         self.offset_ms = 0.0
         self.lease: WriterLease | None = None
         """That of the optimiser."""
+        bank.keep_fresh(Identity, self._identity)
+        bank.keep_fresh(ProcessNow, lambda: program.process)
+        bank.keep_fresh(Status, self._status)
+        bank.keep_fresh(LadderStatus, self._ladder)
+        bank.keep_fresh(WatchdogStatus, lambda: program.watchdog.registers(program.tick))
+        bank.keep_fresh(PlantLinkStatus, self._plant_link)
+        bank.keep_fresh(LeaseStatus, lambda: None if self.lease is None else self.lease.registers())
 
     def begin(self) -> None:
         """Reset the counters: a session begins."""
@@ -60,39 +67,44 @@ class ControlPublication:
         self.lateness = LatenessRecord()
         self.skew, self.offset_ms = Skew(0.0, math.inf), 0.0
 
-    def identity(self) -> None:
-        """Show who we are, and the tick."""
+    def _identity(self) -> Identity:
         program = self._program
-        self._bank.put(
-            Identity(
-                map_digest=self._bank.map.digest,
-                map_version=self._bank.map.version,
-                state=ServiceState.RUNNING if self._sessions.running else ServiceState.READY,
-                model_digest=self._model_digest,
-                session=program.session,
-                tick=program.tick,
-                heartbeat=program.tick & 0xFFFF,
-            )
+        return Identity(
+            map_digest=self._bank.map.digest,
+            map_version=self._bank.map.version,
+            state=ServiceState.RUNNING if self._sessions.running else ServiceState.READY,
+            model_digest=self._model_digest,
+            session=program.session,
+            tick=program.tick,
+            heartbeat=program.tick & 0xFFFF,
         )
 
-    def status(self) -> None:
-        """Show the sequence player and the scan cycle."""
+    def _status(self) -> Status:
         program, lateness = self._program, self.lateness
         player = program.player
-        self._bank.put(
-            Status(
-                mode=program.mode,
-                update=player.update.update if player.update else 0,
-                next_update_tick=player.next_update_tick,
-                playing=player.playing,
-                remaining=program.remaining,
-                accepted=player.accepted & 0xFFFFFFFF,
-                rejected=player.rejected & 0xFFFFFFFF,
-                deadline_misses=player.deadline_misses & 0xFFFFFFFF,
-                overruns=self.overruns & 0xFFFFFFFF,
-                lateness_max=lateness.maximum_s * 1000,
-                lateness_p99=lateness.percentile_s(0.99) * 1000,
-            )
+        return Status(
+            mode=program.mode,
+            update=player.update.update if player.update else 0,
+            next_update_tick=player.next_update_tick,
+            playing=player.playing,
+            remaining=program.remaining,
+            accepted=player.accepted & 0xFFFFFFFF,
+            rejected=player.rejected & 0xFFFFFFFF,
+            deadline_misses=player.deadline_misses & 0xFFFFFFFF,
+            overruns=self.overruns & 0xFFFFFFFF,
+            lateness_max=lateness.maximum_s * 1000,
+            lateness_p99=lateness.percentile_s(0.99) * 1000,
+        )
+
+    def _ladder(self) -> LadderStatus:
+        program = self._program
+        return LadderStatus(
+            mode=program.mode,
+            cause=program.ladder.cause,
+            since=program.ladder.since,
+            optimizer=int(program.optimizer_present),
+            bad_sensors=program.bad_sensors,
+            events=program.journal.count,
         )
 
     @property
@@ -101,8 +113,10 @@ class ControlPublication:
         return self.journal.is_behind
 
     def safety(self) -> None:
-        """Show ladder, watchdog, alarms and events, as far as they have changed, and log the events."""
+        """Show alarms and events, as far as they have changed, and log the events."""
         program = self._program
+        if self.lease is not None:
+            self.lease.note_end()
         events = self.journal.show()
         for event in events:
             log_event(log, event, self._bank.map.process)
@@ -112,21 +126,6 @@ class ControlPublication:
             self._told_alarms = program.alarms.changes
             for row, alarm in enumerate(program.alarms.rows):
                 self._bank.put(alarm, row)
-        self._bank.put(
-            LadderStatus(
-                mode=program.mode,
-                cause=program.ladder.cause,
-                since=program.ladder.since,
-                optimizer=int(program.optimizer_present),
-                bad_sensors=program.bad_sensors,
-                events=program.journal.count,
-            )
-        )
-        self._bank.put(program.watchdog.registers(program.tick))
-        self._bank.put(self._plant_link())
-        if self.lease is not None:
-            self.lease.note_end()
-            self._bank.put(self.lease.registers())
 
     def _plant_link(self) -> PlantLinkStatus:
         link = self._link

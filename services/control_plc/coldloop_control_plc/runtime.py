@@ -105,7 +105,7 @@ class ControlPlc:
             self._link.starting()  # other clients must not take this for a PLC without a session
         if self._store.refused:
             program.alarms.raised(AlarmKind.STATE_NOT_RETAINED, STATE_REFUSED)
-        self._publish()
+        self.publication.safety()
 
     def close(self) -> None:
         """Disconnect from the rack, and save the retained state."""
@@ -141,7 +141,7 @@ class ControlPlc:
             self._link.end()
         else:
             await self._finder.pause(self.clients.changed)
-        self._publish()
+        self.publication.safety()
 
     async def _until_clock(self) -> bool:
         """Wait for the scan's time; return whether it may begin: after a missed tick, the rack is read first.
@@ -234,13 +234,13 @@ class ControlPlc:
             answer = await self._plant.exchange(outputs, Measurement, patience_s=self._patience_s)
         except LinkError as error:
             self._finder.failed(error)
-            self._publish()
+            self.publication.safety()
             return
         answered_at = time.monotonic()
         at = (asked_at + answered_at) / 2
         update = self._cycle.answered(answer, self._in_ticks(at))
         if not self._link.synchronised:
-            self._publish()
+            self.publication.safety()
             return
         self._finder.read_soon()
         self._watch.scanned()
@@ -248,9 +248,9 @@ class ControlPlc:
             self._clock.observe(answer.tick + answer.age, at, (answered_at - asked_at) / 2)
         if update is not None:
             self.clients.tell(update)
-        self._after_scan(latched=update is not None)
+        self._after_scan()
 
-    def _after_scan(self, *, latched: bool) -> None:
+    def _after_scan(self) -> None:
         """Publish what has changed, and save the retained state."""
         program, publication = self._program, self.publication
         on_the_second = program.tick % self._ticks_per_second == 0
@@ -259,13 +259,8 @@ class ControlPlc:
         if on_the_second:
             self._watch_ourselves()
         program.alarms.pass_by()
-        if program.process is not None:
-            self.bank.put(program.process)
-        if latched or on_the_second:
-            publication.status()
         if publication.is_behind or on_the_second:
             publication.safety()
-        publication.identity()
         self._keep()
 
     def _keep(self) -> None:
@@ -327,7 +322,7 @@ class ControlPlc:
                 now = self._clock.tick_at(time.monotonic())
                 self._program.alarms.now = min(max(self._program.tick, now), LAST_TICK)
                 self._program.alarms.pass_by()
-        self._publish()
+        self.publication.safety()
 
     # -- sessions ------------------------------------------------------------------------------------------------------
 
@@ -345,7 +340,7 @@ class ControlPlc:
         self.sessions.start(asked)
         self._begin()
         self._link.begin()
-        self._publish()
+        self.publication.safety()
 
     def _change_pace(self, pace: TimeBase) -> None:
         """Switch to another time base; the rack is read before the next scan."""
@@ -354,7 +349,7 @@ class ControlPlc:
         self._set_clock()
         self._link.repaced()
         self._show_pace()
-        self._publish()
+        self.publication.safety()
         self._keep()
         log.info("pace changed", extra={"realtime": pace.realtime, "factor": pace.factor, "paused": pace.paused})
 
@@ -376,11 +371,6 @@ class ControlPlc:
         pace, session = self.sessions.pace, self._program.session
         self.bank.put(ControlSession(session, int(pace.realtime), pace.factor))
         self.bank.put(SessionPace.shown(session, pace))
-
-    def _publish(self) -> None:
-        self.publication.status()
-        self.publication.safety()
-        self.publication.identity()
 
 
 async def serve(settings: ControlSettings) -> None:

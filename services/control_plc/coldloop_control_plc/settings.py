@@ -6,8 +6,7 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from coldloop.modbus.endpoints import CONTROL_PORT, PLANT_PORT, Endpoint
-from coldloop.modbus.settings import ServerSettings
+from coldloop.modbus.settings import CONTROL_PORT, PLANT_PORT, Endpoint, ServerSettings
 from coldloop.process.settings import InputLimits, ProcessSettings, RootSettings, declared, stretched, within
 from coldloop.registers.codec import WordOrder
 from coldloop.safety.retained import RetainSettings

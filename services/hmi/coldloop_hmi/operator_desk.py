@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 from aiohttp import web
 
 from coldloop.errors import LinkError, UsageError
-from coldloop.modbus.endpoints import Endpoint
+from coldloop.modbus.settings import Endpoint
 from coldloop.number_text import value_text
 from coldloop.operating.commands import (
     Command,

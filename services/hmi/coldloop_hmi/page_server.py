@@ -15,7 +15,7 @@ from aiohttp import BasicAuth, hdrs, web
 from aiohttp.log import server_logger
 
 from coldloop.errors import ConfigurationError, PortInUseError
-from coldloop.modbus.refusals import RefusalLog
+from coldloop.modbus.connection import RefusalLog
 from coldloop.modbus.tls_listener import TlsListener
 from coldloop.service.metrics import exposition
 from coldloop.service.metrics_server import CONTENT_TYPE

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from coldloop.errors import DamagedAnswerError, LinkError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
-from coldloop.modbus.endpoints import Endpoint
+from coldloop.modbus.settings import Endpoint
 from coldloop.operating.observer import JournalReader, UpdateReader, read_alarms
 from coldloop.registers.audit import JournalPage
 from coldloop.registers.common import Identity, SessionPace

@@ -6,8 +6,7 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
-from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT, Endpoint
-from coldloop.modbus.settings import TlsSettings
+from coldloop.modbus.settings import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT, Endpoint, TlsSettings
 from coldloop.process.settings import RootSettings
 
 PAGE_PORT = 8020

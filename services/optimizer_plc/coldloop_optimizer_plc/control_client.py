@@ -5,8 +5,8 @@ from typing import Final, TypeVar
 
 from coldloop.errors import BUSY, DamagedAnswerError, LinkError, ModelFileError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
-from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.requests import MAX_READ_WRITE_WORDS
+from coldloop.modbus.settings import Endpoint
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import (
     Acknowledgement,
@@ -152,10 +152,15 @@ class ControlClient:
 
     # -- sequences -----------------------------------------------------------------------------------------------------
 
-    async def deliver(self, sequence: InputSequence) -> Verdict:
-        """Send a sequence, the header that commits it last; return the verdict of the control PLC."""
+    async def deliver(self, sequence: InputSequence, plan: Plan | None = None) -> Verdict:
+        """Send a sequence, the header that commits it last; return the verdict of the control PLC.
+
+        Args:
+            sequence: The answer to an update.
+            plan: Its updating period, where it has not been sent: it goes first, in the same segment.
+        """
         for attempt in range(1, ATTEMPTS + 1):
-            answer = await self._again(lambda: self._commit(sequence))
+            answer = await self._again(lambda: self._commit(sequence, plan))
             if answer.verdict not in DAMAGED_THERE or attempt == ATTEMPTS:
                 break
         if answer.number != sequence.header.number or answer.verdict not in Verdict.__members__.values():
@@ -165,11 +170,13 @@ class ControlClient:
             )
         return Verdict(answer.verdict)
 
-    async def _commit(self, sequence: InputSequence) -> Acknowledgement:
+    async def _commit(self, sequence: InputSequence, plan: Plan | None) -> Acknowledgement:
         header, rows = sequence.header, list(map(SequenceRow, sequence.rows))
         await self._client.write_rows(rows[self._rows_with_header :], start=self._rows_with_header)
         try:
-            return await self._client.exchange(header, Acknowledgement, rows=rows[: self._rows_with_header])
+            return await self._client.exchange(
+                header, Acknowledgement, rows=rows[: self._rows_with_header], before=plan
+            )
         except DamagedAnswerError:  # the sequence has been judged, and may have been accepted
             self._link.damaged()
             return await self._again(lambda: self._client.read(Acknowledgement))

@@ -46,13 +46,16 @@ class ControlLink:
     Args:
         holder: Number that this optimiser has given itself, 1 to 0xFFFFFFFF.
         journal: Takes the events.
-        changed: Called after every change of what `registers` returns.
+        noted: Called after every event.
     """
 
-    def __init__(self, holder: int, journal: Journal, changed: Callable[[], None]) -> None:
-        self._status = ControlLinkStatus(_S.SEARCHING, holder)
+    def __init__(self, holder: int, journal: Journal, noted: Callable[[], object]) -> None:
+        self.state = _S.SEARCHING
+        self.holder = holder
+        """Number that this optimiser has given itself."""
+        self._counts = dict.fromkeys(("breaks", "damaged", "rejected", "interrupted"), 0)
         self._journal = journal
-        self._changed = changed
+        self._tell = noted
         self._noted = _S.SEARCHING
         self._attempted_at = -math.inf
         self._logged_at: dict[str, float] = {}
@@ -61,19 +64,9 @@ class ControlLink:
         self.was_up = False
         """The control PLC has been found, with our model, since the start."""
 
-    @property
-    def state(self) -> ControlLinkState:
-        """State of the link."""
-        return ControlLinkState(self._status.state)
-
-    @property
-    def holder(self) -> int:
-        """Number that this optimiser has given itself."""
-        return self._status.holder
-
     def registers(self) -> ControlLinkStatus:
         """Return what the registers show."""
-        return self._status
+        return ControlLinkStatus(self.state, self.holder, **self._counts)
 
     # -- what happens --------------------------------------------------------------------------------------------------
 
@@ -144,11 +137,11 @@ class ControlLink:
 
     def _set(self, state: ControlLinkState, **counts: int) -> None:
         """Change the state, add to counters, and note in the journal whether the link is up, or why it is not."""
-        before = self._status._asdict()
-        added = {name: (before[name] + count) & 0xFFFFFFFF for name, count in counts.items()}
-        self._status = self._status._replace(state=state, **added)
+        self.state = state
+        for name, count in counts.items():
+            self._counts[name] = (self._counts[name] + count) & 0xFFFFFFFF
         shown = _S.WAITING if state in _UP else state
         if shown not in (self._noted, _S.INTRODUCING):
             self._noted = shown
             self._journal.note(self.tick, EventKind.CONTROL_LINK, shown)
-        self._changed()
+            self._tell()

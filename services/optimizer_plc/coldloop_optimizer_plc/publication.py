@@ -11,6 +11,7 @@ from coldloop.registers.common import Identity, ServiceState, SessionPace, pace_
 from coldloop.registers.declaration import Block, RegisterMap
 from coldloop.registers.optimizer_plc import (
     HISTORY_ROWS,
+    ControlLinkStatus,
     OperatingLimits,
     Optimization,
     OptimizerSession,
@@ -54,11 +55,12 @@ class OptimizerPublication:
         self._shown = JournalPublication(self._journal, self.bank)
         self._asked_by = ""
         self._last: Optimization | None = None
-        self._session = 0
-        self.link = ControlLink(holder, self._journal, self._show_link)
+        self._session = self._tick = 0
         self._journal.note(0, EventKind.BOOT)
-        self._show_link()
-        self._show_identity(0)
+        self._shown.show()
+        self.link = ControlLink(holder, self._journal, self._shown.show)
+        self.bank.keep_fresh(ControlLinkStatus, self.link.registers)
+        self.bank.keep_fresh(Identity, self._identity)
 
     # -- what operators write ------------------------------------------------------------------------------------------
 
@@ -107,7 +109,7 @@ class OptimizerPublication:
     def session_started(self, session: int, pace: TimeBase, rule: UpdatingRuleStatus) -> None:
         """Show that a session has begun."""
         who = self._asked_by if self.asked_for(session) is not None else ""
-        self._session, self._last = session, None
+        self._session, self._tick, self._last = session, 0, None
         for row in range(HISTORY_ROWS):  # what another session did is not to be taken for an update of this one
             self.bank.put(NO_UPDATE, row)
         self._journal.note(self.link.tick, EventKind.SESSION, int(pace.realtime), value=pace.factor, who=who)
@@ -116,34 +118,25 @@ class OptimizerPublication:
         self.bank.put(rule)
         self.bank.put_sealed(blank(Prediction, self.bank.map))
         self._shown.show()
-        self._show_identity(0)
 
     def optimised(self, tick: int, done: Optimization) -> None:
         """Show what was done with the update latched at `tick`."""
-        self._last = done
+        self._tick, self._last = tick, done
         self.bank.put(done, done.update % HISTORY_ROWS)
-        self._show_identity(tick)
 
     def predicted(self, prediction: Prediction) -> None:
         """Show what a delivered sequence is expected to lead to."""
         self.bank.put_sealed(prediction)
 
-    def _show_link(self) -> None:
-        self.bank.put(self.link.registers())
-        if self._shown.is_behind:
-            self._shown.show()
-
-    def _show_identity(self, tick: int) -> None:
-        self.bank.put(
-            Identity(
-                map_digest=self.bank.map.digest,
-                map_version=self.bank.map.version,
-                state=ServiceState.RUNNING if self._session else ServiceState.READY,
-                model_digest=self._model_digest,
-                session=self._session,
-                tick=tick,
-                heartbeat=(self._last.update + 1 if self._last else 0) & 0xFFFF,
-            )
+    def _identity(self) -> Identity:
+        return Identity(
+            map_digest=self.bank.map.digest,
+            map_version=self.bank.map.version,
+            state=ServiceState.RUNNING if self._session else ServiceState.READY,
+            model_digest=self._model_digest,
+            session=self._session,
+            tick=self._tick,
+            heartbeat=(self._last.update + 1 if self._last else 0) & 0xFFFF,
         )
 
     def snapshot(self) -> Mapping[str, object]:

@@ -25,7 +25,7 @@ from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.settings import InputLimits
 from coldloop.registers.configuration import publish_configuration
-from coldloop.registers.control_plc import AwaitUpdate, Update, Verdict
+from coldloop.registers.control_plc import AwaitUpdate, Plan, Update, Verdict
 from coldloop.registers.maps import maps_of
 from coldloop.registers.optimizer_plc import ControlLinkState, ModelDeviation
 from coldloop.safety.sequence import InputSequence
@@ -62,8 +62,9 @@ class _Answer(NamedTuple):
     sequence: InputSequence
     ready: float
     """When the PLC would have computed it, on the monotonic clock, s."""
-    interruptible: bool
-    """A load step may end the updating period."""
+    plan: Plan
+    planned: bool
+    """The control PLC has the plan: in real time it is sent at once, in lock-step with the sequence."""
     resumed: bool = False
     """The link has been lost since it was computed."""
 
@@ -207,15 +208,12 @@ class OptimizerPlc:
             await self._start(update.session)
         self._link.computes()
         plan = program.plan(update)
-        sending = asyncio.ensure_future(self._control.plan(plan))
-        try:
-            await asyncio.sleep(0)  # the plan is on its way while the sequence is computed
-            sequence = program.solve()
-            await sending
-        finally:
-            sending.cancel()
+        realtime = self.publication.pace.realtime
+        if realtime:  # the next scan does not wait for it
+            await self._control.plan(plan)
+        sequence = program.solve()
         ready = arrived_at + program.answer_after_s() / self.publication.pace.factor
-        await self._finish(_Answer(update, sequence, ready, interruptible=plan.load_step > 0))
+        await self._finish(_Answer(update, sequence, ready, plan, planned=realtime))
 
     async def _finish(self, answer: _Answer) -> None:
         """Deliver an answer when it is ready; keep it, once, should the link be lost meanwhile."""
@@ -225,7 +223,8 @@ class OptimizerPlc:
             await self._conclude(answer.update, Verdict.NONE)
             return
         self._link.delivers()
-        await self._conclude(answer.update, await self._control.deliver(answer.sequence))
+        plan = None if answer.planned else answer.plan
+        await self._conclude(answer.update, await self._control.deliver(answer.sequence, plan))
 
     async def _conclude(self, update: Update, verdict: Verdict) -> None:
         """Take the verdict, Verdict.NONE of an answer that was given up, and decide which update to ask for next."""
@@ -247,18 +246,17 @@ class OptimizerPlc:
 
     async def _is_computed(self, answer: _Answer) -> bool:
         """Wait until the PLC would have its answer; return whether no load step or session has cut it off before."""
-        spacing_s = (
-            self._tick_s * (LOOK_OUT_TICKS if answer.interruptible else HEARTBEAT_TICKS) / self.publication.pace.factor
-        )
+        interruptible = answer.plan.load_step > 0  # a load step may end the updating period
+        spacing_s = self._tick_s * (LOOK_OUT_TICKS if interruptible else HEARTBEAT_TICKS) / self.publication.pace.factor
         look_s = min(max(spacing_s, SHORTEST_PAUSE_S), LONGEST_PAUSE_S)
         while (remaining := answer.ready - time.monotonic()) > 0.0:
             await asyncio.sleep(min(remaining, look_s))
             # an answer that is ready does not wait for a sign of life
-            look = answer.interruptible or remaining > look_s
+            look = interruptible or remaining > look_s
             if not look:
                 continue
             newest = await self._control.newest()
-            stepped = answer.interruptible and newest.update > answer.update.update
+            stepped = interruptible and newest.update > answer.update.update
             if stepped or newest.session != answer.update.session:
                 return False
         return True

@@ -8,8 +8,7 @@ from typing import Annotated, Any, ClassVar, Final, Self
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationInfo, field_validator, model_validator
 
 from coldloop.config import as_toml, flattened
-from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, Endpoint
-from coldloop.modbus.settings import ServerSettings
+from coldloop.modbus.settings import CONTROL_PORT, OPTIMIZER_PORT, Endpoint, ServerSettings
 from coldloop.process.sections import FURTHEST_WEIGHT
 from coldloop.process.settings import InputLimits, ProcessSettings, RootSettings, declared, settings_process, within
 from coldloop.process.updating_periods import SHORTEST_TICKS, TOLERANCE, whole_ticks

@@ -7,8 +7,7 @@ from typing import Annotated, Final
 
 from pydantic import Field, FiniteFloat, field_validator
 
-from coldloop.modbus.endpoints import PLANT_PORT
-from coldloop.modbus.settings import ServerSettings
+from coldloop.modbus.settings import PLANT_PORT, ServerSettings
 from coldloop.process.sections import Section
 from coldloop.process.settings import (
     InputLimits,

@@ -1,6 +1,7 @@
 """A typed client of one server: records in, records out."""
 
 import asyncio
+import math
 import ssl
 import struct
 from collections.abc import Sequence
@@ -14,23 +15,241 @@ from coldloop.errors import (
     UnfitValueError,
     UntrustedPeerError,
 )
-from coldloop.modbus.endpoints import Endpoint
-from coldloop.modbus.peer_check import check_peer
 from coldloop.modbus.requests import (
     MAX_READ_WORDS,
     MAX_WRITE_WORDS,
     READ_HOLDING_REGISTERS,
     READ_WRITE_REGISTERS,
     WRITE_MULTIPLE_REGISTERS,
+    MalformedFrameError,
+    framed,
+    next_frame,
 )
-from coldloop.modbus.settings import TlsSettings
-from coldloop.modbus.transport import REQUESTS_AT_ONCE, NoAnswerError, Transport
+from coldloop.modbus.settings import Endpoint, TlsSettings
 from coldloop.process.declaration import Process
-from coldloop.registers.codec import RecordCodec, WordOrder, codec_of
-from coldloop.registers.common import Identity
+from coldloop.registers.codec import DomainError, RecordCodec, Seal, WordOrder, codec_of, seal_of, sealed_bytes
+from coldloop.registers.common import IDENTITY_BLOCK, MAGIC, Identity
 from coldloop.registers.declaration import Block, RegisterMap
-from coldloop.registers.domain import DomainError
-from coldloop.registers.seal import Seal, seal_of, sealed_bytes
+
+
+def check_peer(raw: bytes, register_map: RegisterMap, order: WordOrder, peer: str) -> None:
+    """Check the bytes of a peer's identity block.
+
+    Raises:
+        PeerUnreachableError: It is something else, uses the other word order, or has another register map.
+    """
+    identity = _identity(raw, order)
+    if not _has_magic(identity):
+        other = WordOrder.LOW_FIRST if order is WordOrder.HIGH_FIRST else WordOrder.HIGH_FIRST
+        if _has_magic(_identity(raw, other)):
+            raise PeerUnreachableError(f"{peer} has the other word order: set it to {other} here, or {order} there")
+        raise PeerUnreachableError(
+            f"{peer}: another program answers there (register 0 is not {MAGIC}): check host and port"
+        )
+    if identity.map_digest != register_map.digest:
+        raise PeerUnreachableError(
+            f"{peer} has another register map (version {identity.map_version}, digest {identity.map_digest:08x}, "
+            f"not version {register_map.version}, {register_map.digest:08x}): "
+            "check the port, and run the same release, of the same process, on both sides"
+        )
+
+
+def _identity(raw: bytes, order: WordOrder) -> Identity:
+    return Identity(*codec_of(IDENTITY_BLOCK, order).decode(raw))
+
+
+def _has_magic(identity: Identity) -> bool:
+    return math.isclose(identity.magic, MAGIC, rel_tol=1e-6)
+
+
+UNIT: Final = 1
+REQUESTS_AT_ONCE: Final = 16
+"""Requests that may be under way."""
+NONSENSE: Final = b"\0"
+"""Placeholder of an answer that is not Modbus: it answers no function."""
+
+
+class NoAnswerError(Exception):
+    """A request was not answered; `closed`: the peer closed the connection."""
+
+    def __init__(self, *, closed: bool) -> None:
+        super().__init__("closed by the peer" if closed else "no answer in time")
+        self.closed = closed
+
+
+class Transport:
+    """A connection to one server: requests out, answers in, several at a time.
+
+    A server tells by the transaction id which request an answer is for, so a client need not wait for one answer before
+    it sends the next request (Modbus Messaging on TCP/IP V1.0b, section 4.4.1.3; 1 to 16 transactions at a time are
+    usual). pymodbus' client has one request under way at a time.
+
+    Args:
+        service: Name of the peer's service.
+        host: Where it is.
+        port: Its TCP port.
+        timeout_s: How long connecting may take.
+        tls: For Modbus/TCP Security; plain Modbus/TCP without.
+
+    Neither retries nor reconnects in the background: a request fails within its time.
+    """
+
+    def __init__(self, service: str, host: str, port: int, timeout_s: float, tls: ssl.SSLContext | None) -> None:
+        self._service = service
+        self._host = host
+        self._port = port
+        self._timeout_s = timeout_s
+        self._tls = tls
+        self._wire: _Wire | None = None
+
+    @property
+    def peer(self) -> str:
+        """The server, as messages name it."""
+        return f"{self._service} at {self._host}:{self._port}"
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a connection."""
+        return self._wire is not None and not self._wire.transport.is_closing()
+
+    async def open(self) -> None:
+        """Connect.
+
+        Raises:
+            PeerUnreachableError: No server listens, or none answers in time with TLS.
+            UntrustedPeerError: The certificate of the peer does not hold.
+        """
+        loop = asyncio.get_running_loop()
+        try:
+            async with asyncio.timeout(self._timeout_s):
+                _, self._wire = await loop.create_connection(_Wire, self._host, self._port, ssl=self._tls)
+        except ssl.SSLCertVerificationError as error:
+            raise UntrustedPeerError(
+                f"{self.peer} cannot be trusted: {error.verify_message}: check the host name, and tls.ca here"
+            ) from None
+        except UnicodeError:
+            raise PeerUnreachableError(f"{self.peer}: the host name is invalid") from None
+        except TimeoutError:
+            raise PeerUnreachableError(
+                f"{self.peer} did not accept the connection in time: check host, port and the network between"
+            ) from None
+        except OSError as error:
+            if self._tls is not None and isinstance(
+                error, ssl.SSLError | ConnectionResetError | ConnectionAbortedError
+            ):
+                raise PeerUnreachableError(f"{self.peer} does not speak TLS 1.3: check server.tls there") from None
+            raise PeerUnreachableError(f"nothing listens as {self.peer}: start it, or check host and port") from None
+
+    async def transact(self, requests: Sequence[bytes], timeout_s: float) -> list[bytes]:
+        """Send up to `REQUESTS_AT_ONCE` PDUs, and return the answers' PDUs; whatever goes wrong closes the connection.
+
+        One call at a time.
+
+        Raises:
+            NoAnswerError: The peer is silent for `timeout_s`, or has closed the connection.
+        """
+        if self._wire is None:
+            raise NoAnswerError(closed=True)
+        try:
+            return await self._wire.send(requests, timeout_s)
+        except (NoAnswerError, asyncio.CancelledError):
+            self.close()  # a late answer must not meet a later request
+            raise
+
+    def close(self) -> None:
+        """Close the connection."""
+        wire, self._wire = self._wire, None
+        if wire is None:
+            return
+        if self._tls is None:
+            wire.transport.close()
+        else:
+            wire.transport.abort()  # the farewell of TLS takes a round trip, and may outlast the event loop
+
+
+class _Wire(asyncio.Protocol):
+    """The frames of one connection."""
+
+    def __init__(self) -> None:
+        self.transport: asyncio.Transport
+        self._loop = asyncio.get_running_loop()
+        self._buffer = bytearray()
+        self._last_id = 0
+        self._awaited: dict[int, int] = {}
+        """By transaction id: which of the requests is not answered yet."""
+        self._answers: list[bytes] = []
+        self._done: asyncio.Future[list[bytes]] | None = None
+        self._deadline = 0.0
+        """Of the answers, by the clock of the event loop."""
+        self._timer: asyncio.TimerHandle | None = None
+        """Looks at the deadline: one timer for many requests, as hardly any answer is late."""
+
+    def send(self, requests: Sequence[bytes], timeout_s: float) -> asyncio.Future[list[bytes]]:
+        """Send PDUs in one piece; return their answers when all are there."""
+        frames = b""
+        self._awaited.clear()
+        self._answers = [b""] * len(requests)
+        for place, pdu in enumerate(requests):
+            self._last_id = transaction = self._last_id + 1 & 0xFFFF
+            self._awaited[transaction] = place
+            frames += framed(transaction, UNIT, pdu)
+        self._done = done = self._loop.create_future()
+        if self.transport.is_closing():  # uvloop raises RuntimeError when it is written to
+            self._fail(closed=True)
+            return done
+        self.transport.write(frames)
+        self._deadline = self._loop.time() + timeout_s
+        if self._timer is None or self._timer.when() > self._deadline:
+            self._look_at(self._deadline)
+        return done
+
+    def _look_at(self, when: float) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self._loop.call_at(when, self._look)
+
+    def _look(self) -> None:
+        """Wait no longer than the deadline."""
+        self._timer = None
+        if self._done is None or self._done.done():
+            return
+        if self._loop.time() < self._deadline:
+            self._look_at(self._deadline)
+        else:
+            self._fail(closed=False)
+
+    def _fail(self, *, closed: bool) -> None:
+        if self._done is not None and not self._done.done():
+            self._done.set_exception(NoAnswerError(closed=closed))
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Take the transport (event loop callback)."""
+        self.transport = cast("asyncio.Transport", transport)
+
+    def data_received(self, data: bytes) -> None:
+        """Take the answers that are whole by now (event loop callback)."""
+        self._buffer += data
+        position = 0
+        try:
+            while position < len(self._buffer) and (frame := next_frame(self._buffer, position)) is not None:
+                transaction, unit, pdu, position = frame
+                place = self._awaited.pop(transaction, None) if unit == UNIT else None
+                if place is not None:  # else it is an answer that nobody waits for any more, or a second one
+                    self._answers[place] = pdu
+        except MalformedFrameError:
+            self.transport.abort()
+            self._answers = [NONSENSE] * len(self._answers)
+            self._awaited.clear()
+        del self._buffer[:position]
+        if not self._awaited and self._done is not None and not self._done.done():
+            self._done.set_result(self._answers)
+
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - why it was lost changes nothing
+        """Fail the waiting requests (event loop callback)."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self._fail(closed=True)
+
 
 R = TypeVar("R", bound=tuple[Any, ...])
 S = TypeVar("S", bound=tuple[Any, ...])
@@ -195,15 +414,21 @@ class RegisterClient:
         if not records:
             return
         block, codec = self._places[type(records[0])]
-        row_words = codec.size // 2
-        rows_at_once = MAX_WRITE_WORDS // row_words
+        rows_at_once = MAX_WRITE_WORDS // (codec.size // 2)
         for first in range(0, len(records), rows_at_once):
-            data = b"".join([_encoded(block, codec, record) for record in records[first : first + rows_at_once]])
-            address = block.address + (start + first) * row_words
-            head = _WRITE.pack(WRITE_MULTIPLE_REGISTERS, address, len(data) // 2, len(data))
-            answer = await self._transact(head + data, block)
-            if answer != head[_WRITTEN]:
-                raise self._nonsense(block)
+            request = self._writing(records[first : first + rows_at_once], start + first)
+            self._check_written(request, (await self._transact([request], block))[0], block)
+
+    def _writing(self, records: Sequence[tuple[Any, ...]], start: int = 0) -> bytes:
+        """Return the PDU that writes rows of one block."""
+        block, codec = self._places[type(records[0])]
+        data = b"".join([_encoded(block, codec, record) for record in records])
+        address = block.address + start * codec.size // 2
+        return _WRITE.pack(WRITE_MULTIPLE_REGISTERS, address, len(data) // 2, len(data)) + data
+
+    def _check_written(self, request: bytes, answer: bytes, block: Block) -> None:
+        if answer != request[_WRITTEN]:
+            raise self._nonsense(block)
 
     async def exchange(
         self,
@@ -211,6 +436,7 @@ class RegisterClient:
         answer: type[R],
         *,
         rows: Sequence[tuple[Any, ...]] = (),
+        before: tuple[Any, ...] | None = None,
         patience_s: float | None = None,
     ) -> R:
         """Write `record`, then read `answer`, in one request.
@@ -219,6 +445,7 @@ class RegisterClient:
             record: What to write.
             answer: What to read.
             rows: First rows of the block that follows the record's in the map, written with it.
+            before: A record that is written before, by a request of its own that is sent together with this one.
             patience_s: How long the answer may take when the server lets it wait; `timeout_s` by default.
         """
         block, codec = self._places[type(record)]
@@ -227,7 +454,11 @@ class RegisterClient:
         head = _READ_WRITE.pack(
             READ_WRITE_REGISTERS, answer_block.address, answer_codec.size // 2, block.address, len(data) // 2, len(data)
         )
-        words = self._checked(await self._transact(head + data, block, patience_s), answer_codec.size, answer_block)
+        requests = [head + data] if before is None else [self._writing([before]), head + data]
+        *written, raw = await self._transact(requests, block, patience_s)
+        if before is not None:
+            self._check_written(requests[0], written[0], block)
+        words = self._checked(raw, answer_codec.size, answer_block)
         return cast("R", self._decoded(answer_block, answer_codec, words))
 
     async def query(self, record: tuple[Any, ...], answer: type[R], rows: type[S], count: int) -> tuple[R, list[S]]:
@@ -243,7 +474,8 @@ class RegisterClient:
         head = _READ_WRITE.pack(
             READ_WRITE_REGISTERS, block.address, size // 2, written.address, len(data) // 2, len(data)
         )
-        raw = self._checked(await self._transact(head + data, written), size, block)
+        (raw,) = await self._transact([head + data], written)
+        raw = self._checked(raw, size, block)
         places = range(codec.size, size, row_codec.size)
         found = [cast("S", self._decoded(row_block, row_codec, raw, place)) for place in places]
         return cast("R", self._decoded(block, codec, raw)), found
@@ -255,7 +487,7 @@ class RegisterClient:
     async def _read_words(self, block: Block, parts: Sequence[tuple[int, int]]) -> list[bytes]:
         """Return the words of parts of a block, each given by its address and the number of words."""
         requests = [_READ.pack(READ_HOLDING_REGISTERS, address, count) for address, count in parts]
-        answers = await self._transact_all(requests, block)
+        answers = await self._transact(requests, block)
         return [self._checked(raw, 2 * count, block) for raw, (_, count) in zip(answers, parts, strict=True)]
 
     def _checked(self, raw: bytes, size: int, block: Block) -> bytes:
@@ -273,13 +505,7 @@ class RegisterClient:
         except DomainError as error:
             raise ImplausibleAnswerError(f"{self.peer}: block '{block.name}' is not plausible: {error}") from None
 
-    async def _transact(self, request: bytes, block: Block, patience_s: float | None = None) -> bytes:
-        """Send a PDU; return the bytes behind the answer's function code."""
-        return (await self._transact_all([request], block, patience_s))[0]
-
-    async def _transact_all(
-        self, requests: Sequence[bytes], block: Block, patience_s: float | None = None
-    ) -> list[bytes]:
+    async def _transact(self, requests: Sequence[bytes], block: Block, patience_s: float | None = None) -> list[bytes]:
         """Send PDUs, connecting first where needed; return the bytes behind the function codes of the answers."""
         async with self._turn:
             if not self._transport.connected:

@@ -2,25 +2,183 @@
 
 Everything runs in the callbacks of the event loop. A request costs no task and no await unless `on_write` asks for a
 wait; then requests that arrive behind it stay in the buffer until its answer is written. A request that comes alone is
-answered at once; many are answered a few at a time (`turns`).
+answered at once; many are answered a few at a time (`Turns`).
 """
 
 import asyncio
+import logging
+import time
+from collections import deque
 from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass, fields
 from functools import partial
 from itertools import count
 from time import monotonic
-from typing import Final, cast
+from typing import Final, Protocol, cast
 
 from coldloop.modbus.access import caller_at, caller_with
-from coldloop.modbus.framing import Frame, MalformedFrameError, framed, next_frame
-from coldloop.modbus.rate_limit import RateLimit, rate_limit_of
-from coldloop.modbus.refusals import RefusalLog
-from coldloop.modbus.requests import NO_SUCH_UNIT, SERVER_FAILURE, RequestHandler, Written, exception_answer
+from coldloop.modbus.requests import (
+    NO_SUCH_UNIT,
+    SERVER_FAILURE,
+    Frame,
+    MalformedFrameError,
+    RequestHandler,
+    Written,
+    exception_answer,
+    framed,
+    next_frame,
+)
 from coldloop.modbus.settings import ServerSettings
-from coldloop.modbus.turns import REQUESTS_AT_ONCE, Turns
 from coldloop.registers.bank import ANYBODY, Caller, ForbiddenWriteError, RefusedAccessError
 from coldloop.registers.declaration import Block, Role
+
+LOG_INTERVAL_S: Final = 10.0
+
+_logger = logging.getLogger("coldloop.modbus")
+
+
+@dataclass(slots=True)
+class ErrorCounters:
+    """Errors since the server was made, by kind."""
+
+    illegal_function: int = 0
+    illegal_address: int = 0
+    illegal_value: int = 0
+    server_failure: int = 0
+    unknown_unit: int = 0
+    malformed_frame: int = 0
+    idle_timeout: int = 0
+    connection_evicted: int = 0
+    connection_refused: int = 0
+    access_refused: int = 0
+    tls_refused: int = 0
+    rate_limited: int = 0
+    second_writer: int = 0
+
+
+class RefusalLog:
+    """Counts each refusal and logs at most one line of a kind in `LOG_INTERVAL_S`, so that no client floods the log.
+
+    Args:
+        service: Whose refusals these are.
+        on_refusal: Called with the kind of every one.
+    """
+
+    def __init__(self, service: str, on_refusal: Callable[[str], None] | None = None) -> None:
+        self.counters = ErrorCounters()
+        self._service = service
+        self._on_refusal = on_refusal
+        self._next_line = dict.fromkeys((field.name for field in fields(ErrorCounters)), 0.0)
+        self._unlogged = dict.fromkeys(self._next_line, 0)
+
+    def note(self, kind: str, peer: str, reason: str) -> None:
+        """Count a refusal of `kind`, a field of `ErrorCounters`."""
+        setattr(self.counters, kind, getattr(self.counters, kind) + 1)
+        if self._on_refusal is not None:
+            self._on_refusal(kind)
+        now = time.monotonic()
+        if now < self._next_line[kind]:
+            self._unlogged[kind] += 1
+            return
+        _logger.warning(
+            "service=%s kind=%s peer=%s unlogged=%d reason=%s", self._service, kind, peer, self._unlogged[kind], reason
+        )
+        self._next_line[kind] = now + LOG_INTERVAL_S
+        self._unlogged[kind] = 0
+
+
+class RateLimit:
+    """A token bucket: `rate` requests a second, and up to `burst` at once."""
+
+    def __init__(self, rate: float, burst: int) -> None:
+        self.rate = rate
+        self._burst = float(burst)
+        self._tokens = self._burst
+        self._filled_at = monotonic()
+
+    def take(self) -> float:
+        """Take the right to one request; return 0, or in how many seconds there will be one."""
+        now = monotonic()
+        self._tokens = min(self._burst, self._tokens + (now - self._filled_at) * self.rate)
+        self._filled_at = now
+        if self._tokens < 1.0:
+            return (1.0 - self._tokens) / self.rate
+        self._tokens -= 1.0
+        return 0.0
+
+
+def rate_limit_of(settings: ServerSettings, *, has_role: bool) -> RateLimit | None:
+    """Return the limit of a connection, None where it has none."""
+    if has_role:
+        return RateLimit(settings.request_rate, settings.request_burst) if settings.request_rate else None
+    rates = [rate for rate in (settings.request_rate, settings.reader_request_rate) if rate]
+    return RateLimit(min(rates), settings.request_burst) if rates else None
+
+
+TURN_S: Final = 0.001
+"""Time for requests in one turn. A request that is being served is finished."""
+REQUESTS_AT_ONCE: Final = 16
+"""Requests of one connection before it is the turn of the next one."""
+
+
+class Client(Protocol):
+    """What a connection offers to be served in turns."""
+
+    has_role: bool
+
+    def serve_some(self, until: float) -> bool:
+        """Serve a few requests, none after `until` (monotonic time, s); return whether there are more."""
+
+
+class Turns:
+    """Divides the turns of the event loop between connections and the control program; one for each server.
+
+    Timers are looked at once in a turn, so a scan is as late as the turn in which it falls due is long. In one turn
+    requests are served for about `TURN_S`, and a few of each connection; the rest waits for later turns.
+    Clients with a role are served before those without, each kind in the order of arrival. Where clients with a role
+    take all the time, one of the others is still served in each turn.
+    """
+
+    def __init__(self) -> None:
+        self._with_role: deque[Client] = deque()
+        self._without: deque[Client] = deque()
+        self._until = 0.0
+        self._begun = False
+
+    def until(self) -> float:
+        """Return until when requests may be served in this turn (monotonic time, s), or 0 when the time is used up."""
+        now = monotonic()
+        if not self._begun:
+            self._begun = True
+            self._until = now + TURN_S
+            asyncio.get_running_loop().call_soon(self._next_turn)
+        return self._until if now < self._until else 0.0
+
+    def queue(self, client: Client) -> None:
+        """Serve a client in a later turn; `until` has been called in this one."""
+        (self._with_role if client.has_role else self._without).append(client)
+
+    def _next_turn(self) -> None:
+        if not self._with_role and not self._without:
+            self._begun = False  # what arrives next begins a turn of its own
+            return
+        # Requests that arrive in this turn share its time with those that have waited for it.
+        asyncio.get_running_loop().call_soon(self._next_turn)
+        self._until = monotonic() + TURN_S
+        self._serve(self._with_role)
+        if self._without:
+            self._serve_one(self._without)
+        self._serve(self._without)
+
+    def _serve(self, clients: deque[Client]) -> None:
+        while clients and monotonic() < self._until:
+            self._serve_one(clients)
+
+    def _serve_one(self, clients: deque[Client]) -> None:
+        client = clients.popleft()
+        if client.serve_some(self._until):
+            clients.append(client)
+
 
 INPUT_LIMIT: Final = 64 * 1024
 """Bytes of unserved requests beyond which a connection is not read from."""
@@ -195,7 +353,7 @@ class Connection(asyncio.Protocol):
         last = self.requests + REQUESTS_AT_ONCE
         more = False
         try:
-            while self._wait is None and not more:
+            while self._wait is None and not more and position < len(self._buffer):
                 frame = next_frame(self._buffer, position)
                 if frame is None or (self._rate is not None and self._too_fast(self._rate)):
                     break
@@ -234,19 +392,19 @@ class Connection(asyncio.Protocol):
             self._refusals.note("unknown_unit", self.peer, f"unit id {frame.unit} is not served")
             if self._settings.unknown_unit == "silence":
                 return b""
-            return framed(frame, exception_answer(frame.pdu[0], NO_SUCH_UNIT))
+            return framed(frame.transaction, frame.unit, exception_answer(frame.pdu[0], NO_SUCH_UNIT))
         try:
             outcome = self._handle(frame.pdu)
         except RefusedAccessError as refusal:
             kind = _KINDS[refusal.exception_code] if not isinstance(refusal, ForbiddenWriteError) else "access_refused"
             self._refusals.note(kind, self.peer, f"function {frame.pdu[0]}: {refusal}")
-            return framed(frame, exception_answer(frame.pdu[0], refusal.exception_code))
+            return framed(frame.transaction, frame.unit, exception_answer(frame.pdu[0], refusal.exception_code))
         except Exception as error:  # noqa: BLE001 - whatever goes wrong in here, the client gets an answer
             return self._failure(frame, error)
         if isinstance(outcome, Written):
             self.written_as.update([block.writer for block in outcome.blocks])
             return self._answer_written(frame, outcome, iter(outcome.blocks))
-        return framed(frame, outcome)
+        return framed(frame.transaction, frame.unit, outcome)
 
     def _answer_written(self, frame: Frame, written: Written, blocks: Iterator[Block]) -> bytes:
         """Report the written blocks to the program; return the answer, or nothing if the program delays it."""
@@ -259,7 +417,7 @@ class Connection(asyncio.Protocol):
                     return b""
         except Exception as error:  # noqa: BLE001 - whatever the program does wrong, the client gets an answer
             return self._failure(frame, error)
-        return framed(frame, written.answer())
+        return framed(frame.transaction, frame.unit, written.answer())
 
     def _go_on(self, frame: Frame, written: Written, blocks: Iterator[Block], wait: asyncio.Future[None]) -> None:
         self._wait = None
@@ -274,7 +432,7 @@ class Connection(asyncio.Protocol):
 
     def _failure(self, frame: Frame, error: BaseException) -> bytes:
         self._refusals.note("server_failure", self.peer, f"function {frame.pdu[0]}: {error!r}")
-        return framed(frame, exception_answer(frame.pdu[0], SERVER_FAILURE))
+        return framed(frame.transaction, frame.unit, exception_answer(frame.pdu[0], SERVER_FAILURE))
 
     def _check_idle(self) -> None:
         now = monotonic()

@@ -10,13 +10,10 @@ from time import monotonic
 from typing import Final
 
 from coldloop.errors import PortInUseError
-from coldloop.modbus.connection import Connection, OnWrite
-from coldloop.modbus.identification import DeviceIdentity
-from coldloop.modbus.refusals import ErrorCounters, RefusalLog
-from coldloop.modbus.requests import RequestHandler
+from coldloop.modbus.connection import Connection, ErrorCounters, OnWrite, RefusalLog, Turns
+from coldloop.modbus.requests import DeviceIdentity, RequestHandler
 from coldloop.modbus.settings import ServerSettings
 from coldloop.modbus.tls_listener import TlsListener
-from coldloop.modbus.turns import Turns
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import ServerStatistics
 from coldloop.registers.declaration import Role

@@ -1,10 +1,12 @@
-"""How a server is set up, and who may do what with it."""
+"""How a server is set up, who may do what with it, and where a client finds one."""
 
 from ipaddress import IPv4Network, IPv6Network
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, IPvAnyNetwork
+from pydantic import BaseModel, ConfigDict, Field, IPvAnyNetwork, PositiveFloat
+
+from coldloop.registers.codec import WordOrder
 
 Networks = tuple[IPvAnyNetwork, ...]
 """Addresses and networks, such as `192.168.7.11` and `10.1.0.0/16`."""
@@ -86,3 +88,24 @@ class ServerSettings(BaseModel):
     request_rate: float = Field(default=0.0, ge=0)
     reader_request_rate: float = Field(default=200.0, ge=0)
     request_burst: int = Field(default=100, ge=1)
+
+
+PLANT_PORT = 5020
+CONTROL_PORT = 5021
+OPTIMIZER_PORT = 5022
+
+
+class Endpoint(BaseModel):
+    """Address of a Modbus/TCP server."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    host: str = "127.0.0.1"
+    """Name or address."""
+    port: Annotated[int, Field(ge=1, le=65535)]
+    """TCP port."""
+    word_order: WordOrder = WordOrder.HIGH_FIRST
+    timeout_s: PositiveFloat = 3.0
+    """How long an answer may take."""
+    tls: TlsSettings | None = None
+    """Modbus/TCP Security instead of plain Modbus/TCP."""

@@ -11,7 +11,7 @@ from functools import partial
 from socket import AI_PASSIVE, SOCK_STREAM, create_server, socket
 from typing import Final, Self
 
-from coldloop.modbus.refusals import RefusalLog
+from coldloop.modbus.connection import RefusalLog
 
 HANDSHAKE_S: Final = 5.0
 """How long a handshake may take."""

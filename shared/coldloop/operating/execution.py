@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from coldloop.errors import BUSY, LinkError, PeerUnreachableError, RequestRefusedError, UsageError
 from coldloop.modbus.client import RegisterClient
-from coldloop.modbus.endpoints import Endpoint
+from coldloop.modbus.settings import Endpoint
 from coldloop.number_text import value_text
 from coldloop.operating.commands import (
     Command,
@@ -26,6 +26,7 @@ from coldloop.operating.commands import (
 from coldloop.operating.observer import read_alarms
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
+from coldloop.registers.codec import sealed
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
 from coldloop.registers.maps import Maps, maps_of
@@ -40,7 +41,6 @@ from coldloop.registers.plant import (
     SensorFaultKind,
 )
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmState, alarms_of
-from coldloop.registers.seal import sealed
 from coldloop.service.event_text import alarm_word
 
 LAST_TICK: Final = 2**32 - 1

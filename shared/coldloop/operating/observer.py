@@ -10,8 +10,7 @@ from collections.abc import Callable, Collection
 from typing import Final, Protocol, TypeVar
 
 from coldloop.errors import LinkError, RequestRefusedError
-from coldloop.modbus.client import RegisterClient
-from coldloop.modbus.transport import REQUESTS_AT_ONCE
+from coldloop.modbus.client import REQUESTS_AT_ONCE, RegisterClient
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import Identity
 from coldloop.registers.optimizer_plc import HISTORY_ROWS as UPDATE_ROWS

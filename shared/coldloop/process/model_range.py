@@ -22,7 +22,8 @@ WARMEST_BATH_M3: Final = -6.37
 COLD_BOX_BAR: Final = (16.0, 1.05)
 """Supply and return of a cold box alone; those of a plant file are within the same ranges."""
 FIRST_CELL: Final = [state.name for state in COLD_BOX.states].index("T_nef1_1")
-COLDEST_CELLS_K: Final = np.array([2.5] * (len(COLD_BOX.states) - FIRST_CELL - 1) + [5.3])
+COLDEST_K, COLDEST_IN_TURBINE_K = 2.5, 5.3
+COLDEST_CELLS_K: Final = np.array([COLDEST_K] * (len(COLD_BOX.states) - FIRST_CELL - 1) + [COLDEST_IN_TURBINE_K])
 """Shape (26,); the last is before the turbine, whose table of entropy ends at 6.1 kJ/kg: 5.3 K at 5 bar, 3.9 at 16."""
 HP, LP = STATION_SIGNAL_NAMES.index("P12"), STATION_SIGNAL_NAMES.index("P11")
 
@@ -42,6 +43,21 @@ def model_range(x: NDArray[Any], supply: NDArray[Any] | float, suction: NDArray[
     for bit, left in outside.items():
         bits |= np.where(left, np.int32(bit), np.int32(0))
     return bits
+
+
+def present_model_range(x: NDArray[Any], supply: float, suction: float) -> int:
+    """Return the same for one state, shape (28,): one that is inside, as in nearly all ticks, is known in 3 us."""
+    pascals, liquid, *cells = x.tolist()
+    inside = (
+        SATURATION_BAR[0] <= 1e-5 * pascals <= SATURATION_BAR[1]
+        and SUPPLY_BAR[0] <= supply <= SUPPLY_BAR[1]
+        and SATURATION_BAR[0] <= suction <= SATURATION_BAR[1]
+        and min(cells) >= COLDEST_K
+        and cells[-1] >= COLDEST_IN_TURBINE_K
+        and max(cells) <= WARMEST_CELL_K
+        and liquid >= WARMEST_BATH_M3
+    )
+    return 0 if inside else int(model_range(x, supply, suction))
 
 
 def recorded_model_range(x: NDArray[Any], station: NDArray[Any]) -> NDArray[np.int32]:

@@ -4,17 +4,25 @@ from bisect import bisect_left
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar, cast
 
-from coldloop.registers.codec import RecordCodec, ValueCodec, WordOrder, codec_of
+from coldloop.registers.codec import (
+    Domain,
+    DomainError,
+    RecordCodec,
+    Seal,
+    ValueCodec,
+    WordOrder,
+    codec_of,
+    seal_of,
+    sealed_bytes,
+)
 from coldloop.registers.declaration import Block, Field, Kind, RegisterMap, Role
-from coldloop.registers.domain import Domain, DomainError
-from coldloop.registers.seal import Seal, seal_of, sealed_bytes
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
 FIRST_HALF, SECOND_HALF = 1, 2
 ALL_ROLES = frozenset(Role)
 MAX_SPANS = 512
-"""Ranges that clients write to are remembered up to this number."""
+"""Ranges that clients write to are remembered up to this number, and those that they read."""
 
 
 class Caller(NamedTuple):
@@ -89,13 +97,17 @@ class RegisterBank:
         self.map = register_map
         self.order = order
         self._memory = bytearray(2 * 0x10000)
+        self._view = memoryview(self._memory)
         self._writable = bytearray(0x10000)
         self._halves = bytearray(0x10000)
         self._places: dict[type[tuple[Any, ...]], tuple[Block, RecordCodec]] = {}
         self._checks: list[tuple[int, Kind, Field, str]] = []
         self._spans: dict[tuple[int, int], _Span] = {}
-        self._judges: dict[type[tuple[Any, ...]], Judge] = {}
-        self._live: list[tuple[int, int, Callable[[], tuple[Any, ...] | None], Callable[[tuple[Any, ...]], None]]] = []
+        self._judges: dict[type[tuple[Any, ...]], tuple[Judge, bool]] = {}
+        self._live: dict[type[tuple[Any, ...]], Callable[[], None]] = {}
+        """What brings a record up to date."""
+        self._read_spans: dict[tuple[int, int], list[Callable[[], None]]] = {}
+        """The same for the words that clients read."""
         for block in register_map.blocks:
             self._declare(block)
         self._check_addresses = [address for address, *_ in self._checks]
@@ -117,8 +129,17 @@ class RegisterBank:
 
     def get(self, record: type[R], row: int = 0) -> R:
         """Return a row of the block that holds `record`."""
+        if record in self._live:
+            self._live[record]()
         block, codec = self._places[record]
         return cast("R", codec.decode(self._memory, 2 * block.address + row * codec.size))
+
+    def get_rows(self, record: type[R], count: int) -> list[R]:
+        """Return the first rows of the block that holds `record`."""
+        block, codec = self._places[record]
+        start = 2 * block.address
+        places = range(start, start + count * codec.size, codec.size)
+        return [cast("R", codec.decode(self._memory, place)) for place in places]
 
     def put(self, record: tuple[Any, ...], row: int = 0) -> None:
         """Store a row of the block that holds this type of record."""
@@ -132,19 +153,30 @@ class RegisterBank:
         start = 2 * block.address
         self._memory[start : start + codec.size] = sealed_bytes(codec, record)
 
-    def judged_by(self, judge: Judge, *records: type[tuple[Any, ...]]) -> None:
-        """Let `judge` have a say in what clients write to the blocks of these records."""
+    def judged_by(self, judge: Judge, *records: type[tuple[Any, ...]], every_row: bool = True) -> None:
+        """Let `judge` have a say in what clients write to the blocks of these records: in every row, or in the first.
+
+        The first is enough where the judge asks who writes, and not what.
+        """
         for record in records:
-            self._judges[record] = judge
+            self._judges[record] = judge, every_row
         self._spans.clear()
 
     def keep_fresh(self, record: type[tuple[Any, ...]], present: Callable[[], tuple[Any, ...] | None]) -> None:
-        """Store `present()`, sealed where the block is, whenever a client reads from the block that holds `record`.
+        """Store `present()`, sealed where the block is, whenever somebody reads from the block that holds `record`.
 
-        None leaves it as it is.
+        None leaves it as it is. What changes in each tick, and is read now and then, costs nothing in between.
         """
         block, _ = self._places[record]
-        self._live.append((block.address, block.end, present, self.put_sealed if block.sealed else self.put))
+        store = self.put_sealed if block.sealed else self.put
+
+        def refresh() -> None:
+            newest = present()
+            if newest is not None:
+                store(newest)
+
+        self._live[record] = refresh
+        self._read_spans.clear()
 
     def check_readable(self, address: int, count: int) -> None:
         """Check that `count` words from `address` on may be read: all up to the end of the map, gaps included.
@@ -163,14 +195,22 @@ class RegisterBank:
         Raises:
             IllegalAddressError: They reach beyond the end of the map.
         """
+        stale = self._read_spans.get((address, count))
+        for refresh in self._read_span(address, count) if stale is None else stale:
+            refresh()
+        return bytes(self._view[2 * address : 2 * (address + count)])
+
+    def _read_span(self, address: int, count: int) -> list[Callable[[], None]]:
+        """Return what brings the words that are to be read up to date, and remember it."""
         self.check_readable(address, count)
-        end = address + count
-        for start, behind, present, store in self._live:
-            if address < behind and start < end:
-                record = present()
-                if record is not None:
-                    store(record)
-        return bytes(self._memory[2 * address : 2 * end])
+        if len(self._read_spans) >= MAX_SPANS:
+            self._read_spans.clear()
+        self._read_spans[address, count] = found = [
+            refresh
+            for record, refresh in self._live.items()
+            if address < self._places[record][0].end and self._places[record][0].address < address + count
+        ]
+        return found
 
     def write(self, address: int, data: bytes, caller: Caller = ANYBODY) -> list[Block]:
         """Judge and store words from `address` on; return the blocks that they fall in.
@@ -246,12 +286,18 @@ class RegisterBank:
                 for block, row in rows
                 if block.sealed
             ],
-            judged=[
-                (self._judges[block.record], self._places[block.record][1], self._offset(block, row, first), row)
-                for block, row in rows
-                if block.record in self._judges
-            ],
+            judged=self._judged(rows, first),
         )
+
+    def _judged(self, rows: list[tuple[Block, int]], first: int) -> list[tuple[Judge, RecordCodec, int, int]]:
+        judged = []
+        before: Block | None = None
+        for block, row in rows:
+            judge, every_row = self._judges.get(block.record, (None, False))
+            if judge is not None and (every_row or block is not before):
+                judged.append((judge, self._places[block.record][1], self._offset(block, row, first), row))
+            before = block
+        return judged
 
     @staticmethod
     def _offset(block: Block, row: int, first: int) -> int:

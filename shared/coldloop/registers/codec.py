@@ -1,15 +1,109 @@
-"""Records to register words and back."""
+"""Records to register words and back: their ranges, their values in words, their seals.
 
+Servers check writes by the declared ranges, clients what they read, and programs the records of a file.
+"""
+
+import math
 import struct
-from collections.abc import Iterable
-from enum import StrEnum
-from functools import cache
-from typing import Any, TypeVar, cast
+import zlib
+from collections.abc import Callable, Iterable, Sequence
+from enum import Enum, StrEnum
+from functools import cache, partial
+from itertools import accumulate, chain
+from operator import itemgetter
+from typing import Any, Final, NamedTuple, TypeVar, cast
 
-from coldloop.registers.declaration import Block, RegisterMap
-from coldloop.registers.domain import DomainError, domain_of
+from coldloop.registers.declaration import Block, Field, Kind, RegisterMap
 
 R = TypeVar("R", bound=tuple[Any, ...])
+
+WIDEST: Final = {Kind.U16: (0, 0xFFFF), Kind.U32: (0, 0xFFFF_FFFF), Kind.F32: (-math.inf, math.inf)}
+"""What a register can hold."""
+
+
+class DomainError(ValueError):
+    """A value that its register cannot have."""
+
+
+class _Run(NamedTuple):
+    """Neighbouring values with the same range."""
+
+    start: int
+    end: int
+    low: float
+    high: float
+
+
+class Domain:
+    """The ranges of a run of registers.
+
+    Args:
+        fields: Declaration of each register, one for each element of an array.
+        names: Of the same registers, for messages.
+    """
+
+    def __init__(self, fields: Sequence[Field], names: Sequence[str]) -> None:
+        self._fields = fields
+        self._names = names
+        self._runs = _runs_of(fields)
+
+    def check(self, values: Sequence[Any]) -> None:
+        """Check values, one for each register.
+
+        Raises:
+            DomainError: One is out of its range, or not finite where it has to be.
+        """
+        if math.isfinite(sum(values)):  # one pass instead of a look at each
+            for start, end, low, high in self._runs:
+                run = values[start:end]
+                if min(run) < low or max(run) > high:
+                    break
+            else:
+                return
+        for value, field, name in zip(values, self._fields, self._names, strict=True):
+            _check_value(value, field, name)
+
+
+def _runs_of(fields: Sequence[Field]) -> list[_Run]:
+    """Return the runs of values whose range is narrower than what their registers can hold."""
+    runs: list[_Run] = []
+    for place, field in enumerate(fields):
+        low, high = _stored_range(field)
+        if (low, high) == WIDEST[field.kind]:
+            continue
+        if runs and runs[-1][1:] == (place, low, high):
+            runs[-1] = runs[-1]._replace(end=place + 1)
+        else:
+            runs.append(_Run(place, place + 1, low, high))
+    return runs
+
+
+def _stored_range(field: Field) -> tuple[float, float]:
+    """Return the range as values are rounded: 0.01 is stored as a little less, and is still in a range from 0.01."""
+    lowest, highest = WIDEST[field.kind]
+    low, high = lowest if field.low is None else field.low, highest if field.high is None else field.high
+    if field.kind is Kind.F32:
+        low, high = struct.unpack("2f", struct.pack("2f", low, high))
+    return low, high
+
+
+def _check_value(value: float, field: Field, name: str) -> None:
+    if not math.isfinite(value):
+        if field.finite:
+            raise DomainError(f"{name} is not a finite number")
+        return
+    low, high = _stored_range(field)
+    if value < low:
+        raise DomainError(f"{name} = {value:g} is below {field.low:g} {field.unit}".rstrip())
+    if value > high:
+        raise DomainError(f"{name} = {value:g} is above {field.high:g} {field.unit}".rstrip())
+
+
+@cache
+def domain_of(block: Block) -> Domain:
+    """Return the (shared) domain of the rows of a block."""
+    names, fields = zip(*block.elements, strict=True)
+    return Domain(fields, names)
 
 
 class WordOrder(StrEnum):
@@ -17,6 +111,10 @@ class WordOrder(StrEnum):
 
     HIGH_FIRST = "high-first"
     LOW_FIRST = "low-first"  # the habit of Schneider's PLCs
+
+
+_Places = Callable[[tuple[Any, ...]], tuple[Any, ...]]
+"""Takes a tuple apart, or puts one together."""
 
 
 class ValueCodec:
@@ -43,8 +141,9 @@ class ValueCodec:
             data, offset = self._reordered(data[offset : offset + self.size]), 0
         return self._struct.unpack_from(data, offset)
 
-    def canonical(self, raw: bytes | bytearray | memoryview) -> bytes | bytearray | memoryview:
-        """Return the same values with the high words first, bit for bit."""
+    def canonical(self, data: bytes | bytearray | memoryview, offset: int = 0) -> bytes:
+        """Return the bytes of the values that stand in `data` at `offset`, with the high words first, bit for bit."""
+        raw = bytes(data[offset : offset + self.size])
         return raw if self._swaps is None else self._reordered(raw)
 
     def _reordered(self, raw: bytes | bytearray | memoryview) -> bytes:
@@ -57,11 +156,11 @@ class RecordCodec:
 
     def __init__(self, block: Block, order: WordOrder) -> None:
         self._values = ValueCodec(block.letters, order)
-        self._record = block.record
         self._domain = domain_of(block)
-        self._arrays = [len(field.elements) for field in block.fields.values()]
-        self._flat = not any(self._arrays)
+        self._parts, self._fields = _places_of([len(field.elements) for field in block.fields.values()])
+        self._make: _Places = partial(tuple.__new__, block.record)
         self.size = self._values.size
+        self.canonical = self._values.canonical
 
     def encode(self, record: tuple[Any, ...]) -> bytes:
         """Return the row's bytes.
@@ -69,11 +168,12 @@ class RecordCodec:
         Raises:
             struct.error, OverflowError: A value does not fit its register.
         """
-        return self._values.pack(record if self._flat else self._flattened(record))
+        return self._values.pack(record if self._parts is None else chain.from_iterable(self._parts(record)))
 
     def decode(self, data: bytes | bytearray | memoryview, offset: int = 0) -> tuple[Any, ...]:
         """Return the record in `data` at `offset` (bytes)."""
-        return self._made_of(self._values.unpack(data, offset))
+        values = self._values.unpack(data, offset)
+        return self._make(values if self._fields is None else self._fields(values))
 
     def decode_checked(self, data: bytes | bytearray | memoryview, offset: int = 0) -> tuple[Any, ...]:
         """Return the record in `data` at `offset` (bytes), made by another program.
@@ -89,7 +189,7 @@ class RecordCodec:
         except DomainError:
             if any(values):
                 raise
-        return self._made_of(values)
+        return self._make(values if self._fields is None else self._fields(values))
 
     def check(self, record: tuple[Any, ...]) -> None:
         """Check a record that has not come by the bus.
@@ -103,29 +203,21 @@ class RecordCodec:
             raise DomainError(f"a value does not fit its register: {error}") from None
         self._domain.check(values)
 
-    def _made_of(self, values: tuple[Any, ...]) -> tuple[Any, ...]:
-        return self._record(*(values if self._flat else self._nested(values)))
 
-    def canonical(self, data: bytes | bytearray | memoryview, offset: int = 0) -> bytes | bytearray | memoryview:
-        """Return the row's bytes that stand in `data` at `offset`, with the high words first, bit for bit."""
-        return self._values.canonical(data[offset : offset + self.size])
+def _places_of(arrays: list[int]) -> tuple[_Places | None, _Places | None]:
+    """Return what takes a record to tuples of values, and all values to its fields; None where each field is a value.
 
-    def _flattened(self, record: tuple[Any, ...]) -> list[Any]:
-        flat: list[Any] = []
-        for value, elements in zip(record, self._arrays, strict=True):
-            if elements:
-                flat += value
-            else:
-                flat.append(value)
-        return flat
-
-    def _nested(self, values: tuple[Any, ...]) -> list[Any]:
-        nested: list[Any] = []
-        start = 0
-        for elements in self._arrays:
-            nested.append(values[start : start + elements] if elements else values[start])
-            start += elements or 1
-        return nested
+    Args:
+        arrays: Elements of each field, 0 where it is a value.
+    """
+    if not any(arrays):
+        return None, None
+    parts = [place if elements else slice(place, place + 1) for place, elements in enumerate(arrays)]
+    ends = list(accumulate(elements or 1 for elements in arrays))
+    fields = [slice(end - elements, end) if elements else end - 1 for end, elements in zip(ends, arrays, strict=True)]
+    if len(arrays) == 1:  # a getter of one place returns what is there, not a tuple of it
+        return itemgetter(slice(1)), lambda values: (values,)
+    return itemgetter(*parts), itemgetter(*fields)
 
 
 def _swapped_words(letters: str) -> list[int]:
@@ -161,3 +253,45 @@ def blank(record: type[R], of: RegisterMap) -> R:
     """Return the record of a map whose registers are all 0."""
     block = of.block_of(record)
     return cast("R", codec_of(block).decode(bytes(2 * block.row_words)))
+
+
+CRC_BYTES = 4
+
+
+class Seal(Enum):
+    """What the seal of a record says.
+
+    TCP's checksum does not see what a gateway, a proxy or a memory does to a value. A sealed record ends with the
+    CRC-32 of all before it, as big-endian words whatever the word order of the link; 0 is "not sealed", as a simple
+    client leaves it. A seal is checked on the bytes that arrived: decoding changes some of them (a signalling NaN
+    becomes a quiet one).
+    """
+
+    ABSENT = "absent"
+    INTACT = "intact"
+    BROKEN = "broken"
+
+
+def seal_of(codec: RecordCodec, data: bytes | bytearray | memoryview, offset: int = 0) -> Seal:
+    """Return what the seal says of the record in `data` at `offset`."""
+    raw = codec.canonical(data, offset)
+    crc = int.from_bytes(raw[-CRC_BYTES:], "big")
+    if not crc:
+        return Seal.ABSENT
+    return Seal.INTACT if crc == _checksum(raw) else Seal.BROKEN
+
+
+def sealed(record: R, of: RegisterMap) -> R:
+    """Return a record of a map with its field `crc`, the last one, filled in."""
+    crc = _checksum(codec_of(of.block_of(type(record))).encode(record))
+    return cast("R", record._replace(crc=crc))  # type: ignore[attr-defined] # a NamedTuple
+
+
+def sealed_bytes(codec: RecordCodec, record: tuple[Any, ...]) -> bytes:
+    """Return the bytes of `sealed`, which is encoded once only."""
+    raw = codec.canonical(codec.encode(record))
+    return codec.canonical(raw[:-CRC_BYTES] + _checksum(raw).to_bytes(CRC_BYTES, "big"))  # words back in order
+
+
+def _checksum(raw: bytes) -> int:
+    return zlib.crc32(raw[:-CRC_BYTES]) or 1

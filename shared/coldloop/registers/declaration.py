@@ -288,7 +288,7 @@ class Block:
     writer: Role | None = None
     rows: int = 1
     sealed: bool = False
-    """Each row ends with the CRC-32 of the words before it (`coldloop.registers.seal`)."""
+    """Each row ends with the CRC-32 of the words before it (`coldloop.registers.codec`)."""
     process: Process = COLD_BOX
     """By which sizes, names, units and ranges are."""
 

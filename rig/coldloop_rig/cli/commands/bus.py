@@ -29,7 +29,7 @@ from coldloop_rig.cli.commands.options import (
 from coldloop_rig.interruption import run_until_interrupted
 
 if TYPE_CHECKING:
-    from coldloop.modbus.endpoints import Endpoint
+    from coldloop.modbus.settings import Endpoint
     from coldloop.operating.observer import JournalReader
     from coldloop.process.declaration import Process
     from coldloop.registers.audit import Event
@@ -227,7 +227,7 @@ def _listener(text: str) -> HostPort:
 
 def execute_proxy(options: argparse.Namespace) -> int:
     """A link to any Modbus/TCP server, disturbed by plan: late, lost, doubled, damaged, cut, refused."""
-    from coldloop.modbus.endpoints import Endpoint
+    from coldloop.modbus.settings import Endpoint
     from coldloop_rig.chaos.plan import find_link_plan
     from coldloop_rig.chaos.proxy import disturb
 

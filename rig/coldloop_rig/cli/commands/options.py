@@ -221,8 +221,7 @@ def rig_endpoints(options: argparse.Namespace, settings: "OperatorSettings | Set
         UsageError: --rig and --port-base were both given, the folder of --tls has no configuration, no rig is up, or
             several are.
     """
-    from coldloop.modbus.endpoints import Endpoint
-    from coldloop.modbus.settings import TlsSettings
+    from coldloop.modbus.settings import Endpoint, TlsSettings
     from coldloop_rig.cosim.wiring import RigEndpoints
     from coldloop_rig.live.started_rigs import find_rig, ports_from, require_listener
 

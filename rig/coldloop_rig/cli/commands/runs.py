@@ -69,7 +69,7 @@ def execute_run(options: argparse.Namespace) -> int:
 
 
 def _run_job(options: argparse.Namespace) -> "Job":
-    from coldloop.modbus.endpoints import Endpoint
+    from coldloop.modbus.settings import Endpoint
     from coldloop_rig.cosim.scenario import Job
     from coldloop_rig.results.recording import Way
     from coldloop_rig.runs.running import check_certificates, make_scenario

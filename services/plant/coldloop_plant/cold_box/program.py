@@ -9,7 +9,7 @@ import numpy as np
 
 from coldloop.kernels.intrinsics import plain_tuples
 from coldloop.process.cold_box import L1, TICK_S
-from coldloop.process.model_range import model_range
+from coldloop.process.model_range import present_model_range
 from coldloop_plant.cold_box.physics import ColdBox, advance_and_read, outputs
 from coldloop_plant.helium.properties import load_helium
 from coldloop_plant.numeric import PA_PER_BAR, RealArray
@@ -49,7 +49,7 @@ class ColdBoxProgram(PlantProgram):
     @property
     def model_range(self) -> int:
         """What is outside the property tables at the current tick, bits of `ModelRange`."""
-        return int(model_range(self._x, self.box.P_HP / PA_PER_BAR, self.box.P_LP / PA_PER_BAR))
+        return present_model_range(self._x, self.box.P_HP / PA_PER_BAR, self.box.P_LP / PA_PER_BAR)
 
     def advance(self) -> None:
         """Go one tick forward."""

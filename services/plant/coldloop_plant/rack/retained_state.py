@@ -7,9 +7,8 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from coldloop.process.declaration import LAST_TICK, Process
-from coldloop.registers.codec import check_record
+from coldloop.registers.codec import DomainError, check_record
 from coldloop.registers.common import SessionPace
-from coldloop.registers.domain import DomainError
 from coldloop.registers.plant import LoadStep, plant_map
 from coldloop.safety.retained import RetainedFile, RetainedStateError
 from coldloop.session.settings import TimeBase

@@ -17,7 +17,7 @@ from coldloop.config import explained
 from coldloop.errors import ModelFileError
 from coldloop.kernels.intrinsics import plain_tuples
 from coldloop.process.model_file import FORMAT, read_document, write_document
-from coldloop.process.model_range import model_range
+from coldloop.process.model_range import present_model_range
 from coldloop.registers.plant import StationAlarm, StationMode, StationSample, StationStatus, Surroundings
 from coldloop_plant.cold_box.model import parameters_digest
 from coldloop_plant.cold_box.program import ColdBoxProgram
@@ -224,7 +224,7 @@ class RefrigeratorProgram(ColdBoxProgram):
     def model_range(self) -> int:
         """What is outside the property tables at the current tick, bits of `ModelRange`."""
         signals = self._memory.signals
-        return int(model_range(self._x, signals[HP], signals[LP]))
+        return present_model_range(self._x, float(signals[HP]), float(signals[LP]))
 
     @property
     def station_status(self) -> StationStatus:
