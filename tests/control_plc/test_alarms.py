@@ -12,8 +12,7 @@ from coldloop.registers.audit import EventKind
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmPriority, AlarmState
 from coldloop.registers.text import from_words
 from coldloop.service.journal import Journal
-from coldloop_control_plc.alarm_settings import DEFAULT_RULES, OF_THE_PROCESS, AlarmSettings
-from coldloop_control_plc.alarms import TRANSITIONS, AlarmPanel
+from coldloop_control_plc.alarms import DEFAULT_RULES, TRANSITIONS, AlarmPanel, AlarmSettings
 
 KIND = AlarmKind.FIRST_BAND
 NAME = "l1_band"
@@ -261,12 +260,9 @@ def test_a_condition_that_does_not_last_as_long_as_its_delay_changes_nothing() -
 def test_the_alarms_of_the_process_have_delays_and_others_none() -> None:
     settings = AlarmSettings()
     assert {kind for kind in AlarmKind if settings.rule(kind).on_delay_s} == {
-        *OF_THE_PROCESS,
+        AlarmKind.CAPACITY,
         AlarmKind.FIRST_BAND,
         AlarmKind.SECOND_BAND,
-    } - {
-        AlarmKind.SENSOR_SUSPECT,
-        AlarmKind.INPUT_WITHOUT_EFFECT,
     }
     assert course(settings, [(tick, True) for tick in range(40)]) == [(EventKind.ALARM_RAISED, 20)]
 

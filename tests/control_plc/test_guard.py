@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from coldloop.process.settings import InputLimits, RateReference
 from coldloop.registers.control_plc import Verdict
-from coldloop_control_plc.guard import OutputGuard
+from coldloop_control_plc.output_limits import OutputGuard
 from tests.harness.records import Row
 
 INITIAL = Row(43.0, 75.0, 36.0)

@@ -253,7 +253,7 @@ def test_an_input_without_effect_is_an_alarm_until_it_acts_again(rig: "Bench", a
         rig.scan()
         assert alarm(rig, AlarmKind.INPUT_WITHOUT_EFFECT) is state
         assert alarm(rig, AlarmKind.SENSOR_SUSPECT) is AlarmState.NORMAL
-        assert program.has_noted_suspects
+        assert program.player.suspects == bits
     assert program.alarms.rows[AlarmKind.INPUT_WITHOUT_EFFECT].cause == valve
 
 

@@ -12,7 +12,7 @@ from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import LinkCause, Mode, Operator, OperatorMode, Verdict
 from coldloop.registers.safety import AlarmKind
 from coldloop.session.settings import TimeBase
-from coldloop_control_plc.guard import OutputGuard
+from coldloop_control_plc.output_limits import OutputGuard
 from coldloop_control_plc.retained_state import ControlStateStore, RetainedControlState
 from tests.harness.records import Row, as_transmitted
 

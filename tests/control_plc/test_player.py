@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from coldloop.process.declaration import LAST_NUMBER
 from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import Mode, Plan, Update, Verdict
-from coldloop_control_plc.guard import OutputGuard
+from coldloop_control_plc.output_limits import OutputGuard
 from coldloop_control_plc.player import SequencePlayer
 from tests.harness.records import Row, as_transmitted
 

@@ -32,10 +32,9 @@ from coldloop.registers.declaration import Block
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.safety.retained import RetainedFile
-from coldloop_control_plc.certificate_watch import EXPIRES_SOON, UNREADABLE
 from coldloop_control_plc.program import ControlProgram
 from coldloop_control_plc.retained_state import OWNER
-from coldloop_control_plc.runtime import ControlPlc
+from coldloop_control_plc.runtime import EXPIRES_SOON, UNREADABLE, ControlPlc
 from coldloop_control_plc.sessions import ADOPT_AFTER_S
 from coldloop_control_plc.settings import ControlSettings
 from coldloop_rig.cli.certificates import Authority
@@ -281,7 +280,7 @@ async def test_certificates_that_cannot_be_read_for_a_while_end_nothing(
     authority = Authority.new("site", 20)
     for file, pair in ((tmp_path / "ca", authority.pair), (certificate, authority.issue_client("a", "control"))):
         file.write_bytes(pair.certificate_pem)
-    monkeypatch.setattr("coldloop_control_plc.certificate_watch.PERIOD_S", 0.01)
+    monkeypatch.setattr("coldloop_control_plc.runtime.CERTIFICATES_S", 0.01)
     tls = {"certificate": certificate, "key": tmp_path / "key", "ca": tmp_path / "ca"}
     async with running(control_plc={"server": {"tls": tls}}) as plc:
         watching = asyncio.create_task(plc.certificates.run())

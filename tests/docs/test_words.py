@@ -9,7 +9,7 @@ from coldloop.registers.common import MAGIC
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.safety import AlarmKind
 from coldloop.service.event_text import alarm_word
-from coldloop_control_plc.alarm_settings import PASSING, AlarmSettings
+from coldloop_control_plc.alarms import PASSING, AlarmSettings
 from tests.harness.records import CONTROL_MAP
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 from coldloop.process.cold_box import TICK_S
 from coldloop.process.settings import InputLimits, RateReference
 from coldloop.registers.control_plc import Verdict
-from coldloop_control_plc.guard import OutputGuard
-from coldloop_control_plc.output_limits import begin
+from coldloop_control_plc.output_limits import OutputGuard, begin
 from coldloop_export.c_files import GuardExport
 from coldloop_export.counting import counted_guard, counted_longest
 from coldloop_export.golden import Call, GoldenCall, Judgement, golden_calls

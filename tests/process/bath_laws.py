@@ -13,7 +13,7 @@ from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.settings import InputLimits, settings_of
 from coldloop_control_plc.cool_down import CoolDown, CoolDownSettings
-from coldloop_control_plc.sensors import SensorCheckSettings, SensorMonitor
+from coldloop_control_plc.sensors import SensorCheckSettings, SensorMonitor, may_stand
 from coldloop_optimizer_plc.computing_settings import signals_of
 from coldloop_optimizer_plc.decisions import Latched, begin_again, most_open, shortage
 from coldloop_optimizer_plc.program import OptimizerProgram
@@ -86,13 +86,13 @@ def answers(file: Path, given: dict[str, Any]) -> dict[str, Any]:
     with settings_of(model.declared):
         laws = Laws(model, given["settings"])
         names = model.declared.output_names
-        monitor = SensorMonitor(SensorCheckSettings(), model.y0.tolist())
+        constants = SensorMonitor(SensorCheckSettings(), model.y0.tolist()).constants
         return {
             "weights": state_weights(model, laws.program.settings.design).tolist(),
             "situations": [laws.of(each) for each in given["situations"]],
             "cool down": cool_down(model, given["courses"], given["by loops"]),
             "may stand": [
-                [name for place, name in enumerate(names) if monitor.may_stand(place, measured(model.declared, y))]
+                [name for place, name in enumerate(names) if may_stand(constants, place, measured(model.declared, y))]
                 for y in given["courses"]
             ],
         }

@@ -12,6 +12,7 @@ from coldloop.process.model_file import read_header
 from coldloop.registers.audit import EventKind
 from coldloop_rig.cosim import one_process
 from coldloop_rig.cosim.compiled import stretches
+from coldloop_rig.cosim.compiled.records import record_of
 from coldloop_rig.cosim.compiled.stretches import CompiledStretches, Stretch
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.results.recording import MemorySink
@@ -39,7 +40,7 @@ class Left(NamedTuple):
     trace: str
     updates: list[Any]
     events: list[Any]
-    sensors: list[Any]
+    sensors: bytes
     """What the control PLC's check of sensors goes on with."""
     late: int
     """Kernels that were compiled after its beginning."""
@@ -55,9 +56,8 @@ def left_by(settings: Settings, load: LoadProfile, ticks: int, *, compiled: bool
     recorder.close()
     recording = sink.recording(recorder.link)
     events = [(service, event.tick, event.kind, event.subject, event.cause) for service, event in sink.events]
-    sensors = rig.control.sensors
-    history = [sensors.unchanged, sensors.rests, sensors.inputs, sensors.inputs_moved, vars(sensors.image)]
-    return Left(recording.trace_sha256, recording.updates, events, history, compiled_kernels() - recorder.before)
+    sensors = record_of(rig.control.sensors).tobytes()
+    return Left(recording.trace_sha256, recording.updates, events, sensors, compiled_kernels() - recorder.before)
 
 
 class Compared(NamedTuple):

@@ -12,12 +12,16 @@ import coldloop_rig.cosim.compiled.portable  # noqa: F401 lets numba compile wha
 from coldloop.config import load_configuration
 from coldloop.kernels.compiled import kernel
 from coldloop.kernels.single_precision import neighbour, single
+from coldloop.process.declaration import LAST_NUMBER
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.settings import InputLimits, RateReference
 from coldloop.registers.audit import EventKind
 from coldloop_control_plc.output_limits import admit, beginning, plain
+from coldloop_control_plc.player import begin_sequence, latch, latches
+from coldloop_control_plc.program import ControlProgram, Scan, make_program, observe
+from coldloop_plant.kinds import own_header
 from coldloop_rig.cosim.compiled import stretches
-from coldloop_rig.cosim.compiled.control import guard_records
+from coldloop_rig.cosim.compiled.records import as_arrays, record_of, scan_records
 from coldloop_rig.cosim.compiled.stretches import CompiledStretches, Stretch
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
@@ -139,7 +143,7 @@ def test_the_guard_is_the_same_compiled(
 ) -> None:
     limits = plain(InputLimits(slew_s=slew_s, rate_reference=reference))
     state = beginning(limits, (43.0, 75.0, 36.0))
-    records, tick = guard_records(state, limits), 0
+    records, tick = record_of(state), 0
     for wanted, update, ticks in history:
         for repetition in range(ticks):
             began = update and repetition == 0
@@ -148,3 +152,86 @@ def test_the_guard_is_the_same_compiled(
             assert records[0]["applied"].tolist() == list(state.applied)
             assert (records[0]["share"], records[0]["moved"]) == (state.share, state.moved)
             tick += 1
+
+
+@kernel
+def compiled_tick(c: Any, parts: Any, tick: int, y: Any, x: Any, load: float, u: Any, cooling: bool) -> bool:  # noqa: ANN401, FBT001 a kernel
+    """Do what the control PLC does in a tick beside its outputs."""
+    s = Scan(parts.guard[0], parts.player[0], parts.sensors[0], parts.alarms[0], parts.watchdog[0])
+    begin_sequence(s.player, tick)
+    told = observe(c, s, tick, y, x, load, u, cooling)
+    if latches(s.player, tick, load):
+        latch(s.player, tick, load, 20)
+    return told
+
+
+def plain_tick(program: ControlProgram, tick: int, y: Any, x: Any, load: float, u: Any, *, cooling: bool) -> bool:  # noqa: ANN401 rows
+    begin_sequence(program.player, tick)
+    told = observe(program.scan_constants, program.scan, tick, y, x, load, u, cooling=cooling)
+    if latches(program.player, tick, load):
+        latch(program.player, tick, load, 20)
+    return told
+
+
+counts = st.integers(0, 300)
+ticks = st.integers(-2, 300)
+readings = st.sampled_from([0.0, 4.5, 12.0, 60.0, 75.0, 200.0, 2350.0, math.nan, math.inf, -1e30])
+
+
+@st.composite
+def any_scan(draw: st.DrawFn) -> dict[str, dict[str, Any]]:
+    """Draw the state of a scan, by parts and names."""
+
+    def some(kind: st.SearchStrategy[Any], size: int) -> list[Any]:
+        return draw(st.lists(kind, min_size=size, max_size=size))
+
+    flags = st.booleans()
+    return {
+        "player": {
+            "phase": draw(st.integers(0, 5)), "has_update": draw(flags), "invited": draw(flags), "late": draw(flags),
+            "has_answer": draw(flags), "slot": draw(st.integers(0, 1)), "next_update_tick": draw(counts),
+            "load_step": draw(st.sampled_from([0.0, 10.0])), "update_load": draw(st.sampled_from([375.0, 385.0])),
+            "first_ticks": some(counts, 2), "lengths": some(counts, 2), "periods": some(st.integers(0, 20), 2),
+            "missed": draw(ticks), "updates": draw(st.sampled_from([7, LAST_NUMBER])),
+        },
+        "sensors": {
+            "tick": draw(ticks), "good": some(readings, 22), "before": some(readings, 22),
+            "unchanged": some(counts, 22), "rests": some(st.integers(-240, 300), 22), "inputs_moved": some(ticks, 22),
+            "inputs": [[43.0, 75.0, each] for each in some(readings, 22)], "standing": some(flags, 22),
+            "bad_since": (bad := some(st.integers(-1, 0), 22)), "bad_count": sum(each >= 0 for each in bad),
+            "good_since": some(st.integers(-1, 0), 22), "x": some(readings, 28), "load": draw(readings),
+            "image_count": draw(counts), "image_moved": draw(flags),
+        },
+        "alarms": {"active": some(flags, 23), "since": some(st.sampled_from([2**62, 0, 200, 299]), 23)},
+    }  # fmt: skip
+
+
+measured = st.tuples(
+    st.lists(readings, min_size=22, max_size=22),
+    st.booleans(),
+    st.sampled_from([375.0, 385.0, 1e9, math.nan]),
+    st.booleans(),
+)
+
+
+@given(state=any_scan(), measurements=st.lists(measured, min_size=1, max_size=4), as_one=st.booleans())
+def test_a_scan_is_the_same_compiled(
+    state: dict[str, dict[str, Any]], measurements: list[Any], *, as_one: bool
+) -> None:
+    """From any state whatever: an alarm's condition and a sensor's rule are written once, and run in both ways."""
+    section = Settings().control_plc
+    program = make_program(own_header(Settings().model.file), section, InputLimits())
+    sensors = program.sensors.constants._replace(each_may_rest=not as_one)
+    program.scan_constants = program.scan_constants._replace(sensors=sensors)
+    for part, values in state.items():
+        for name, value in values.items():
+            setattr(getattr(program.scan, part), name, value)
+    records, constants = scan_records(program.scan), as_arrays(program.scan_constants)
+    u = (43.0, 75.0, 36.0)
+    for tick, (read, again, load, cooling) in enumerate(measurements, start=300):
+        y, x = program.sensors.before[:] if again else read, program.sensors.x[:]
+        told = plain_tick(program, tick, y, x, load, u, cooling=cooling)
+        arrays = np.array(y), np.array(x), load, np.array(u)
+        assert told == compiled_tick(constants, records, tick, *arrays, cooling)
+        for part, record in zip(program.scan, records, strict=True):
+            assert repr(record_of(part)[0]) == repr(record[0])

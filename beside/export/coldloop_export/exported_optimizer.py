@@ -67,10 +67,16 @@ class ExportedProgram(OptimizerProgram):
         model: The model that it was made for; so are settings and limits.
         settings: See `model`.
         limits: See `model`.
+
+    Raises:
+        UsageError: The library cannot be loaded.
     """
 
     def __init__(self, library: Path, model: LtiModel, settings: ProgramSettings, limits: InputLimits) -> None:
-        self._c = CDLL(str(library))
+        try:
+            self._c = CDLL(str(library))
+        except OSError as error:
+            raise UsageError(f"the exported optimiser cannot be loaded: {error}") from None
         for name in ("optimizer_restart", "optimizer_plan", "optimizer_solve"):
             getattr(self._c, name).restype = c_bool
         self._c.optimizer_answered.argtypes = [c_bool]
@@ -96,8 +102,8 @@ class ExportedProgram(OptimizerProgram):
         self._update["reals"] = (update.load, *update.u_before, *update.u, *update.y, *update.x)
         if not self._c.optimizer_plan(self._update.ctypes, self._planned.ctypes):
             raise UsageError("a tick or a number is beyond what its 32 bits hold: begin another session")
-        ticks, reals, (suspects, _) = (part.tolist() for part in self._planned[0])
-        return Plan._make((*ticks, *reals, suspects))
+        (_, next_update_tick), (load_step, shortage), (suspects, _) = (part.tolist() for part in self._planned[0])
+        return Plan(update.update, next_update_tick, load_step, shortage, suspects)
 
     def answer_after_s(self) -> float:
         """Return the plant time from the instant of the last `plan` until the PLC has computed its answer."""

@@ -14,7 +14,7 @@ from coldloop.process.lti_model import load
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import SequenceRow, control_map
 from coldloop.registers.plant import PlantSample
-from coldloop_control_plc.guard import OutputGuard
+from coldloop_control_plc.output_limits import OutputGuard
 from coldloop_optimizer_plc.computing_settings import EstimatorKind
 from coldloop_optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
 from coldloop_optimizer_plc.qp.prediction import prediction_of

@@ -57,7 +57,10 @@ class Programs(NamedTuple):
             self._deliver(listener)
         if not self.control.player.invited:
             self.control.optimizer_seen()  # an optimiser that idles goes on to send heartbeats
-        update = self._scan(listener)
+        self.plan(self._scan(listener))
+
+    def plan(self, update: Update | None) -> None:
+        """Let the optimiser plan an update, if one was latched."""
         if update is not None:
             to_control = self.maps.control_plc
             plan = self.optimizer.plan(as_transmitted(update, to_control))
@@ -155,10 +158,11 @@ class OneProcessRig:
         recorder.begin()
         while self.control.tick < scenario.ticks:
             stretch = stretches.ahead(scenario.ticks) if stretches else None
-            if stretch is not None:
-                recorder.stretch(*stretch)
-                continue
-            programs.tick(recorder)
+            if stretch is None:
+                programs.tick(recorder)
+            else:
+                recorder.stretch(stretch.block, stretch.updates)
+                programs.plan(stretch.latched)
             for event in self.control.journal.since(noted):
                 recorder.event(event)
                 noted = event.number

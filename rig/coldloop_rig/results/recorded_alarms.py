@@ -9,8 +9,7 @@ from coldloop.process.settings import settings_of
 from coldloop.registers.audit import EventKind
 from coldloop.registers.safety import Alarm, AlarmState, alarms_of
 from coldloop.service.event_text import alarm_cause, alarm_word
-from coldloop_control_plc.alarm_settings import AlarmSettings
-from coldloop_control_plc.alarms import TRANSITIONS
+from coldloop_control_plc.alarms import TRANSITIONS, AlarmSettings
 from coldloop_hmi.process_image import JournalEntry
 
 _KINDS: Final = {event.word: event for events in TRANSITIONS.values() for event in events}

@@ -2,21 +2,187 @@
 
     condition ──on-delay, off-delay──> active ──TRANSITIONS──> state ──> registers, journal
 
-A condition is reported as it is (`report`, `raised`, `returned`, `pulse`). When it has changed for the delay of its
-alarm, `active` follows, and the state makes a transition. Operators make the others. All times are plant time, measured
-by ticks and not by scans: scans can be missed.
+A condition is reported as it is (`report`, `raised`, `returned`, `pulse`; those of bands by `watch_bands`). When it has
+changed for the delay of its alarm (`follow`), `active` follows, and the state makes a transition. Operators make the
+others. All times are plant time, measured by ticks and not by scans: scans can be missed.
 
 "Suppressed by design" of the standard is not there: no alarm depends on another one.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Final, NamedTuple
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Annotated, Final, Literal, NamedTuple, Self
 
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, model_validator
+
+from coldloop.process.declaration import Process
+from coldloop.process.sections import Range
+from coldloop.process.settings import ProcessSettings, declared, settings_process, stretched, within
 from coldloop.registers.audit import EventKind
-from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmState, alarms_of, band_alarms
+from coldloop.registers.control_plc import Cause, Mode
+from coldloop.registers.safety import (
+    ALL_ALARMS,
+    Alarm,
+    AlarmAction,
+    AlarmCommand,
+    AlarmKind,
+    AlarmPriority,
+    AlarmState,
+    CapacityCause,
+    alarm_key,
+    alarms_of,
+    band_alarms,
+)
 from coldloop.service.journal import Journal
-from coldloop_control_plc.alarm_settings import OF_THE_PROCESS, PASSING, AlarmSettings, RuleSettings
+from coldloop_control_plc.output_limits import Numbers
+
+PASSING: Final = (AlarmKind.SCAN_OVERRUN, AlarmKind.ACCESS_REFUSED, AlarmKind.SECOND_WRITER)
+"""Alarms for something that happens at an instant: their off-delay is how long ago the last time must be."""
+LOW, MEDIUM, HIGH, CRITICAL = AlarmPriority
+
+
+class AlarmRule(NamedTuple):
+    """How one alarm is treated. Delays are seconds of plant time."""
+
+    priority: AlarmPriority
+    on_delay_s: float = 0.0
+    """How long the condition must hold before the alarm is raised."""
+    off_delay_s: float = 0.0
+    """How long the condition must have ended before the alarm returns."""
+
+
+DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
+    # The process is uncontrolled, or under another master: act at once.
+    AlarmKind.PLANT_LOST: AlarmRule(CRITICAL),  # only the rack's watchdog protects the plant
+    AlarmKind.PLANT_OTHER_MASTER: AlarmRule(CRITICAL),  # another master decides the outputs
+    AlarmKind.OUTPUTS_REJECTED: AlarmRule(CRITICAL),  # what is computed is not applied
+    AlarmKind.SCANS_STOPPED: AlarmRule(CRITICAL),  # nothing is computed
+    # The process leaves its limits, or is about to unnoticed: act within minutes.
+    AlarmKind.FIRST_BAND: AlarmRule(HIGH),  # as all bands; of the cold box the bath may run dry or flood
+    AlarmKind.SECOND_BAND: AlarmRule(HIGH),  # of the cold box the turbine leaves its range
+    AlarmKind.PLANT_FROZEN: AlarmRule(HIGH),  # measurements are old
+    AlarmKind.CAPACITY: AlarmRule(HIGH, 20.0, 30.0),  # no control holds this load
+    # Control is degraded, or a protection is lost: act within the shift.
+    AlarmKind.MODE: AlarmRule(MEDIUM),  # the ladder has left MPC
+    AlarmKind.SEQUENCE_EXHAUSTED: AlarmRule(MEDIUM),  # outputs are held, then the classical loops control
+    AlarmKind.OPTIMIZER_LOST: AlarmRule(MEDIUM),  # no new sequence will come by itself
+    AlarmKind.SENSOR_BAD: AlarmRule(MEDIUM),  # substituted; the ladder reacts to those that matter
+    AlarmKind.SENSOR_SUSPECT: AlarmRule(MEDIUM),  # the optimiser does without it
+    AlarmKind.INPUT_WITHOUT_EFFECT: AlarmRule(MEDIUM),  # likewise: the turbine stands
+    AlarmKind.MODEL_MISMATCH: AlarmRule(MEDIUM),  # no sequence is accepted until a configuration is changed
+    AlarmKind.SECOND_WRITER: AlarmRule(MEDIUM, off_delay_s=60.0),  # refused, but wired or configured wrongly
+    AlarmKind.CERTIFICATE: AlarmRule(MEDIUM),  # clients will not connect once it has expired
+    AlarmKind.STATE_NOT_RETAINED: AlarmRule(MEDIUM),  # a restart would not continue from here
+    # No immediate action: a hint for maintenance.
+    AlarmKind.SEQUENCE_REJECTED: AlarmRule(LOW),  # the rest of the last sequence is played meanwhile
+    AlarmKind.SEQUENCE_LATE: AlarmRule(LOW),  # likewise
+    AlarmKind.SCAN_OVERRUN: AlarmRule(LOW, off_delay_s=60.0),  # outputs came some milliseconds late
+    AlarmKind.ACCESS_REFUSED: AlarmRule(LOW, off_delay_s=60.0),  # nothing has happened
+    AlarmKind.CLOCK_SKEW: AlarmRule(LOW),  # the scan follows the rack's clock
+})  # fmt: skip
+"""Priorities by how soon an operator has to act (ANSI/ISA-18.2-2016, clause 8), and delays."""
+
+
+def _known_name(name: str) -> str:
+    process = settings_process()
+    known = [alarm_key(alarm, process) for alarm in alarms_of(process)]
+    if name.lower() not in known:
+        raise ValueError(f"unknown alarm '{name}'; choose from {', '.join(known)}")
+    return name.lower()
+
+
+Delay = Annotated[FiniteFloat, within(lambda process: (0, 345_600 * process.tick_s))]
+
+
+class RuleSettings(BaseModel):
+    """What differs from the default rule of an alarm; what is not given stays."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    priority: Literal["low", "medium", "high", "critical"] | None = None
+    on_delay_s: Delay | None = None
+    """How long the condition must hold before the alarm is raised, plant time."""
+    off_delay_s: Delay | None = None
+    """How long the condition must have ended before the alarm returns, plant time."""
+
+    def changed(self, rule: AlarmRule) -> AlarmRule:
+        """Return a rule with what is given here."""
+        return AlarmRule(
+            rule.priority if self.priority is None else AlarmPriority[self.priority.upper()],
+            rule.on_delay_s if self.on_delay_s is None else self.on_delay_s,
+            rule.off_delay_s if self.off_delay_s is None else self.off_delay_s,
+        )
+
+
+def _bands_of(process: Process) -> dict[str, Range]:
+    return {one.name: one.alarm or one.edges for one in process.banded if one.edges is not None}
+
+
+def _with_declared(given: object) -> object:
+    """Return bands by output, those of the process where none are given."""
+    if not isinstance(given, Mapping):
+        return given
+    found: dict[str, object] = {**_bands_of(settings_process())}
+    names = {name.lower(): name for name in found}  # the environment has no capitals
+    for name, band in given.items():
+        if str(name).lower() not in names:
+            raise ValueError(f"{name}: no output with a band; choose from {', '.join(found)}")
+        found[names[str(name).lower()]] = band
+    return found
+
+
+class AlarmSettings(ProcessSettings):
+    """When the alarms are raised, how urgent they are, and how long they may be shelved."""
+
+    bands: Annotated[dict[str, tuple[FiniteFloat, FiniteFloat]], BeforeValidator(_with_declared)] = declared(_bands_of)
+    """Of each output that has one, by its name; those that are not given are as the process declares them."""
+    band_delay_s: Delay = stretched(5.0)
+    """On-delay of their alarms: how long an output must be outside, plant time."""
+    rules: dict[Annotated[str, AfterValidator(_known_name)], RuleSettings] = Field(default_factory=dict)
+    """By name of the alarm, such as `sensor_bad`."""
+    shelving_s: Annotated[FiniteFloat, Field(ge=1, le=65_535)] = 900.0
+    """How long an alarm is shelved by a command that gives no time, plant time."""
+    longest_shelving_s: Annotated[FiniteFloat, Field(ge=1, le=65_535)] = 28_800.0
+    """Longest time of one command, plant time. A shift: the next one decides again."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, given: object) -> object:
+        for name in ("level_band", "t5_band"):
+            if isinstance(given, Mapping) and name in given:
+                raise ValueError(f"{name}: bands have the names of their outputs since 0.4: set bands.L1 or bands.T5")
+        return given
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.shelving_s > self.longest_shelving_s:
+            raise ValueError("shelving_s is above longest_shelving_s; shorten it, or allow more")
+        delayed = [kind.name.lower() for kind in PASSING if self.rule(kind).on_delay_s]
+        if delayed:
+            raise ValueError(f"{delayed[0]} happens at an instant and would never be raised; leave out its on_delay_s")
+        return self
+
+    def rule(self, alarm: int) -> AlarmRule:
+        """Return how an alarm is treated."""
+        is_band = alarm in band_alarms(self.process)
+        default = DEFAULT_RULES[AlarmKind.FIRST_BAND if is_band else AlarmKind(alarm)]
+        if alarm == AlarmKind.CAPACITY:
+            stretch = self.process.stretch
+            default = AlarmRule(default.priority, default.on_delay_s * stretch, default.off_delay_s * stretch)
+        if is_band:
+            default = default._replace(on_delay_s=self.band_delay_s)
+        return self.rules.get(alarm_key(alarm, self.process), RuleSettings()).changed(default)
+
+    def shelving_ticks(self, asked_s: int) -> int:
+        """Return how long an alarm is shelved when so many seconds are asked for; 0 asks for the default."""
+        return self.ticks(min(asked_s or self.shelving_s, self.longest_shelving_s))
+
+    def ticks(self, seconds: float) -> int:
+        """Return a time in ticks, not shorter than it; what is smaller than the error of a float does not count."""
+        return math.ceil(seconds / self.process.tick_s - 1e-9)
+
 
 TRANSITIONS: Final[Mapping[AlarmState, Mapping[EventKind, AlarmState]]] = {
     AlarmState.NORMAL: {
@@ -66,16 +232,59 @@ COMMANDED: Final[Mapping[int, EventKind]] = {
 """The event that an operator's action asks for."""
 
 
-class _Pending(NamedTuple):
-    """A change of a condition that `active` does not show yet: it waits for its delay."""
-
-    since: int
-    """Tick."""
-    cause: int
-    value: float
+NOT: Final = 2**62
+"""In the place of the tick since which a condition differs."""
 
 
-class AlarmPanel:
+class AlarmConstants(NamedTuple):
+    """Delays of all alarms in ticks, by number; then the alarms of bands, by band."""
+
+    on_delays: Sequence[int]
+    off_delays: Sequence[int]
+    bands: Sequence[int]
+    """Number of the alarm."""
+    outputs: Sequence[int]
+    low: Numbers
+    high: Numbers
+    dead: Numbers
+    """By which the band is wider while its alarm is not active."""
+
+
+@dataclass(slots=True)
+class AlarmConditions:
+    """What is known of the conditions, by number of the alarm."""
+
+    active: list[bool]
+    """Whether it is active: its condition held for longer than its on-delay, and has not ended for its off-delay."""
+    since: list[int]
+    """`NOT`, or since which tick the condition is another than `active` says."""
+
+
+def follow(c: AlarmConstants, a: AlarmConditions, kind: int, condition: bool, tick: int) -> bool:  # noqa: FBT001 compiled
+    """Take the condition of an alarm at a tick; return whether `active` is to follow it now."""
+    if condition == a.active[kind]:
+        a.since[kind] = NOT
+        return False
+    if a.since[kind] == NOT:
+        a.since[kind] = tick
+    return tick - a.since[kind] >= (c.off_delays[kind] if a.active[kind] else c.on_delays[kind])
+
+
+def watch_bands(c: AlarmConstants, a: AlarmConditions, tick: int, y: Numbers, cooling: bool) -> bool:  # noqa: FBT001
+    """Take the outputs of a tick; return whether the alarm of a band is to follow its condition.
+
+    While the plant is being cooled down it is not to be in its bands yet.
+    """
+    due = False
+    for band in range(len(c.bands)):
+        kind, value = c.bands[band], y[c.outputs[band]]
+        dead = 0.0 if a.active[kind] else c.dead[band]
+        outside = not (cooling or c.low[band] - dead <= value <= c.high[band] + dead)
+        due = follow(c, a, kind, outside, tick) or due
+    return due
+
+
+class AlarmPanel(AlarmConditions):
     """All alarms.
 
     Args:
@@ -86,11 +295,19 @@ class AlarmPanel:
     def __init__(self, journal: Journal, settings: AlarmSettings | None = None) -> None:
         without_delay = {"capacity": RuleSettings(on_delay_s=0.0)}
         settings = settings or AlarmSettings(band_delay_s=0.0, rules=without_delay)
+        process = settings.process
         self._journal = journal
         self._settings = settings
-        self._of_the_process = {*OF_THE_PROCESS, *band_alarms(settings.process)}
-        self._rules = [settings.rule(alarm) for alarm in alarms_of(settings.process)]
-        self._pending: dict[int, _Pending] = {}
+        self._rules = [settings.rule(alarm) for alarm in alarms_of(process)]
+        super().__init__(active=[False for _ in self._rules], since=[NOT for _ in self._rules])
+        low, high = zip(*settings.bands.values(), strict=True) if settings.bands else ((), ())
+        self.constants = AlarmConstants(
+            [settings.ticks(rule.on_delay_s) for rule in self._rules],
+            [settings.ticks(rule.off_delay_s) for rule in self._rules],
+            [int(each) for each in band_alarms(process)], process.controlled, low, high, process.dead_bands,
+        )  # fmt: skip
+        self.reports: dict[int, tuple[int, float]] = {}
+        """Last reported cause and value of alarms that are about to follow their condition, without those of bands."""
         self._causes: dict[int, set[int]] = {}
         """Causes for which an active alarm has been raised since its last acknowledgement."""
         self._now = 0
@@ -116,7 +333,7 @@ class AlarmPanel:
         self._now = tick
         if back <= 0:
             return
-        self._pending = {kind: each._replace(since=each.since - back) for kind, each in self._pending.items()}
+        self.since[:] = [since if since == NOT else since - back for since in self.since]
         for kind in self._shelved():
             self._store(kind, shelved_until=max(tick + 1, self.rows[kind].shelved_until - back))
 
@@ -126,8 +343,9 @@ class AlarmPanel:
 
     def pass_by(self) -> None:
         """Apply expired delays and shelving times; call it once per scan."""
-        for kind in list(self._pending):
-            self._settle(kind)
+        for kind, since in enumerate(self.since):
+            if since != NOT:
+                self.settle(kind)
         for kind in self._shelved():
             if self.now >= self.rows[kind].shelved_until:
                 self._step(kind, EventKind.ALARM_UNSHELVED)
@@ -137,51 +355,24 @@ class AlarmPanel:
     def report(self, kind: int, *, condition: bool, cause: int = 0, value: float = 0.0) -> None:
         """Report the condition of an alarm and its cause; a new cause raises the alarm again, whatever the value."""
         row = self.rows[kind]
-        if condition != bool(row.active):
-            earlier = self._pending.get(kind)
-            self._pending[kind] = _Pending(self.now if earlier is None else earlier.since, cause, value)
-            self._settle(kind)
+        if follow(self.constants, self, kind, condition, self._now) or self.since[kind] != NOT:
+            self.reports[kind] = cause, value
+            self.settle(kind)
             return
-        self._pending.pop(kind, None)
+        self.reports.pop(kind, None)
         if condition and cause != row.cause:
             if cause in self._causes[kind]:  # alternating causes are not new
                 self._store(kind, cause=cause)
             else:
                 self._raise(kind, cause, value)
 
-    def pending(self, *kinds: int) -> list[int | None]:
-        """Return since when the condition of each alarm has differed from its shown state; None where it does not."""
-        changes = map(self._pending.get, kinds)
-        return [None if change is None else change.since for change in changes]
-
-    def set_pending(self, kind: int, since: int | None) -> None:
-        """Set since when the condition of an alarm has differed from its shown state."""
-        self._pending.pop(kind, None)
-        if since is not None:
-            self._pending[kind] = _Pending(since, 0, 0.0)
-
     @property
-    def are_quiet(self) -> bool:
-        """No alarm but those of the process is active, or about to be."""
-        others = (row for kind, row in enumerate(self.rows) if kind not in self._of_the_process)
-        return not any(row.active for row in others) and all(kind in self._of_the_process for kind in self._pending)
+    def next_report(self) -> float:
+        """The tick at which an alarm, but those of bands, follows the condition that was reported; else infinity."""
+        return min((self.since[kind] + self._delay(kind) for kind in self.reports), default=math.inf)
 
-    def reported(self, kind: int) -> int:
-        """Return the cause last reported of an alarm, whatever its delay; 0 where its condition does not hold."""
-        pending, row = self._pending.get(kind), self.rows[kind]
-        if pending is None:
-            return row.cause if row.active else 0
-        return 0 if row.active else pending.cause
-
-    def due(self, kind: int) -> float:
-        """Return the tick at which an alarm follows its condition; infinite where it already does."""
-        (since,) = self.pending(kind)
-        return math.inf if since is None else since + self.delay(kind)
-
-    def delay(self, kind: int) -> int:
-        """Return the delay (ticks) after which an alarm follows its condition."""
-        rule = self._rules[kind]
-        return self._settings.ticks(rule.off_delay_s if self.rows[kind].active else rule.on_delay_s)
+    def _delay(self, kind: int) -> int:
+        return (self.constants.off_delays if self.active[kind] else self.constants.on_delays)[kind]
 
     def raised(self, kind: int, cause: int = 0) -> None:
         """Report that the condition of an alarm holds, and its cause."""
@@ -199,16 +390,16 @@ class AlarmPanel:
         self.raised(kind, cause)
         self.returned(kind)
 
-    def _settle(self, kind: int) -> None:
+    def settle(self, kind: int) -> None:
         """Let a change of a condition take effect if its delay is over."""
-        pending = self._pending[kind]
-        if self.now - pending.since < self.delay(kind):
+        if self._now - self.since[kind] < self._delay(kind):
             return
-        del self._pending[kind]
-        if self.rows[kind].active:
+        self.since[kind] = NOT
+        cause, value = self.reports.pop(kind, (0, 0.0))
+        if self.active[kind]:
             self._return(kind)
         else:
-            self._raise(kind, pending.cause, pending.value)
+            self._raise(kind, cause, value)
 
     def _raise(self, kind: int, cause: int, value: float = 0.0) -> None:
         row = self.rows[kind]
@@ -255,7 +446,9 @@ class AlarmPanel:
         self.rows = [row._replace(priority=rule.priority) for row, rule in zip(rows, self._rules, strict=True)]
         self._causes = {kind: {row.cause} for kind, row in enumerate(rows) if row.active}
         # An instantaneous alarm has no end.
-        self._pending = {kind: _Pending(self.now, 0, 0.0) for kind in PASSING if self.rows[kind].active}
+        self.active[:] = [bool(row.active) for row in rows]
+        self.reports = {kind: (0, 0.0) for kind in PASSING if self.active[kind]}
+        self.since[:] = [self.now if kind in self.reports else NOT for kind in range(len(self.rows))]
         self.changes += 1
 
     # -- the state machine ---------------------------------------------------------------------------------------------
@@ -278,8 +471,92 @@ class AlarmPanel:
             self._raise(kind, row.cause)
 
     def _store(self, kind: int, **fields: int) -> None:
-        self.rows[kind] = self.rows[kind]._replace(**fields)
+        row = self.rows[kind] = self.rows[kind]._replace(**fields)
+        self.active[kind] = bool(row.active)
         self.changes += 1
 
     def _shelved(self) -> list[int]:
         return [i for i, row in enumerate(self.rows) if row.state == AlarmState.SHELVED]
+
+
+SENSORS: Final = {AlarmKind.SENSOR_BAD: 1, AlarmKind.SENSOR_SUSPECT: 2}
+"""Alarms of sensors, and the cause of their events."""
+OPTIMIZER_DRIVES: Final = (Mode.MPC, Mode.REST)
+"""Modes in which the optimiser's sequences are played."""
+
+
+class ScanSummary(NamedTuple):
+    """What the alarms of a scan depend on, beside those of bands."""
+
+    mode: Mode
+    cause: Cause
+    late: bool
+    """The rest of a sequence is being played."""
+    optimizer: bool
+    """The optimiser's heartbeat is present."""
+    short: bool
+    """The load is above what can be held, ..."""
+    idle: bool
+    """... or below what is needed."""
+    bad: int
+    """Bit i is set when output i is substituted."""
+    suspects: int
+    """Outputs that the optimiser does without: bit i is output i; then inputs that have no effect."""
+
+
+class ProcessAlarms:
+    """Raises and returns the alarms that depend on the process and on the ladder.
+
+    Args:
+        panel: Whose alarms they are.
+        journal: Where sensors that became bad or good are noted.
+        outputs: How many the process has.
+    """
+
+    def __init__(self, panel: AlarmPanel, journal: Journal, outputs: int) -> None:
+        self._panel = panel
+        self._journal = journal
+        self._outputs = outputs
+        self._before: dict[AlarmKind, frozenset[int]] = dict.fromkeys(SENSORS, frozenset())
+        self.reported: ScanSummary | None = None
+
+    def watch(self, tick: int, scan: ScanSummary, shortage: float) -> None:
+        """Look at everything after a scan.
+
+        Args:
+            tick: Of the scan.
+            scan: What was found.
+            shortage: What the load is above what can be held, in W; negative: below what is needed.
+        """
+        for kind in self._panel.constants.bands:
+            if self._panel.since[kind] != NOT:
+                self._panel.settle(kind)
+        if scan == self.reported and not self._panel.reports:
+            return
+        self.reported, report = scan, self._panel.report
+        mode, cause = scan.mode, scan.cause
+        fallen = mode is not Mode.MPC and cause not in (Cause.SESSION_STARTED, Cause.OPERATOR, Cause.COOL_DOWN)
+        report(AlarmKind.MODE, condition=fallen, cause=cause)
+        exhausted = mode is not Mode.MPC and cause in (Cause.SEQUENCE_EXHAUSTED, Cause.HOLD_EXPIRED)
+        report(AlarmKind.SEQUENCE_EXHAUSTED, condition=exhausted)
+        report(AlarmKind.SEQUENCE_LATE, condition=scan.late)
+        report(AlarmKind.OPTIMIZER_LOST, condition=not scan.optimizer)
+        short = CapacityCause.of(shortage if mode is Mode.MPC else 0.0)
+        report(AlarmKind.CAPACITY, condition=bool(short), cause=short, value=abs(shortage))
+        self._watch_sensors(tick, AlarmKind.SENSOR_BAD, scan.bad)
+        suspects = scan.suspects if mode in OPTIMIZER_DRIVES else 0
+        self._watch_sensors(tick, AlarmKind.SENSOR_SUSPECT, suspects & ~(-1 << self._outputs))
+        idle = suspects >> self._outputs
+        first = (idle & -idle).bit_length() - 1
+        report(AlarmKind.INPUT_WITHOUT_EFFECT, condition=bool(idle), cause=max(0, first))
+
+    def _watch_sensors(self, tick: int, kind: AlarmKind, bits: int) -> None:
+        """Note each sensor that became bad, suspect or good, and raise the alarm; its cause is the newest one."""
+        found = frozenset(output for output in range(self._outputs) if bits >> output & 1)
+        before, self._before[kind] = self._before[kind], found
+        for output in sorted(found ^ before):
+            self._journal.note(tick, EventKind.SENSOR, output, SENSORS[kind] if output in found else 0)
+        for output in sorted(found - before):
+            self._panel.raised(kind, output)
+        if not found:
+            self._panel.returned(kind)

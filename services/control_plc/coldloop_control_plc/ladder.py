@@ -9,16 +9,16 @@ An operator may take the ladder away (CLASSICAL, MANUAL). A bad sensor that MPC 
 (`cool_down.py`), lead to CLASSICAL at once.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from coldloop.registers.control_plc import Cause, Mode, OperatorMode
 
 
-@dataclass(frozen=True, slots=True)
-class LadderInputs:
+class LadderInputs(NamedTuple):
     """Inputs of the choice of mode."""
 
-    operator: OperatorMode
+    operator: int
+    """Its `OperatorMode`."""
     cooling: bool
     """The plant is being cooled down from a warm start."""
     sensors_unusable: bool
@@ -48,9 +48,9 @@ class Ladder:
         self.since = min(self.since, tick)
 
     def _chosen(self, tick: int, inputs: LadderInputs) -> tuple[Mode, Cause]:
-        if inputs.operator is OperatorMode.MANUAL:
+        if inputs.operator == OperatorMode.MANUAL:
             return Mode.MANUAL, Cause.OPERATOR
-        if inputs.operator is OperatorMode.CLASSICAL:
+        if inputs.operator == OperatorMode.CLASSICAL:
             return Mode.CLASSICAL, Cause.OPERATOR
         if inputs.cooling:
             return Mode.CLASSICAL, Cause.COOL_DOWN

@@ -5,16 +5,21 @@ Scans can be missed and time can leap, so everything here goes by ticks, never b
 """
 
 from collections.abc import Sequence
-from enum import IntEnum
+from dataclasses import dataclass, field
+from typing import Any, Final
 
 from coldloop.process.declaration import LAST_NUMBER
-from coldloop.registers.control_plc import SEQUENCE_ROWS, Acknowledgement, Plan, Update, Verdict
-from coldloop.safety.sequence import Inputs, InputSequence, checksum
-from coldloop_control_plc.guard import OutputGuard
+from coldloop.registers.control_plc import SEQUENCE_ROWS, Acknowledgement, Plan, SequenceHeader, Update, Verdict
+from coldloop.safety.sequence import Inputs, InputSequence, checksum, with_checksum
+from coldloop_control_plc.output_limits import OutputGuard
 
-
-class UpdatePhase(IntEnum):
-    """How far the update under way has got.
+NONE: Final = 0
+LATCHED: Final = 1
+PLANNED: Final = 2
+ANSWERED: Final = 3
+REFUSED: Final = 4
+ABANDONED: Final = 5
+"""How far the update under way has got.
 
     NONE      ->  LATCHED                                       at an updating instant (`latch`)
     LATCHED   ->  PLANNED                                       the optimiser has decided the period
@@ -22,234 +27,278 @@ class UpdatePhase(IntEnum):
     REFUSED   ->  ANSWERED                                      another one was accepted in time
     any       ->  ABANDONED                                     given up: its answer is no longer awaited
     any       ->  LATCHED                                       the next updating instant, or a load step
-    """
-
-    NONE = 0
-    LATCHED = 1
-    PLANNED = 2
-    ANSWERED = 3
-    REFUSED = 4
-    ABANDONED = 5
+"""
 
 
-EXPECTING = (UpdatePhase.LATCHED, UpdatePhase.PLANNED)
-"""A lock-step runtime waits for what is missing."""
-PROMISED = (UpdatePhase.PLANNED, UpdatePhase.REFUSED)
-"""A sequence was to be expected."""
+@dataclass(slots=True)
+class PlayerState:
+    """Where the player is; lists of two are of a sequence each, `slot` of the one that is played."""
+
+    updates: int
+    """Number of the next update."""
+    update_number: int = 0
+    """Number, tick and load of the last update, if there is one."""
+    update_tick: int = 0
+    update_load: float = 0.0
+    has_update: bool = False
+    phase: int = NONE
+    next_update_tick: int = 0
+    load_step: float = 0.0
+    """Change of the load (W) that interrupts the update under way; 0 is never."""
+    shortage: float = 0.0
+    """What the load is above what can be held by the last plan, W; negative: below what is needed."""
+    suspects: int = 0
+    """Outputs that the last plan does without: bit i is output i; then inputs that have no effect."""
+    missed: int = -1
+    """Updating instant without a sequence that was counted last."""
+    invited: bool = True
+    late: bool = False
+    """The updating instant of what is being played has passed without a new sequence."""
+    broken_promise: bool = False
+    """The sequence of an update that was planned is missing at its instant, which is now."""
+    has_answer: bool = False
+    """A sequence has been accepted that has not begun: that of the other slot."""
+    slot: int = 0
+    numbers: list[int] = field(default_factory=lambda: [0, 0])
+    answers: list[int] = field(default_factory=lambda: [0, 0])
+    """The update that each answers."""
+    first_ticks: list[int] = field(default_factory=lambda: [0, 0])
+    lengths: list[int] = field(default_factory=lambda: [0, 0])
+    """In ticks; 0 where there is no sequence."""
+    periods: list[int] = field(default_factory=lambda: [0, 0])
+    """Updating period before each, in ticks."""
+    accepted: int = 0
+    rejected: int = 0
+    deadline_misses: int = 0
 
 
-class SequencePlayer:
+def has_row(p: PlayerState, tick: int) -> bool:
+    """Return whether a row is to be played at this tick."""
+    return 0 <= tick - p.first_ticks[p.slot] < p.lengths[p.slot]
+
+
+def plays_in_time(p: PlayerState, tick: int) -> bool:
+    """Return whether a row will be played at this tick, the next one, and not of a sequence that is late."""
+    if p.has_answer and p.first_ticks[1 - p.slot] <= tick:
+        return p.first_ticks[1 - p.slot] == tick
+    return has_row(p, tick) and not p.late and p.invited and (tick < p.next_update_tick or p.phase == ANSWERED)
+
+
+def awaits_sequence(p: PlayerState, tick: int) -> bool:
+    """Return whether an updating instant has come without its sequence; one that a load may cut off is due at once."""
+    is_due = tick == p.next_update_tick and tick > 0
+    return p.invited and (
+        (p.phase == PLANNED and (is_due or p.load_step > 0.0)) or (p.phase == LATCHED and is_due)
+    )  # fmt: skip
+
+
+def begin_sequence(p: PlayerState, tick: int) -> bool:
+    """Return whether a sequence begins at this tick; an updating instant without one is a miss."""
+    p.broken_promise = False
+    other = 1 - p.slot
+    if p.has_answer and p.first_ticks[other] <= tick:
+        p.slot = other
+        p.has_answer = False
+        # Scans were missed: what is played so late is the rest of a sequence, not a new one.
+        p.late = tick - p.first_ticks[other] >= max(1, p.periods[other])
+        return True
+    if p.invited and tick >= p.next_update_tick and tick > 0 and p.phase != ANSWERED:
+        p.late = p.has_update or p.lengths[p.slot] > 0
+        p.broken_promise = p.phase in (PLANNED, REFUSED)
+        if p.has_update and p.missed != p.next_update_tick:  # once however often its scan is begun
+            p.deadline_misses += 1
+        p.missed = p.next_update_tick
+    return False
+
+
+def latches(p: PlayerState, tick: int, load: float) -> bool:
+    """Return whether to latch an update at the end of this scan: its instant, or an interrupting load step."""
+    if not p.invited:
+        return False
+    expected = p.has_update and p.phase in (PLANNED, REFUSED, ANSWERED)
+    if expected and p.load_step != 0.0 and abs(load - p.update_load) > p.load_step:
+        p.has_answer = False
+        p.next_update_tick = tick
+    return tick >= p.next_update_tick
+
+
+def latch(p: PlayerState, tick: int, load: float, longest: int) -> None:
+    """Begin an update; the next is due after the `longest` period, until the optimiser has planned another."""
+    p.update_number = p.updates
+    p.update_tick = tick
+    p.update_load = load
+    p.has_update = True
+    p.updates = p.updates + 1 if p.updates < LAST_NUMBER else 0  # as at the start of a session
+    p.next_update_tick = tick + longest
+    p.phase = LATCHED
+
+
+def promise(p: PlayerState, next_update_tick: int, load_step: float, shortage: float, suspects: int) -> None:
+    """Take the plan of the update."""
+    p.next_update_tick = next_update_tick
+    p.load_step = load_step
+    p.shortage = shortage
+    p.suspects = suspects
+    p.phase = PLANNED
+
+
+def accept(p: PlayerState, number: int, first_tick: int, length: int) -> None:
+    """Take the sequence that answers the update."""
+    other = 1 - p.slot
+    p.numbers[other] = number
+    p.answers[other] = p.update_number
+    p.first_ticks[other] = first_tick
+    p.lengths[other] = length
+    p.periods[other] = first_tick - p.update_tick
+    p.has_answer = True
+    p.phase = ANSWERED
+    p.accepted += 1
+
+
+class SequencePlayer(PlayerState):
     """Plays what the optimiser sends, and refuses what breaks the contract."""
 
     def __init__(self, guard: OutputGuard, model_digest: int, *, updates: int = 0) -> None:
+        super().__init__(updates)
         self._guard = guard
         self._model_digest = model_digest
-        self._updates = updates
-        self._playing: InputSequence | None = None
-        self._spare: InputSequence | None = None
-        self._load_step = 0.0
-        self._missed = -1
-        self.phase = UpdatePhase.NONE
         self.update: Update | None = None
-        self.next_update_tick = 0
-        self.invited = True
-        self.late = False
-        """The updating instant of what is being played has passed without a new sequence."""
-        self.broken_promise = False
-        """The sequence of an update that was planned is missing at its instant, which is now."""
+        self.sequences: list[InputSequence | None] = [None, None]
         self.acknowledgement = Acknowledgement(0, Verdict.NONE)
-        self.accepted = self.rejected = self.deadline_misses = 0
-
-    # -- what a lock-step runtime waits for ----------------------------------------------------------------------------
 
     @property
     def awaiting_plan(self) -> bool:
         """The last update has no updating period yet."""
-        return self.invited and self.phase is UpdatePhase.LATCHED
-
-    def awaiting_sequence(self, tick: int) -> bool:
-        """An updating instant has come and its sequence has not; one that a load step may cut off is due at once."""
-        due = tick == self.next_update_tick and tick > 0
-        wanted = due or (self.phase is UpdatePhase.PLANNED and self._load_step > 0)
-        return self.invited and wanted and self.phase in EXPECTING
-
-    @property
-    def has_answer(self) -> bool:
-        """A sequence has been accepted that has not begun."""
-        return self._spare is not None
+        return self.invited and self.phase == LATCHED
 
     @property
     def answering(self) -> bool:
         """The optimiser has planned the current update: a sequence is expected."""
-        return self.phase in (UpdatePhase.PLANNED, UpdatePhase.ANSWERED)
+        return self.phase in (PLANNED, ANSWERED)
 
     @property
     def given_up(self) -> bool:
         """No sequence is expected for the last update: it was abandoned, or its sequence rejected."""
-        return self.phase in (UpdatePhase.NONE, UpdatePhase.REFUSED, UpdatePhase.ABANDONED)
-
-    # -- scan ----------------------------------------------------------------------------------------------------------
-
-    def begin(self, tick: int) -> bool:
-        """Return whether a sequence begins at this tick; an updating instant without one is a miss."""
-        self.broken_promise = False
-        spare = self._spare
-        if spare is not None and spare.header.first_tick <= tick:
-            self._playing, self._spare = spare, None
-            # Scans were missed: what is played so late is the rest of a sequence, not a new one.
-            self.late = tick - spare.header.first_tick >= max(1, spare.header.tau_u)
-            return True
-        if self.invited and tick >= self.next_update_tick and tick > 0 and self.phase is not UpdatePhase.ANSWERED:
-            self._miss()
-        return False
-
-    def _miss(self) -> None:
-        """Count an updating instant without a sequence, once however often its scan is begun."""
-        self.late = self.update is not None or self._playing is not None
-        self.broken_promise = self.phase in PROMISED
-        if self.update is not None and self._missed != self.next_update_tick:
-            self.deadline_misses += 1
-        self._missed = self.next_update_tick
+        return self.phase in (NONE, REFUSED, ABANDONED)
 
     def row(self, tick: int) -> Inputs | None:
         """Return the row to be played at this tick, if any."""
-        playing = self._playing
-        if playing is None or not 0 <= tick - playing.header.first_tick < len(playing.rows):
+        sequence = self.sequences[self.slot]
+        if sequence is None or not has_row(self, tick):
             return None
-        return playing.rows[tick - playing.header.first_tick]
-
-    def latches(self, tick: int, load: float) -> bool:
-        """Return whether to latch an update at the end of this scan: its instant, or an interrupting load step."""
-        if not self.invited:
-            return False
-        if self._interrupted_by(load):
-            self._spare = None
-            self.next_update_tick = tick
-        return tick >= self.next_update_tick
+        return sequence.rows[tick - self.first_ticks[self.slot]]
 
     def latch(self, update: Update) -> Update:
         """Begin an update; return it with its number."""
-        self.update = update._replace(update=self._updates, playing=self.playing)
-        self._updates = self._updates + 1 if self._updates < LAST_NUMBER else 0  # as at the start of a session
-        self.next_update_tick = (
-            update.tick + self._guard.limits.ticks_per_sample
-        )  # until the optimiser has planned another
-        self.phase = UpdatePhase.LATCHED
+        latch(self, update.tick, update.load, self._guard.limits.ticks_per_sample)
+        self.update = update._replace(update=self.update_number, playing=self.playing)
         return self.update
-
-    def _interrupted_by(self, load: float) -> bool:
-        """Return whether the load has left the one that the update under way was latched with."""
-        if self.update is None or self.phase not in (*PROMISED, UpdatePhase.ANSWERED) or not self._load_step:
-            return False
-        return abs(load - self.update.load) > self._load_step
 
     def remaining(self, tick: int) -> int:
         """Ticks of the sequence that are still to be played, the present one included."""
-        if self._playing is None:
-            return 0
-        header = self._playing.header
-        return min(header.length, max(0, header.first_tick + header.length - tick))
+        length = self.lengths[self.slot]
+        return min(length, max(0, self.first_ticks[self.slot] + length - tick))
 
     @property
     def playing(self) -> int:
         """Number of the sequence being played; 0 is none."""
-        return self._playing.header.number if self._playing else 0
+        return self.numbers[self.slot] if self.lengths[self.slot] else 0
 
     @property
     def sequence(self) -> InputSequence | None:
         """The sequence being played."""
-        return self._playing
-
-    @property
-    def updates(self) -> int:
-        """Number of the next update."""
-        return self._updates
-
-    def is_ordinary(self, tick: int) -> bool:
-        """Return whether a sequence is being played in time, and the update under way is planned."""
-        if self._playing is None or self.late or not self.invited or self.next_update_tick < tick:
-            return False
-        if self._spare is None:
-            return self.phase is UpdatePhase.PLANNED
-        return self.phase is UpdatePhase.ANSWERED
-
-    @property
-    def load_step(self) -> float:
-        """Change of the load (W) that interrupts the update under way; 0 is never."""
-        return self._load_step
-
-    def take_over(self, playing: InputSequence, update: Update, next_update_tick: int, sequences: int) -> None:
-        """Resume after so many more accepted sequences: the last one is being played, and its update is planned."""
-        self._playing, self.update = playing, update
-        self._updates = update.update + 1
-        self.next_update_tick = next_update_tick
-        self.phase, self.late = UpdatePhase.PLANNED, False
-        self.accepted += sequences
-        self.acknowledgement = Acknowledgement(playing.header.number, Verdict.ACCEPTED)
+        return self.sequences[self.slot] if self.lengths[self.slot] else None
 
     # -- who else drives, and time that leaps --------------------------------------------------------------------------
 
     def dismiss(self) -> None:
         """Let nothing be played, and nothing be offered, until `invite`."""
         self.invited = self.late = False
-        self.phase = UpdatePhase.NONE
-        self._playing = self._spare = self.update = None
+        self.phase = NONE
+        self._forget()
 
     def invite(self, tick: int) -> None:
         """Latch an update at the next scan, so that the optimiser may begin again."""
         self.invited = True
-        self.phase = UpdatePhase.ABANDONED
+        self.phase = ABANDONED
         self.next_update_tick = tick
+
+    def _forget(self) -> None:
+        self.lengths[self.slot] = 0
+        self.has_answer = self.has_update = False
+        self.update = None
 
     def drop(self) -> None:
         """Drop the sequence that has been played to its end: another mode moves the inputs now."""
-        self._playing = None
+        self.lengths[self.slot] = 0
 
     def resume(self, sequence: InputSequence | None, tick: int) -> None:
         """Resume the rest of the sequence after a restart, and latch an update at the next scan."""
-        self._playing = sequence
+        self.sequences[self.slot] = sequence
+        if sequence is not None:
+            header = sequence.header
+            self.numbers[self.slot], self.first_ticks[self.slot] = header.number, header.first_tick
+            self.lengths[self.slot], self.periods[self.slot] = len(sequence.rows), header.tau_u
         self.late = sequence is not None
         self.invite(tick)
 
     def set_back(self, tick: int) -> None:
         """Start over at a tick long before the present one: all sequences were for a time that will come again."""
-        self._playing = self._spare = self.update = None
+        self._forget()
         self.late = False
         if self.invited:
             self.invite(tick)
+
+    def continue_from(self, rows: Any, update: Update | None) -> None:  # noqa: ANN401 an array of who has numpy
+        """Continue after updates that were done with the state alone.
+
+        Args:
+            rows: Rows of the sequences, a table a slot.
+            update: The last update, if another than before.
+        """
+        self.update = update or self.update
+        for slot, number in enumerate(self.numbers):
+            known, length = self.sequences[slot], self.lengths[slot]
+            if length and (known is None or known.header.number != number):
+                header = SequenceHeader(
+                    number,
+                    self.answers[slot],
+                    self.first_ticks[slot],
+                    length,
+                    self.periods[slot],
+                    self._model_digest,
+                    0,
+                )
+                table = [tuple(map(float, rows[slot][tick])) for tick in range(length)]
+                self.sequences[slot] = with_checksum(header, table)
+                self.acknowledgement = Acknowledgement(max(self.numbers), Verdict.ACCEPTED)
 
     # -- the optimiser's side ------------------------------------------------------------------------------------------
 
     def accept_plan(self, plan: Plan, earliest: int) -> bool:
         """Take the updating period of the last update; return whether it was acceptable."""
-        update = self.update
-        if not self.invited or update is None or self.phase is not UpdatePhase.LATCHED or plan.update != update.update:
+        expected = self.invited and self.has_update and self.phase == LATCHED and plan.update == self.update_number
+        if not expected or not earliest <= plan.next_update_tick <= self.update_tick + SEQUENCE_ROWS:
             return False
-        if not earliest <= plan.next_update_tick <= update.tick + SEQUENCE_ROWS:
-            return False
-        self.next_update_tick = plan.next_update_tick
-        self._load_step = plan.load_step
-        self.phase = UpdatePhase.PLANNED
+        promise(self, plan.next_update_tick, plan.load_step, plan.shortage, plan.suspects)
         return True
 
     def abandon(self, earliest: int) -> None:
         """Give up the update under way: an optimiser that has lost the thread asks for a new one."""
-        if self.update is not None and self._spare is None:
-            self.phase = UpdatePhase.ABANDONED
+        if self.has_update and not self.has_answer:
+            self.phase = ABANDONED
             self.next_update_tick = earliest
 
     def offer(self, sequence: InputSequence, earliest: int, *, plant_lost: bool = False) -> Acknowledgement:
         """Check a committed sequence; accept it for its first tick, or reject it with a reason."""
         verdict = Verdict.PLANT_LOST if plant_lost else self._judge(sequence, earliest)
         if verdict is Verdict.ACCEPTED:
-            self._spare = sequence
-            self.phase = UpdatePhase.ANSWERED
-            self.accepted += 1
+            self.sequences[1 - self.slot] = sequence
+            accept(self, sequence.header.number, sequence.header.first_tick, sequence.header.length)
         else:
             self.rejected += 1
-            answers = self.update is not None and sequence.header.update == self.update.update
-            if answers and self.phase is UpdatePhase.PLANNED:
-                self.phase = UpdatePhase.REFUSED
+            if self.has_update and sequence.header.update == self.update_number and self.phase == PLANNED:
+                self.phase = REFUSED
         self.acknowledgement = Acknowledgement(sequence.header.number, verdict)
         return self.acknowledgement
 
@@ -263,14 +312,14 @@ class SequencePlayer:
             return Verdict.BAD_CRC
         if header.model_digest != self._model_digest:
             return Verdict.WRONG_MODEL
-        if header.number <= max(self.playing, self._spare.header.number if self._spare else 0):
+        if header.number <= max(self.playing, self.numbers[1 - self.slot] if self.has_answer else 0):
             return Verdict.REPEATED
         if header.first_tick < earliest:
             return Verdict.LATE
-        expected = self.phase in (*PROMISED, UpdatePhase.ANSWERED)
-        if self.update is None or not expected or header.update != self.update.update:
+        expected = self.has_update and self.phase in (PLANNED, REFUSED, ANSWERED)
+        if not expected or header.update != self.update_number:
             return Verdict.WRONG_UPDATE
-        if header.first_tick != self.next_update_tick or header.first_tick - self.update.tick != header.tau_u:
+        if header.first_tick != self.next_update_tick or header.first_tick - self.update_tick != header.tau_u:
             return Verdict.WRONG_TICK
         return self._judge_rows(rows, header.first_tick, earliest)
 

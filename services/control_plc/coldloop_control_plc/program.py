@@ -3,12 +3,13 @@
 Pure: no sockets, no clock, no sleeping. A scan is `begin_scan` (decide the outputs), the exchange with the plant's
 rack, `end_scan` (take the measurement, latch an update at an updating instant). Who decides the outputs is the
 ladder's choice (`ladder.py`); what the optimiser sends goes through the sequence player (`player.py`); the guard has
-the last word (`guard.py`).
+the last word (`output_limits.py`).
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from coldloop.errors import ConfigurationError
 from coldloop.process.model_file import ModelHeader
@@ -28,19 +29,26 @@ from coldloop.registers.control_plc import (
     Update,
     Verdict,
 )
-from coldloop.registers.plant import MAX_STATE, Actuators, Measurement
+from coldloop.registers.plant import Actuators, Measurement
 from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.safety.sequence import Inputs, InputSequence
 from coldloop.safety.watchdog import Watchdog
 from coldloop.service.journal import Journal
-from coldloop_control_plc.alarms import AlarmPanel
+from coldloop_control_plc.alarms import (
+    OPTIMIZER_DRIVES,
+    AlarmConditions,
+    AlarmConstants,
+    AlarmPanel,
+    ProcessAlarms,
+    ScanSummary,
+    watch_bands,
+)
 from coldloop_control_plc.classical import ClassicalLoops
 from coldloop_control_plc.cool_down import CoolDown
-from coldloop_control_plc.guard import OutputGuard
 from coldloop_control_plc.ladder import Ladder, LadderInputs
-from coldloop_control_plc.player import SequencePlayer
-from coldloop_control_plc.process_alarms import OPTIMIZER_DRIVES, ProcessAlarms
-from coldloop_control_plc.sensors import SensorMonitor
+from coldloop_control_plc.output_limits import GuardState, Limits, Numbers, OutputGuard
+from coldloop_control_plc.player import PlayerState, SequencePlayer, awaits_sequence, begin_sequence, latches
+from coldloop_control_plc.sensors import SensorConstants, SensorMonitor, SensorState, check
 from coldloop_control_plc.settings import ControlSection, ControlStrategy
 
 SEEN = 0.1
@@ -58,6 +66,36 @@ class OperatingPoint:
     inputs: tuple[float, ...]
     outputs: tuple[float, ...]
     model_digest: int
+
+
+class ScanConstants(NamedTuple):
+    """What does not change in a session."""
+
+    limits: Limits
+    sensors: SensorConstants
+    alarms: AlarmConstants
+
+
+class Scan(NamedTuple):
+    """All that a scan changes while it tells nothing: each part is an object with lists here, a record in the rig."""
+
+    guard: GuardState
+    player: PlayerState
+    sensors: SensorState
+    alarms: AlarmConditions
+    watchdog: Watchdog
+
+
+def observe(
+    c: ScanConstants, s: Scan, tick: int, y: Numbers, x: Numbers, load: float, applied: Numbers, cooling: bool  # noqa: FBT001
+) -> bool:  # fmt: skip
+    """Take the measurement of a tick; return whether it tells something beside the numbers in `s`.
+
+    A sensor is bad or good again, load or state make no sense, or the alarm of a band is due.
+    """
+    told = check(c.sensors, s.sensors, tick, y, x, load, applied)
+    due = watch_bands(c.alarms, s.alarms, tick, s.sensors.good, cooling)
+    return told or due or s.sensors.is_unknown
 
 
 class ControlProgram:
@@ -154,9 +192,6 @@ class ControlProgram:
         self.tick = tick
         self.process: ProcessNow | None = None
         self.optimizer_present = True
-        self.shortage = 0.0
-        """Of the last plan, as the next."""
-        self.suspects = 0
         self.guard = OutputGuard(self._limits, self._initial)
         if applied != self._initial:
             self.guard.begin_at(tick, applied)
@@ -168,8 +203,6 @@ class ControlProgram:
         self.cool_down = CoolDown(
             self._section.cool_down, self._limits, self._point.inputs, self._point.outputs, cool_down
         )
-        self._unknown = False
-        """The load or the state that was measured last makes no sense."""
         self._failed_handshake = -math.inf
         self._held_from: int | None = None
         """Since when the loops have been held for the sequence to come."""
@@ -180,8 +213,11 @@ class ControlProgram:
         self._in_scan = False
         self.watchdog.set(self.watchdog.time, tick)
         self._loops.restart()
-        self._process_alarms = ProcessAlarms(self.alarms, self.journal, self.alarm_settings)
+        self._process_alarms = ProcessAlarms(self.alarms, self.journal, len(self._point.outputs))
         self.alarms.begin_at(tick)
+        self._begin_step()
+        self.scan = Scan(self.guard.state, self.player, self.sensors, self.alarms, self.watchdog)
+        self.scan_constants = ScanConstants(self.guard.limits, self.sensors.constants, self.alarms.constants)
 
     # -- what others see -----------------------------------------------------------------------------------------------
 
@@ -194,11 +230,6 @@ class ControlProgram:
     def bad_sensors(self) -> int:
         """Bit i is set when output i is substituted."""
         return self.sensors.mask
-
-    @property
-    def has_noted_suspects(self) -> bool:
-        """Whether alarm and journal have what the last plan says of suspects."""
-        return self._process_alarms.has_noted(self.suspects)
 
     @property
     def applied(self) -> Inputs:
@@ -218,7 +249,7 @@ class ControlProgram:
     @property
     def awaiting_sequence(self) -> bool:
         """An updating instant has come, its sequence has not, and an optimiser is there to send it."""
-        return self.optimizer_present and self.player.awaiting_sequence(self.tick)
+        return self.optimizer_present and awaits_sequence(self.player, self.tick)
 
     @property
     def _usable(self) -> bool:
@@ -227,7 +258,7 @@ class ControlProgram:
         Nor does it begin before the plant is cold.
         """
         missing = self.sensors.unestimated if self.ladder.mode in OPTIMIZER_DRIVES else self.sensors.unusable
-        return not (self.cool_down.is_active or self._unknown or missing)
+        return not (self.cool_down.is_active or self.sensors.is_unknown or missing)
 
     @property
     def _earliest(self) -> int:
@@ -242,7 +273,7 @@ class ControlProgram:
         self._before = self.guard.applied
         if self.watchdog.check(tick):
             self.optimizer_lost()
-        began = self.player.begin(tick)
+        began = begin_sequence(self.player, tick)
         if self.player.broken_promise and self.ladder.mode is not Mode.CLASSICAL:
             self._failed_handshake = tick
         row = self.player.row(tick)
@@ -253,17 +284,11 @@ class ControlProgram:
     def _climb(self, tick: int, row: Inputs | None) -> None:
         """Let the ladder choose the mode of this scan."""
         before = self.ladder.mode
-        changed = self.ladder.step(
-            tick,
-            LadderInputs(
-                operator=OperatorMode(self.operator.mode),
-                cooling=self.cool_down.is_active,
-                sensors_unusable=not self._usable,
-                row=row is not None,
-                late=self.player.late or not self.optimizer_present,
-            ),
-        )
-        if not changed:
+        inputs = LadderInputs(
+            self.operator.mode, self.cool_down.is_active, not self._usable, row is not None,
+            self.player.late or not self.optimizer_present,
+        )  # fmt: skip
+        if not self.ladder.step(tick, inputs):
             return
         if self.ladder.mode is Mode.CLASSICAL:
             self.player.drop()
@@ -324,31 +349,76 @@ class ControlProgram:
 
     def end_scan(self, measurement: Measurement) -> Update | None:
         """Take the measurement of this tick; return the update if it was latched here."""
-        applied = self.guard.applied
-        others = measurement.x, (measurement.load,)
-        y = tuple(self.sensors.check(self.tick, measurement.y, applied, *others, standing=self.cool_down.standing))
-        if self.cool_down.observe(self.tick, y):
-            self.journal.note(self.tick, EventKind.COOL_DOWN, self.cool_down.step)
-        self.process = ProcessNow(self.tick, measurement.load, applied, y)
-        least, largest = self._limits.process.load.stored_span
-        self._unknown = not (least <= measurement.load <= largest and _are_states(measurement.x))
+        y, x, load = measurement.y, measurement.x, measurement.load
+        observe(self.scan_constants, self.scan, self.tick, y, x, load, self.guard.applied, self.cool_down.is_active)
+        return self.conclude(measurement)
+
+    def conclude(self, measurement: Measurement) -> Update | None:
+        """Do what follows when the measurement of this tick has been observed; return the update if one is latched."""
+        tick, applied, sensors, load = self.tick, self.guard.applied, self.sensors, measurement.load
+        y = tuple(sensors.good) if sensors.bad_count else measurement.y
+        if self.cool_down.observe(tick, y):
+            self.journal.note(tick, EventKind.COOL_DOWN, self.cool_down.step)
+            self._begin_step()
+            watch_bands(self.alarms.constants, self.alarms, tick, y, self.cool_down.is_active)
+        self.process = ProcessNow(tick, load, applied, y)
         self._let_play(usable=self._usable)
         latched = None
-        if self.player.latches(self.tick, measurement.load):
+        if latches(self.player, tick, load):
+            if bad := sensors.bad:
+                y = tuple(math.nan if i in bad else value for i, value in enumerate(y))
             latched = self.player.latch(
-                Update(
-                    session=self.session, update=0, tick=self.tick, playing=0, load=measurement.load,
-                    u_before=tuple(self._before), u=applied,
-                    y=tuple(math.nan if i in self.sensors.bad else value for i, value in enumerate(y)), x=measurement.x,
-                )
-            )  # fmt: skip
-        self._process_alarms.watch(
-            self.tick, y, self.ladder, cooling=self.cool_down.is_active, late=self.player.late,
-            optimizer=self.optimizer_present, shortage=self.shortage, bad=self.sensors.bad, suspects=self.suspects,
-        )  # fmt: skip
+                Update(self.session, 0, tick, 0, load, tuple(self._before), applied, y, measurement.x)
+            )
+        self._process_alarms.watch(tick, self._summary, self.player.shortage)
         self.tick += 1
         self._in_scan = False
         return latched
+
+    def _begin_step(self) -> None:
+        """Begin a step of the cool-down, or none."""
+        standing = self.cool_down.standing
+        self.sensors.standing[:] = [output in standing for output in range(len(self._point.outputs))]
+
+    @property
+    def _summary(self) -> ScanSummary:
+        ladder, player = self.ladder, self.player
+        return ScanSummary(
+            ladder.mode, ladder.cause, player.late, self.optimizer_present, player.shortage > 0.0,
+            player.shortage < 0.0, self.bad_sensors, player.suspects,
+        )  # fmt: skip
+
+    # -- scans that are done with `scan` alone -------------------------------------------------------------------------
+
+    @property
+    def is_ordinary(self) -> bool:
+        """Whether the scans to come do nothing beside `scan`, for as long as rows are played in time.
+
+        They are done then by `begin_sequence`, `admit`, `observe` and, unless that tells something, `latches`.
+        """
+        alarms, answers = self.alarms, (AlarmKind.SEQUENCE_REJECTED, AlarmKind.MODEL_MISMATCH)
+        return (
+            self.ladder.mode is Mode.MPC
+            and self.operator.mode == OperatorMode.AUTO
+            and not (self.sensors.bad_count or self.sensors.is_unknown)
+            and self._process_alarms.reported == self._summary
+            and self.optimizer_present
+            and alarms.next_report > self.tick
+            and not any(alarms.active[kind] for kind in answers)
+        )
+
+    def take_over(self, measurement: Measurement, before: Inputs, *, concluded: bool) -> Update | None:
+        """Continue after such scans, with the measurement of the last one, which may be still to be concluded.
+
+        `before` was applied before that scan. Returns the update if it was latched in the conclusion.
+        """
+        self.tick = self.alarms.now = measurement.tick
+        self.guard.applied, self._before = measurement.u, before
+        if not concluded:
+            return self.conclude(measurement)
+        self.process = ProcessNow(self.tick, measurement.load, measurement.u, measurement.y)
+        self.tick += 1
+        return None
 
     def _let_play(self, *, usable: bool) -> None:
         """Invite the optimiser, or send it away: an operator drives, or MPC would work with what is not so."""
@@ -410,10 +480,7 @@ class ControlProgram:
     def accept_plan(self, plan: Plan) -> bool:
         """Take the updating period of the last update; return whether it was acceptable."""
         self.optimizer_seen()
-        accepted = self.player.accept_plan(plan, self._earliest)
-        if accepted:
-            self.shortage, self.suspects = plan.shortage, plan.suspects
-        return accepted
+        return self.player.accept_plan(plan, self._earliest)
 
     def abandon(self) -> None:
         """Give up the update under way: an optimiser that has lost the thread asks for a new one."""
@@ -444,11 +511,6 @@ class ControlProgram:
         """Set the operating mode from the next scan on."""
         self.operator = operator
         self._let_play(usable=self._usable)
-
-
-def _are_states(x: Sequence[float]) -> bool:
-    """Return whether these can be states; otherwise the update is invalid."""
-    return math.isfinite(sum(x)) and min(x) >= -MAX_STATE and max(x) <= MAX_STATE
 
 
 def make_program(header: ModelHeader, section: ControlSection, limits: InputLimits) -> ControlProgram:

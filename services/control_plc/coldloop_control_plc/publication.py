@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.control_plc import LadderStatus, PlantLinkStatus, ProcessNow, Status
-from coldloop.registers.safety import AlarmState, LeaseStatus, WatchdogStatus
+from coldloop.registers.safety import AlarmState
 from coldloop.safety.lease import WriterLease
 from coldloop.service.event_text import alarm_word, log_event
 from coldloop.service.journal import JournalPublication
@@ -21,7 +21,7 @@ log = logging.getLogger("coldloop.control_plc")
 
 
 class ControlPublication:
-    """Shows the program's state in the registers: most of it when it is read, alarms and events when they change.
+    """Shows the program's state in the registers: what changes in each scan when it is read, the rest with its events.
 
     `keep` is called with new events, so that no number of an event is given out twice, and what an operator has said
     is retained also while no scans are made.
@@ -56,10 +56,6 @@ class ControlPublication:
         bank.keep_fresh(Identity, self._identity)
         bank.keep_fresh(ProcessNow, lambda: program.process)
         bank.keep_fresh(Status, self._status)
-        bank.keep_fresh(LadderStatus, self._ladder)
-        bank.keep_fresh(WatchdogStatus, lambda: program.watchdog.registers(program.tick))
-        bank.keep_fresh(PlantLinkStatus, self._plant_link)
-        bank.keep_fresh(LeaseStatus, lambda: None if self.lease is None else self.lease.registers())
 
     def begin(self) -> None:
         """Reset the counters: a session begins."""
@@ -113,7 +109,7 @@ class ControlPublication:
         return self.journal.is_behind
 
     def safety(self) -> None:
-        """Show alarms and events, as far as they have changed, and log the events."""
+        """Show ladder, watchdog, links, alarms and events, which agree with each other, and log the events."""
         program = self._program
         if self.lease is not None:
             self.lease.note_end()
@@ -126,6 +122,10 @@ class ControlPublication:
             self._told_alarms = program.alarms.changes
             for row, alarm in enumerate(program.alarms.rows):
                 self._bank.put(alarm, row)
+        for shown in (self._ladder(), program.watchdog.registers(program.tick), self._plant_link()):
+            self._bank.put(shown)
+        if self.lease is not None:
+            self._bank.put(self.lease.registers())
 
     def _plant_link(self) -> PlantLinkStatus:
         link = self._link

@@ -10,13 +10,15 @@ import asyncio
 import contextlib
 import logging
 import time
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from coldloop import __version__
 from coldloop.config import selected
-from coldloop.errors import LinkError, PeerUnreachableError
+from coldloop.errors import ConfigurationError, LinkError, PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
+from coldloop.modbus.settings import TlsSettings
 from coldloop.process.declaration import LAST_TICK
 from coldloop.process.model_file import read_header
 from coldloop.registers.audit import EventKind
@@ -32,16 +34,14 @@ from coldloop.service.metrics_server import MetricsServer
 from coldloop.service.start import SERVING
 from coldloop.service.telemetry import Telemetry
 from coldloop.session.settings import TimeBase
-from coldloop_control_plc.certificate_watch import CertificateWatch
 from coldloop_control_plc.client_requests import Clients
 from coldloop_control_plc.plant_link import FROZEN_S, FROZEN_TICKS, PlantLink
-from coldloop_control_plc.program import make_program
+from coldloop_control_plc.program import ControlProgram, make_program
 from coldloop_control_plc.publication import ControlPublication
 from coldloop_control_plc.rack_clock import PHASE, RackClock
 from coldloop_control_plc.rack_finder import RackFinder
 from coldloop_control_plc.retained_state import ControlStateStore
 from coldloop_control_plc.scan_cycle import ScanCycle
-from coldloop_control_plc.scan_watch import LOOK_S, ScanWatch
 from coldloop_control_plc.sessions import Sessions
 from coldloop_control_plc.settings import SHOWN, ControlSettings
 
@@ -56,10 +56,80 @@ REPACED_S: Final = 0.5
 """Between two changes of the time base in real time: each reads the rack before outputs are written again."""
 KEEP_ALIVE_S: Final = 1.0
 """While paused, the rack is asked something so often."""
-
-
+LOOK_S: Final = 0.25
+"""Real time between two looks."""
+LOOKS: Final = 8
+"""Looks without a scan between them after which scans have stopped: looks, so that a process that had no processor time
+does not take that for a fault."""
+SCANS: Final = 8
+"""Scans that are missing then, at least, where the factor is low."""
+EXPIRES_SOON: Final = 1
+"""Causes of the alarm CERTIFICATE."""
+EXPIRED: Final = 2
+UNREADABLE: Final = 3
+CERTIFICATES_S: Final = 3600.0
+"""Between two looks at the certificates, in real time."""
 STATE_REFUSED: Final = 1
 """Cause of the alarm STATE_NOT_RETAINED: at the start there was one that is not used."""
+
+
+class CertificateWatch:
+    """Raises the alarm while a certificate has expired, or will soon.
+
+    Args:
+        certificates: Those of our server and of our client, with the days of warning.
+        program: Whose alarm it is.
+        show: Shows the alarms.
+    """
+
+    def __init__(self, certificates: Sequence[TlsSettings], program: ControlProgram, show: Callable[[], None]) -> None:
+        self._certificates = certificates
+        self._program = program
+        self._show = show
+        self._noted = 0
+
+    async def run(self) -> None:
+        """Look every hour, until cancelled."""
+        while self._certificates:
+            try:
+                days = await asyncio.to_thread(self._days_of_those_to_renew)  # no scan waits for a disk
+            except ConfigurationError as error:  # they may be being renewed: keep what was read at the start
+                log.warning("certificates unreadable", extra={"reason": str(error)})
+                self._program.alarms.raised(AlarmKind.CERTIFICATE, UNREADABLE)
+            else:
+                self._judge(days)
+            self._show()
+            await asyncio.sleep(CERTIFICATES_S)
+
+    def _days_of_those_to_renew(self) -> list[float]:
+        from coldloop.modbus.tls import certificate_days_left  # noqa: PLC0415 not needed without TLS
+
+        return [days for tls in self._certificates if (days := certificate_days_left(tls)) < tls.warn_days]
+
+    def _judge(self, days: Sequence[float]) -> None:
+        """Take the days that are left of those to be renewed."""
+        least, program = min(days, default=0.0), self._program
+        cause = (EXPIRED if least < 0.0 else EXPIRES_SOON) if days else 0
+        program.alarms.report(AlarmKind.CERTIFICATE, condition=bool(days), cause=cause)
+        if cause and cause != self._noted:
+            program.journal.note(program.alarms.now, EventKind.CERTIFICATE, cause, value=least)
+        self._noted = cause
+
+
+class ScanWatch:
+    """Whether scans are made, watched from outside of them: an alarm that they are not cannot come from a scan."""
+
+    def __init__(self) -> None:
+        self._looks = 0
+
+    def scanned(self) -> None:
+        """Note that a scan was made, or that none is expected."""
+        self._looks = 0
+
+    def look(self, tick_s: float) -> bool:
+        """Return, `LOOK_S` after the last check, whether scans have stopped; a tick lasts `tick_s` of real time."""
+        self._looks += 1
+        return self._looks > max(LOOKS, SCANS * tick_s / LOOK_S)
 
 
 class ControlPlc:

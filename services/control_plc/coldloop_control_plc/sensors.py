@@ -3,16 +3,20 @@
 A measurement is bad when it is no number, outside its sensor's range, or frozen: it does not change by a bit for a
 while in which most of the others move. When nothing at all changes, load and states included, the image is an old one:
 a plant that rests is known by its inputs, which rest too. A turbine without a pressure difference may stand still.
+
+The check is plain Python that the rig compiles too: functions of constants and one state.
 """
 
-from collections.abc import Collection, MutableSequence, Sequence
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated, NamedTuple, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from coldloop.process.declaration import Process
 from coldloop.process.settings import ProcessSettings, declared, stretched, within
-from coldloop_control_plc.numbers import Numbers
+from coldloop.registers.plant import MAX_STATE
+from coldloop_control_plc.output_limits import Numbers
 
 Range = tuple[FiniteFloat, FiniteFloat]
 STANDSTILL_RATIO = 1.1
@@ -21,6 +25,8 @@ MOVES = 240
 """Ticks in which an output that is not controlled must have moved before it can be frozen."""
 UNKNOWN, NOT_MOVED = -2, -1
 """In the place of the tick since which the inputs have moved."""
+NONE = -1
+"""In the place of another tick."""
 RECOVERY_TICKS = 8
 """A sensor is good again when its measurements have been good for so long."""
 
@@ -76,53 +82,138 @@ class SensorCheckSettings(ProcessSettings):
         return self
 
 
-def are_inside(y: Numbers, low: Numbers, high: Numbers) -> bool:
-    """Return whether all measurements are numbers within their ranges; the rig compiles this function, and the next."""
-    inside = True
-    for output in range(len(y)):
-        inside = inside and low[output] <= y[output] <= high[output]
-    return inside
+class SensorConstants(NamedTuple):
+    """What does not change in a session; tuples of an element an output, of `moves` an input."""
+
+    low: Numbers
+    """Range of the sensor."""
+    high: Numbers
+    least: Numbers
+    """Ticks for which an output is at least unchanged before it is frozen."""
+    controlled: Numbers
+    """Whether the output has a band."""
+    kinds: Kinds
+    moves: Numbers
+    """How far an input must have moved for something to be seen of it."""
+    may_rest: bool
+    """Nothing may be measured to move while the inputs do not."""
+    each_may_rest: bool
+    """Nor need an output move while others do, then."""
+    frozen_ticks: int
+    """Ticks for which the image is at least unchanged before it is an old one."""
+    speed: int
+    """The output that is the turbine's speed, and the pressures before and behind it; -1 without a turbine."""
+    before: int
+    behind: int
+    least_load: float
+    largest_load: float
 
 
-def count_unchanged(
-    unchanged: MutableSequence[int],
-    rests: MutableSequence[int],
-    before: MutableSequence[float],
-    y: Numbers,
-    elapsed: int,
-    least: Numbers,
-    controlled: Numbers,
-    kinds: Kinds,
-) -> None:
-    """Count for how many ticks each output is unchanged while most of the others moved.
+@dataclass(slots=True)
+class SensorState:
+    """What the check remembers; lists of an element an output, of `inputs` a row. Ticks are plant time."""
 
-    For those that are not controlled these are most temperatures and most pressures: exact sensors of one kind rest
-    with the plant while noisy ones of the other kind do not.
+    tick: int
+    """Of the last check; `NONE` after a leap back."""
+    now: int
+    good: list[float]
+    """Last good values."""
+    before: list[float]
+    """Measured last."""
+    unchanged: list[int]
+    rests: list[int]
+    """Longest times unchanged of those that are not controlled, without the times for which they were frozen; below 0:
+    the moves that are missing until they count."""
+    inputs: list[list[float]]
+    """Inputs when each output moved last."""
+    inputs_moved: list[int]
+    """`UNKNOWN`, then `NOT_MOVED` or the tick since which the inputs have been others than those."""
+    bad_since: list[int]
+    """`NONE` or the tick since which the output has been substituted."""
+    good_since: list[int]
+    """Since which tick the measurements of a substituted output have been good again."""
+    bad_count: int
+    standing: list[bool]
+    """Which may be constant while others move."""
+    x: list[float]
+    """States and load that were measured last: with the outputs the image."""
+    load: float
+    image_inputs: list[float]
+    """Applied when the image changed last."""
+    image_count: int
+    """Ticks for which it has been unchanged."""
+    image_moved: bool
+    """The inputs have moved meanwhile."""
+    is_unknown: bool
+    """The load or the state that was measured last makes no sense."""
 
-    `before` (outputs,) becomes `y`, the measurements `elapsed` ticks later. `rests` (outputs,) are the
-    longest such times of those that are not controlled, without the times for which they were frozen; below 0: the
-    moves that are missing until they count. `least` is as `SensorMonitor` has it; `controlled` says which are.
+
+def check(c: SensorConstants, s: SensorState, tick: int, y: Numbers, x: Numbers, load: float, inputs: Numbers) -> bool:
+    """Take what was measured at `tick`, with these inputs applied; return whether an output is bad, or was until now.
+
+    Outputs are then `good`: the measured ones, with bad ones replaced by their last good value.
     """
-    first, end = kinds.temperatures, kinds.pressures
+    elapsed = 1 if s.tick == NONE else max(0, tick - s.tick)
+    has_moved = count_unchanged(c, s, y, elapsed)
+    s.tick = tick
+    s.now = tick
+    if c.each_may_rest:
+        note_moves(c, s, inputs, tick)
+    is_old = is_old_image(c, s, has_moved, x, load, inputs, elapsed)
+    suspicious = is_old or s.bad_count > 0
+    for output in range(len(y)):
+        if not c.low[output] <= y[output] <= c.high[output] or s.unchanged[output] >= c.least[output]:
+            suspicious = True
+    if not suspicious:
+        s.good[:] = y
+        return False
+    told = s.bad_count > 0
+    for output in range(len(y)):
+        judge(c, s, output, y, is_old or is_stuck(c, s, output, y, tick))
+    return told or s.bad_count > 0
+
+
+def judge(c: SensorConstants, s: SensorState, output: int, y: Numbers, stuck: bool) -> None:  # noqa: FBT001 compiled
+    """Substitute an output from now on, or no more."""
+    if stuck or not c.low[output] <= y[output] <= c.high[output]:
+        if s.bad_since[output] == NONE:
+            s.bad_since[output] = s.now
+            s.bad_count += 1
+        s.good_since[output] = NONE
+        return
+    if s.bad_since[output] != NONE:
+        if s.good_since[output] == NONE:
+            s.good_since[output] = s.now
+        if s.now - s.good_since[output] + 1 < RECOVERY_TICKS:
+            return
+        s.bad_since[output] = s.good_since[output] = NONE
+        s.bad_count -= 1
+    s.good[output] = y[output]
+
+
+def count_unchanged(c: SensorConstants, s: SensorState, y: Numbers, elapsed: int) -> bool:
+    """Count for how many ticks each output is unchanged while most of the others moved; return whether any moved.
+
+    `y` was measured `elapsed` ticks after the last one. For those that are not controlled the others are most
+    temperatures and most pressures: exact sensors of one kind rest with the plant while noisy ones of the other do not.
+    """
+    first, end = c.kinds.temperatures, c.kinds.pressures
     few = int(end == 0)  # most of the others are counted without the output itself, which matters where there are few
-    most = 2 * moved(before, y, 0, len(y)) > len(y) - few
-    temperatures, pressures = moved(before, y, first, end), moved(before, y, end, len(y))
+    temperatures, pressures = moved(s.before, y, first, end), moved(s.before, y, end, len(y))
+    count = temperatures + pressures + (moved(s.before, y, 0, first) if end > 0 else 0)
+    most = 2 * count > len(y) - few
     most_of_each = (end == 0 or 2 * temperatures > end - first) and 2 * pressures > len(y) - end - few
     for output in range(len(y)):
-        if y[output] == before[output]:
-            unchanged[output] += elapsed * (most if controlled[output] else most_of_each)
+        if y[output] == s.before[output]:
+            s.unchanged[output] += elapsed * (most if c.controlled[output] else most_of_each)
             continue
-        if rests[output] < 0:
-            rests[output] += bool(abs(y[output] - before[output]) > 0.0)  # from or to no number is no move
-        elif not controlled[output] and not is_frozen(unchanged[output], rests[output], least[output]):
-            rests[output] = max(unchanged[output], rests[output])
-        unchanged[output] = 0
-    before[:] = y
-
-
-def is_frozen(unchanged: float, rest: float, least: float) -> bool:
-    """Return whether an output is unchanged for at least so many ticks, and for twice its longest rest."""
-    return rest >= 0 and unchanged >= least and unchanged >= 2 * rest
+        if s.rests[output] < 0:
+            s.rests[output] += bool(abs(y[output] - s.before[output]) > 0.0)  # from or to no number is no move
+        elif not c.controlled[output] and not is_frozen(s.unchanged[output], s.rests[output], c.least[output]):
+            s.rests[output] = max(s.unchanged[output], s.rests[output])
+        s.unchanged[output] = 0
+    s.before[:] = y
+    return count > 0
 
 
 def moved(before: Numbers, y: Numbers, first: int, end: int) -> int:
@@ -133,6 +224,28 @@ def moved(before: Numbers, y: Numbers, first: int, end: int) -> int:
     return count
 
 
+def is_frozen(unchanged: float, rest: float, least: float) -> bool:
+    """Return whether an output is unchanged for at least so many ticks, and for twice its longest rest."""
+    return rest >= 0 and unchanged >= least and unchanged >= 2 * rest
+
+
+def is_stuck(c: SensorConstants, s: SensorState, output: int, y: Numbers, tick: int) -> bool:
+    """Return whether an output is frozen that does not stand, and that should have moved with the inputs."""
+    if (
+        not is_frozen(s.unchanged[output], s.rests[output], c.least[output])
+        or s.standing[output]
+        or may_stand(c, output, y)
+    ):
+        return False
+    since = s.inputs_moved[output]
+    return not c.each_may_rest or (since >= 0 and tick - since >= c.least[output])
+
+
+def may_stand(c: SensorConstants, output: int, y: Numbers) -> bool:
+    """Return whether an output is the speed of a turbine that stands, for all that the pressures say."""
+    return output == c.speed and y[output] == 0.0 and y[c.before] < STANDSTILL_RATIO * y[c.behind]
+
+
 def have_moved(inputs: Numbers, before: Numbers, moves: Numbers) -> bool:
     """Return whether an input has moved so far that something is to be seen of it."""
     moved_far = False
@@ -141,83 +254,47 @@ def have_moved(inputs: Numbers, before: Numbers, moves: Numbers) -> bool:
     return moved_far
 
 
-def note_moves(
-    unchanged: Numbers,
-    last: Sequence[MutableSequence[float]],
-    since: MutableSequence[int],
-    inputs: Numbers,
-    moves: Numbers,
-    tick: int,
-) -> None:
-    """Note what the inputs were when each output moved last, and at which tick they had moved from there.
+def note_moves(c: SensorConstants, s: SensorState, inputs: Numbers, tick: int) -> None:
+    """Note what the inputs were when each output moved last, and at which tick they had moved from there."""
+    for output in range(len(s.unchanged)):
+        if s.unchanged[output] == 0 or s.inputs_moved[output] == UNKNOWN:
+            s.inputs_moved[output] = NOT_MOVED
+            for i in range(len(c.moves)):
+                s.inputs[output][i] = inputs[i]
+        elif s.inputs_moved[output] == NOT_MOVED and have_moved(inputs, s.inputs[output], c.moves):
+            s.inputs_moved[output] = tick
 
-    `last` has a row an output; `since`, of each, is at first `UNKNOWN`, then `NOT_MOVED` or a tick.
+
+def is_old_image(
+    c: SensorConstants, s: SensorState, has_moved: bool, x: Numbers, load: float, inputs: Numbers, elapsed: int  # noqa: FBT001
+) -> bool:  # fmt: skip
+    """Return whether the whole image (all measurements) has been unchanged for long although the inputs have moved.
+
+    `has_moved`: an output has. What is no number is other than itself: a sensor that fails is for others to find.
+    Whether load and states make sense is found out, too.
     """
-    for output in range(len(unchanged)):
-        if unchanged[output] == 0 or since[output] == UNKNOWN:
-            since[output] = NOT_MOVED
-            for i in range(len(moves)):
-                last[output][i] = inputs[i]
-        elif since[output] == NOT_MOVED and have_moved(inputs, last[output], moves):
-            since[output] = tick
+    same = not has_moved and load == s.load
+    if same:
+        for i in range(len(x)):
+            same = same and x[i] == s.x[i]
+    s.x[:] = x
+    s.load = load
+    s.is_unknown = not c.least_load <= load <= c.largest_load
+    for i in range(len(x)):
+        s.is_unknown = s.is_unknown or not abs(x[i]) <= MAX_STATE
+    if not same:
+        for i in range(len(c.moves)):
+            s.image_inputs[i] = inputs[i]
+        s.image_count = 0
+        s.image_moved = not c.may_rest
+        return c.frozen_ticks <= 0
+    s.image_count += elapsed
+    s.image_moved = s.image_moved or have_moved(inputs, s.image_inputs, c.moves)
+    return (s.image_count if s.image_moved else 0) >= c.frozen_ticks
 
 
-def is_to_move(since: int, tick: int, least: float) -> bool:
-    """Return whether the inputs have moved, and for so long that the output should have moved too."""
-    return since >= 0 and tick - since >= least
-
-
-class ImageWatch:
-    """Watches the whole image: for how many ticks it is unchanged, and whether the inputs have moved.
-
-    Args:
-        moves: How far each input must have moved for something to be seen of it.
-        may_rest: Whether an image may be unchanged while the inputs are.
-    """
-
-    def __init__(self, moves: Sequence[float], *, may_rest: bool) -> None:
-        self._moves = moves
-        self._may_rest = may_rest
-        self.begin()
-
-    def begin(self) -> None:
-        """Reset: nothing is known of earlier ticks."""
-        self.last: tuple[Sequence[float], ...] = ()
-        self.inputs: Sequence[float] = ()
-        """Applied when the image changed last."""
-        self.count = 0
-        self.has_moved = False
-
-    def unchanged(self, inputs: Sequence[float], *image: Sequence[float], elapsed: int) -> int:
-        """Return for how many ticks the image (all measurements) is unchanged although the inputs have moved."""
-        if image != self.last:  # NaN is not the same as NaN: a sensor that fails is for others to find
-            self.last, self.inputs = image, inputs
-            self.count, self.has_moved = 0, not self._may_rest
-            return 0
-        self.count += elapsed
-        if not self.has_moved:
-            self.has_moved = have_moved(inputs, self.inputs, self._moves)
-        return self.count if self.has_moved else 0
-
-
-def _kinds(process: Process) -> Kinds:
-    quantities = [output.quantity for output in process.outputs]
-    return Kinds(*(quantities.index(kind) if kind in quantities else 0 for kind in ("temperature", "pressure")))
-
-
-def _turbine(process: Process) -> tuple[int, int, int] | None:
-    """Return the outputs that are the turbine's speed, and the pressures before and behind it; None without one."""
-    bath = process.bath
-    if bath is None or not bath.turbine_speed:
-        return None
-    speed, before, behind = map(process.output_names.index, (bath.turbine_speed, *bath.turbine_pressures))
-    return speed, before, behind
-
-
-class SensorMonitor:
-    """Looks at every measurement. All its times are plant time: scans can be missed.
-
-    `bad` holds the outputs that are substituted now, and since which tick.
+class SensorMonitor(SensorState):
+    """Looks at every measurement. Scans can be missed.
 
     Args:
         settings: Ranges of sensors.
@@ -226,101 +303,44 @@ class SensorMonitor:
     """
 
     def __init__(self, settings: SensorCheckSettings, initial: Sequence[float], moves: Sequence[float] = ()) -> None:
-        process = settings.process
-        self.low, self.high = zip(*settings.ranges, strict=True)
-        self.frozen_ticks = round(settings.frozen_s / process.tick_s)
+        process, count = settings.process, len(initial)
+        frozen_ticks, resting_ticks = (round(s / process.tick_s) for s in (settings.frozen_s, settings.resting_s))
+        controlled = [output in process.controlled for output in range(count)]
+        quantities, bath = [output.quantity for output in process.outputs], process.bath
+        kinds = (quantities.index(kind) if kind in quantities else 0 for kind in ("temperature", "pressure"))
+        turbine = (-1, -1, -1)
+        if bath is not None and bath.turbine_speed:
+            before, behind = map(process.output_names.index, bath.turbine_pressures)
+            turbine = process.output_names.index(bath.turbine_speed), before, behind
+        low, high = zip(*settings.ranges, strict=True)
+        self.constants = SensorConstants(
+            low, high, [frozen_ticks if each else resting_ticks for each in controlled], controlled, Kinds(*kinds),
+            moves, settings.may_rest, settings.may_rest and not process.moves_as_one, frozen_ticks,
+            *turbine, *process.load.stored_span,
+        )  # fmt: skip
         self._controlled = process.controlled
-        self.is_controlled = [output in process.controlled for output in range(len(initial))]
-        self.kinds, self._turbine = _kinds(process), _turbine(process)
-        resting_ticks = round(settings.resting_s / process.tick_s)
-        self.least = [self.frozen_ticks if controlled else resting_ticks for controlled in self.is_controlled]
-        """Ticks for which each output is at least unchanged before it is frozen."""
         self._bridged_ticks = round(settings.bridged_s / process.tick_s)
         self._estimated_ticks = round(settings.estimated_s / process.tick_s)
         self._estimated_most = settings.estimated_most
-        self._good = list(initial)
-        self.before = list(initial)
-        self._tick: int | None = None
-        self._now = 0
-        self.unchanged = [0] * len(initial)
-        self.rests = [0 if controlled else -MOVES for controlled in self.is_controlled]
-        self.moves = moves
-        self.may_rest = settings.may_rest
-        self.each_may_rest = settings.may_rest and not process.moves_as_one
-        self.inputs = [[0.0] * len(moves) for _ in initial]
-        """Inputs when each output moved last, ..."""
-        self.inputs_moved = [UNKNOWN] * len(initial)
-        """... and since which tick they have been others: `note_moves`."""
-        self.image = ImageWatch(moves, may_rest=settings.may_rest)
-        self._recovering: dict[int, int] = {}
-        """Output, and since which tick its measurements have been good again."""
-        self.bad: dict[int, int] = {}
-
-    def check(
-        self,
-        tick: int,
-        y: Sequence[float],
-        inputs: Sequence[float] = (),
-        *others: Sequence[float],
-        standing: Collection[int] = (),
-    ) -> Sequence[float]:
-        """Return the outputs measured at `tick`, with bad ones replaced by their last good value.
-
-        Args:
-            tick: When.
-            y: As they were measured.
-            inputs: Being applied.
-            others: What else was measured.
-            standing: Outputs that may be constant while others move.
-        """
-        elapsed = 1 if self._tick is None else max(0, tick - self._tick)
-        count_unchanged(self.unchanged, self.rests, self.before, y, elapsed, self.least, self.is_controlled, self.kinds)
-        self._tick = self._now = tick
-        history = zip(self.unchanged, self.rests, self.least, strict=True)
-        frozen: Collection[int] = [output for output, each in enumerate(history) if is_frozen(*each)]
-        frozen = [output for output in frozen if output not in standing and not self.may_stand(output, y)]
-        if self.each_may_rest:
-            note_moves(self.unchanged, self.inputs, self.inputs_moved, inputs, self.moves, tick)
-            frozen = [output for output in frozen if is_to_move(self.inputs_moved[output], tick, self.least[output])]
-        if self.image.unchanged(inputs, y, *others, elapsed=elapsed) >= self.frozen_ticks:
-            frozen = range(len(y))
-        if not self.bad and not frozen and are_inside(y, self.low, self.high):
-            self._good[:] = y
-            return y
-        for output, value in enumerate(y):
-            self._judge(output, ok=self.low[output] <= value <= self.high[output] and output not in frozen)
-            if output not in self.bad:
-                self._good[output] = value
-        return tuple(self._good)
-
-    def may_stand(self, output: int, y: Sequence[float]) -> bool:
-        """Return whether an output is the speed of a turbine that stands, for all that the pressures say."""
-        if self._turbine is None or output != self._turbine[0] or y[output] != 0.0:
-            return False
-        _, before, behind = self._turbine
-        return y[before] < STANDSTILL_RATIO * y[behind]
+        super().__init__(
+            tick=NONE, now=0, good=list(initial), before=list(initial), unchanged=[0] * count,
+            rests=[0 if each else -MOVES for each in controlled], inputs=[[0.0] * len(moves) for _ in initial],
+            inputs_moved=[UNKNOWN] * count, bad_since=[NONE] * count, good_since=[NONE] * count, bad_count=0,
+            standing=[False] * count, x=[math.nan] * len(process.states), load=math.nan,
+            image_inputs=[0.0] * len(moves), image_count=0, image_moved=not settings.may_rest,
+            is_unknown=False,
+        )  # fmt: skip
 
     def set_back(self, tick: int) -> None:
         """Set the time back to `tick`: conditions that hold now begin there."""
-        self._tick = None
-        self.bad = {output: min(since, tick) for output, since in self.bad.items()}
-        self._recovering = {output: min(since, tick) for output, since in self._recovering.items()}
-        self.inputs_moved = [min(at, tick) for at in self.inputs_moved]
+        self.tick = NONE
+        for ticks in (self.bad_since, self.good_since, self.inputs_moved):
+            ticks[:] = [min(each, tick) for each in ticks]
 
-    def _judge(self, output: int, *, ok: bool) -> None:
-        if not ok:
-            self.bad.setdefault(output, self._now)
-            self._recovering.pop(output, None)
-        elif output in self.bad:
-            since = self._recovering.setdefault(output, self._now)
-            if self._now - since + 1 >= RECOVERY_TICKS:
-                del self.bad[output], self._recovering[output]
-
-    def seen(self, tick: int, y: Sequence[float], *others: Sequence[float]) -> None:
-        """Note that all outputs y (outputs,) have been good up to `tick`, and what was measured there."""
-        self._tick = self._now = tick
-        self.image.last = (y, *others)
-        self._good[:] = self.before[:] = y
+    @property
+    def bad(self) -> list[int]:
+        """Outputs that are substituted."""
+        return [output for output, since in enumerate(self.bad_since) if since != NONE] if self.bad_count else []
 
     @property
     def unusable(self) -> list[int]:
@@ -330,12 +350,11 @@ class SensorMonitor:
     @property
     def unestimated(self) -> list[int]:
         """Controlled outputs that have been bad for longer than an estimate of them is believed: MPC is left."""
-        return self._bad_for(self._bridged_ticks if len(self.bad) > self._estimated_most else self._estimated_ticks)
+        return self._bad_for(self._bridged_ticks if self.bad_count > self._estimated_most else self._estimated_ticks)
 
     def _bad_for(self, ticks: int) -> list[int]:
-        return [
-            output for output in self._controlled if output in self.bad and self._now - self.bad[output] + 1 > ticks
-        ]
+        bad = (output for output in self._controlled if self.bad_count and self.bad_since[output] != NONE)
+        return [output for output in bad if self.now - self.bad_since[output] + 1 > ticks]
 
     @property
     def mask(self) -> int:

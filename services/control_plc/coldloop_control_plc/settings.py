@@ -13,7 +13,7 @@ from coldloop.safety.retained import RetainSettings
 from coldloop.service.metrics_settings import MetricsSettings
 from coldloop.service.telemetry_settings import TelemetrySettings
 from coldloop.session.settings import SessionSettings
-from coldloop_control_plc.alarm_settings import AlarmSettings
+from coldloop_control_plc.alarms import AlarmSettings
 from coldloop_control_plc.classical import ClassicalSettings
 from coldloop_control_plc.cool_down import CoolDownSettings
 from coldloop_control_plc.sensors import SensorCheckSettings

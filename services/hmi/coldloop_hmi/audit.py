@@ -6,7 +6,9 @@ import os
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from heapq import merge
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -41,13 +43,13 @@ class _Kind(NamedTuple):
 OTHERS: Final = _Kind("request", "", "", "other refusals")
 
 
+@dataclass
 class _Repeats:
     """Refusals of one kind since the first of them."""
 
-    def __init__(self, entry: Entry, until: float) -> None:
-        self.entry = entry
-        self.until = until
-        self.count = 1
+    entry: Entry
+    until: float
+    count: int = 1
 
 
 class Audit:
@@ -150,7 +152,8 @@ class Audit:
                 log.error("audit not written", extra={"file": str(self._file), "reason": error.strerror})  # noqa: TRY400
 
     def _append(self, file: Path, text: str) -> None:
-        with open(file, "a", encoding="utf-8", errors="backslashreplace", opener=_private) as lines:
+        private = partial(os.open, mode=0o600)
+        with open(file, "a", encoding="utf-8", errors="backslashreplace", opener=private) as lines:
             lines.write(text)
             is_full = lines.tell() > LARGEST_FILE
         if is_full:
@@ -158,10 +161,6 @@ class Audit:
                 older = file if number == 1 else _set_aside(file, number - 1)
                 if older.exists():
                     older.replace(_set_aside(file, number))
-
-
-def _private(path: str, flags: int) -> int:
-    return os.open(path, flags, mode=0o600)
 
 
 def _set_aside(file: Path, number: int) -> Path:

@@ -196,18 +196,12 @@ def _branch(update: Optimization, before: Optimization | None, rule: UpdatingRul
     if undecided and (before is None or not _was_played(update, before)):
         return _why_not_played(update, before, rule)
     if rule.rule == UpdatingRuleKind.ALGORITHM_1:
-        return _by_sign(update.gamma)
+        return Branch.DOWN if update.gamma > 0 else Branch.UP if update.gamma < 0 else Branch.LEVEL
     if rule.rule == UpdatingRuleKind.CONTRACTION:
         return Branch.CONTRACTION
     if rule.rule == UpdatingRuleKind.OUTSIDE:
         return Branch.OUTSIDE
     raise NotImplementedError(f"no words for the rule {rule.rule} of the updating period: add a branch")
-
-
-def _by_sign(gamma: float) -> Branch:
-    if gamma > 0:
-        return Branch.DOWN
-    return Branch.UP if gamma < 0 else Branch.LEVEL
 
 
 def _was_played(update: Optimization, before: Optimization) -> bool:

@@ -161,7 +161,13 @@ class OperatorDesk:
             UsageError: It is not possible now.
             LinkError: The service does not answer.
         """
-        self._check(command)
+        if isinstance(command, FaultSensor) and not self._training:
+            raise UsageError("sensor faults are offered only where hmi.training is switched on")
+        if isinstance(command, SetSetpoint):
+            limits = self._model.limits
+            low, high = limits.input_low[command.place], limits.input_high[command.place]
+            if high > low:  # they are known
+                check_bounds(command, low, high)
         token = secrets.token_urlsafe(16)
         text = f"{command.text}{self._consequences(command)}"
         premises = await self._premises(command)
@@ -174,15 +180,6 @@ class OperatorDesk:
     async def _premises(self, command: Command) -> Premises:
         async with connected(self._clients(WORK[type(command)][0])) as clients:
             return await read_premises(clients, command)
-
-    def _check(self, command: Command) -> None:
-        if isinstance(command, FaultSensor) and not self._training:
-            raise UsageError("sensor faults are offered only where hmi.training is switched on")
-        if isinstance(command, SetSetpoint):
-            limits = self._model.limits
-            low, high = limits.input_low[command.place], limits.input_high[command.place]
-            if high > low:  # they are known
-                check_bounds(command, low, high)
 
     def _consequences(self, command: Command) -> str:
         """Return what a command means at present, beyond its own words."""

@@ -1,13 +1,21 @@
 """A watchdog that counts ticks of plant time: the watched client triggers it, otherwise it expires."""
 
+from dataclasses import dataclass
+
 from coldloop.registers import safety
 
 
+@dataclass(slots=True, init=False, eq=False)
 class Watchdog:
     """Expires when it has not been triggered for `time` ticks; 0 is off. A trigger starts it again."""
 
+    time: int
+    triggered: int
+    lowest: int
+    expired: bool
+    trips: int
+
     def __init__(self, time: int) -> None:
-        self.triggered = 0
         self.trips = 0
         self.set(time, 0)
 
@@ -20,9 +28,7 @@ class Watchdog:
 
     def trigger(self, tick: int) -> None:
         """Trigger it at `tick`."""
-        self.lowest = min(self.lowest, self._remaining(tick))
-        self.triggered = tick
-        self.expired = False
+        trigger(self, tick)
 
     def set_back(self, tick: int) -> None:
         """Set the time back to a tick before the present one."""
@@ -30,19 +36,33 @@ class Watchdog:
 
     def check(self, tick: int) -> bool:
         """Return whether it expires at `tick`; once for each time that it does."""
-        if not self.time or self.expired or self._remaining(tick) > 0:
+        if not expires(self, tick):
             return False
         self.expired = True
         self.lowest = 0
         self.trips += 1
         return True
 
-    def _remaining(self, tick: int) -> int:
-        return min(self.time, max(0, self.time - (tick - self.triggered)))
-
     def registers(self, tick: int) -> safety.WatchdogStatus:
         """Return what its registers show at `tick`."""
         running = safety.WatchdogState.RUNNING if self.time else safety.WatchdogState.OFF
         state = safety.WatchdogState.EXPIRED if self.expired else running
-        remaining = 0 if self.expired else self._remaining(tick)
-        return safety.WatchdogStatus(self.time, state, remaining, self.lowest, self.trips & 0xFFFF)
+        left = 0 if self.expired else remaining(self, tick)
+        return safety.WatchdogStatus(self.time, state, left, self.lowest, self.trips & 0xFFFF)
+
+
+def remaining(watchdog: Watchdog, tick: int) -> int:
+    """Return the ticks until it expires. It and what follows are plain Python that the rig compiles too."""
+    return min(watchdog.time, max(0, watchdog.time - (tick - watchdog.triggered)))
+
+
+def expires(watchdog: Watchdog, tick: int) -> bool:
+    """Return whether it expires at a tick."""
+    return watchdog.time > 0 and not watchdog.expired and remaining(watchdog, tick) <= 0
+
+
+def trigger(watchdog: Watchdog, tick: int) -> None:
+    """Trigger it at `tick`."""
+    watchdog.lowest = min(watchdog.lowest, remaining(watchdog, tick))
+    watchdog.triggered = tick
+    watchdog.expired = False

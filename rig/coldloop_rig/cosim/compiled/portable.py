@@ -1,39 +1,28 @@
-"""Lets kernels call the control PLC's arithmetic, which is plain Python (that PLC runs without numba), and be exported.
+"""Lets kernels call the control PLC's scan, which is plain Python (that PLC runs without numba), and be exported.
 
 Rounding to single precision has a form of its own for numba.
 """
 
 from collections.abc import Callable
+from inspect import isfunction
 from typing import Any, Final
 
 import numpy as np
 from numba.extending import overload, register_jitable
 
 from coldloop.kernels import single_precision
-from coldloop_control_plc import output_limits, sensors
+from coldloop.safety import watchdog
+from coldloop_control_plc import alarms, output_limits, player, program, sensors
 
 PORTABLE: Final[tuple[Callable[..., Any], ...]] = (
     single_precision.neighbour,
-    output_limits.admit,
-    output_limits.admits,
-    output_limits.are_near,
-    output_limits.begin,
-    output_limits.change,
-    output_limits.copy_state,
-    output_limits.in_range,
-    output_limits.is_reached,
-    output_limits.judge,
-    output_limits.nearest,
-    output_limits.rate_share,
-    output_limits.resume,
-    output_limits.same,
-    sensors.are_inside,
-    sensors.have_moved,
-    sensors.is_frozen,
-    sensors.is_to_move,
-    sensors.note_moves,
-    sensors.moved,
-    sensors.count_unchanged,
+    program.observe,
+    *(
+        function
+        for module in (alarms, output_limits, player, sensors, watchdog)
+        for name, function in vars(module).items()
+        if isfunction(function) and function.__module__ == module.__name__ and not name.startswith("_")
+    ),
 )
 
 for function in PORTABLE:

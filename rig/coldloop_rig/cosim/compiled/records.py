@@ -1,13 +1,17 @@
-"""The numbers that ordinary ticks change, as records and arrays that kernels overwrite."""
+"""What compiled loops take and overwrite: the state of the scan as records, constants, the trace, reports."""
 
-from typing import Any, Final, NamedTuple
+from collections.abc import Sequence
+from dataclasses import fields
+from functools import cache
+from typing import Any, Final, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.process.declaration import Process
 from coldloop_control_plc.output_limits import Limits
-from coldloop_control_plc.sensors import Kinds
+from coldloop_control_plc.program import Scan, ScanConstants
+from coldloop_optimizer_plc.decisions import Latched, Starts
 from coldloop_optimizer_plc.rules import UpdatingRule
 from coldloop_optimizer_plc.scheme import Constants, OptimizerState
 
@@ -15,44 +19,65 @@ Array = NDArray[np.float64]
 
 BLOCK_TICKS: Final = 512
 """Ticks that a loop does at most before it returns: a signal waits for no more."""
-NOT: Final = -1
-"""Tick of what is not."""
+KINDS: Final = {int: "i8", float: "f8", bool: "?"}
+FLAGS: Final = "u1"
+"""Kind of a list of flags: numba has none of truth values within records."""
 
 
-def guard_type(limits: Limits) -> np.dtype[Any]:
-    """Return the record of a `coldloop_control_plc.output_limits.GuardState`."""
-    inputs, ticks = len(limits.low), limits.ticks_per_sample
-    return np.dtype([
-        ("applied", "f8", (inputs,)), ("anchor", "f8", (inputs,)), ("coming", "f8", (inputs,)),
-        ("moves", "i8", ticks), ("before", "f8", (ticks, inputs)),
-        ("moved", "i8"), ("start", "i8"), ("share", "f8"), ("oldest", "i8"), ("out_of_bounds", "?"),
-    ])  # fmt: skip
+Records = Any
+"""`Scan` with records in the place of its parts, or one of these."""
 
 
-def scan_type(process: Process) -> np.dtype[Any]:
-    """Return the record of the control PLC and the load.
+@cache
+def _kinds(part: type) -> dict[str, str]:
+    """Return the fields of a part of the scan's state and their kinds, where lists have those of their numbers."""
+    kinds, hints = {}, get_type_hints(part)
+    for field in fields(part):
+        hint = hints[field.name]
+        while inner := get_args(hint):
+            (hint,) = inner
+        kinds[field.name] = FLAGS if hint is bool is not hints[field.name] else KINDS[hint]
+    return kinds
 
-    first: tick of the trace's first row. tick: the next scan. next_update, updates: tick and number of the next
-    update. update_tick, update_load, u_before: the one under way, and what was applied before it. load_step: change of
-    the load that interrupts it, or 0. number, first_tick, length, tau_u: the sequence being played. accepted: sequences
-    accepted. triggered, lowest: the optimiser's watchdog. since: since when each band alarm is about to change.
-    unchanged, rests, seen, inputs, inputs_moved: of the sensor check. image_count, image_moved, image_inputs: of its
-    watch of the image. seen_x, seen_load: of the tick before the trace's first row. same: the image is unchanged.
-    load_index: step of the load that holds. solved: reports made. short, suspects: sign of the shortage, and suspects,
-    of the last plan.
-    """
-    inputs, outputs, states = len(process.inputs), len(process.outputs), len(process.states)
-    return np.dtype([
-        ("first", "i8"), ("tick", "i8"), ("next_update", "i8"), ("updates", "i8"), ("update_tick", "i8"),
-        ("update_load", "f8"), ("load_step", "f8"), ("u_before", "f8", (inputs,)), ("number", "i8"),
-        ("first_tick", "i8"), ("length", "i8"), ("tau_u", "i8"), ("accepted", "i8"), ("triggered", "i8"),
-        ("lowest", "i8"), ("since", "i8", (len(process.bands),)),
-        ("unchanged", "i8", (outputs,)), ("rests", "i8", (outputs,)),
-        ("seen", "f8", (outputs,)), ("seen_x", "f8", (states,)), ("seen_load", "f8"), ("same", "?"),
-        ("image_count", "i8"), ("image_moved", "?"), ("image_inputs", "f8", (inputs,)),
-        ("inputs", "f8", (outputs, inputs)), ("inputs_moved", "i8", (outputs,)), ("load_index", "i8"),
-        ("solved", "i8"), ("short", "f8"), ("suspects", "i8"),
-    ])  # fmt: skip
+
+def record_of(part: Any, count: int = 1) -> Records:  # noqa: ANN401 its class
+    """Return so many records of a part of the scan's state, the first of which holds it."""
+    kinds = _kinds(part.__class__)
+    records = np.zeros(count, [(name, kind, np.shape(getattr(part, name))) for name, kind in kinds.items()])
+    write(part, records)
+    return records
+
+
+def write(part: Any, records: Records) -> None:  # noqa: ANN401 its class
+    """Write a part of the scan's state into the first record."""
+    record = records[0]
+    for name in _kinds(part.__class__):
+        record[name] = getattr(part, name)
+
+
+def restore(part: Any, records: Records) -> None:  # noqa: ANN401 its class
+    """Overwrite a part of the scan's state by the first record."""
+    record = records[0]
+    for name, kind in _kinds(part.__class__).items():
+        value, present = record[name].tolist(), getattr(part, name)
+        if isinstance(present, list):
+            present[:] = map(bool, value) if kind == FLAGS else value
+        else:
+            setattr(part, name, value)
+
+
+def scan_records(scan: Scan) -> Records:
+    """Return the state of the scan as records, with room for a twin of the guard's."""
+    return Scan(*(record_of(part, 2 if part is scan.guard else 1) for part in scan))
+
+
+def as_arrays(constants: Any) -> Any:  # noqa: ANN401 named tuples
+    """Return a tuple of constants with arrays in the place of sequences; limits stay as they are."""
+    if isinstance(constants, Limits) or not isinstance(constants, Sequence):
+        return constants
+    if hasattr(constants, "_fields"):
+        return type(constants)(*map(as_arrays, constants))
+    return np.array(constants)
 
 
 PlantState = Any
@@ -75,29 +100,8 @@ class World(NamedTuple):
     load_ticks: NDArray[np.int64]
     """First tick of each step of the load."""
     load_watts: Array
-    limits: Limits
-    low: Array
-    """Lowest value in the range of a sensor, shape (outputs,)."""
-    high: Array
-    least: NDArray[np.int64]
-    """Ticks for which each output is at least unchanged before it is frozen, shape (outputs,)."""
-    controlled: NDArray[np.bool_]
-    """Which outputs have a band, shape (outputs,)."""
-    kinds: Kinds
-    moves: Array
-    """How far an input must have moved for something to be seen of it, shape (inputs,)."""
-    may_rest: bool
-    """Nothing may be measured to move while the inputs do not."""
-    each_may_rest: bool
-    """Nor need an output move while others do, then."""
-    frozen_ticks: int
-    """Ticks for which the image is at least unchanged before it is an old one."""
-    least_load: float
-    largest_load: float
-    watchdog: int
-    """Time-out, ticks; 0 is off."""
-    load_step: float
-    """Change of the load that interrupts an updating period, W, or 0."""
+    scan: ScanConstants
+    """With arrays."""
 
 
 class Optimizer(NamedTuple):
@@ -107,20 +111,18 @@ class Optimizer(NamedTuple):
     method: Any
     """Of a solver of our own."""
     rule: UpdatingRule
+    starts: Starts
     memory: OptimizerState
     """Its state, which is overwritten."""
+    latched: Latched
+    """Room for an update."""
 
 
-class Alarms(NamedTuple):
-    """The band alarms as they are until one of them changes; arrays are of shape (bands,)."""
-
-    low: Array
-    high: Array
-    places: NDArray[np.int64]
-    """The output of each."""
-    active: NDArray[np.bool_]
-    delays: NDArray[np.int64]
-    """Ticks until each alarm follows its condition."""
+FIRST: Final = 0
+TICK: Final = 1
+LOAD: Final = 2
+SOLVED: Final = 3
+"""Places in the counts of a loop: tick of the trace's first row, the next tick, step of the load, reports made."""
 
 
 class Trace(NamedTuple):

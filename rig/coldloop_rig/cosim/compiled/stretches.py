@@ -1,4 +1,4 @@
-"""Does stretches of ordinary ticks in compiled loops, on behalf of the three programs."""
+"""Does stretches of ticks in compiled loops, on behalf of the three programs."""
 
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
@@ -7,22 +7,29 @@ import numpy as np
 
 from coldloop.kernels.compiled import is_compiled
 from coldloop.process.load_profile import LoadProfile
-from coldloop.registers.control_plc import Verdict
+from coldloop.registers.control_plc import SEQUENCE_ROWS, Update, Verdict
 from coldloop.registers.optimizer_plc import Optimization
+from coldloop.registers.plant import Measurement
 from coldloop_control_plc.program import ControlProgram
+from coldloop_optimizer_plc.decisions import Latched, Starts
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.solvers import KernelSolver
 from coldloop_plant.program import PlantProgram
-from coldloop_rig.cosim.compiled import control, loops
+from coldloop_rig.cosim.compiled import loops
 from coldloop_rig.cosim.compiled.plants import CompiledPlant
 from coldloop_rig.cosim.compiled.records import (
     BLOCK_TICKS,
+    SOLVED,
+    TICK,
     Optimizer,
-    PlantState,
     Reports,
     World,
+    as_arrays,
     empty_reports,
     empty_trace,
+    restore,
+    scan_records,
+    write,
 )
 from coldloop_rig.results.recording import NO_STATION, STATION_COLUMNS, SampleBlock
 
@@ -35,6 +42,8 @@ class Stretch(NamedTuple):
 
     block: SampleBlock
     updates: list[Optimization]
+    latched: Update | None
+    """Latched in the last tick, and without a plan."""
 
 
 class CompiledStretches:
@@ -61,97 +70,88 @@ class CompiledStretches:
     ) -> None:
         self._plant, self._compiled, self._control, self._optimizer = plant, compiled, control_plc, optimizer_plc
         process = control_plc.alarm_settings.process
-        self._is_compiled = _is_compiled(optimizer_plc)
+        self._updates_too = _is_compiled(optimizer_plc)
         self._may_compile = may_compile
         self._is_there: dict[Callable[..., int], bool] = {}
         self._trace, self._reports = empty_trace(process, STATION_COLUMNS if plant.station else 0), empty_reports()
+        self._rows = np.zeros((2, SEQUENCE_ROWS, len(process.inputs)))
+        self._scans = scan_records(control_plc.scan)
         self._pause_until = 0
-        sensors = control_plc.sensors
+        real = optimizer_plc.state.u.dtype
+        u_before, u, y, x, ahead = (
+            np.zeros(len(part), real) for part in (process.inputs, process.inputs, process.outputs, process.states, ())
+        )
+        self._latched = Latched(0, 0, 0, real.type(0.0), u_before, u, y, x, ahead)
         self._world = World(
             compiled.constants, plant.biases, plant.deviations, np.array(load.times), np.array(load.watts),
-            control_plc.guard.limits, np.array(sensors.low), np.array(sensors.high), np.array(sensors.least),
-            np.array(sensors.is_controlled), sensors.kinds, np.array(sensors.moves),
-            sensors.may_rest, sensors.each_may_rest, sensors.frozen_ticks, *process.load.stored_span,
-            control_plc.watchdog.time, optimizer_plc.settings.interrupting_load_step_w,
+            as_arrays(control_plc.scan_constants),
         )  # fmt: skip
 
     def ahead(self, until: int) -> Stretch | None:
-        """Do ordinary ticks before the tick `until`, at most a block; return them, or None if there are none."""
-        if self._control.tick < self._pause_until or not control.is_ordinary(self._control):
+        """Do ticks before the tick `until`, at most a block; return them, or None if there are none for the loop."""
+        program, o = self._control, self._optimizer
+        first, instant = program.tick, program.player.next_update_tick
+        if first < self._pause_until or not program.is_ordinary:
             return None
-        answered = self._control.player.has_answer
-        whole = self._is_compiled and not answered and _is_ordinary(self._optimizer)
-        if not whole and not answered and self._control.player.load_step:
-            return None  # the programs deliver at once what a load step may cut off
-        if not whole:
-            until = min(until, self._control.player.next_update_tick)
-        until = min(until, (self._control.tick // BLOCK_TICKS + 1) * BLOCK_TICKS)
-        until = int(min(until, control.due(self._control)))
-        ticks = until - self._control.tick
-        with self._plant.noise(ticks) as noise:
-            plant = self._compiled.state(noise, ticks)
-            stretch = self._updates_too(plant, until) if whole else self._ticks_alone(plant, until)
-        if stretch is None:  # the programs run alone to the next updating instant
-            self._pause_until = self._control.player.next_update_tick
-        return stretch
+        if not self._updates_too and (program.awaiting_sequence or instant - first < SHORTEST):
+            return None
+        until = int(min(until, (first // BLOCK_TICKS + 1) * BLOCK_TICKS, program.alarms.next_report))
+        for slot, sequence in enumerate(program.player.sequences):
+            if sequence is not None:
+                self._rows[slot, : len(sequence.rows)] = sequence.rows
+        scans, counts = self._scans, np.array([first, first, 0, 0])
+        for part, records in zip(program.scan, scans, strict=True):
+            write(part, records)
+        with self._plant.noise(until - first) as noise:
+            plant = self._compiled.state(noise, until - first)
+            loop: Callable[..., int] = loops.play
+            further: tuple[Any, ...] = (scans, self._rows, plant, self._trace)
+            if self._updates_too:
+                starts = Starts(o.rule.first, o.rule.after_interruption())
+                parts = Optimizer(o.constants, o.method, o.rule, starts, o.state, self._latched)
+                loop, further = loops.run_block, (parts, scans, self._rows, plant, self._trace, self._reports)
+            outcome = self._run(loop, self._world, *further, counts, until)
+            ticks = int(counts[TICK]) - first
+            if ticks:
+                self._compiled.restore(plant, int(counts[TICK]), scans.guard[0]["applied"])
+        if not ticks:  # the programs run alone to the next updating instant
+            self._pause_until = instant
+            return None
+        latched = self._give_back(first, ticks, outcome)
+        load, u, y, x, station = (part[:ticks].copy() for part in self._trace)
+        block = SampleBlock(first, load, u, y, x, station if station.size else NO_STATION)
+        return Stretch(block, _optimizations(self._reports, int(counts[SOLVED])), latched)
 
-    def _ticks_alone(self, plant: PlantState, until: int) -> Stretch | None:
-        """Play on to the next updating instant, where that is worth while."""
-        program, sequence = self._control, self._control.player.sequence
-        if sequence is None or program.player.next_update_tick - program.tick < SHORTEST:
-            return None
-        scans, guards = control.scan_record(program), control.guard_records(program.guard.state, program.guard.limits)
-        rows, alarms = control.sequence_rows(sequence), control.alarms_of(program)
-        if not self._run(loops.play, self._world, alarms, scans, guards, rows[0], plant, self._trace, until):
-            return None
-        s = scans[0]
-        if s["tick"] == s["first"]:
-            return None
-        return Stretch(self._give_back(plant, s, guards[0]), [])
-
-    def _updates_too(self, plant: PlantState, until: int) -> Stretch | None:
-        program, optimizer_plc, playing = self._control, self._optimizer, self._control.player.sequence
-        if playing is None:
-            raise RuntimeError("an ordinary update plays a sequence")
-        scans, guards = control.scan_record(program), control.guard_records(program.guard.state, program.guard.limits)
-        rows = control.sequence_rows(playing)
-        o = optimizer_plc
-        parts = Optimizer(o.constants, o.method, o.rule, o.state)
-        alarms = control.alarms_of(program)
-        if not self._run(
-            loops.run_block, self._world, alarms, parts, scans, guards, rows, plant, self._trace, self._reports, until
-        ):
-            return None
-        s = scans[0]
-        if s["tick"] == s["first"]:
-            return None
-        block, solved = self._give_back(plant, s, guards[0]), int(s["solved"])
-        if solved:
-            update = control.latched_update(program, s, self._trace)
-            sequence = control.played_sequence(s, update.update - 1, rows[0], optimizer_plc.model_digest)
-            program.player.take_over(sequence, update, int(s["next_update"]), int(s["accepted"]))
-            now = o.state.numbers[0]
-            program.shortage, program.suspects = float(np.float32(now["shortage"])), int(now["suspects"])
-        return Stretch(block, _optimizations(self._reports, solved))
-
-    def _run(self, loop: Callable[..., int], *arguments: Any) -> bool:  # noqa: ANN401 of each loop
-        """Run a loop; return whether it is there, for it may have to be compiled: that is asked once."""
+    def _run(self, loop: Callable[..., int], *arguments: Any) -> int:  # noqa: ANN401 of each loop
+        """Run a loop and return how it ended; it may have to be compiled: whether it is there is asked once."""
         if not self._may_compile:
             if loop not in self._is_there:
                 self._is_there[loop] = is_compiled(loop, *arguments)
             if not self._is_there[loop]:
-                return False
-        loop(*arguments)
-        return True
+                return loops.UNUSUAL
+        return loop(*arguments)
 
-    def _give_back(self, plant: PlantState, s: np.void, guard: np.void) -> SampleBlock:
-        """Hand the state of the loop back to plant and control PLC; return the ticks it has run."""
-        self._compiled.restore(plant, int(s["tick"]), guard["applied"])
-        control.restore_guard(self._control, guard)
-        control.restore_scan(self._control, s, self._trace)
-        ticks = int(s["tick"]) - int(s["first"])
-        load, u, y, x, station = (part[:ticks].copy() for part in self._trace)
-        return SampleBlock(int(s["first"]), load, u, y, x, station if station.size else NO_STATION)
+    def _give_back(self, first: int, ticks: int, outcome: int) -> Update | None:
+        """Let the control PLC continue behind the ticks of a loop; return an update that awaits its plan."""
+        program, player, u = self._control, self._control.player, self._trace.u[:ticks].tolist()
+        befores = [program.applied, *map(tuple, u)]
+        for part, records in zip(program.scan, self._scans, strict=True):
+            restore(part, records)
+        place, update = player.update_tick - first, None
+        if place >= 0:
+            m = self._measurement(first, place)
+            update = Update(
+                session=m.session, update=player.update_number, tick=m.tick, playing=player.playing, load=m.load,
+                u_before=befores[place], u=m.u, y=m.y, x=m.x,
+            )  # fmt: skip
+        player.continue_from(self._rows, update)
+        concluded = outcome != loops.OBSERVED
+        latched = program.take_over(self._measurement(first, ticks - 1), befores[ticks - 1], concluded=concluded)
+        return update if outcome == loops.LATCHED else latched
+
+    def _measurement(self, first: int, row: int) -> Measurement:
+        u, y, x = (tuple(part[row].tolist()) for part in (self._trace.u, self._trace.y, self._trace.x))
+        return Measurement(first + row, float(self._trace.load[row]), y, x, self._control.session, u)
 
 
 def _is_compiled(program: OptimizerProgram) -> bool:
@@ -159,12 +159,6 @@ def _is_compiled(program: OptimizerProgram) -> bool:
     if type(program) is not OptimizerProgram:  # who has made another kind of it wants to be asked
         return False
     return isinstance(program.solver, KernelSolver) and not (program.plans_by_steps or program.process.forecasts)
-
-
-def _is_ordinary(program: OptimizerProgram) -> bool:
-    """Tell whether the update under way is one of many: what is played began at its instant."""
-    now, playing = program.state.numbers[0], program.state.playing.numbers[0]
-    return bool(now["planned"] and playing["length"] and playing["first_tick"] == now["tick"])
 
 
 def _optimizations(reports: Reports, solved: int) -> list[Optimization]:
