@@ -43,8 +43,7 @@ def main() -> None:
             place.set_ylabel(label)
             legend_above(place)
         axes[-1].set_xlabel("plant time (h)")
-        figure.align_ylabels(axes)
-        figure.savefig(options.figure, dpi=260)
+    figure.savefig(options.figure, dpi=260)
 
 
 if __name__ == "__main__":

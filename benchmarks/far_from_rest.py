@@ -20,8 +20,8 @@ from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.program import PlantProgram
 from coldloop_plant.settings import PlantSettings
-from coldloop_rig.figures.plot import COLOURS
-from coldloop_studies.drawing import panels
+from coldloop_rig.figures.plot import COLOURS, DASHES
+from coldloop_studies.drawing import legend_outside, panels
 
 HEADER = own_header(DEFAULT_MODEL_FILE)
 COLUMNS = ("minute", "L1", "T1", "T5", "P12", "P11", "lost", "imbalance")
@@ -51,7 +51,7 @@ CASES = {
     "no load": Case(180, _load(0.0)),
     "250 W more": Case(120, _load(HEADER.w0 + 250.0)),
     "both compressors off": Case(11, events=(("nc1", 0.0), ("nc2", 0.0))),
-    "a leak of 50 g per s": Case(16, events=(("leak", 50.0),)),
+    "leak, 50 g per s": Case(16, events=(("leak", 50.0),)),
 }
 
 
@@ -100,14 +100,14 @@ def draw(figure_file: Path, folders: list[Path]) -> None:
             for folder, colour in zip(folders, COLOURS[len(folders) - 1 :: -1], strict=False):
                 table = np.loadtxt(folder / f"{name}.csv", delimiter=",", skiprows=1)
                 for place, values in zip(column, table[:, 1:].T, strict=True):
-                    place.plot(table[:, 0], values, color=colour, linewidth=0.9, label=folder.name)
+                    place.plot(table[:, 0], values, color=colour, linestyle=DASHES[colour], linewidth=0.9,
+                               label=folder.name)  # fmt: skip
             column[-1].set_xlabel("plant time (min)")
         first = axes[:: len(names)]
         for place, label in zip(first, LABELS, strict=True):
             place.set_ylabel(label)
-        first[0].legend(fontsize=7)
-        figure.align_ylabels(first)
-        figure.savefig(figure_file, dpi=110)
+        legend_outside(figure, first[0])
+    figure.savefig(figure_file, dpi=200)
 
 
 def main() -> None:

@@ -71,7 +71,7 @@ def test_every_benchmark_is_run_by_a_test() -> None:
         *(one.partition(".")[0] for one in TIMED),
         *re.findall(r'printed_by\("(\w+)\.py"', Path(__file__).read_text(encoding="utf-8")),
     }
-    parts = {"qp_peers", "page_rig"}  # of qp_solvers and page_truth
+    parts = {"qp_peers", "page_rig", "bare_link"}  # of qp_solvers, page_truth and lockstep
     assert named | parts == {file.stem for file in FOLDER.glob("*.py")}
 
 

@@ -28,9 +28,9 @@ def _declare(parser: argparse.ArgumentParser) -> None:
         ("hdf5", "run.h5, with a group for each of them (needs h5py)"),
     ):
         kinds.add_argument(f"--{kind}", dest="kind", action="store_const", const=kind, help=text)
-    kinds.add_argument("--target", choices=("c", "st", "plcopen"), help="with plc: as C99 the whole optimiser in single"
-                       " precision and its ODE-based solver, as Structured Text (IEC 61131-3), or as PLCopen XML of"
-                       " that; with golden vectors and self-tests")  # fmt: skip
+    kinds.add_argument("--target", choices=("c", "st", "plcopen"), help="with plc: the whole optimiser in single"
+                       " precision, its ODE-based solver alone and the output guard, as C99, as Structured Text"
+                       " (IEC 61131-3), or as PLCopen XML of that; with golden vectors and self-tests")  # fmt: skip
     parser.add_argument("--out", type="into", metavar="FOLDER", help="where to (default: the folder of the run)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
     parser.add_argument("--plc", type="name", metavar="PLC", help="with plc: a profile, as of coldloop budget: the"

@@ -36,6 +36,7 @@ def panels(rows: int, columns: int, height_in: float, *, sharex: bool = False) -
         figure = Figure(figsize=(COLUMN_IN if columns == 1 else PAGE_IN, height_in), layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, sharex="col" if sharex else False)
         yield figure, list(np.ravel(axes))
+        figure.align_ylabels()
         label_marks(figure)
 
 
@@ -104,7 +105,8 @@ def time_panels(outcomes: Sequence[tuple[str, Outcome]], bands: Sequence[tuple[f
         for (label, outcome), colour in zip(outcomes, COLOURS, strict=False):
             hours = outcome.series("time_s") / 3600
             for name, _ in shown[1:7]:
-                place[name].plot(hours, outcome.series(name), color=colour, linewidth=0.9, label=label)
+                place[name].plot(hours, outcome.series(name), color=colour, linestyle=DASHES[colour], linewidth=0.9,
+                                 label=label)  # fmt: skip
             _updates(place, label, outcome, colour)
         _, first = outcomes[0]
         place["load"].plot(first.series("time_s") / 3600, first.series("load"), color=INK, linewidth=0.9, label="load")
@@ -121,7 +123,6 @@ def time_panels(outcomes: Sequence[tuple[str, Outcome]], bands: Sequence[tuple[f
         legend_outside(figure, place["cost"])
         axes[-1].set_xlabel("plant time (h)")
         axes[-1].set_xlim(0, float(first.series("time_s")[-1]) / 3600)
-        figure.align_ylabels(axes)
     return figure
 
 
@@ -156,7 +157,6 @@ def over_time(title: str, runs: Sequence[tuple[str, Outcome]], shown: Mapping[st
         axes[0].set_title(title, loc="left")
         axes[-1].set_xlabel("plant time (min)")
         legend_outside(figure, axes[0])
-        figure.align_ylabels(axes)
     return figure
 
 
@@ -234,7 +234,7 @@ def hour_panels(
                 place.minorticks_off()
                 place.set_ylim(max(low, 0.8 * ticks[0]), high)
         legend_outside(figure, axes[0], columns)
-        for place in axes[-beside:]:
+        for place in axes[max(0, len(names) - beside) : len(names)]:
             place.set_xlabel("updating period (s)")
         for place in axes[len(names) :]:
             place.set_visible(False)

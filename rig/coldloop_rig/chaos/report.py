@@ -166,10 +166,6 @@ def _alarms(alarms: Sequence[RaisedAlarm], process: Process) -> str:
     return ", ".join(cells) or "none"
 
 
-MODE_COLOURS: Final = {
-    Mode.MPC: plot.INK, Mode.REST: "#7f9cb8", Mode.HOLD: "#d9a441", Mode.CLASSICAL: plot.ACCENT,
-    Mode.MANUAL: plot.THIRD,
-}  # fmt: skip
 MANY: Final = 24
 """More faults than this are marked, but not named."""
 
@@ -181,7 +177,7 @@ def plot_chaos(path: Path, experiment: Experiment) -> None:
     minutes = np.arange(trace.ticks) * process.tick_s / 60
     recording = trace.recording()
     bands = list(zip(design.output_low, design.output_high, strict=True))
-    with plot.styled({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False}):
+    with plot.styled():
         figure = Figure(figsize=(10, 10), layout="constrained")
         units: dict[str, list[int]] = {}  # inputs that have the same unit share a panel
         for number, unit in enumerate(process.input_units):
@@ -224,11 +220,11 @@ def _draw_modes(axes: Axes, trace: ChaosTrace) -> None:
     changes = [(event.tick, Mode(event.subject)) for event in trace.modes()]
     ends = [tick for tick, _ in changes[1:]] + [trace.ticks]
     for (tick, mode), end in zip(changes, ends, strict=False):
-        axes.axvspan(tick * tick_s / 60, end * tick_s / 60, color=MODE_COLOURS[mode], linewidth=0)
-    present = {mode for _, mode in changes}
+        axes.axvspan(tick * tick_s / 60, end * tick_s / 60, color=plot.MODE_COLOURS[mode.name.lower()], linewidth=0)
+    present = {mode.name.lower() for _, mode in changes}
     axes.legend(
-        handles=[Patch(color=colour, label=mode.name) for mode, colour in MODE_COLOURS.items() if mode in present],
-        loc="upper center", bbox_to_anchor=(0.5, -0.6), ncols=len(MODE_COLOURS), frameon=False,
+        handles=[Patch(color=colour, label=mode) for mode, colour in plot.MODE_COLOURS.items() if mode in present],
+        loc="upper center", bbox_to_anchor=(0.5, -0.6), ncols=len(plot.MODE_COLOURS),
     )  # fmt: skip
     axes.set_yticks([])
     axes.set_ylabel("mode")

@@ -116,10 +116,7 @@ def given_outputs(file: Process) -> Array:
 def from_matrices(file: Process, folder: Path, given: str) -> Linearised:
     """Return the model whose matrices are given: dx/dt = A x + B u + F w, y = C x + D u + G w.
 
-    Args:
-        file: The process file.
-        folder: Where it is.
-        given: An NPZ or JSON file there, or `file.py:NAME`, a state space.
+    `given` is an NPZ or JSON file in the folder, or `file.py:NAME`, a state space.
 
     Raises:
         ColdloopError: It cannot be read, or does not fit the signals.

@@ -42,11 +42,7 @@ PREFIX: Final = "mimic-"
 
 
 def drawing_of(path: Path, signals: Collection[str]) -> str:
-    """Return the drawing as it is in the model file.
-
-    Args:
-        path: An SVG file.
-        signals: Names that it may show.
+    """Return the drawing of an SVG file as it is in the model file; it may show these signals.
 
     Raises:
         UsageError: One line that names file, element and remedy.

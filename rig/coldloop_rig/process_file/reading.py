@@ -1,6 +1,5 @@
 """Reads a process file and what it names: sources of plants, courses of disturbances; or has its model file made."""
 
-import multiprocessing
 import signal
 import tempfile
 from collections.abc import Callable
@@ -8,9 +7,8 @@ from importlib.metadata import entry_points
 from importlib.util import decode_source, find_spec
 from itertools import pairwise
 from keyword import iskeyword
-from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from coldloop.config import load_configuration
 from coldloop.errors import ColdloopError, ConfigurationError, UsageError
@@ -20,6 +18,9 @@ from coldloop.process.sections import Disturbance, Forecast, Load
 from coldloop.table import TIME, read_table
 from coldloop.text_file import read_bytes
 from coldloop_rig.interruption import SIGNALS
+
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
 
 LISTING: Final = "`coldloop docs keys` lists all keys"
 RESERVED: Final = frozenset((
@@ -162,6 +163,8 @@ def text_of_child(path: Path, work: Callable[[], str], limit_s: int) -> str:
     Raises:
         ColdloopError: As the work does; or the child has crashed, or has taken longer than the limit.
     """
+    import multiprocessing  # noqa: PLC0415 a model file is read without
+
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
     with tempfile.TemporaryDirectory(prefix="coldloop-") as folder:  # whatever ends the child, nothing is left
@@ -187,7 +190,7 @@ def text_of_child(path: Path, work: Callable[[], str], limit_s: int) -> str:
     return found
 
 
-def _work(work: Callable[[], str], limit_s: int, folder: str, sender: Connection) -> None:
+def _work(work: Callable[[], str], limit_s: int, folder: str, sender: "Connection") -> None:
     tempfile.tempdir = folder
     for number in (*SIGNALS, signal.SIGALRM):
         signal.signal(number, signal.SIG_DFL)
@@ -198,16 +201,10 @@ def _work(work: Callable[[], str], limit_s: int, folder: str, sender: Connection
         sender.send(error)
 
 
-LIMIT_S: Final = 300
-"""How long a plant may take when its model is made."""
-
-
 def model_file_of(path: Path, *, in_child: bool = False) -> tuple[Path, list[str]]:
     """Return the model file of a process file or a model file, and warnings; that of a process file is made now.
 
-    Args:
-        path: What is named.
-        in_child: The plant runs in a process of its own, which ends it when it takes too long.
+    With `in_child` the plant runs in a process of its own, which ends it when it takes too long.
 
     Raises:
         ColdloopError: There is no such file, or no model can be made of it.
@@ -226,8 +223,6 @@ def model_file_of(path: Path, *, in_child: bool = False) -> tuple[Path, list[str
         made.model.save(out)
         return f"{out}\n{described(made)}"
 
-    from coldloop_rig.process_file.reading import text_of_child  # noqa: PLC0415
-
-    said = text_of_child(path, work, LIMIT_S) if in_child else work()
+    said = text_of_child(path, work, limit_s=300) if in_child else work()
     out, *lines = said.splitlines()
     return Path(out), [line for line in lines if line.startswith("warning")]

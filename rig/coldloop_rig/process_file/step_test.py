@@ -375,14 +375,7 @@ def _places(file: Process, moved: Sequence[Load | Disturbance]) -> list[int]:
 
 
 def model_identified(file: Process, found: Identified, y0: Array, moved: Sequence[Load | Disturbance]) -> Linearised:
-    """Return what was identified as the model of a process.
-
-    Args:
-        file: What the process file says.
-        found: Of its inputs, and of what moved beside them.
-        y0: Outputs at its operating point.
-        moved: The load, if it moved, and those of the other disturbances that did.
-    """
+    """Return what was identified, of inputs and of what moved beside them, as a process that rests at `y0`."""
     u, w = operating_point(file)
     n, m, p = len(found.A), len(u), len(y0)
     F = np.zeros((n, len(w)))

@@ -229,34 +229,24 @@ def lq_gains(J: RealArray, lag_s: float, weights: LqWeights) -> RealArray:
     return gains
 
 
-def rest_of(plant: Refrigerator = REFERENCE_REFRIGERATOR) -> Rest:
-    """Return the operating point of a refrigerator.
-
-    Raises:
-        NoEquilibriumError: It does not come to rest.
-    """
-    helium = load_helium()
-    cold = find_equilibrium(np.array(OPERATING_INPUTS), OPERATING_LEVEL, plant.box, helium)
-    return find_refrigerator_equilibrium(cold, plant, helium)
-
-
 def make_refrigerator_file(
     plant: Refrigerator = REFERENCE_REFRIGERATOR, weights: LqWeights | None = None, rest: Rest | None = None
 ) -> RefrigeratorFile:
-    """Return operating point and gains of a refrigerator at a rest, by default that of `rest_of`, which may raise."""
-    weights, rest = weights or LqWeights(), rest or rest_of(plant)
-    helium = load_helium()
+    """Return operating point and gains of a refrigerator at a rest, by default at the cold box's operating inputs.
+
+    Raises:
+        NoEquilibriumError: It does not come to rest there.
+    """
+    helium, weights = load_helium(), weights or LqWeights()
+    if rest is None:
+        cold = find_equilibrium(np.array(OPERATING_INPUTS), OPERATING_LEVEL, plant.box, helium)
+        rest = find_refrigerator_equilibrium(cold, plant, helium)
     J = jacobian(rest.x, rest.u, rest.v, rest.d, plant, helium)
     first, second = lq_gains(J, plant.station.actuator.lag, weights).tolist()
     return RefrigeratorFile(
-        parameters_digest=refrigerator_digest(plant, helium),
-        x0=tuple(rest.x.tolist()),
-        u0=tuple(rest.u.tolist()),
-        v0=tuple(rest.v.tolist()),
-        w0=float(rest.d[0]),
-        gains=(tuple(first), tuple(second)),
-        weights=weights,
-    )
+        parameters_digest=refrigerator_digest(plant, helium), w0=float(rest.d[0]), x0=tuple(rest.x.tolist()),
+        u0=tuple(rest.u.tolist()), v0=tuple(rest.v.tolist()), gains=(tuple(first), tuple(second)), weights=weights,
+    )  # fmt: skip
 
 
 KEPT: Final = (*range(STATE_NAMES.index("T_nef5") + 1), *LINES)

@@ -164,23 +164,17 @@ class RefrigeratorParameters(BoxParameters):
     @property
     def refrigerator(self) -> Refrigerator:
         """The refrigerator, in SI units."""
-        return Refrigerator(self.box, self._precooler, self._station)
-
-    @property
-    def _precooler(self) -> Precooler:
-        conductance, volume, wet_level, capacity, area, lag, fastest = self.nef5.si
+        conductance, volume, wet_level, capacity, area, feed_lag, feed_fastest = self.nef5.si
         bath = NitrogenBath(conductance, volume, wet_level, capacity, Valve(area))
-        return Precooler(self.nef6.component(NEF6_CELLS), bath, Actuator(lag, fastest))
-
-    @property
-    def _station(self) -> CompressionStation:
+        precooler = Precooler(self.nef6.component(NEF6_CELLS), bath, Actuator(feed_lag, feed_fastest))
         hp, lp, buffer, _, bypass, discharge, charge, lag, fastest, *rest = self.station.si
-        return CompressionStation(
+        station = CompressionStation(
             GasVolume(hp), GasVolume(lp), GasVolume(buffer),
             ScrewCompressor(*self.nc1.si), ScrewCompressor(*self.nc2.si),
             Valve(bypass), Valve(discharge), Valve(charge), Actuator(lag, fastest),
             self.hp_relief.component, self.lp_relief.component, self.buffer_relief.component, *rest,
         )  # fmt: skip
+        return Refrigerator(self.box, precooler, station)
 
 
 REFERENCE_REFRIGERATOR: Final = RefrigeratorParameters().refrigerator

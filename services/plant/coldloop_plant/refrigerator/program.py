@@ -114,7 +114,8 @@ def rest_in(document: dict[str, Any], plant: Refrigerator, path: str) -> Refrige
     try:
         file = RefrigeratorFile.model_validate(document)
     except ValidationError as error:
-        raise ModelFileError(f"{path}: {explained(error, {}, RefrigeratorFile, REMEDY)}") from error
+        wrong = explained(error, {}, RefrigeratorFile, "the file is incomplete")
+        raise ModelFileError(f"{path}: {wrong}; {REMEDY}") from error
     names, sizes = (file.state_names, file.command_names), list(map(len, (file.x0, file.u0, file.v0, *file.gains)))
     if names != (STATE_NAMES, COMMAND_NAMES) or sizes != [len(STATE_NAMES), 3, len(COMMAND_NAMES), 6, 6]:
         raise ModelFileError(f"{path}: made for a refrigerator with other states; {REMEDY}")
