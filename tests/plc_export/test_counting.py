@@ -93,6 +93,7 @@ def test_the_count_of_the_budget_is_that_of_the_export(recorded: GoldenVectors) 
     assert count.total == round(count.recorded.mean * len(recorded.vectors) * ITERATIONS)
 
 
+@pytest.mark.usefixtures("compiles")
 def test_updates_are_counted() -> None:
     found = counted_updates(recorder().optimizer, recorded_updates(60, "e"))
     assert set(found) == {"plan", "start", "finish"}
