@@ -28,13 +28,16 @@ INVERSE: Final = 0.1
 
 
 def described(made: Made) -> str:
-    """Return the description of a process and its linear model."""
+    """Return the description of a process and its model; first come how late an update may be and a warning."""
+    warnings = _warnings(made)
     lines = [
+        *_late(made),
+        *warnings[:1],
         *_rest(made),
         *made.linear.notes,
         *_modes(made),
         *_gains(made),
-        *_warnings(made),
+        *warnings[1:],
         f"model      sha256 {made.model.digest}",
     ]
     return "\n".join(lines) + "\n"
@@ -77,9 +80,14 @@ def _modes(made: Made) -> list[str]:
     lines = [f"modes      {'  '.join(texts[i : i + 8])} /s" for i in range(0, len(texts), 8)]
     if made.linear.error:
         lines.append(f"derivatives within {made.linear.error:.1e} of those with steps twice as wide")
-    if values[0].real <= 0.0:
-        lines.append(f"late       no mode grows: no period loses the plant{leaves_its_band(made.model, made.process)}")
     return lines
+
+
+def _late(made: Made) -> list[str]:
+    """Return that a plant without a mode that grows waits for any update; the first warning says it of another."""
+    if np.linalg.eigvals(made.own_A).real.max() > NOTHING:
+        return []
+    return [f"late       no mode grows: no period loses the plant{leaves_its_band(made.model, made.process)}"]
 
 
 def _gains(made: Made) -> list[str]:
