@@ -17,7 +17,7 @@ is made at the start, modules and types, stays."""
 def main() -> int:
     """Run the command line; return its exit code."""
     _open_closed_streams()
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of small matrices: more of them wait for each other
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: more threads wait for each other
     gc.set_threshold(OBJECTS_MADE)
     with INTERRUPTION:
         from coldloop_rig.cli import main as run  # noqa: PLC0415 this takes time

@@ -1,4 +1,4 @@
-"""What Ctrl-C, SIGTERM and the end of the terminal (SIGHUP) do to a command.
+"""Handling of Ctrl-C, SIGTERM and the end of the terminal (SIGHUP) in a command.
 
 A run takes them as a request to stop and writes what it has (`INTERRUPTION.passed_to`). Anything else ends at once:
 no exception is raised inside an import or a compiled kernel, where it would surface as a traceback.
@@ -106,7 +106,7 @@ def end_at_once(number: int) -> NoReturn:
 
 
 INTERRUPTION: Final = Interruption()
-"""That of the command line."""
+"""Interruption handler of the command line."""
 
 
 def run_until_interrupted(start: Callable[[], Coroutine[Any, Any, None]]) -> bool:

@@ -1,4 +1,4 @@
-"""What an operator's commands read of the configuration; it imports no service, for they are to answer at once."""
+"""Settings that an operator's commands read; no service is imported, so that they answer at once."""
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -20,7 +20,7 @@ class RigSection(BaseModel):
 
 
 class ServerPlace(BaseModel):
-    """What a client has to know of a service; its other keys are the service's."""
+    """Keys of a service that its clients need; the other keys are the service's own."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -28,7 +28,7 @@ class ServerPlace(BaseModel):
 
 
 class OperatorSettings(RootSettings):
-    """What an operator's client reads of a configuration."""
+    """Keys of a configuration that an operator's client reads."""
 
     limits: InputLimits = Field(default_factory=InputLimits)
     plant: ServerPlace = ServerPlace()

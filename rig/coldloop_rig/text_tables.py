@@ -15,7 +15,7 @@ from coldloop.errors import printable
 Cell = str | float | int
 
 SHA256: Final = re.compile("[0-9a-f]{64}")
-"""Of which a table shows the beginning."""
+"""Pattern of a SHA-256 digest, of which a table shows the first digits."""
 
 
 def aligned(rows: Sequence[Sequence[str]], *, numbers: bool = False) -> str:
@@ -45,7 +45,7 @@ def _cell(value: Cell) -> str:
 
 
 GAP: Final = re.compile(" {2,}")
-"""What lies between the columns of a table, in all of its rows."""
+"""Gap between the columns of a table."""
 
 
 class Colour(IntEnum):

@@ -1,1 +1,1 @@
-"""What tests of several folders share, and what is no fixture: programs as processes, and waiting for a condition."""
+"""Shared parts of the tests beside fixtures: programs as processes, and waiting for a condition."""

@@ -63,7 +63,7 @@ def folder_of(nodeid: str) -> str:
 
 
 class Use(NamedTuple):
-    """What one test has used."""
+    """Resources that one test has used."""
 
     test: str
     lane: str

@@ -62,14 +62,14 @@ COMPILED: Final[dict[str, tuple[str, ...]]] = {
     "single precision": (SINGLE,),
     "single precision, fixed": (SINGLE, f"{PROGRAM}updating_period_s=2.5", *NOISE),
 }
-"""Whose updates are compiled too."""
+"""Configurations whose updates are compiled too."""
 LEFT_TO_PROGRAMS: Final[dict[str, tuple[str, ...]]] = {
     "osqp": (f'{PROGRAM}solver="osqp"', f"{PROGRAM}updating_period_s=5"),
     "daqp": (f'{PROGRAM}solver="daqp"', *NOISE),
     "qpoases": (f'{PROGRAM}solver="qpoases"',),
     "qpoases and a refrigerator": (f'{PROGRAM}solver="qpoases"', REFRIGERATOR),
 }
-"""Whose ticks alone are compiled, where that is worth while."""
+"""Configurations of which only the ticks are compiled, where that is worth while."""
 UNUSUAL: Final[dict[str, tuple[str, ...]]] = {
     "narrow alarm bands": ("control_plc.alarms.bands.L1=[59.9,60.1]", "control_plc.alarms.bands.T5=[12,13]"),
     "sensors out of range": ("control_plc.sensors.level=[59.9,60.1]",),
@@ -82,7 +82,7 @@ UNUSUAL: Final[dict[str, tuple[str, ...]]] = {
     "an impatient watchdog": ("control_plc.ladder.optimizer_timeout_s=2",),
     "the classical loops": ('control_plc.driver="classical"',),
 }
-"""What leads back to the programs in some of the ticks, or in all of them."""
+"""Configurations that fall back to the programs in some of the ticks, or in all of them."""
 
 
 def lively(mean_load: float) -> LoadProfile:

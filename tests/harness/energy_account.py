@@ -23,11 +23,11 @@ from coldloop_plant.refrigerator.tick import act
 from tests.harness.refrigerator_energy import refrigerator_energy_rates
 
 CROSSED, SIZE, TO_BATH, WORST = range(4)
-"""What crossed the boundary inwards and its size (J), what the bath's rates brought it (J), and the largest difference
-between what crosses and what is stored (W)."""
+"""Places of the sums: energy that crossed the boundary inwards and its absolute sum (J), energy that the bath's rates
+brought it (J), and the largest difference between inflow and storage (W)."""
 WEIGHTS: Final = np.array([0.25 / 6.0, 0.25 / 3.0, 0.25 / 3.0, 0.25 / 6.0])
 AHEAD: Final = np.array([0.125, 0.125, 0.25, 0.0])
-"""Of the stages of a tick, s."""
+"""Steps to the next stages of a tick, s."""
 LP, TO_BOX, COMPRESSED = (SIGNAL_NAMES.index(name) for name in ("P11", "M12", "M_NC"))
 V1 = OUTPUT_NAMES.index("V1")
 

@@ -59,7 +59,7 @@ class Watch:
         _before(time, "sleep", self._sleep)
         original = selectors.DefaultSelector.select
 
-        def select(selector: Any, timeout: float | None = None) -> Any:  # noqa: ANN401 of the library
+        def select(selector: Any, timeout: float | None = None) -> Any:  # noqa: ANN401 types of the library
             ready = original(selector, timeout)
             if not ready and timeout is not None and timeout > 0:
                 self.waited_s += timeout
@@ -75,7 +75,7 @@ class Watch:
 
     @property
     def notes(self) -> list[str]:
-        """What the test has done so far."""
+        """Notes on what the test has done so far."""
         waited = [f"it waits {self.waited_s:.1f} s for the clock"] if self.waited_s > WAITED_S else []
         return [*dict.fromkeys(self._notes), *waited]
 
@@ -97,11 +97,11 @@ class _Compilations(event.Listener):
     def __init__(self, note: Callable[[str], None]) -> None:
         self._note = note
 
-    def on_start(self, happening: Any) -> None:  # noqa: ANN401 of numba
+    def on_start(self, happening: Any) -> None:  # noqa: ANN401 an event of numba
         """Note a kernel."""
         self._note(happening.data["dispatcher"].py_func.__qualname__)
 
-    def on_end(self, happening: Any) -> None:  # noqa: ANN401 of numba
+    def on_end(self, happening: Any) -> None:  # noqa: ANN401 an event of numba
         """Nothing: it has been noted."""
 
 

@@ -36,7 +36,7 @@ def modules() -> list[ModuleType]:
     found = []
     for package in PACKAGES:
         for info in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            with suppress(ImportError):  # what an extra brings
+            with suppress(ImportError):  # an extra may be missing
                 if not info.name.endswith("__main__"):
                     found.append(import_module(info.name))
     return found

@@ -31,7 +31,7 @@ ANSWERS: Final = {
         "what it leads to is written into",
     ),
 }  # fmt: skip
-"""By type of an option: what it is, and what is said or done."""
+"""Texts by the type of an option: its meaning, and the message or effect of each kind of path."""
 
 
 class PathOption(NamedTuple):

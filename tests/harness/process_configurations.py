@@ -16,11 +16,11 @@ class Case(NamedTuple):
     assignments: tuple[str, ...] = ()
     load: str = "0:0.1,400:0.8,900:-0.9"
     events: frozenset[str] = frozenset()
-    """That happen in it."""
+    """Kinds of events that happen in the run."""
     ticks: int = 1200
-    """Of 1500 that are compiled at least."""
+    """Least number of ticks, out of 1500, that are compiled."""
     updates: float = 0.8
-    """Share of those that are compiled at least."""
+    """Least share of the updates that are compiled."""
 
 
 ALARMS: Final = frozenset({"ALARM_RAISED", "ALARM_RETURNED"})

@@ -144,4 +144,4 @@ PROCESSES: Final[Mapping[str, Callable[[Path], Path]]] = {
     "foreseen": foreseen, "lags": lags, "short samples": short_samples,
     "record": lambda _: EXAMPLES / "quadruple_tank_record.toml", "fmu": fmu,
 }  # fmt: skip
-"""What makes the process file, in a folder."""
+"""Functions that make the process file in a folder, by the name of the process."""

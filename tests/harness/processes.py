@@ -19,7 +19,7 @@ END_S: Final = 60.0
 """A process that is told to end has failed when it takes longer; the machine may be busy with something else."""
 
 PROGRAM_S: Final = 900.0
-"""The same for lines of Python: kernels that are in no cache may have to be compiled."""
+"""Longest time of a program given as lines of Python, s: kernels that are in no cache may have to be compiled."""
 
 
 def environment(settings: BaseModel | None = None, more: Mapping[str, str] | None = None) -> dict[str, str]:
@@ -29,7 +29,7 @@ def environment(settings: BaseModel | None = None, more: Mapping[str, str] | Non
 
 
 class Ended(NamedTuple):
-    """What a program left behind that has ended."""
+    """Exit code and output of a program that has ended."""
 
     code: int
     out: str
@@ -57,7 +57,7 @@ class Process:
 
     @property
     def said(self) -> str:
-        """What it has written to its log so far."""
+        """Text that it has written to its log so far."""
         return self.log.read_text(encoding="utf-8", errors="replace")
 
     def pause(self) -> None:

@@ -11,7 +11,7 @@ from coldloop.registers.maps import maps_of
 R = TypeVar("R", bound=tuple[Any, ...])
 PLANT_MAP, CONTROL_MAP, OPTIMIZER_MAP = maps_of(COLD_BOX)
 MAPS: Final = maps_of(COLD_BOX).by_service
-"""By service."""
+"""Register maps by service."""
 
 
 class Row(NamedTuple):

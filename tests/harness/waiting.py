@@ -10,7 +10,7 @@ T = TypeVar("T")
 PATIENCE_S: Final = 120.0
 POLL_S: Final = 0.02
 LONGEST_POLL_S: Final = 10.0
-"""What a poll counts at most: a machine that stood still for minutes is not what is waited for."""
+"""Longest time that a poll counts: a machine suspended for minutes must not use up the patience."""
 
 
 def eventually(condition: Callable[[], T], what: str) -> T:

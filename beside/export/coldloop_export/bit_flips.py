@@ -1,4 +1,4 @@
-"""Which one-bit changes of an exported program's tables its self-test misses, in the image that a linker makes."""
+"""One-bit changes of an exported program's tables that its self-test misses, in the image that a linker makes."""
 
 import ctypes
 import re
@@ -19,20 +19,21 @@ PER_TABLE: Final = 8
 """Bits that are changed in each table, one at a time."""
 FLAGS: Final = ("-std=c99", "-ffp-contract=off", "-fno-pie", "-no-pie")
 PATIENCE_S: Final = 60.0
-"""After which a self-test is taken to hang, which is noticed."""
+"""Time after which a self-test counts as hanging, s; a change that makes it hang is noticed."""
 SCALARS: Final = {"float": ctypes.c_float, "double": ctypes.c_double, "int32_t": ctypes.c_int32, "bool": ctypes.c_bool}
 _SECTION: Final = re.compile(r"\[ *(\d+)\] (\.rodata|\.data\.rel\.ro)\S* +\S+ +([0-9a-f]+) ([0-9a-f]+) ")
 _OBJECT: Final = re.compile(r": ([0-9a-f]+) +(\w+) OBJECT +\w+ +\w+ +(\d+) ([A-Za-z]\w*)")
 
 
 class Flips(TypedDict):
-    """What became of changes of one bit."""
+    """Result of changing each bit in turn: how many changes there were, and which were missed."""
 
     changes: int
     missed: dict[str, list[int]]
     """Bytes in which one was missed, by table."""
     padding: dict[str, list[int]]
-    """Likewise, of bytes between the members of a structure, which no code reads."""
+    """Bytes of padding in which a change was missed, by table: they lie between the members of a structure, and no code
+reads them."""
 
 
 def require_compiler() -> None:
@@ -56,7 +57,7 @@ def scored(texts: Mapping[str, str]) -> dict[str, dict[str, Flips]]:
         for part, inside in PARTS.items():
             sources = [each for each in texts if each.startswith(inside) and "/" not in each.removeprefix(inside)]
             if not sources:
-                continue  # of a process with a forecast
+                continue  # for a process with a forecast
             folder = Path(made) / part
             folder.mkdir()
             for name in sources:

@@ -56,7 +56,7 @@ class Printer(tree.TreePrinter):
     # -- numbers -------------------------------------------------------------------------------------------------------
 
     def number(self, value: float) -> str:
-        """Return a number with a point such that it is read back with the same bits; what is not finite as a macro."""
+        """Return a number as a literal with a point, which keeps its bits; a non-finite one as a macro."""
         if np.isinf(value):
             return "-INFINITY" if value < 0 else "INFINITY"
         if np.isnan(value):
@@ -401,7 +401,7 @@ class ConstantRecords:
     def __init__(self, printer: Printer) -> None:
         self.printer = printer
         self.arrays: dict[str, Array] = {}
-        """By their names."""
+        """Arrays of constants, by name."""
         self.real, self.type = np.dtype(np.float32 if printer.single else np.float64), printer.scalars[Kind.REAL]
         self._sums: list[str] = []
         self._sum = crc(np.array([float(each.rstrip("f")) for each in printer.literals], self.real))

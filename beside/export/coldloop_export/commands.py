@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 PLC: Final = Path("plc")
 SAID: Final = {"export": "a run as CSV, MATLAB or HDF5; the optimiser as C99 or Structured Text"}
 GROUP: Final = {"export": "a run"}
-"""Where `coldloop --help` has it."""
+"""Group in which `coldloop --help` lists the command."""
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:

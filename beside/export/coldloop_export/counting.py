@@ -85,7 +85,7 @@ class CountedProgram:
         """Return a list that gets the operations of each further call of a function."""
         called, found = self[name], list[int]()
 
-        def noted(*arguments: Any) -> Any:  # noqa: ANN401 of any function
+        def noted(*arguments: Any) -> Any:  # noqa: ANN401 arguments of any function
             before = self._count[0]
             result = called(*arguments)
             found.append(self._count[0] - before)
@@ -203,7 +203,7 @@ class _Printer:
         parts = [self._of(each) for each in operation.operands]
         match operation.operator:
             case "min" | "max" as name:
-                return f"{name}({', '.join(parts)})"  # of two that are equal the first one, as in the kernels
+                return f"{name}({', '.join(parts)})"  # the first of two equal ones, as in the kernels
             case "and" | "or" as name:
                 return f"({parts[0]} {name} {self._conditional(operation.operands[1])})"
             case name if name in CALLED:
@@ -259,9 +259,9 @@ def operations_in(expression: Expression) -> int:
 
 REAL: Final = real_of(Arithmetic.FLOAT32)
 NEAR: Final = REAL(0.01)
-"""Of the bounds to the guess, where they are to cut a step."""
+"""Distance from the guess to bounds that are to cut a step."""
 FAR: Final = REAL(1e6)
-"""Of bounds and rows that have no effect."""
+"""Distance of bounds and rows that have no effect."""
 COUNTS: Final = np.arange(1, ITERATIONS + 1)
 ITERATION: Final = "descend"
 """The kernel that a call does one iteration by."""
@@ -276,7 +276,7 @@ class IterationCounts(NamedTuple):
     worst: int
     """Every row is active at each point, no variable is held, a bound cuts the step, and the step is taken."""
     total: int
-    """Of all recorded ones."""
+    """Sum over all recorded calls."""
 
 
 class Counter:

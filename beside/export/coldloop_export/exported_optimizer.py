@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 PREFIX: Final = "export:"
 FOLDER: Final = "optimizer"
-"""In the folder of an export: the whole optimiser."""
+"""Folder of the whole optimiser within that of an export."""
 MANIFEST: Final = "manifest.json"
 FORMAT: Final = 1
 MOST_BYTES: Final = 2**26
@@ -139,7 +139,7 @@ class ExportedProgram(OptimizerProgram):
 
 
 class _Manifest(BaseModel):
-    """What is read of the manifest of an export."""
+    """Keys of an export's manifest that are read here."""
 
     model_config = ConfigDict(extra="ignore", strict=True)
 

@@ -84,7 +84,7 @@ FUNCTIONS: Final[dict[object, str]] = {
     round: "round", single: "single",
 }  # fmt: skip
 OPERANDS: Final = {"min": 2, "max": 2, "copysign": 2}
-"""At least, of functions that take more than one."""
+"""Least number of operands of functions that take more than one."""
 OF_PLATFORM: Final = ("power", "log")
 """Operators whose bits are those of the platform's library."""
 LARGEST_INTEGER: Final = 2**31 - 1
@@ -122,7 +122,7 @@ class Shape(Untyped):
 
 @dataclass(frozen=True)
 class Python(Untyped):
-    """What a global name means: a module, a kernel, a function of Python's or numpy's."""
+    """Value of a global name: a module, a kernel, a function of Python's or numpy's."""
 
     value: object
 
@@ -134,7 +134,7 @@ class Record(Untyped):
     name: str
     parts: tuple[tuple[str, "Value"], ...]
     variable: Name | None = None
-    """Where it is a record of the tree."""
+    """Variable of the tree that holds the record; None if it has none."""
 
 
 @dataclass(frozen=True)

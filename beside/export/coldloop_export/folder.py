@@ -1,4 +1,4 @@
-"""What is exported for a PLC as a folder: sources, golden vectors, self-tests, READMEs for who loads it, manifests."""
+"""Folder of an export for a PLC: sources, golden vectors, self-tests, READMEs for who loads it, manifests."""
 
 import json
 import os
@@ -237,7 +237,7 @@ def problem_layout(problem: PredictiveProblem, prediction: PredictionModel) -> s
 
 
 def refuse_taken(folder: Path) -> None:
-    """Refuse a folder that has something in it, what is no folder, and a place where none can be made.
+    """Reject a folder that is not empty, a path that is no folder, and one where no folder can be made.
 
     Raises:
         UsageError: It is so.

@@ -49,16 +49,16 @@ SINGLE: Final = (
     "optimizer_plc.program.arithmetic=float32",
     "optimizer_plc.program.solver=ode",
 )
-"""What the run is made with: the paper's configuration in the arithmetic of its PLC."""
+"""Assignments of the recorded run: the paper's configuration in the arithmetic of its PLC."""
 ITERATIONS: Final = 20
-"""Of the solver for each recorded problem; each one is compared."""
+"""Iterations of the solver for each recorded problem; the result after each one is compared."""
 
 TELLING: Final = 8
 """Golden vectors of an export; each takes 5 kB."""
 LEAST_GAIN: Final = 1e-6
-"""Of the cost: a problem at rest gains less, by rounding alone."""
+"""Decrease of the cost below which a problem is no golden vector: at steady state there is less, by rounding alone."""
 TICKS, LOAD = 1440, "e"
-"""Of the run that is recorded: six minutes, in which this load has a large step."""
+"""Length (ticks) and load of the recorded run: six minutes, in which this load has a large step."""
 
 
 class GoldenVector(NamedTuple):
@@ -76,7 +76,7 @@ class GoldenVectors(NamedTuple):
     vectors: list[GoldenVector]
 
     def telling(self, most: int = TELLING) -> list[GoldenVector]:
-        """Return the problems that the solver lowers most, in their order; none that leave the inputs at rest."""
+        """Return the problems whose cost the solver lowers most, in their order; none at steady state."""
         gains = [float(each.answer.guessed) - float(each.answer.costs[-1]) for each in self.vectors]
         by_gain = sorted(range(len(gains)), key=lambda place: -gains[place])
         return [self.vectors[place] for place in sorted(by_gain[:most]) if gains[place] > LEAST_GAIN]
@@ -112,11 +112,11 @@ class GoldenUpdate(NamedTuple):
     """An update with what it was answered by."""
 
     fixed_ticks: int
-    """Of a session that begins with it; -1 in a session."""
+    """Fixed updating period (ticks) of the session that begins with this update; -1 within a session."""
     update: Update
     plan: Plan
     sequence: InputSequence | None
-    """None if it was interrupted before."""
+    """Sequence of the answer; None if the update was interrupted before."""
 
 
 def integers_of(golden: GoldenUpdate) -> tuple[int, ...]:
@@ -168,7 +168,7 @@ class _ListeningOptimizer(OptimizerProgram):
         return plan
 
     def solve(self) -> InputSequence:
-        """Keep what is solved, and the sequence: posing a problem twice gives the same bits."""
+        """Record the solved problem and its sequence: posing a problem twice gives the same bits."""
         self.problems.append(scheme.pose(self.constants, self.state))
         sequence = super().solve()
         self.updates[-1] = self.updates[-1]._replace(sequence=sequence)
@@ -205,7 +205,7 @@ Row = tuple[float, ...]
 
 
 class Call(IntEnum):
-    """What the guard is called for."""
+    """Function of the guard that is called."""
 
     RESTART = 0
     SCAN = 1
@@ -214,7 +214,7 @@ class Call(IntEnum):
 
 
 class Judgement(IntEnum):
-    """What it says of a sequence."""
+    """Verdict of the guard on a sequence."""
 
     ACCEPTED = 0
     OUT_OF_RANGE = 1
@@ -227,11 +227,11 @@ class GoldenCall(NamedTuple):
     call: Call
     tick: int
     given: Row
-    """What is wanted, or has been applied, shape (inputs,)."""
+    """Inputs requested, or applied before, shape (inputs,)."""
     applied: Row
-    """What is applied after it."""
+    """Inputs applied after the call, shape (inputs,)."""
     update: bool = False
-    """Of a scan: a sequence begins."""
+    """Whether a sequence begins in this scan."""
     judgement: Judgement = Judgement.ACCEPTED
     meanwhile: tuple[Row, ...] = ()
     first_tick: int = 0
@@ -240,7 +240,8 @@ class GoldenCall(NamedTuple):
 
 CALLS: Final = 800
 MOST_NUMBERS: Final = 8_000
-"""Of the rows of all golden calls, and of what is given and applied: each table is in one list of constants."""
+"""Limit on the numbers in the rows of all golden calls, and in the inputs given and applied: each table is one list of
+constants."""
 FARTHEST: Final = 30
 """Ticks until a sequence that is judged begins."""
 LATEST: Final = 2_000_000_000
@@ -249,7 +250,7 @@ NOT_FINITE: Final = (math.nan, math.inf, -math.inf)
 
 
 def golden_calls(limits: InputLimits) -> list[GoldenCall]:
-    """Return calls that want what is and what is not allowed, with the answers of the control PLC's own guard."""
+    """Return calls with valid and invalid inputs, with the answers of the control PLC's own guard."""
     drawing, calls, rows = _Drawing(plain(limits), random.Random(SEED)), list[GoldenCall](), 0  # noqa: S311 no secret
     inputs = len(limits.low)
     for call in drawing.calls():
@@ -307,7 +308,7 @@ class _Drawing:
         return GoldenCall(Call.SCAN, self.tick - 1, wanted, self._applied(), update)
 
     def _wanted(self) -> Row:
-        """Return what may be wanted: often too much, now and then what is no number."""
+        """Return random requested inputs: often beyond the limits, now and then NaN or infinite."""
         wanted = self._row(-0.3, 1.3)
         return self._changed(wanted, NOT_FINITE) if self._chance(0.3) else wanted
 
@@ -371,7 +372,7 @@ class _Drawing:
         )
 
     def _judgement(self, meanwhile: Sequence[Row], first_tick: int, rows: Sequence[Row]) -> Judgement:
-        """Return what the guard says of a sequence, as the control PLC does."""
+        """Return the guard's verdict on a sequence, as in the control PLC."""
         limits, state, twin, tick = self.limits, self.state, self.twin, self.tick
         if not all(in_range(limits, row) for row in rows):
             return Judgement.OUT_OF_RANGE
@@ -386,7 +387,7 @@ class _Drawing:
 
 
 def tables_of(golden: Sequence[GoldenCall]) -> dict[str, Array]:
-    """Return golden calls as tables, a row each: integers, reals (what is given and applied), and all their rows.
+    """Return golden calls as tables, one row each: integers, reals (inputs given and applied), and all their rows.
 
     Integers: call, tick, update or judgement, rows played meanwhile, first tick, rows of the sequence, and where these
     begin in the table of rows, those that are played meanwhile behind them.

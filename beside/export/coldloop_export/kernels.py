@@ -1,4 +1,4 @@
-"""What is exported, as functions of the typed tree with their constants: solver, whole optimiser, output guard."""
+"""Exported parts as functions of the typed tree with their constants: solver, whole optimiser, output guard."""
 
 import zlib
 from collections.abc import Callable, Mapping

@@ -77,7 +77,7 @@ class StructuredTextExport:
     """
 
     outputs: ClassVar[tuple[str, ...]] = ("iteration", "element", "iterations_done", "total_us", "longest_us")
-    """Of the self-test, beside those of each."""
+    """Outputs of the self-test besides those that every self-test has."""
 
     def __init__(self, method: OdeMethod, problem: QuadraticProblem, vectors: Iterable[GoldenVector]) -> None:
         self.vectors = [bounded(method, each) for each in vectors]
@@ -169,7 +169,7 @@ def bounded(method: OdeMethod, vector: GoldenVector) -> GoldenVector:
 
 STATE: Final[Path] = ("m", "state")
 FIXED_TICKS: Final[Path] = ("c", "fixed_ticks")
-"""Of the session: the one setting that is not constant."""
+"""Fixed updating period of the session: the one setting that is not constant."""
 BEGUN: Final[Path] = (*STATE, "begun")
 JOBS: Final[Path] = (*STATE, "jobs")
 """Number of the last plan or solve that was begun."""
@@ -181,7 +181,7 @@ class OptimizerText:
     """The optimiser of some settings, with its solver cut into calls, and golden updates."""
 
     outputs: ClassVar[tuple[str, ...]] = ("element",)
-    """Of the self-test, beside those of each."""
+    """Outputs of the self-test besides those that every self-test has."""
 
     def __init__(self, optimizer: OptimizerProgram, golden: Sequence[GoldenUpdate]) -> None:
         kernels, self.golden, self._process = OptimizerKernels(optimizer), golden, optimizer.process
@@ -355,7 +355,7 @@ def signal_counts(process: Process) -> Mapping[str, str]:
 
 GUARD_STATE: Final[Path] = ("g", "guard")
 TWIN: Final[Path] = ("g", "twin")
-"""What a sequence that is judged is played to."""
+"""Copy of the guard's state on which a sequence is played to judge it."""
 GUARD_BEGUN: Final[Path] = (*GUARD_STATE, "begun")
 PLACES: Final = {"state": Record(GUARD_STATE), "twin": Record(TWIN), "limits": Record(("c", "limits"))}
 ROW: Final = {"applied": "wide", "wanted": "wide", "row": "row"}
@@ -372,7 +372,7 @@ class GuardText:
     """The output guard for some limits as Structured Text, with golden calls."""
 
     outputs: ClassVar[tuple[str, ...]] = ()
-    """Of the self-test, beside those of each."""
+    """Outputs of the self-test besides those that every self-test has."""
 
     def __init__(self, kernels: GuardKernels, golden: Sequence[GoldenCall]) -> None:
         self._tables = tables_of(golden)
@@ -458,7 +458,7 @@ OTHERS: Final = {
     ("acknowledgement", "verdict"): "`answered.late` is true for 2 (late)",
     ("plan", "update"): "`plan.update` (input)",
 }
-"""Of the client: what is no variable of the same name."""
+"""Registers of the client without a variable of the same name, and what stands for them."""
 
 
 def register_table(control: RegisterMap) -> str:

@@ -66,12 +66,12 @@ Place: TypeAlias = Part | Record | Rows | Entry | Made | Expression
 
 
 def dotted(path: Path) -> str:
-    """Return the name of what is at a path."""
+    """Return the name of the value at a path."""
     return ".".join(path)
 
 
 def located(kind: tree.Type, path: Path) -> Place:
-    """Return what is at a path."""
+    """Return the value at a path."""
     if isinstance(kind, tree.RecordType):
         return Record(path)
     if isinstance(kind, tree.RowsType):

@@ -1,4 +1,4 @@
-"""Blocks that pause: a call does a bounded number of operations, and the next one goes on where it has stopped.
+"""Blocks that pause: a call does a bounded number of operations, and the next call resumes there.
 
 The solver is cut at its loop over the counts first: a call starts it or does one iteration, and what it needs is kept.
 A block with more operations than a piece may have becomes steps, each of which is such a piece: `STEP` says which is
@@ -260,7 +260,7 @@ class Steps:
     def __init__(self, pausing: Pausing, source: str) -> None:
         self.pausing, self.source = pausing, source
         self.kept: list[Name] = []
-        """What is computed once: last values of loops, arguments of calls."""
+        """Variables that are computed once: last values of loops, arguments of calls."""
         self._cases: dict[int, tuple[Statement, ...]] = {}
 
     def cases(self) -> tuple[tuple[int, tuple[Statement, ...]], ...]:

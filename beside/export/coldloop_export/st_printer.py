@@ -30,9 +30,9 @@ from coldloop_export.tree import (
 from coldloop_rig.text_tables import markdown_table
 
 LONGEST: Final = 32
-"""Characters of a name that every tool tells apart."""
+"""Significant characters of a name in every tool."""
 PREFIX: Final = "cl_"
-"""Of all that is global: types, functions, function blocks and constants."""
+"""Prefix of all global names: types, functions, function blocks and constants."""
 KEYWORDS: Final = tree.template("structured_text/keywords.txt")
 
 
@@ -130,7 +130,7 @@ FUNCTIONS: Final = {
 NO_NOTES: Final[Mapping[str, str]] = {}
 TABLE: Final = f"{PREFIX}literals"
 LARGEST: Final = np.finfo(np.float32).max
-"""In the place of what is infinite or no number, for which there is no literal."""
+"""Largest number of single precision, printed in the place of infinities and NaN, for which there is no literal."""
 
 
 class StructuredTextPrinter(tree.TreePrinter):
@@ -154,7 +154,7 @@ class StructuredTextPrinter(tree.TreePrinter):
     # -- numbers and types ---------------------------------------------------------------------------------------------
 
     def number(self, value: float) -> str:
-        """Return an initial value with digits enough for its bits; the largest one for what is not finite.
+        """Return an initial value with enough digits for its bits; the largest one in the place of a non-finite one.
 
         A type is named where there is no sign, as not every tool takes one behind `REAL#`.
         """
@@ -385,11 +385,11 @@ PRIME, FACTOR = 65521, 257
 PARTS: Final = 3
 """Integers that the bits of a number in double precision are read as."""
 LEAST_EXPONENT: Final = -1100
-"""Below that of the smallest number."""
+"""Exponent below that of the smallest number of double precision."""
 
 
 class Constants:
-    """What nothing writes to, as `VAR_GLOBAL`: the literals of a printer, and values by the fields that lead to them.
+    """Read-only values as `VAR_GLOBAL`: the literals of a printer, and values by the fields that lead to them.
 
     Not every tool takes `VAR_EXTERNAL CONSTANT`, which would have to go with `VAR_GLOBAL CONSTANT`.
     """

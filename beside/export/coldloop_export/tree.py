@@ -71,9 +71,9 @@ class RecordType:
     name: str
     fields: tuple[tuple[str, "Type"], ...]
     state: bool = False
-    """It has arrays of records of numbers, or is a dataclass: all of its arrays are its own, and may be written to."""
+    """Whether it has arrays of records of numbers, or is a dataclass: its arrays are its own, and may be written to."""
     mutable: bool = False
-    """A dataclass: so may its numbers."""
+    """Whether it is a dataclass, whose numbers may be written to as well."""
 
 
 Type: TypeAlias = Kind | ArrayType | StructType | RowsType | RecordType
@@ -300,13 +300,13 @@ class PausingCall:
     anew: Name
     """The variable that says that it begins: false from then on."""
     busy: Name
-    """Its output that says that it has paused."""
+    """Output of the block that says that it has paused."""
     following: tuple["Statement", ...]
 
 
 @dataclass(frozen=True)
 class Switch:
-    """What is done for each value of a number; only in blocks that pause (`pausing.py`)."""
+    """Statements for each value of a number; only in blocks that pause (`st_pausing.py`)."""
 
     number: Name
     cases: tuple[tuple[int, tuple["Statement", ...]], ...]
@@ -339,14 +339,14 @@ class Function:
     source: str
     """File and line of the kernel."""
     summary: str
-    """What it does, in a sentence."""
+    """Sentence that says what the kernel does."""
     parameters: tuple[Name, ...]
     written: set[str] = field(default_factory=set)
     """Parameters that it writes to: arrays and states."""
     used: set[str] = field(default_factory=set)
     results: tuple[Name, ...] = ()
     returned: Name | Field | Group | None = None
-    """How they belong together."""
+    """Structure of the results: a single one, or tuples of them."""
     value: Kind | None = None
     body: tuple[Statement, ...] = ()
 
@@ -369,7 +369,7 @@ class Block:
     outputs: tuple[Name, ...]
     variables: tuple[Name, ...]
     constants: tuple[Path, ...]
-    """What it has of constants and of the state."""
+    """Constants, and fields of the state, that it uses."""
     body: tuple[Statement, ...]
 
     @property
@@ -396,7 +396,7 @@ KINDS = {"f": Kind.REAL, "i": Kind.INT, "u": Kind.UNSIGNED, "b": Kind.BOOL}
 
 
 class UnfitKernelError(UsageError):
-    """A kernel uses what is not in the subset."""
+    """A kernel uses a construct that is not in the subset."""
 
 
 def rows_of(name: str, value: object) -> RowsType | None:

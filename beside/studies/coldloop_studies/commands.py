@@ -30,7 +30,7 @@ SAID: Final = {
     "design": "which decision and constraint instants the problem needs",
 }
 GROUP: Final = {"study": "studies", "reproduce": "studies", "design": "a plant and its controller"}
-"""Where `coldloop --help` has them."""
+"""Groups in which `coldloop --help` lists the commands."""
 OF_RUNS: Final = ("load", "duration", "seeds", "workers", "scheduler", "quick", "shard", "merge")
 """Options that only a study with runs has a use for."""
 

@@ -1,4 +1,4 @@
-"""How the figures of studies are drawn."""
+"""Drawing of the figures of studies."""
 
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -25,7 +25,7 @@ COLUMN_IN: Final = 88 / 25.4
 """Width of a column of a journal, for figures without panels side by side."""
 PAGE_IN: Final = 180 / 25.4
 LONGEST_NAME: Final = 28
-"""Of a row in a figure of one column."""
+"""Longest name of a row in a figure of one column, characters."""
 JOURNAL: Final = STYLE | {"font.size": 8, "axes.titlesize": 8, "legend.fontsize": 7}
 
 

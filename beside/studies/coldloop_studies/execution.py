@@ -1,4 +1,4 @@
-"""How the runs of a study are done: by Dask workers, each run once, what is done already being read back.
+"""Execution of the runs of a study: by Dask workers, each run once; results that exist are read back.
 
 Results do not depend on the number of workers: a run is a function of its request. A worker that dies costs only the
 runs it had in hand, which others do again; a stopped study resumes where it was. Workers write outcomes to the store
@@ -161,7 +161,7 @@ FILE_PATIENCE_S: Final = 60.0
 
 @dataclass(frozen=True)
 class Workers:
-    """Who does the runs."""
+    """Workers that do the runs: a local cluster, or those of a Dask scheduler."""
 
     count: int
     """Workers of a local cluster; its runs share nothing."""
@@ -209,7 +209,7 @@ def checked_requests(study: Study, options: StudyOptions, folder: Path) -> Seque
 
 
 def perform_all(requests: Sequence[RunRequest], store: Store, workers: Workers, title: str) -> StoredOutcomes:
-    """Do what is missing; return the outcome of every request.
+    """Do the runs that are missing; return the outcome of every request.
 
     Raises:
         StudyError: A run failed, or a worker runs other programs than we do, or writes to another folder.

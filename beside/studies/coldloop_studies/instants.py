@@ -1,4 +1,4 @@
-"""Which decision and constraint instants a problem needs: sets compared by what they cost in the loop, and on a PLC.
+"""Decision and constraint instants that a problem needs: sets compared by their cost in the loop and on a PLC.
 
 Each set is judged by the loop of an infinitely fast PLC (`ideal_loop`), so that the parametrisation alone is judged and
 not the time that its iterations take. The loss is J_BF over that of the fullest set tried.
@@ -26,7 +26,7 @@ from coldloop_studies.drawing import legend_outside, panels
 KNOTS: Final = (2, 3, 4, 5, 6, 7, 8, 10, 12)
 """Numbers of decision instants that are tried; there are twice as many constraint instants."""
 FULLEST: Final = 24
-"""Those of the set that others are compared with."""
+"""Number of decision instants of the reference set, with which the others are compared."""
 ENOUGH: Final = 1.01
 """A loss up to which the smallest set is proposed."""
 
@@ -39,9 +39,9 @@ class Judged(NamedTuple):
     variables: int
     rows: int
     condition: float
-    """Of Phi."""
+    """Condition number of Phi."""
     flops: float
-    """Of an iteration of the configured solver, zeros left out."""
+    """Operations of an iteration of the configured solver, zeros left out."""
     memory: int
     """Bytes in single precision."""
     iterations: int

@@ -51,7 +51,7 @@ class PlayedCost(NamedTuple):
 
     @property
     def total(self) -> float:
-        """What profiles are compared by."""
+        """Cost by which profiles are compared: J_dev + J_cst."""
         return self.j_dev + self.j_cst
 
 
@@ -170,7 +170,7 @@ class ProblemSequence(NamedTuple):
     prediction: PredictionModel
     limits: InputLimits
     problem: PredictiveProblem
-    """With the default penalties: what profiles are judged by."""
+    """Problem with the default penalties, by whose cost profiles are judged."""
     profiles: PlayedProfiles
     recorded: Sequence[LoopProblem]
     lowest: Array

@@ -24,7 +24,7 @@ BELOW: Final = 1e-9
 
 
 class Sums(NamedTuple):
-    """Of one solver at one power on the problems of one draw."""
+    """Summed costs and violations of one solver at one power on the problems of one draw."""
 
     J_dev: float
     J_cst: float
@@ -34,7 +34,7 @@ class Sums(NamedTuple):
 
     @property
     def J_total(self) -> float:
-        """What is compared with the lowest."""
+        """Cost that is compared with the lowest one: J_dev + J_cst."""
         return self.J_dev + self.J_cst
 
     @classmethod

@@ -61,7 +61,7 @@ class ClaimVerdict(StrEnum):
 
 
 class ClaimKind(StrEnum):
-    """What a claim is, and whether its verdict counts."""
+    """Kind of a claim, which decides whether its verdict counts."""
 
     CLAIM = "claim"
     """The paper's."""
@@ -77,7 +77,7 @@ COUNTED: Final = (ClaimKind.CLAIM, ClaimKind.AIM)
 
 
 class Revision(BaseModel):
-    """When something was added, changed or withdrawn after a report, and why; a claim as it was at first has none."""
+    """Revision after a report: date and reason of an addition, change or withdrawal; an original claim has neither."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -104,7 +104,7 @@ class Claim(Revision):
     reproduced: Range | None = None
     partly: Range | None = None
     calibrated: str = ""
-    """What was chosen with this value in view; empty if nothing was."""
+    """Choices that were made with this value in view; empty if there were none."""
     signed: bool = False
     """Whether a value of a draw can be negative."""
 
@@ -120,7 +120,7 @@ class Judged(NamedTuple):
     values: tuple[float, ...]
     """One a draw; empty where the study gave none."""
     of_paper: float | None
-    """From the points of the paper's figures."""
+    """Value of the paper, from the points of its figures; None where it has none."""
     verdict: ClaimVerdict
 
 

@@ -51,14 +51,14 @@ UPDATE_COLUMNS = (
 
 
 class Procedure(StrEnum):
-    """Who decides in a run."""
+    """Procedure of a run: the programs in a loop, or problems solved outside of it."""
 
     CONFIGURED = "configured"
     """The three programs, as they are configured."""
     PAIRED_PROBLEMS = "paired problems"
     """No loop: the configured solver solves the problems of a converged loop (`coldloop_studies.paired_run`)."""
     HARSH_PROBLEMS = "harsh problems"
-    """The same, and only those count whose guess is far from the optimum, each solver beginning at the same one."""
+    """Paired problems, of which only those with a guess far from the optimum count; all solvers begin at that guess."""
     LINEAR_PLANT = "linear plant"
     """The optimiser and the control PLC with the linear model for a plant (`coldloop_rig.cosim.linear_plant`)."""
 
@@ -77,7 +77,7 @@ class RunRequest:
     assignments: tuple[str, ...] = ()
     """Configuration that differs from the paper's preset, as `section.key=value`."""
     draw: int = 1
-    """Which draw of a named load this is; of a load file, which draw of the sensors' noise."""
+    """Number of the draw: of a named load, or of the sensors' noise where the load is a file."""
     networked: bool = False
     """Three services on the bus instead of one process."""
     trace_ticks: int = 0
@@ -101,7 +101,7 @@ class Happening(NamedTuple):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run left behind."""
+    """Result of a run."""
 
     programs: str
     """Digest of the programs that did it."""
@@ -113,7 +113,7 @@ class Outcome:
     trace: dict[str, list[float]]
     """Columns of the trace, by name; empty unless it was asked for."""
     events: list[Happening] = field(default_factory=list)
-    """What the journals say, if the trace was asked for."""
+    """Events of the journals; empty unless the trace was asked for."""
     failed_updates: int = 0
     """Updates that had no answer."""
 

@@ -31,7 +31,7 @@ from coldloop_studies.study import RUNS, Study, StudyOptions, StudyResult
 
 
 def conduct(study: Study, options: StudyOptions, workers: Workers, folder: Path) -> StudyResult:
-    """Do what is missing of a study and write its files to `folder / study.name`.
+    """Do the missing runs of a study and write its files to `folder / study.name`.
 
     Raises:
         ColdloopError: A run failed, or a file cannot be written.
@@ -97,7 +97,7 @@ class Shard:
     """One of several parts of a study."""
 
     number: int
-    """From 1 on."""
+    """Number of the shard, from 1 to `of`."""
     of: int
 
     @classmethod
@@ -118,7 +118,7 @@ class Shard:
 
 
 class ShardRecord(BaseModel):
-    """What a shard is a part of."""
+    """Study, options and programs that a shard is a part of."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -126,7 +126,7 @@ class ShardRecord(BaseModel):
     shard: int
     of: int
     options: dict[str, Any]
-    """Of the study."""
+    """Options of the study."""
     programs: str
     """Digest of the programs that do its runs."""
     runs: str
@@ -152,7 +152,7 @@ def unique(requests: Sequence[RunRequest]) -> list[RunRequest]:
 
 
 def conduct_shard(study: Study, options: StudyOptions, workers: Workers, folder: Path, shard: Shard) -> int:
-    """Do what is missing of a shard; return how many runs it has.
+    """Do the missing runs of a shard; return how many runs it has.
 
     Raises:
         ColdloopError: A run failed, or a file cannot be written.

@@ -23,7 +23,7 @@ from coldloop_studies.settings import PAPER, outside_digests, settings_of
 
 Outcomes = Mapping[RunRequest, Outcome]
 USUAL_DRAWS = 3
-"""Of each load, unless the study or the command sets another number."""
+"""Draws of each load, unless the study or the command sets another number."""
 RUNS = "runs"
 """Folder, beside those of the studies, in which runs are kept: studies share them."""
 QUICK_TICKS = 2400
@@ -31,7 +31,7 @@ QUICK_TICKS = 2400
 
 
 def noise(factor: float) -> tuple[str, ...]:
-    """Return measurement noise of so many times the size that the Kalman filter reckons with."""
+    """Return settings of measurement noise, `factor` times the noise that the Kalman filter assumes."""
     sizes = {"level": 0.01, "speed": 1.0, "temperature": 0.02, "pressure": 0.001}
     return tuple(f"plant.sensors.{name}={factor * size:g}" for name, size in sizes.items())
 
@@ -39,11 +39,11 @@ def noise(factor: float) -> tuple[str, ...]:
 NOISE = noise(1.0)
 PROGRAM = "optimizer_plc.program."
 TUNED: Final = f"{PROGRAM}preset=tuned"
-"""What `coldloop run` has by default."""
+"""Assignment of the default preset of `coldloop run`."""
 
 
 class Variant(NamedTuple):
-    """What the study `compare` sets beside others."""
+    """Configuration that the study `compare` compares with others."""
 
     name: str
     assignments: tuple[str, ...]
@@ -63,9 +63,9 @@ class StudyOptions:
     quick: bool = False
     """One seed, ten minutes, fewer points: to see that it works."""
     variants: tuple[Variant, ...] = ()
-    """Of the study `compare`; the first is the reference."""
+    """Variants of the study `compare`; the first is the reference."""
     settings: tuple[str, ...] = ()
-    """Of all runs, as `section.key=value`: `model.file` of another process than the cold box."""
+    """Settings of all runs, as `section.key=value`: `model.file` of another process than the cold box."""
 
     @property
     def process(self) -> Process:
@@ -96,7 +96,7 @@ class Load:
     profile: LoadProfile
     ticks: int
     settings: tuple[str, ...] = ()
-    """Of its runs: those of the study, and noise."""
+    """Settings of its runs: those of the study, and noise."""
 
     def request(
         self,
@@ -156,14 +156,14 @@ def first_and_fresh(hours: Iterable[Load], first: str = "hours") -> dict[str, li
 
 @dataclass
 class StudyResult:
-    """What a study found."""
+    """Result of a study: table, figures and values of its claims."""
 
     columns: tuple[str, ...]
     rows: list[tuple[Cell, ...]]
     figures: dict[str, Figure]
-    """By name; drawn in the manner of the paper's."""
+    """Figures by name, drawn in the manner of the paper's."""
     values: dict[str, list[float]] = field(default_factory=dict)
-    """What the claims are judged by: one value for each draw, by claim."""
+    """Values by which the claims are judged: one for each draw, by claim."""
     remarks: list[str] = field(default_factory=list)
     """Paragraphs for the report."""
     always_shown: bool = False
@@ -181,7 +181,7 @@ class Study(Protocol):
 
     @property
     def name(self) -> str:
-        """What the command calls it."""
+        """Name of the study in the command."""
 
     @property
     def title(self) -> str:
@@ -209,7 +209,7 @@ INEFFECTIVE: Final = {
 """Keys and sections that do not act on a run of a study, and what to do instead."""
 LONGEST_NAME: Final = 40
 LAST_LETTER: Final = "\u04ff"
-"""Of those that the font of the figures has throughout: Latin, Greek, Cyrillic."""
+"""Last letter of the scripts that the font of the figures covers completely: Latin, Greek, Cyrillic."""
 NOT_IN_NAMES: Final = frozenset("$|\\")
 """Characters that figures and Markdown tables read as marks."""
 
@@ -240,7 +240,7 @@ def read_variants(file: Path, own: tuple[str, ...] = ()) -> tuple[Variant, ...]:
     return variants
 
 
-def _variant(file: Path, name: str, table: Any, own: tuple[str, ...]) -> Variant:  # noqa: ANN401 what a user wrote
+def _variant(file: Path, name: str, table: Any, own: tuple[str, ...]) -> Variant:  # noqa: ANN401 written by a user
     place = f"{file} [{name}]"
     if not isinstance(table, Mapping):
         raise UsageError(f"{file}: {name} is not in the table of a variant; write [NAME] above it")

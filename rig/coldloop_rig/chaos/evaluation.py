@@ -1,4 +1,4 @@
-"""What the faults of a run did, fault by fault: from the trace, the events, and the same run without faults."""
+"""Effect of each fault of a run, from the trace, the events, and the same run without faults."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -35,7 +35,7 @@ class Mark:
 
 
 class Resources(NamedTuple):
-    """What the processes use at one tick."""
+    """Resources that the processes use at one tick."""
 
     tick: int
     seconds: float
@@ -51,7 +51,7 @@ class ChaosTrace(Sink):
     ticks: int
     process: Process
     events: list[Event] = field(default_factory=list)
-    """Of the control PLC, as they came."""
+    """Events of the control PLC, in the order of arrival."""
     alarms: list[Alarm] = field(default_factory=list)
     ladder: LadderStatus | None = None
     marks: list[Mark] = field(default_factory=list)
@@ -101,7 +101,7 @@ class RaisedAlarm(NamedTuple):
     name: str
     after_s: float
     after_done_s: float
-    """The same from the tick at which the fault was certainly there; in lock-step ticks go by between the two."""
+    """Delay from the tick at which the fault was certainly in effect, s; in lock-step ticks pass between the two."""
 
 
 class Row(NamedTuple):
@@ -114,15 +114,15 @@ class Row(NamedTuple):
     modes: tuple[str, ...]
     """The mode before, and those passed until the next fault."""
     alarms: tuple[RaisedAlarm, ...]
-    """Raised in the window."""
+    """Alarms raised in the window."""
     largest_steps: PerInput
     """Largest change of each input from a tick to the next, as a share of its limit."""
     outside_s: PerBand
     """Time in the window that each output with a band was outside, beyond its dead band."""
     undisturbed_s: PerBand
-    """The same without faults."""
+    """Time outside in the same window of the run without faults, s."""
     back_s: float | None
-    """From the end of the fault to MPC: 0 when MPC drove then, None when it did not come back in the window."""
+    """Time from the end of the fault to mode MPC, s: 0 if MPC drove then, None if it did not return in the window."""
 
     @property
     def largest_step(self) -> float:

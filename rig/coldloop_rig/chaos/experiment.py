@@ -84,7 +84,7 @@ class Experiment(NamedTuple):
     design: ControlDesign
     """Has the bands that it was judged by."""
     failure: str | None
-    """Why the run ended early, if it did."""
+    """Reason why the run ended early; None if it did not."""
 
 
 def perform(

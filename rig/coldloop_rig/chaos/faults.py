@@ -13,7 +13,7 @@ Duration = Annotated[float, Field(gt=0, le=86_400)]
 Milliseconds = Annotated[float, Field(ge=0, le=60_000)]
 
 SERVICE_OF: Final = {"optimizer": "optimizer_plc", "control": "control_plc", "plant": "plant"}
-"""What plans call a process, and the service that it is."""
+"""Services by the names that plans have for their processes."""
 
 
 class Link(StrEnum):
@@ -26,7 +26,7 @@ class Link(StrEnum):
 
 
 class Direction(StrEnum):
-    """Which frames of a link."""
+    """Direction of the frames of a link that a fault affects."""
 
     BOTH = "both"
     REQUESTS = "requests"
@@ -56,11 +56,11 @@ class Fault(BaseModel):
         return self.tick + round(self.duration_s / self._tick_s)
 
     in_tables: ClassVar[str] = "{what}"
-    """What tables call it, with `what`, its kind in words, and its fields."""
+    """Template of its name in tables: `what` is its kind in words, the others are its fields."""
 
     @property
     def label(self) -> str:
-        """What tables call it."""
+        """Name in tables."""
         return self.in_tables.format(what=self.kind.replace("_", " "), **self.__dict__)
 
     @property
@@ -94,7 +94,7 @@ class FrameFault(LinkFault):
 
     @property
     def label(self) -> str:
-        """What tables call it."""
+        """Name in tables."""
         which = "" if self.direction is Direction.BOTH else f" ({self.direction})"
         return f"{super().label}{which}"
 
@@ -129,7 +129,7 @@ class Reorder(FrameFault):
     kind: Literal["reorder"]
     share: Share
     hold_ms: Milliseconds = 20.0
-    """How long it waits for one to overtake it, real time."""
+    """Longest wait for a frame that overtakes it, ms of real time."""
 
 
 class Reset(LinkFault):
@@ -247,7 +247,7 @@ class Sensor(Fault):
 
     @property
     def label(self) -> str:
-        """What tables call it."""
+        """Name in tables."""
         return f"sensor {self.output} {self.shows if self.value is None else f'= {self.value:g}'}"
 
 

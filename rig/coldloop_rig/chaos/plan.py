@@ -45,7 +45,7 @@ class LinkPlan(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _completed(cls, content: Any) -> Any:  # noqa: ANN401 what a file holds
+    def _completed(cls, content: Any) -> Any:  # noqa: ANN401 any content of a file
         if not isinstance(content, dict) or not isinstance(content.get("faults"), list):
             return content
         if "load" in content:
@@ -102,9 +102,9 @@ class ChaosPlan(ProcessSettings):
     """Named load or CSV file; or named loads, one after the other."""
     duration_s: Annotated[float, Field(gt=0, le=7 * 86_400), AfterValidator(_of_ticks)]
     plant: Annotated[PlantKind, one_of("plant", lambda process: process.plants)] | None = None
-    """Which plant; that of the configuration if the plan does not say."""
+    """Kind of the plant; that of the configuration if not given."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
-    """Of all that is drawn: instants, the fate of frames, the sensors' noise."""
+    """Seed of all random draws: instants, frames that are hit, the sensors' noise."""
     mode: TimeMode = TimeMode.LOCKSTEP
     factor: Annotated[float, Field(ge=0.01, le=10_000)] = 1.0
     updating_period_s: Annotated[float, within(lambda process: (0, process.sampling_period_s))] = 0.0
@@ -215,7 +215,7 @@ def shipped_plans() -> list[ChaosPlan]:
         if entry.name.endswith(".toml"):
             try:
                 plans.append(parse_plan(entry.read_text(encoding="utf-8"), entry.name, {}))
-            except UsageError:  # of signals or a plant that are another's
+            except UsageError:  # its signals or its plant are another process's
                 continue
     return sorted(plans, key=lambda plan: plan.name)
 

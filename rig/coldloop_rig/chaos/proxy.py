@@ -22,11 +22,11 @@ from coldloop_rig.settings import Settings
 
 Replacing = faults.Drop | faults.Duplicate | faults.ExceptionAnswer | faults.Flip | faults.WrongUnit
 UNIT: Final = 6
-"""Where a frame has its unit; the function comes next."""
+"""Place of the unit in a frame; the function code is the next byte."""
 
 
 class FrameAction(NamedTuple):
-    """How one frame is forwarded."""
+    """Forwarding of one frame: its bytes and delay."""
 
     data: bytes
     """Bytes to forward, with any that were held back before."""
@@ -106,7 +106,7 @@ def _with_other_words(frame: bytes, fault: faults.ExceptionAnswer | faults.Wrong
 
 
 def take_frames(buffer: bytearray) -> list[bytes]:
-    """Take all whole frames out of a buffer; what is not Modbus/TCP comes as one piece, unchanged."""
+    """Take all whole frames out of a buffer; bytes that are not Modbus/TCP come as one piece, unchanged."""
     frames, position = [], 0
     try:
         while (frame := next_frame(buffer, position)) is not None:
@@ -124,7 +124,7 @@ CHUNK: Final = 4096
 MOST_FROZEN: Final = 64
 """Connections that are kept while nothing passes: those who try again and again would take up all files."""
 HALF_CLOSED_S: Final = 60.0
-"""How long one direction may stay open alone."""
+"""Longest time that one direction may stay open alone, s."""
 _LINGER_NOT: Final = struct.pack("ii", 1, 0)
 
 
@@ -156,7 +156,7 @@ class LinkProxy:
         self._number = 0
         self._open: set[asyncio.StreamWriter] = set()
         self._serving: dict[asyncio.Task[None], None] = {}
-        """What serves each connection, the oldest one first."""
+        """Tasks that serve the connections, the oldest one first."""
         self._listener: asyncio.Server | None = None
 
     async def start(self) -> None:

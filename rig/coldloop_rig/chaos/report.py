@@ -1,4 +1,4 @@
-"""What is shown of a run under chaos: its progress, table, files and picture."""
+"""Report of a run under chaos: its progress, table, files and picture."""
 
 import time
 from collections import Counter

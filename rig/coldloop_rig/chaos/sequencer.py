@@ -33,11 +33,11 @@ from coldloop_rig.cosim.session import CONTACT_S, SessionClient
 from coldloop_rig.cosim.wiring import SERVICES
 
 WRONG_MODEL: Final = "wrong_model.json"
-"""Its file in the folder of a run."""
+"""File of the wrong model in the folder of a run."""
 MOVED_INPUTS: Final = (-3.0, -15.0, 2.0)
-"""From those of the right model: CV155 %, NCR22_A W, CV156 %."""
+"""Shift of the wrong model's inputs from those of the right one: CV155 %, NCR22_A W, CV156 %."""
 GAIN: Final = 0.9
-"""Of other processes: over those of the right model."""
+"""Gains of the wrong model of other processes, over those of the right one."""
 
 
 def save_wrong_model(right: Path, wrong: Path) -> None:
@@ -226,7 +226,7 @@ STANDSTILL_PATIENCE_S: Final = 60.0
 """A rig that does not move for so long without a fault is given up."""
 RESTART_PATIENCE_S: Final = 90.0
 PRESENCE_S: Final = 10.0
-"""How long an optimiser may take after a fault, in lock-step, until the control PLC knows of it."""
+"""Longest real time after a fault, in lock-step, until the control PLC detects the optimiser, s."""
 RESOURCE_TICKS: Final = 1200
 LOOK_S: Final = 0.005
 
@@ -365,7 +365,7 @@ class FaultSequencer:
             await asyncio.sleep(LOOK_S)
 
     async def _until_optimizer_is_known(self) -> None:
-        """Hold plant time in lock-step until the control PLC knows of its optimiser again.
+        """Hold plant time in lock-step until the control PLC detects its optimiser again.
 
         Without one it runs as fast as it can, and what the optimiser takes to come back says nothing in plant time.
         """

@@ -29,7 +29,7 @@ WORDS: Final = {
     "integer": "whole number", "number": "number", "string": "text", "object": "table", "boolean": "true or false",
 }  # fmt: skip
 ARGUMENT: Final = re.compile(r"^    (\w+): (.*(?:\n     +.*)*)", re.MULTILINE)
-"""Of a docstring."""
+"""Pattern of an argument in a docstring."""
 FORMATS: Final = {"path": "file", "ipvanynetwork": "address or network"}
 COUNTS: Final = {1: "one number", 2: "two numbers", 3: "three numbers"}
 LIMITS: Final = {"minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most", "exclusiveMaximum": "below"}

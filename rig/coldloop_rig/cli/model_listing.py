@@ -41,7 +41,7 @@ class Description(NamedTuple):
     model: LtiModel
     text: str
     box: ColdBox
-    """With the temperature after the pre-cooler that it has at rest."""
+    """Cold box with the temperature after the pre-cooler that it has at steady state."""
 
 
 def describe_model(
@@ -118,7 +118,7 @@ def _station_lines(rest: Rest) -> list[str]:
 
 
 def _set_point_line(plant: RefrigeratorPlantFile, control: StationSettings) -> list[str]:
-    """Return what is to be set where the pressures at rest are not the set points."""
+    """Return the settings to change where the steady-state pressures are not the setpoints."""
     high, low = plant.boundaries.p_hp_bar, plant.boundaries.p_lp_bar
     if (high, low) == (control.hp_bar, control.lp_bar):
         return []
@@ -167,7 +167,7 @@ def held_line(box: ColdBox, level: float, design: ControlDesign, limits: InputLi
 
 
 def _band_lines(rest: Equilibrium, design: ControlDesign) -> list[str]:
-    """Return what is to be set where an output at rest is outside its band."""
+    """Return the settings to change where a steady-state output is outside its band."""
     bands = zip((L1, T5), ("L1", "T5"), ("%", "K"), design.output_low, design.output_high, strict=True)
     return [
         f"outside    {name} rests at {rest.y[k]:.2f} {unit}, its band is {low:g} to {high:g} {unit}: set"

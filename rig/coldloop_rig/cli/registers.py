@@ -136,7 +136,7 @@ FORMATS: Final[dict[str, Callable[[Sequence[RegisterMap]], str]]] = {
 
 
 WIDTH: Final = 24
-"""Of a board, in Grafana's units."""
+"""Width of a dashboard, in Grafana's units."""
 UNITS: Final = {"%": "percent", "K": "kelvin", "W": "watt"}
 """Grafana's names of units; others are in the title of the panel."""
 DATASOURCE: Final = {"type": "prometheus", "uid": "${datasource}"}
@@ -432,5 +432,5 @@ EXPORTS: Final[Mapping[str, Callable[[Sequence[RegisterMap], Places], str]]] = {
     "node-red": as_node_red,
     "fuxa": as_fuxa,
     "ignition": as_ignition,
-    "grafana": lambda maps, _places: board(maps[0].process),  # of metrics, which have the names of the registers
+    "grafana": lambda maps, _places: board(maps[0].process),  # metrics have the names of the registers
 }

@@ -31,15 +31,15 @@ LOOK_S: Final = 0.25
 TOGETHER_S: Final = 1.5
 """Services that are started at once say within this time that they compile."""
 PAUSES_S: Final = (1.0, 2.0, 4.0, 8.0, 16.0)
-"""Before each further start; after the last one the service is given up."""
+"""Pauses before each further start, s; after the last one the service is given up."""
 STEADY_S: Final = 60.0
-"""After this time without an exit the pauses start from the first one."""
+"""Time without an exit after which the pauses start from the first one again, s."""
 T = TypeVar("T")
 STOP_GRACE_S = 5.0
 MOST_LOG_BYTES = 2**26
 """Size of a file that a service writes, its log among them: a write beyond it fails."""
 EXIT_S = 2.0
-"""How long a process may take to end after it has closed its connections."""
+"""Longest time that a process may take to end after it has closed its connections, s."""
 
 
 async def show_compiling(logs: Sequence[Path]) -> None:
@@ -167,7 +167,7 @@ class LocalServices:
         self._logs = log_folder
         self.services = tuple(services)
         self.processes: dict[str, asyncio.subprocess.Process] = {}
-        """By service, of those that are to run."""
+        """Processes of the services that are to run, by service."""
         self._watchers: set[asyncio.Task[None]] = set()
         self._ended: asyncio.Queue[str] = asyncio.Queue()
         self._showing: asyncio.Task[None] | None = None

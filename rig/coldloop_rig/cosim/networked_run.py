@@ -30,7 +30,7 @@ SHOWN: Final[Mapping[str, Sequence[str]]] = {
     "control_plc": coldloop_control_plc.settings.SHOWN,
     "optimizer_plc": coldloop_optimizer_plc.settings.SHOWN,
 }
-"""What each service shows."""
+"""Keys of the configuration that each service publishes."""
 OF_SESSION: Final = (
     "session.mode", "session.factor", "plant.load", "plant.seed", "optimizer_plc.program.updating_period_s",
 )  # fmt: skip

@@ -21,7 +21,7 @@ class SavedSession(NamedTuple):
     pace: SessionPace
     operator: Operator
     load: LoadProfile
-    """From that tick on."""
+    """Load from that tick on, W."""
 
 
 async def save_session(rig: SessionClient) -> SavedSession | None:

@@ -68,9 +68,9 @@ class Job:
     scenario: Scenario
     way: Way
     endpoints: tuple[Endpoint, ...] = ()
-    """Of a rig that is up, to attach to."""
+    """Endpoints of a running rig to attach to; empty where the run starts its own."""
     conduct: Conduct | None = None
-    """How it is done, in a way that the others do not describe."""
+    """Function that does the run in a way that the other fields do not describe."""
     optimizer: tuple[str, ...] = ()
     """A program that takes the place of our optimiser, with its options."""
 

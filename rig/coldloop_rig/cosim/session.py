@@ -34,19 +34,19 @@ T = TypeVar("T")
 AHEAD: Final = HISTORY_ROWS - 32
 """Ticks that the control PLC may be ahead of the recording, so that the history still has them."""
 STATION_AHEAD: Final = STATION_ROWS - 32
-"""The same where the history of the station counts too."""
+"""Ticks that the control PLC may be ahead where the station's history is recorded too."""
 SHORTEST_PAUSE_S: Final = 0.001
 LONGEST_PAUSE_S: Final = 0.2
 LONGEST_LOCKSTEP_PAUSE_S: Final = 0.01
-"""A rig that does not move is looked at so often."""
+"""Longest interval at which a rig whose time does not advance is polled, s."""
 EVENTS_S: Final = 0.25
-"""Real time between two looks at the journals."""
+"""Interval at which the journals are polled, s of real time."""
 LAST_LOOK_S: Final = 2.0
-"""How long the events of a run that has ended are waited for."""
+"""Longest wait for the events of a run that has ended, s."""
 CONTACT_S: Final = 1.0
-"""With `tolerant`: how long an answer may take. A stopped process must not hold up the rest for long."""
+"""Longest time of an answer with `tolerant`, s: a stopped process must not delay the others for long."""
 PASSING: Final = frozenset({EventKind.ALARM_RAISED, EventKind.ALARM_RETURNED, EventKind.ALARM_ACKNOWLEDGED})
-"""Of these, what has happened to an alarm since it was raised last says how it is."""
+"""Alarm transitions: those since an alarm was last raised determine its state."""
 HELD: Final = (
     frozenset({EventKind.MODE}),
     frozenset({EventKind.ALARM_SHELVED, EventKind.ALARM_UNSHELVED}),
@@ -345,12 +345,12 @@ class SessionClient:
 
 
 class SessionUnderWay(NamedTuple):
-    """What is found at a rig."""
+    """Session that is under way at a rig."""
 
     identity: Identity
     pace: SessionPace
     load: float
-    """At present, W."""
+    """Present load, W."""
 
     def scenario(self, ticks: int) -> Scenario:
         """Return what is recorded of it in so many ticks; what its load will be is not known."""
@@ -436,7 +436,7 @@ async def record_session(rig: SessionClient, scenario: Scenario, recorder: Recor
             recorder.link = late.after(await rig.contact(rig.control.read(Status)))
             pause_s = rig.plant.process.tick_s / scenario.factor if scenario.realtime else 0.0
             await asyncio.sleep(min(max(pause_s, 2 * SHORTEST_PAUSE_S), LONGEST_PAUSE_S))
-    finally:  # what ended the recording is reported, not that the last of it cannot be read
+    finally:  # reports what ended the recording, not a failed read of its last part
         for read in (updates.read, partial(events.read, CONTROL), partial(events.read, PLANT)):
             with contextlib.suppress(LinkError):
                 await rig.contact(read())

@@ -1,4 +1,4 @@
-"""Where the three services of a rig are, where their clients are pointed at, and how long a rig may take to answer."""
+"""Wiring of a rig: endpoints of its three services, endpoints of their clients, and time limits of its answers."""
 
 import asyncio
 import socket
@@ -16,7 +16,7 @@ from coldloop_rig.settings import Settings
 REQUIRED: Final = ("plant", "control_plc")
 """Services of every rig; an optimiser may be somebody else's (`up --without optimizer`)."""
 ANSWER_S: Final = 10.0
-"""How long a rig may take to answer all that a command asks at once."""
+"""Longest time that a rig may take to answer all requests of a command, s."""
 QUIET_S: Final = 20.0
 """A run gives up a rig on which nothing happens, or a service that does not answer, for this long."""
 HOST: Final = "127.0.0.1"
@@ -28,7 +28,7 @@ START_PATIENCE_S: Final = 600.0
 
 
 class RigEndpoints(NamedTuple):
-    """Where the three servers are."""
+    """Endpoints of the three servers."""
 
     plant: Endpoint
     control_plc: Endpoint
@@ -91,9 +91,9 @@ class Detours(NamedTuple):
     """Ports that clients are pointed at instead of those of their servers."""
 
     plant: int
-    """For the control PLC."""
+    """Port of the plant, for the control PLC."""
     control_plc: int
-    """For the optimiser."""
+    """Port of the control PLC, for the optimiser."""
 
 
 def endpoints_on(ports: Sequence[int], settings: Settings) -> RigEndpoints:

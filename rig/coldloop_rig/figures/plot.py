@@ -34,9 +34,9 @@ Series = NDArray[np.floating]
 
 INK, ACCENT, THIRD, BAND = "#0072b2", "#d55e00", "#009e73", "#b8c4ce"
 COLOURS: Final = (INK, ACCENT, THIRD, "#cc79a7", "#e69f00", "#000000")
-"""Of curves that are drawn over each other (Okabe and Ito, which people with colour blindness tell apart)."""
+"""Colours of curves that share a panel (Okabe and Ito, which people with colour blindness can distinguish)."""
 DASHES: Final = dict(zip(COLOURS, ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2))), strict=True))
-"""Of the same curves, where a page is printed without colours."""
+"""Line styles of the same curves, for pages printed without colours."""
 MODE_COLOURS: Final = {"mpc": INK, "rest": "#56b4e9", "hold": "#e69f00", "classical": ACCENT, "manual": THIRD}
 STYLE: Final[Any] = {
     "font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False, "axes.spines.right": False,
@@ -70,21 +70,21 @@ _STYLED: Final = RLock()
 NOT_CURVES: Final = ("tau_u_s", "stage_cost")
 """The last of these columns, which are drawn in their own ways."""
 LEAST_COST: Final = 1e-6
-"""Stage costs below it are drawn as it: at rest the cost is rounding."""
+"""Least stage cost that is drawn: at steady state the cost is rounding."""
 NARROWEST: Final = 1 / 2000
 """Share of the whole time that can be seen."""
 SMOOTHING_S: Final = 60.0
 """Window of the mean of tau_u: adaptive periods change at nearly every update."""
 PANELS: Final = {"left": 0.083, "right": 0.993, "top": 0.962, "bottom": 0.048, "hspace": 0.3}
-"""Where the panels are, in shares of the figure. Matplotlib's layout engine would draw the figure three times more."""
+"""Places of the panels, in shares of the figure. Matplotlib's layout engine would draw the figure three times more."""
 LETTERS: Final = ascii_lowercase + ascii_uppercase
-"""Of panels."""
+"""Letters of the panels."""
 LABEL_AT: Final = -0.068
-"""Where letters and labels of panels are, in widths of a panel: beside numbers of six characters."""
+"""Place of letters and labels of panels, in widths of a panel: beside numbers of six characters."""
 
 
 class Bounds(NamedTuple):
-    """What outputs and inputs may be: lowest and highest, by column."""
+    """Bands of the outputs and limits of the inputs: lowest and highest value, by column."""
 
     bands: Mapping[str, tuple[float, float]]
     inputs: Mapping[str, tuple[float, float]]
@@ -100,7 +100,7 @@ class Bounds(NamedTuple):
 
 
 class RunCurves(NamedTuple):
-    """What is drawn of a run."""
+    """Curves, events and texts of the figure of a run."""
 
     process: Process
     series: Mapping[str, Series]
@@ -109,9 +109,9 @@ class RunCurves(NamedTuple):
     bounds: Bounds
     title: str
     identity: str
-    """Which run it was: a line below the figure."""
+    """Identity of the run: a line below the figure."""
     pressures: Mapping[str, tuple[float, float]] = {}
-    """Of a whole refrigerator: where the station's alarms begin (bar), for each of its pressures in `series`."""
+    """Alarm limits (bar) of each of the station's pressures in `series`; empty without a station."""
 
 
 def draw_run(curves: RunCurves) -> Figure:

@@ -67,7 +67,7 @@ class FigureProcess:
 
 def main() -> None:
     """Draw the run that standard input names; none when it is closed."""
-    from coldloop_rig.figures.plot import draw_nothing, plot_run  # noqa: PLC0415 what takes long comes before the wait
+    from coldloop_rig.figures.plot import draw_nothing, plot_run  # noqa: PLC0415 slow imports come before the wait
 
     draw_nothing()
     request = sys.stdin.buffer.read()

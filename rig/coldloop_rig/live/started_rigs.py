@@ -36,13 +36,13 @@ STATE, STARTED = 0, 19
 """Places in /proc/PID/stat, counted behind the name of the program."""
 DEFAULT_PORTS: Final = (PLANT_PORT, CONTROL_PORT, OPTIMIZER_PORT)
 STATE_FILE: Final = "rig.json"
-"""What `coldloop down`, `status` and `set` know of a rig that is up: process, ports, certificates."""
+"""File from which `coldloop down`, `status` and `set` know a running rig: process, ports, certificates."""
 LOCK_FILE: Final = "lock"
 """Locked by the process of a rig while it runs."""
 LOOK_UP_S: Final = 0.05
-"""Between two looks at the process of a rig."""
+"""Interval at which the process of a rig is polled, s."""
 ANSWER_S: Final = 5.0
-"""How long a connection to a port of this machine may take."""
+"""Longest time of a connection to a port of this machine, s."""
 _HOLDER: Final = "a rig in containers, or another program (ss -ltnp names it): end it, or give another --port-base"
 
 
@@ -194,12 +194,12 @@ class RunningRig(NamedTuple):
 
     pid: Pid
     identity: str
-    """Of its process; see `identity_of`."""
+    """Identity of its process; see `identity_of`."""
     ports: Annotated[tuple[Port, ...], Field(min_length=3, max_length=3)]
     tls: Annotated[str, Field(pattern=r"\A[^\x00]*\z")]
     """Folder of certificates that it was started with; empty when none."""
     services: dict[str, ServiceProcess]
-    """Those that were started: an optimiser may be somebody else's."""
+    """Services that were started, by name: the optimiser may be somebody else's."""
     cuttable: bool
     """Whether its links can be cut; see `coldloop_rig.live.up`."""
 
@@ -210,7 +210,7 @@ class RunningRig(NamedTuple):
         return cls(*ServiceProcess.of(os.getpid()), tuple(ports), tls, processes, cuttable)
 
     def write(self) -> None:
-        """Write the state file, from which commands know of this rig."""
+        """Write the state file, by which commands find this rig."""
         write_own(state_folder(self.ports[0]) / STATE_FILE, json.dumps(self._asdict()) + "\n")
 
     @classmethod
@@ -230,7 +230,7 @@ class RunningRig(NamedTuple):
 
     @property
     def process(self) -> ServiceProcess:
-        """Its own process."""
+        """Process of the rig itself."""
         return ServiceProcess(self.pid, self.identity)
 
     @property
@@ -444,7 +444,7 @@ def detached(ports: Sequence[int], lock: RigLock) -> int:
 def _is_up(first_port: int, pid: int) -> bool:
     try:
         rig = running_rig(first_port)
-    except UsageError:  # what another one has left, until it is replaced
+    except UsageError:  # a file that another rig has left, until it is replaced
         return False
     return rig is not None and rig.pid == pid
 

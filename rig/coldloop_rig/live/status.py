@@ -1,4 +1,4 @@
-"""What commands ask of a rig that is up over Modbus: its status, or something with the role of an operator."""
+"""Requests of commands to a running rig over Modbus: its status, or writes with the role of an operator."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Iterable, Iterator
@@ -44,7 +44,7 @@ async def ask(rig: RigEndpoints, process: Process, services: Iterable[str], work
 
 
 class PlantStatus(NamedTuple):
-    """One look at the plant."""
+    """Status of the plant at one time."""
 
     identity: Identity
     pace: SessionPace
@@ -52,7 +52,7 @@ class PlantStatus(NamedTuple):
 
 
 class ControlStatus(NamedTuple):
-    """One look at the control PLC."""
+    """Status of the control PLC at one time."""
 
     ladder: LadderStatus
     operator: Operator
@@ -62,16 +62,16 @@ class ControlStatus(NamedTuple):
 
 
 class RigStatus(NamedTuple):
-    """One look at the services of a rig."""
+    """Status of the services of a rig at one time."""
 
     process: Process
     plant: PlantStatus | None
-    """None where it does not answer, as below."""
+    """State of the plant; None if it does not answer, as with the fields below."""
     control: ControlStatus | None
     update: Optimization | None
     """The last one that was done; None before the first as well, and of an optimiser that is not ours."""
     silent: tuple[str, ...] = ()
-    """What is said of each service that does not answer."""
+    """Messages about the services that do not answer, one each."""
 
 
 async def read_status(clients: Clients) -> RigStatus:

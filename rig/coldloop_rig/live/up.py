@@ -61,12 +61,12 @@ from coldloop_rig.settings import Settings
 
 CUT_FILES: Final = "cut-*.json"
 CUT_LOOK_S: Final = 0.2
-"""Between two looks for a cut that is wanted, and for one that is taken."""
+"""Interval at which requested cuts, and taken ones, are polled, s."""
 TAKEN_S: Final = 10.0
-"""A rig takes it within this time."""
+"""Longest time until a rig takes a cut, s."""
 OPERATOR: Final = "operator"
 LOOK_S: Final = 0.5
-"""Between two looks at the load that the plant knows of, and at a service that was started again."""
+"""Interval at which the load known to the plant, and a restarted service, are polled, s."""
 LOOKING: Final = (PlantLinkState.SEARCHING, PlantLinkState.JOINING)
 """A control PLC without a session is looking for the one that it has retained."""
 
@@ -76,7 +76,7 @@ class Cut(NamedTuple):
 
     link: Link
     seconds: Annotated[float, Field(gt=0, le=3600)]
-    """By the clock."""
+    """Duration in real time, s."""
 
     @classmethod
     def parsed(cls, text: str) -> Self:
@@ -220,7 +220,7 @@ class FirstLogin(NamedTuple):
 
     @property
     def line(self) -> str:
-        """How to log in."""
+        """Line that says how to log in."""
         return f"  to operate     user {OPERATOR}, password {self.password} (of this run)\n"
 
 
@@ -293,7 +293,7 @@ class PageProcess:
 
     @property
     def addresses(self) -> str:
-        """Where it is, and who may operate."""
+        """Lines that say where the page is, and who may operate."""
         scheme = "https" if self._section.https else "http"
         text = f"  page           {scheme}://{self._section.host}:{self._section.port}/\n"
         if self._login is not None:

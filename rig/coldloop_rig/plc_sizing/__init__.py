@@ -1,1 +1,1 @@
-"""What the reference PLC can do: its speed and memory, operations counted, budgets, certified iterations."""
+"""Sizing of PLCs: speed and memory of the reference PLC, operations counted, budgets, certified iterations."""

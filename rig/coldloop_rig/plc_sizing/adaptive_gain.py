@@ -44,7 +44,7 @@ def require_costs(costs: ArrayLike) -> None:
 
 
 SHARES: Final = (0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
-"""Of a sampling period: updating periods that are compared, unless one is given."""
+"""Updating periods that are compared unless one is given, as shares of the sampling period."""
 
 
 def fixed_periods(process: Process) -> tuple[float, ...]:

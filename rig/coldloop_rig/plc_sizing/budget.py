@@ -1,4 +1,4 @@
-"""What a PLC can do in an updating period, and whether its memory holds the problem, as tables and in a sentence."""
+"""Budget of a PLC in an updating period, and whether its memory holds the problem, as tables and in a sentence."""
 
 from collections.abc import Callable, Sequence
 from math import floor
@@ -32,7 +32,7 @@ from coldloop_rig.text_tables import aligned
 
 
 class Workspace(NamedTuple):
-    """What a solver holds at a time besides the problem, in numbers of single precision; zeros are stored.
+    """Workspace of a solver besides the problem, in numbers of single precision; zeros are stored.
 
     Our own solvers as in their code, without copies of Phi and Gamma in another order; the others as their papers have
     them.
@@ -78,7 +78,7 @@ class Footprint(NamedTuple):
     shift: int
     """One shift of the profile; its other shifts are computed when they are needed."""
     solver: int
-    """Its workspace."""
+    """Workspace of the solver."""
     estimator: int
     """Transitions, Kalman gains and inverse covariances of every updating period, output matrices, states beside."""
     sequence: int
@@ -116,15 +116,15 @@ def footprint(problem: PredictiveProblem, estimator: int, solver: SolverName) ->
 
 ROUNDING = 1e-9
 MANY = 1000
-"""Variables from which on their number is not said."""
+"""Number of variables from which on it is not printed."""
 
 
 class Capacity(NamedTuple):
-    """Up to how many variables a PLC has memory and time, where all else grows with them."""
+    """Largest numbers of variables for which a PLC has memory and time, where all else grows with them."""
 
     by_memory: float
     by_time: float
-    """For one iteration in the longest updating period."""
+    """Variables for which there is time for one iteration in the longest updating period."""
 
 
 def power_of(profile: PlcProfile, size: int) -> float:

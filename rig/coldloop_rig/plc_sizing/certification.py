@@ -1,4 +1,4 @@
-"""How many iterations are enough, and how sure that is: sampled scenarios and the binomial bound.
+"""Certified number of iterations, with its confidence: sampled scenarios and the binomial bound.
 
 A scenario is fifteen minutes under a random telegraph: a family of hour drawn from a to f, and a draw of it that no
 study uses. Scenarios are independent of each other. Each gives, for each solver, two figures: the iterations that its
@@ -43,7 +43,7 @@ SCENARIO_TICKS: Final = 3600
 LONGEST: Final = 200
 """Iterations after which a problem counts as not solved: those of 5 s at ten times the power of the PLC."""
 OWN_SEEDS: Final = 10**9
-"""From here on the seeds of scenarios begin: no named load has one so large."""
+"""First seed of the scenarios: no named load has one so large."""
 
 
 class Problem(NamedTuple):
@@ -63,7 +63,7 @@ class Needs(NamedTuple):
 
 
 class Certificate(NamedTuple):
-    """What N scenarios say of one solver."""
+    """Result of N scenarios for one solver."""
 
     solver: SolverName
     fitting: int

@@ -1,4 +1,4 @@
-"""What an export for a PLC costs there, from its manifest: operations of its calls, bytes, times."""
+"""Cost of an export on its PLC, from its manifest: operations of its calls, bytes, times."""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -27,9 +27,9 @@ class CallCost(BaseModel):
     least: Count
     mean: Count
     most: Count
-    """Of recorded calls."""
+    """Largest number of operations in a recorded call."""
     worst: Count | None = None
-    """That there can be, where that is known."""
+    """Largest number of operations that a call can have; None if not known."""
 
     @property
     def bound(self) -> float:
@@ -38,21 +38,21 @@ class CallCost(BaseModel):
 
 
 class ExportCost(BaseModel):
-    """What an export needs."""
+    """Operations and bytes that an export needs."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
     variables: Annotated[int, Field(ge=1)]
     operations: dict[str, CallCost]
-    """By the kind of the call."""
+    """Operations of a call, by the kind of the call."""
     bytes: dict[str, int]
-    """By what takes them."""
+    """Bytes of memory, by use."""
     self_test: dict[str, int] = {}
     """Iterations and operations of the solver in the self-test."""
     work: Annotated[int, Field(ge=0)] = 0
     """Operations that a call is given to do; 0 where each call does all of its kind."""
     piece: Annotated[int, Field(ge=0)] = 0
-    """What it does beyond them at most."""
+    """Operations that a call does beyond `work` at most."""
     longest_period_s: PositiveFloat = 5.0
     """Longest updating period; exports that do not say it are of the cold box."""
 

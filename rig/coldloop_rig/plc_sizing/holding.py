@@ -1,4 +1,4 @@
-"""How long a plant with a mode that grows can wait for an update.
+"""Longest updating period of a plant with an unstable mode.
 
 A mode of the linear model is z' = a z + v (B u + F w), v its left eigenvector. Its worst case: the load steps from one
 end of its span to the other just after a measurement. The next one, a period tau later, shows it; the answer acts
@@ -22,20 +22,20 @@ from coldloop.process.updating_periods import ROUNDING, SHORTEST_TICKS
 Array = NDArray[np.float64]
 
 RESERVE: Final = 2.0
-"""What the inputs can bring back over what they may have to, a gain margin of 6 dB: plants are not linear."""
+"""Disturbance that the inputs can reject over the largest one, a gain margin of 6 dB: plants are not linear."""
 NOTHING: Final = 1e-12
-"""What is smaller is rounding: growth, 1/s, of integrators and of disturbances that hold."""
+"""Growth rate, 1/s, below which a mode counts as an integrator or a constant disturbance: the rest is rounding."""
 
 
 class Waiting(NamedTuple):
-    """What a plant with a mode that grows needs of a PLC."""
+    """Updating periods with which a PLC can hold a plant with an unstable mode."""
 
     growth: float
-    """Of the fastest mode, 1/s."""
+    """Growth rate of the fastest unstable mode, 1/s."""
     longest_s: float
     """Longest updating period that has the reserve."""
     limit_s: float
-    """Longest one without; 0 is none."""
+    """Longest updating period without the reserve; 0 if there is none."""
 
     def text(self, period_s: float, whose: str) -> str:
         """Return what a period means for this plant; `whose` says which period it is."""
@@ -53,7 +53,7 @@ class Waiting(NamedTuple):
 def waiting(
     model: LtiModel, process: Process, limits: Array, share: Callable[[int], float] = lambda _: 1.0
 ) -> Waiting | None:
-    """Return what a plant needs of a PLC; None where no mode grows.
+    """Return the updating periods that a plant needs; None where all its modes are stable.
 
     `limits` are low, high and rate of the inputs, shape (3, inputs); `share` is that of the rate after so many ticks.
     """

@@ -19,7 +19,7 @@ Pattern = NDArray[np.bool_]
 
 
 class QpSizes(NamedTuple):
-    """What the operations of an iteration depend on."""
+    """Sizes of a QP on which the operations of an iteration depend."""
 
     n: int
     """Variables."""
@@ -309,9 +309,9 @@ class SolverCount(NamedTuple):
 
     operations: Callable[[QpSizes], Operations]
     default: str
-    """What the default of `tau_1_s` follows."""
+    """Source of the default of `tau_1_s`."""
     paper_s: float | None = None
-    """Its time in the paper."""
+    """Time of an iteration in the paper, s; None if the paper has none."""
 
 
 SOLVERS: Final = {
@@ -326,7 +326,7 @@ SOLVERS: Final = {
 
 
 class ProblemSizes(NamedTuple):
-    """What the sizes of a problem follow from."""
+    """Dimensions of process and design from which the sizes of a problem follow."""
 
     knots: int
     inputs: int
@@ -335,7 +335,7 @@ class ProblemSizes(NamedTuple):
     constraints: int
     """Constraint instants."""
     states: int
-    """With those of the estimated constants and of the load."""
+    """States of the estimator: those of the model, of the estimated biases and of the load."""
 
 
 COLD_BOX_SIZES: Final = ProblemSizes(knots=7, inputs=3, outputs=22, bands=2, constraints=14, states=49)

@@ -85,7 +85,7 @@ def slow_down(times: CholeskyTimes, size: float) -> float:
 LISTING: Final = "`coldloop docs keys` lists the keys"
 SHIPPED: Final = files("coldloop_rig.plc_sizing") / "profiles"
 FEWEST_SIZES: Final = 3
-"""Of a factorisation, for a curve of three coefficients."""
+"""Fewest sizes with a measured factorisation time, for a curve of three coefficients."""
 TIMES_HEADER: Final = ("size", "plc_ms")
 """First columns of a file of factorisation times."""
 
@@ -94,7 +94,7 @@ SHORTEST_MS, LONGEST_MS = 1e-6, 1e9
 
 
 class PlcProfile(BaseModel):
-    """What decides whether a controller runs on a PLC."""
+    """Properties of a PLC that decide whether a controller runs on it."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 

@@ -1,4 +1,4 @@
-"""The linear model of an FMU at rest: by its own derivatives, by differences, or from a step test of it."""
+"""Linear model of an FMU at steady state: by its own derivatives, by differences, or from a step test of it."""
 
 import re
 from dataclasses import asdict, replace
@@ -21,13 +21,13 @@ Array = NDArray[np.float64]
 STILL: Final = 1e-6
 """Move of an output within a horizon, over the range of its sensor, that counts as rest."""
 HORIZONS_TO_REST: Final = 24
-"""After which a plant counts as one that does not come to rest, unless the file says otherwise."""
+"""Horizons after which a plant counts as one without a steady state, unless the file says otherwise."""
 STEP_SIZE: Final = 0.01
-"""Of the step test, to both sides of the operating point, over the range of the input or the span of the load."""
+"""Steps of the step test to both sides of the operating point, over the range of the input or the span of the load."""
 SAMPLES: Final = 400
-"""Of the step test, at least; ten horizons if that is more."""
+"""Least number of samples of the step test; ten horizons if that is more."""
 MOST_FINDINGS: Final = 5
-"""Of a description that breaks the standard, that are told."""
+"""Largest number of violations of the standard in a model description that are reported."""
 
 
 def with_units(file: Process, folder: Path) -> Process:
@@ -40,7 +40,7 @@ def with_units(file: Process, folder: Path) -> Process:
         return file
     fmu = Fmu(folder / file.plant.fmu)
 
-    def unit(section: Any) -> Any:  # noqa: ANN401 of any signal
+    def unit(section: Any) -> Any:  # noqa: ANN401 any kind of signal
         variable = section.variable or section.name
         fmu.port(variable)
         declared = fmu.variables.get(variable) or fmu.variables[variable.rpartition("[")[0]]  # an array has one unit

@@ -37,7 +37,7 @@ FINER: Final = (1e11, 1e14, 1e17)
 """... and in milliseconds, microseconds, nanoseconds."""
 UNITS: Final = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
 DAYS: Final = (20_000.0, 80_000.0)
-"""Of a spreadsheet, since 1900, if its times are closer to each other than DAY_STEP."""
+"""Range of a spreadsheet's times, days since 1900, where they are closer to each other than DAY_STEP."""
 DAY_STEP: Final = 0.01
 GAP: Final = 5.0
 """Periods without a reading beyond which a record is cut, unless another gap is given."""
@@ -56,15 +56,15 @@ FEWEST: Final = 10
 
 
 class Request(NamedTuple):
-    """What is to be imported, and how."""
+    """Export of a historian to be imported, with the options of the import."""
 
     path: Path
     names: Mapping[str, str]
-    """By tag; without any, all columns that have the name of a signal. TIME names the column of time."""
+    """Signals by tag; if empty, all columns with the name of a signal are read. TIME names the column of time."""
     inputs: tuple[str, ...]
     """Signals that hold between readings; the others are outputs."""
     zone: str | None = None
-    """Of stamps that have none, as in Europe/Berlin."""
+    """Time zone of stamps without one, such as Europe/Berlin."""
     good: tuple[str, ...] = ()
     """Texts of good quality, beside those of `is_good`."""
     every_s: float | None = None
@@ -209,7 +209,7 @@ def _seconds(stamps: Frame, lines: Frame, table: Table, request: Request, said: 
     else:
         clear = texts.str.replace(r"(:\d\d),(?=\d)", r"\1.", regex=True)
         zoned = clear.str.contains(WITH_ZONE)
-        day = bool(clear.str.match(r"\d\d?\.\d").any())  # of 31.12.2026 it comes first, of others it may
+        day = bool(clear.str.match(r"\d\d?\.\d").any())  # in 31.12.2026 the day comes first, in others it may
         ways = [
             pd.to_datetime(clear, format="mixed", dayfirst=way, utc=True, errors="coerce") for way in (day, not day)
         ]

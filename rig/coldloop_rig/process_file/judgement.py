@@ -1,4 +1,4 @@
-"""What there is to know of a process before it is controlled, as text: rest, modes, gains, and what is wrong."""
+"""Description of a process before it is controlled, as text: steady state, modes, gains, and errors found."""
 
 from collections.abc import Sequence
 from math import log
@@ -22,9 +22,9 @@ ROUGH: Final = 1e-4
 SMALL: Final = 1e-6
 """Singular value, over the largest, below which a direction counts as none."""
 SHARE: Final = 0.01
-"""Of a rate or a band, that is still to be told apart."""
+"""Largest step of a signal in single precision, over its rate or its band, with which it can be controlled."""
 INVERSE: Final = 0.1
-"""Move to the other side, over the change in the end, from which on it is told."""
+"""Inverse response, over the final change, from which on it is reported."""
 
 
 def described(made: Made) -> str:
@@ -157,7 +157,7 @@ def _too_coarse(signal: Input | Output, ends: tuple[float, float], least: float,
 
 
 def unheld(banded: Sequence[Output], A: Array) -> str:
-    """Return that nothing but MPC holds a plant (n, n), where a mode grows and no output has a loop; else nothing."""
+    """Return that only MPC holds a plant (n, n) with an unstable mode and no loop on any output; else nothing."""
     if any(one.loop for one in banded) or np.linalg.eigvals(A).real.max() <= NOTHING:
         return ""
     return "nothing holds this plant when MPC has no answer: a mode grows, and no output has a loop"

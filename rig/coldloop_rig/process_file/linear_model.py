@@ -60,17 +60,17 @@ class Linearised(NamedTuple):
     states: dict[str, str]
     """Name and unit of each."""
     kind: str
-    """Of the plant."""
+    """Kind of the plant."""
     parameters: dict[str, Any]
-    """What the plant is made from, in the model file."""
+    """Parameters from which the plant is made, in the model file."""
     digest: str
-    """Of its source."""
+    """Digest of the plant's source."""
     error: float
-    """Of the derivatives: largest difference from those with steps twice as wide, over the largest of each column."""
+    """Error of the derivatives: difference from those with steps twice as wide, over the largest of each column."""
     notes: tuple[str, ...] = ()
-    """What there is to say of how it was found, a line each."""
+    """Notes on how the model was found, one line each."""
     record: "tuple[Record, Identified] | None" = None
-    """What it was identified from, if it was, and what was found there."""
+    """Record from which it was identified, and the result; None if it was not identified."""
 
 
 def operating_point(file: Process) -> tuple[Array, Array]:
@@ -190,7 +190,7 @@ def _of_state_space(file: Process, folder: Path, given: str) -> dict[str, Array]
     return M
 
 
-def realised(transfer: Any) -> dict[str, Array]:  # noqa: ANN401 of python-control or SciPy
+def realised(transfer: Any) -> dict[str, Array]:  # noqa: ANN401 types of python-control or SciPy
     """Return the matrices of transfer functions, with numerators and denominators as python-control or SciPy has them.
 
     Inputs that act on an output with the same denominator share states: the observable companion form shows all of

@@ -32,10 +32,10 @@ from coldloop_rig.process_file.step_test import from_step_test, record_compared
 Array = NDArray[np.float64]
 
 REGISTERS_OF_A_REQUEST: Final = 125
-"""What one read of Modbus carries: the latched update, and the rack's measurement, are one."""
+"""Registers of one Modbus read at most: the latched update, and the rack's measurement, are one read each."""
 TINY: Final = 1e-12
 TOLD_APART: Final = 1e-6
-"""Least singular value, of columns of size 1, with which constants are told from states."""
+"""Least singular value, of columns of size 1, with which biases are observable separately from states."""
 USUAL_WALK: Final = 0.01
 """Process noise of a state over what it moves by when each input makes its largest step, held for the horizon."""
 SINGULAR: Final = 1e-9
@@ -48,7 +48,7 @@ ALIKE: Final = (0.5, 2.0)
 
 @dataclass(frozen=True)
 class Made:
-    """What is made from a process file."""
+    """Model and process that are made from a process file."""
 
     model: LtiModel
     process: Process
@@ -203,7 +203,7 @@ def _states(file: Process, linear: Linearised) -> tuple[State, ...]:
 
 
 def _constants(file: Process, linear: Linearised) -> tuple[str, ...]:
-    """Return the outputs whose constant error can be told from states, load and each other.
+    """Return the outputs whose bias is observable separately from states, load and each other.
 
     Hautus' test at the integrator: (A, F; C, G) and a column of ones for each constant have no direction of zeros
     (Pannocchia and Rawlings, AIChE J. 49, 2003). Those with bands come last; of equals first the one that is told apart
@@ -260,7 +260,7 @@ def _check_room(process: Process) -> None:
 
 
 def _check_rest(file: Process, linear: Linearised) -> None:
-    """Check that outputs at rest are within the ranges of their sensors (`UsageError`)."""
+    """Check that steady-state outputs are within the ranges of their sensors (`UsageError`)."""
     for one, value in zip(file.outputs, linear.y0, strict=True):
         if not one.range[0] <= value <= one.range[1]:
             raise UsageError(

@@ -25,7 +25,7 @@ SIGNAL, FILL, ENDS = "data-signal", "data-fill", ("data-low", "data-high")
 """Attributes: a signal whose value a text or a tag shows, one that fills a rectangle, and the ends of its bar."""
 NAMED: Final = re.compile(r"\{(\w+)\}")
 OUTSIDE: Final = re.compile(r"\\|url\((?!\s*['\"]?#)|(?:src|image|image-set)\(", re.IGNORECASE)
-"""What reaches outside the drawing; a backslash may write any of it."""
+"""Pattern of references to outside the drawing; a backslash may encode any of them."""
 INSIDE: Final = re.compile(r"url\(\s*(['\"]?)#([^'\")\s]*)\1\s*\)", re.IGNORECASE)
 LONGEST: Final = 500_000
 """Characters: the drawing is in the model file."""
@@ -38,7 +38,7 @@ VIEW_BOX: Final = 4
 QUOTED: Final = 60
 """Characters of a value in a message."""
 PREFIX: Final = "mimic-"
-"""Of the names of its elements, which are others than those of the page."""
+"""Prefix of the ids of its elements, which keeps them apart from those of the page."""
 
 
 def drawing_of(path: Path, signals: Collection[str]) -> str:

@@ -70,7 +70,7 @@ def _wrong(file: Process) -> str:  # noqa: PLR0911 a return for each
 
 
 GROUP: Final = "coldloop.plants"
-"""Of entry points: classes with the equations of a plant."""
+"""Group of entry points: classes with the equations of a plant."""
 
 
 def source_of(folder: Path, place: str) -> tuple[str, str]:

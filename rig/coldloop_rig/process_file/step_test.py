@@ -34,11 +34,11 @@ WORTH: Final = 1.1
 LONGEST_PAST: Final = 20
 """Samples of the past that a prediction goes by, at most."""
 ROWS_PER_UNKNOWN: Final = 3
-"""Of the autoregression, at least."""
+"""Least number of rows per unknown of the autoregression."""
 FASTEST: Final = 1e-3
 """Least pole in the plane of z: one below, or on the negative real axis, has no continuous counterpart."""
 TOGETHER: Final = 0.98
-"""Correlation of two inputs from which on their effects cannot be told apart."""
+"""Correlation of two inputs from which on their effects cannot be identified separately."""
 EXACT: Final = 1e-6
 """Error that no order improves on: the record has no noise."""
 NOTHING: Final = 1e-13
@@ -46,7 +46,7 @@ NOTHING: Final = 1e-13
 
 
 class Record(NamedTuple):
-    """What was recorded at N equidistant times: each row's inputs hold until the next one."""
+    """Record of inputs and outputs at N equidistant times: each row's inputs hold until the next one."""
 
     period_s: float
     inputs: Array
@@ -168,7 +168,7 @@ def _past(record: Record, rows: int) -> int:
 
 
 class _States(NamedTuple):
-    """What the past tells of the future: as many states as there may be, the largest first."""
+    """State sequence that predicts future outputs from past data: as many states as there may be, the largest first."""
 
     rows: Array
     """Scaled to a standard deviation of 1, shape (N - past, n)."""
@@ -252,7 +252,7 @@ def _continuous(A: Array, B: Array, period_s: float) -> tuple[Array, Array]:
     n, m = B.shape
     whole = np.block([[A, B], [np.zeros((m, n)), np.eye(m)]])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of errors of 1e-13: a record is not known as well as that
+        warnings.simplefilter("ignore", RuntimeWarning)  # for errors of 1e-13: no record is that accurate
         rates = np.real(logm(whole)) / period_s
     return rates[:n, :n], rates[:n, n:]
 

@@ -85,7 +85,7 @@ _DRIVING: Final = (
     Column("bad_sensors", pa.string(), "", "Outputs whose measurement the control PLC substitutes; empty when none"),
     Column("stage_cost", pa.float64(), "1", "Stage cost of what was reached: deviations and violations of the bands"),
 )
-"""What the control PLC was doing, by its events, and what that cost."""
+"""Columns of the control PLC's operating state, from its events, and of the stage cost."""
 
 
 def _physical(process: Process, maps: Maps) -> tuple[Column, ...]:
@@ -232,7 +232,7 @@ def text_array(texts: Sequence[str | None], places: NDArray[np.int64] | None = N
 
 
 def numbers_of(column: pa.Array) -> NDArray[np.float64]:
-    """Return a numeric column as numbers; what is null is NaN."""
+    """Return a numeric column as numbers; null becomes NaN."""
     validity, data = column.buffers()
     rows = slice(column.offset, column.offset + len(column))
     values = np.frombuffer(data, column.type.to_pandas_dtype())[rows].astype(float)

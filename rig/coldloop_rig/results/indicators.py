@@ -42,7 +42,7 @@ class Indicators(NamedTuple):
     """Mean updating period over the updates, s, in which short periods count more often."""
     iterations_total: int
     outside_band_pct: Mapping[str, float]
-    """For each output that has a band, by name, the share of the ticks that are known, %, in which it was outside."""
+    """Share of the known ticks, %, in which each output with a band was outside, by name."""
 
     @property
     def by_name(self) -> dict[str, float]:
@@ -145,7 +145,7 @@ class RunEvaluation(Sink):
 
     @property
     def excesses(self) -> dict[str, float]:
-        """How far each output with a band was beyond it, by `excess_keys`; NaN where no tick is known."""
+        """Excess of each output over its band, with the names of `excess_keys`; NaN where no tick is known."""
         known = self._known or math.nan
         exists = known / known
         by_band = zip(100.0 * self._beyond / known, self._furthest * exists, self._excess * exists, strict=True)

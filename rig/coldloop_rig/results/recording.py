@@ -1,4 +1,4 @@
-"""What a run leaves behind: samples, updates and events, which a rig reports to a recorder and the recorder to sinks.
+"""Recording of a run: samples, updates and events, which a rig reports to a recorder and the recorder to sinks.
 
 The `Recorder` passes samples on in blocks, and updates when their sequence was played. Sinks write files, evaluate,
 show a line, or keep all in memory.
@@ -24,15 +24,15 @@ from coldloop.registers.plant import PlantSample, StationSample
 
 
 class Way(StrEnum):
-    """How the three programs are connected."""
+    """Connection of the three programs."""
 
     IN_PROCESS = "in-process"
     LOCALHOST = "localhost"
     ATTACHED = "attached"
     RECORDED = "recorded"
-    """Nothing was driven: a session of others was looked at."""
+    """Recording of another client's session, which is not driven."""
     CHAOS = "chaos"
-    """On localhost, with faults on purpose."""
+    """Three services on localhost with injected faults."""
 
 
 FloatArray = NDArray[np.float32]
@@ -46,7 +46,7 @@ STATION_COLUMNS = len(STATION_SIGNAL_NAMES) + 2
 
 
 class LinkStatistics(NamedTuple):
-    """How well a run kept time, as the control PLC counts it."""
+    """Timing of a run, as counted by the control PLC."""
 
     deadline_misses: int = 0
     overruns: int = 0
@@ -95,7 +95,7 @@ class SampleBlock(NamedTuple):
 
     @property
     def digested(self) -> bytes:
-        """What the digest of a trace takes: the rows, and after each that of the station where there is one."""
+        """Bytes that the digest of a trace covers: the rows, each followed by the station's where there is one."""
         if not self.station.size:
             return self.rows.tobytes()
         return np.ascontiguousarray(np.hstack([self.rows, self.station]), dtype="<f4").tobytes()
@@ -173,9 +173,9 @@ class Recording(NamedTuple):
     updates: list[Optimization]
     link: LinkStatistics
     station: FloatArray = NO_STATION
-    """As in `SampleBlock`."""
+    """Samples of the station as in `SampleBlock`."""
     events: Sequence[tuple[str, Event]] = ()
-    """Of the journals, with the service that each is of."""
+    """Events of the journals, each with the service that reported it."""
 
     @property
     def block(self) -> SampleBlock:
@@ -194,7 +194,7 @@ SETTLED_TICKS: Final = 512
 """An update that nothing has followed for so long after its period was not cut off. In a networked run samples are
 read up to 256 ticks before the updates that go with them."""
 KEPT_TICKS: Final = BLOCK_TICKS
-"""So many of the last ticks are not passed on yet: a plant that was restarted may do some of them again."""
+"""Newest ticks that are not passed on yet: a restarted plant may do some of them again."""
 
 
 class Sink:
@@ -267,7 +267,7 @@ class Recorder:
         self._sinks = (self._memory,) if sinks is None else tuple(sinks)
         self._pending = PendingTicks()
         self._stations: dict[int, StationSample] = {}
-        """Of ticks that are about to come."""
+        """Samples of the station, by ticks whose own sample is still to come."""
         self._unsettled: deque[Optimization] = deque()
         self._stop: ColdloopError | None = None
         self._closed = False

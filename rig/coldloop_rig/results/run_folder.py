@@ -27,7 +27,7 @@ from coldloop_rig.results.columns import EVENTS, FILES, FORMAT, STATION, TRACE, 
 from coldloop_rig.results.folders import prepare_folder, writing
 
 Curves = dict[str, NDArray[np.float64]]
-"""Columns by name; what is null is NaN."""
+"""Columns by name; null is NaN."""
 
 OLDER: Final[dict[str, Any]] = {
     "optimizer_plc.program.adaptive.rule": "algorithm-1",
@@ -52,12 +52,12 @@ BOUNDS: Final = ("limits.low", "limits.high")
 """Keys that have a number for each output with a band, and for each input."""
 ENDED: Final = "name the folder of a run that has ended"
 MOST_BYTES: Final = 2**24
-"""Of a JSON document."""
+"""Largest size of a JSON document."""
 MOST_COLUMNS: Final = 2000
 MOST_TEXT: Final = 4096
 """Bytes of a text in a table."""
 ROW_BYTES: Final = 4096
-"""Of a row, on average, before it is compressed; `SPARE_BYTES` more for the file."""
+"""Largest average size of a row before compression; a file may have `SPARE_BYTES` more."""
 SPARE_BYTES: Final = 2**20
 MOST_IN_MEMORY: Final = 2_000_000
 """Rows of a file that is read as a whole: 139 h of ticks."""
@@ -336,7 +336,7 @@ def export(run: Path, kind: str, out: Path, *, force: bool) -> list[Path]:
 
 
 Writers = dict[str, Callable[[Path], object]]
-"""What writes a file, by the file's name."""
+"""Functions that write a file, by the file's name."""
 
 
 def _tables(run: RunFolder, most: int = LONGEST_TICKS) -> Tables:

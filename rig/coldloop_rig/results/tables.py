@@ -41,7 +41,7 @@ class Driving(NamedTuple):
 
 
 class SensorFaultRecord(NamedTuple):
-    """What is wrong with a sensor from one tick on."""
+    """Fault of a sensor from one tick on."""
 
     tick: int
     kind: int
@@ -59,7 +59,7 @@ class DrivingHistory:
         self._states = [Driving()]
         self._faults: dict[int, list[SensorFaultRecord]] = {output: [] for output in process.controlled}
         self._held = dict.fromkeys(process.controlled, math.nan)
-        """What a frozen sensor shows."""
+        """Values that frozen sensors show, by output."""
 
     def event(self, service: str, event: Event) -> None:
         """Take an event."""
@@ -104,7 +104,7 @@ class DrivingHistory:
             begin = min(max(fault.tick - first, 0), len(values))
             stop = min(max(until - first, 0), len(values))
             if fault.kind == SensorFaultKind.FROZEN and first <= fault.tick < end:
-                # what it showed then: the output itself, or what the fault before let it show
+                # the value shown then: the output itself, or that of the previous fault
                 before = faults[place - 1] if place else None
                 self._held[output] = _shown_by(before, values[fault.tick - first], self._held[output])
             if fault.kind and begin < stop:

@@ -1,4 +1,4 @@
-"""By how much the gains of the prediction model should be scaled for it to predict what a run has measured.
+"""Factors on the gains of the prediction model with which it predicts the measurements of a run.
 
 The model's responses to each input and to the load alone are simulated over the record. Measurements and responses are
 compared by their changes over `WINDOW_S`, so that constants and slow drifts drop out, each output over its spread. The
@@ -23,7 +23,7 @@ WINDOW_S: Final = 60.0
 SETTLING_S: Final = 300.0
 """Left out at the beginning: the state is not known there, and is forgotten like the model's slowest mode, in 110 s."""
 BLOCKS: Final = 8
-"""Of the half that is fitted: left out in turn, they give standard errors that allow for correlated residuals."""
+"""Blocks of the fitted half: left out in turn, they give standard errors that allow for correlated residuals."""
 LEAST_S: Final = 1800.0
 """Shortest record: blocks of 90 s, longer than the window."""
 MOST_ERROR: Final = 0.05
@@ -32,7 +32,7 @@ TAIL: Final = 0.025
 
 
 class Record(NamedTuple):
-    """What was measured at N ticks in a row."""
+    """Record of inputs and outputs at N consecutive ticks."""
 
     inputs: RealArray
     """Inputs and load that were applied from each tick on, shape (N, m + 1)."""
@@ -43,29 +43,29 @@ class Record(NamedTuple):
 
 
 class Factor(NamedTuple):
-    """What was found of an input, or of the load."""
+    """Identified factor of an input or of the load, with its confidence interval."""
 
     name: str
     unit: str
     value: float
-    """On its columns of the model; 1 if it was not fitted."""
+    """Factor on the columns of the model; 1 if it was not fitted."""
     low: float
-    """Of the 95 % interval, as `high`; NaN if it was not fitted."""
+    """Lower end of the 95 % interval, whose upper end is `high`; NaN if the factor was not fitted."""
     high: float
     moved: float
-    """From its least to its largest value."""
+    """Range of the input or load in the record: largest minus least value."""
     reason: str
-    """Why it was not fitted; empty if it was."""
+    """Reason why the factor was not fitted; empty if it was."""
 
 
 class Identification(NamedTuple):
-    """Factors of all inputs and of the load, and what they are worth on the half of the record that was held back."""
+    """Factors of all inputs and of the load, and the prediction errors on the half of the record that was held out."""
 
     factors: tuple[Factor, ...]
     before: RealArray
     """RMS error of predicted changes over `WINDOW_S` with the model as it is, in the outputs' units, shape (p,)."""
     after: RealArray
-    """The same with the factors."""
+    """RMS error with the factors, shape (p,)."""
     improved: bool
     """Whether the mean square of all errors, each output over its spread, is less than before."""
 
@@ -180,7 +180,7 @@ def _moments(effects: RealArray, changes: RealArray) -> tuple[RealArray, RealArr
 def _factors(
     model: LtiModel, moments: tuple[RealArray, RealArray], reach: RealArray, moved: RealArray
 ) -> tuple[Factor, ...]:
-    """Fit all factors that can be told; the least certain one is fixed at 1 first, which makes others more certain.
+    """Fit all identifiable factors; the least certain one is fixed at 1 first, which makes the others more certain.
 
     Args:
         model: Names inputs and load.

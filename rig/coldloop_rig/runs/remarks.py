@@ -1,4 +1,4 @@
-"""What the head of a run says of its configuration, and a configuration that the PLC can do."""
+"""Remarks on the configuration in the head of a run, and the configuration changed to one that the PLC can do."""
 
 from dataclasses import replace
 
@@ -48,7 +48,7 @@ def remarks(effective: Configuration[Settings]) -> list[str]:
 
 
 def too_slow(program: ProgramSettings) -> str:
-    """Return that the PLC cannot do what is simulated; empty where it can."""
+    """Return the remark that the PLC is too slow for the simulated controller; empty where it is fast enough."""
     why = _budget(program).too_slow(round(program.updating_period_s / program.process.tick_s))
     return why and (
         f"this PLC (P = {program.budget.power:g}) cannot do what is simulated: with {program.solver_name} {why}; "

@@ -81,11 +81,11 @@ class Simulation:
     recording: Recording
     """The trace as arrays."""
     summary: dict[str, Any]
-    """What `summary.json` has."""
+    """Content of `summary.json`."""
     configuration: dict[str, Any]
     """The effective configuration by dotted key."""
     process: Process
-    """What was run."""
+    """Process that was simulated."""
     _cost: StageCost
     _events: tuple[tuple[str, Event], ...]
 
@@ -153,6 +153,11 @@ def simulate(
     **settings: Mapping[str, Any] | object,
 ) -> Simulation:
     """Run the three programs in this process, in lock-step; return what they did.
+
+    Example:
+        result = simulate(load="a", updating_period=2.5, duration_s=15)
+        print(result.summary["tau_u_mean"])
+        print(result.trace.to_dict()["T5"][-1], result.trace.units["T5"])
 
     Args:
         load: Named load such as `a`, or a CSV file with the columns time_s and load_w; by default `2h`.

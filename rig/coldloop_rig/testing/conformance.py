@@ -1,4 +1,4 @@
-"""What a solver, a rule or an estimator that is installed beside this package keeps, and how good it is.
+"""Conformance test of a solver, a rule or an estimator that is installed beside this package, and its quality.
 
 `python -m coldloop_rig.testing.conformance NAME` prints it of a solver, with `rule` or `estimator` behind it of such.
 """
@@ -27,9 +27,9 @@ from coldloop_rig.settings import Settings
 from coldloop_rig.text_tables import aligned
 
 DECISIONS: Final = 200
-"""In each session."""
+"""Decisions in each session."""
 LONGEST_TICKS: Final = 20
-"""Of a sampling period, as the cold box has it; a ladder says what periods there are."""
+"""Ticks of the cold box's sampling period; a ladder lists the updating periods to choose from."""
 LADDERS: Final = (
     tuple(range(SHORTEST_TICKS, LONGEST_TICKS + 1)), (SHORTEST_TICKS, LONGEST_TICKS), (LONGEST_TICKS,),
 )  # fmt: skip
@@ -148,9 +148,9 @@ def equal(some: list[Estimate], others: list[Estimate]) -> bool:
 
 
 class World:
-    """A plant that is the model, and begins elsewhere than the estimator believes; nothing disturbs it.
+    """Plant that equals the model and begins away from the initial estimate, without process noise.
 
-    Its inputs move; its constant errors are some of its sensors' standard deviations, and a part of its load is unseen.
+    Its inputs move; its sensor biases are some standard deviations of the noise; a part of its load is unmeasured.
     """
 
     def __init__(self, model: PlantModel, process: Process, seed: int, *, loses: bool) -> None:
@@ -163,7 +163,7 @@ class World:
         """Error of the outputs predicted from the last estimate, over that from nothing."""
 
     def session(self, estimator: OutsideCorrection) -> list[Estimate]:
-        """Return the estimates of a session; what is none is followed by the prediction, as in the program."""
+        """Return the estimates of a session; a missing one is replaced by the prediction, as in the program."""
         m, random = self._model, np.random.default_rng(self._seed)
         A, B, F = over(m, self._ticks)
         scale = math.sqrt(self._process.ticks_per_sample) * m.walks
@@ -264,7 +264,7 @@ def problems_of(settings: Settings, count: int = PROBLEMS) -> Iterator[Quadratic
 
 
 class Report(NamedTuple):
-    """What there is to say of a part."""
+    """Result of the conformance test of a part."""
 
     kept: list[Requirement]
     more: str = ""

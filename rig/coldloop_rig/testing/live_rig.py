@@ -30,11 +30,11 @@ from coldloop_rig.settings import Period, Settings, configured
 
 T = TypeVar("T")
 LOOK_S: Final = 0.01
-"""Between two looks at the tick of the plant, in real time."""
+"""Interval at which the plant's tick is polled, s of real time."""
 END_S: Final = 1.0
-"""How long the end of a process may take to be known after its connections were closed."""
+"""Longest time from a closed connection until the end of its process is known, s."""
 FEED_S: Final = 0.5
-"""Between two looks at the load that the plant knows of, in a session in real time."""
+"""Interval at which the load known to the plant is polled in a session in real time, s."""
 _FAULT: Final[TypeAdapter[AnyFault]] = TypeAdapter(AnyFault)
 
 
@@ -92,9 +92,9 @@ class NamedRegisters:
         self._blocks = {block.name: block for block in register_map.blocks}
         self._places = {name: place for block in register_map.blocks for name, place in _places_of(block)}
         self.endpoint = endpoint
-        """Where the service listens, for clients of your own."""
+        """Endpoint of the service, for clients of your own."""
         self.latest: dict[str, Any] = {}
-        """What was read last, by name, since `clear`."""
+        """Values that were read last, by name, since `clear`."""
 
     def read(self, name: str, *, row: int = 0) -> Any:  # noqa: ANN401 a number, or a tuple of an array
         """Return the value of a register; `row` counts from 0 in blocks that have several."""
@@ -177,13 +177,13 @@ class LiveRig:
 
     def __init__(self, settings: Settings, folder: Path) -> None:
         self.settings = settings
-        """Their configuration, but for the ports."""
+        """Configuration of the services, except for the ports."""
         maps, self._tick_s = maps_of(settings.process), settings.process.tick_s
         self._scenario = make_scenario(settings)
         self._folder = folder
         self._proxied = ProxiedServices(settings, folder, str(settings.plant.seed))
         self.endpoints: RigEndpoints = self._proxied.services.endpoints
-        """Where the services listen."""
+        """Endpoints of the services."""
         self._loop = BackgroundLoop()
         self._stack = AsyncExitStack()
         self._driver = SessionClient(self.endpoints, settings)
@@ -379,6 +379,11 @@ def up(
 ) -> Iterator[LiveRig]:
     """Start plant, control PLC and optimiser PLC on free ports of localhost, and begin a session; stop them at the end.
 
+    Example:
+        with up(load="a", updating_period=2.5) as rig:
+            rig.advance(15)
+            print(rig.plant.read("measurement.y.T5"))
+
     Args:
         load: Named load such as `a`, or a CSV file with the columns time_s and load_w, whose last value is held; by
             default `2h`.
@@ -422,8 +427,8 @@ class Rigs(contextlib.ExitStack):
         self._folder = folder
         self._started = 0
 
-    def up(self, **arguments: Any) -> LiveRig:  # noqa: ANN401 those of `rig.testing.up`
-        """Start a rig; the arguments are those of `rig.testing.up`."""
+    def up(self, **arguments: Any) -> LiveRig:  # noqa: ANN401 as `up` has them
+        """Start a rig; the arguments are those of `coldloop_rig.testing.up`."""
         self._started += 1
         arguments.setdefault("folder", self._folder / f"rig{self._started}")
         return self.enter_context(up(**arguments))

@@ -19,9 +19,9 @@ BLOCK_ROWS: Final = 16
 COLUMN_DIGITS: Final = 8
 """Hexadecimal digits of a column's digest."""
 ROW_DIGITS: Final = 3
-"""Of a row's check in a group: one difference in 4096 is named a row late, or by its block alone."""
+"""Hexadecimal digits of a row's check in a group: one difference in 4096 is named a row late, or by its block alone."""
 CELL_DIGITS: Final = 2
-"""Of a column's check in a block."""
+"""Hexadecimal digits of a column's check in a block."""
 
 
 class Table(TypedDict):
@@ -29,22 +29,22 @@ class Table(TypedDict):
 
     rows: int
     columns: list[str]
-    """Of each group, its columns' digests, separated by spaces."""
+    """Digests of each group's columns, separated by spaces."""
     blocks: list[str]
-    """Of each block of rows, each group's checks of the rows, and the checks of all columns, separated by spaces."""
+    """Checks of each block of rows: each group's checks of the rows, and those of all columns, separated by spaces."""
 
 
 class Difference(NamedTuple):
-    """Where two tables begin to differ."""
+    """First difference of two tables."""
 
     first: int
-    """Row."""
+    """First row that differs."""
     last: int
-    """The same, unless the rows' checks do not tell; then the last row of its block."""
+    """Last row in question: `first`, or the last row of its block where the rows' checks show no difference."""
     columns: tuple[int, ...]
-    """That differ in the block of the row, of the groups that differ in the row."""
+    """Columns that differ in the block of the row, of the groups that differ in the row."""
     others: tuple[int, ...]
-    """That differ elsewhere."""
+    """Columns that differ elsewhere."""
 
 
 def checked(groups: Sequence[Group]) -> Table:

@@ -18,7 +18,7 @@ class Configuration(NamedTuple):
 
     assignments: tuple[str, ...] = ()
     load: str = LIVELY
-    """That, a named load, or `tick:share,...`: shares of the way from the mean load to the end of its span."""
+    """`LIVELY`, a named load, or `tick:share,...`: shares of the way from the mean load to the end of its span."""
     ticks: int = 1000
     process: str = COLD_BOX
     """Name of a process file of `tests.harness.process_files`."""
@@ -69,7 +69,7 @@ FURTHER: Final = {
     "a step test": Configuration((DECLARED_NOISE,), STEPS, 1200, "record"),
     "an FMU": Configuration((DECLARED_NOISE,), STEPS, 1200, "fmu"),
 }  # fmt: skip
-"""What no comparison of the compiled loop with the programs is about."""
+"""Configurations that no comparison of the compiled loop with the programs covers."""
 
 
 COMPARED_ONLY: Final = (
@@ -77,7 +77,7 @@ COMPARED_ONLY: Final = (
     "sequences that are refused, and load steps that interrupt", "column, load steps that interrupt",
     "matrices, state feedback",
 )  # fmt: skip
-"""Whose parts other configurations have as well: the comparison of the compiled loop with the programs will do."""
+"""Configurations whose parts others have as well: comparing the compiled loop with the programs is enough."""
 
 
 def _all() -> Mapping[str, Configuration]:
@@ -91,4 +91,4 @@ def _all() -> Mapping[str, Configuration]:
 
 
 CONFIGURATIONS: Final = _all()
-"""By name."""
+"""Configurations by name."""

@@ -1,4 +1,4 @@
-"""What a configuration left behind, and in which of it two differ, by name."""
+"""Results of a configuration, and the differences of two of them, by name."""
 
 from collections.abc import Collection, Iterator, Sequence
 from typing import Final, NotRequired, TypedDict
@@ -10,7 +10,7 @@ SHOWN: Final = 4
 
 
 class Names(TypedDict):
-    """What columns are called, by place: of messages, never compared."""
+    """Names of columns, by place: for messages, never compared."""
 
     trace: list[str]
     updates: list[str]
@@ -18,7 +18,7 @@ class Names(TypedDict):
 
 
 class Left(TypedDict):
-    """What a run leaves behind, as it is in the file."""
+    """Results of a run, as they are in the file."""
 
     process: str
     processor: NotRequired[str]
@@ -29,7 +29,7 @@ class Left(TypedDict):
     trace has single precision, which rounds away what moves the last bits of a plant only."""
     updates: Table
     instants: str
-    """Tick of each update, separated by spaces: of messages, never compared."""
+    """Tick of each update, separated by spaces: for messages, never compared."""
     events: list[str]
     """Each as the numbers of service, kind, tick, subject, cause."""
     indicators: list[str]

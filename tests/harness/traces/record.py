@@ -17,7 +17,7 @@ class RecordError(Exception):
 
 
 class Platform(TypedDict):
-    """What a record was made with."""
+    """Versions and processor that a record was made with."""
 
     python: str
     numpy: str
@@ -28,22 +28,22 @@ class Platform(TypedDict):
 
 
 class Reason(TypedDict):
-    """Why traces are what they are since a date."""
+    """Reason for traces that are new or have moved at a date."""
 
     date: str
     reason: str
     configurations: list[str]
-    """Whose traces are new or have moved."""
+    """Configurations whose traces are new or have moved."""
 
 
 class Found(TypedDict):
-    """What runs have found."""
+    """Results of runs, by configuration."""
 
     made_with: Platform
     services: list[str]
-    """By the numbers that events have."""
+    """Services by the numbers that events have."""
     names: dict[str, Names]
-    """By process, for readers: a renaming moves no trace."""
+    """Names of columns by process, for readers: a renaming moves no trace."""
     configurations: dict[str, Left]
 
 

@@ -82,7 +82,7 @@ def left_by(configuration: Configuration, models: Path) -> tuple[Process, Left]:
         ],
         indicators=[repr(float(value)) for value in evaluation.indicators.by_name.values()],
     )
-    if configuration.process != COLD_BOX:  # whose model is a file; those of others were just computed, by LAPACK
+    if configuration.process != COLD_BOX:  # the cold box's model is a file; others were just computed by LAPACK
         left["processor"] = processor()
     return settings.process, left
 

@@ -116,7 +116,7 @@ OF_COLD_BOX: Final = {
     "near the capacity": ("plant.mismatch.heat_transfer=0.9",),
     "rate limits by elapsed time": ("limits.rate_reference=elapsed",),
 }
-"""What differs; with exchangers 10 % worse the plant holds 513 W, and the hours d to f have up to 585 W."""
+"""Settings of each regime; with exchangers 10 % worse the plant holds 513 W, and the hours d to f have up to 585 W."""
 COLUMNS: Final = ("regime", "load", "tau_u (s)", "mean tau_u (s)", "J_BF")
 SUMMARY: Final = ("regime", "mean of adaptive (s)", "best fixed (s)", "adaptive over it", "in words")
 

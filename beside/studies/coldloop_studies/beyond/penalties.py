@@ -1,4 +1,4 @@
-"""What penalties, start and devices of the ODE-based solver do to costs, to violations and to the best period.
+"""Effect of penalties, start and devices of the ODE-based solver on costs, violations and the best period.
 
 The solver tuned and as printed, and each with one thing changed at a time.
 """
@@ -75,7 +75,7 @@ OWN: Final = {
     AS_PRINTED: ("alpha = 1 rho", "rate rows in % and W", f"{COST_SCALE} 1e-08", "without look-ahead rows",
                         "not held at bounds", "first knot as rows", "box penalty"),
 }  # fmt: skip
-"""What each preset has itself. A test compares it with the presets."""
+"""Changes that each preset contains itself. A test compares them with the presets."""
 
 
 def _preset(preset: str) -> tuple[str, ...]:
@@ -98,9 +98,9 @@ VARIANTS: Final = tuple(
 )
 
 SETTLED: Final = 10.0
-"""At which a solver has converged."""
+"""Computing power, over that of the reference PLC, at which a solver has converged."""
 START_POWERS: Final = (0.2, 0.4, 0.6, 1.0)
-"""Of other starts, which are all about few iterations."""
+"""Computing powers at which other starts are compared: a start matters only with few iterations."""
 
 
 def variants(options: StudyOptions) -> tuple[PenaltyVariant, ...]:
@@ -155,7 +155,7 @@ def closed(load: Load, variant: PenaltyVariant) -> RunRequest:
 
 def hours(options: StudyOptions) -> list[Load]:
     """Return the hours that periods are compared in."""
-    return loads(options, *options.hours, usual=3)  # those from the second on are fresh
+    return loads(options, *options.hours, usual=3)  # draws from the second on are fresh
 
 
 def periods(options: StudyOptions) -> tuple[float, ...]:
@@ -181,7 +181,7 @@ def requests(options: StudyOptions) -> Iterator[RunRequest]:
 FIRST: Final = "hours of the first draw"
 COSTS: Final = {"J_open_mean": "open loop", "J_BF": "J_BF"}
 PeriodCosts = dict[Load, Mapping[str, Series]]
-"""By hour: costs of the periods, by kind of cost."""
+"""Costs of the periods, by hour and kind of cost."""
 
 
 def table_of(costs: PeriodCosts, some: Sequence[Load], cost: str) -> Series:

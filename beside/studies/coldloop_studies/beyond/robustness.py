@@ -1,4 +1,4 @@
-"""What controllers and rules of the updating period are worth on plants and sensors that differ from the model."""
+"""Comparison of controllers and rules of the updating period on plants and sensors that differ from the model."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -37,7 +37,7 @@ CONDITIONS: Final = {
     ),
     ESTIMATED: (f"{PROGRAM}estimator.load_known=false",),
 }  # fmt: skip
-"""What differs from what the controller believes. Bias: 0.2 % of level, 0.2 K, 5 mbar."""
+"""Assignments by which plant and sensors differ from the controller's model. Bias: 0.2 % of level, 0.2 K, 5 mbar."""
 _OTHERS: Final = {"heater": ("heater", 0.2), "load as announced": ("load", 0.05), "level gauge": ("level_gauge", 0.01)}
 BESIDE_THE_BOX: Final = {
     **{
@@ -46,7 +46,7 @@ BESIDE_THE_BOX: Final = {
     },
     **{f"delay of {ticks} ticks": (f"{MISMATCH}delay_ticks={ticks}",) for ticks in (1, 2)},
 }  # fmt: skip
-"""The same of heater, load, gauge and actuators, for which no loop is compiled."""
+"""Assignments of deviations of heater, load, gauge and actuators, for which no loop is compiled."""
 _LOADS: Final = {
     ESTIMATED: CONDITIONS[ESTIMATED], "load 5 % above its measurement": BESIDE_THE_BOX["load as announced +5 %"],
 }  # fmt: skip
@@ -55,7 +55,7 @@ UNKNOWN_LOADS: Final = {
     f"{plant}, {load}, noise": (*CONDITIONS[plant], *changes, *NOISE)
     for plant in _PLANTS for load, changes in _LOADS.items()
 }  # fmt: skip
-"""A plant that is off and a load that is not known, with noise: what each of them does alone stands above."""
+"""Conditions that combine a deviating plant, an unmeasured load and noise; those above have one of them alone."""
 LINEAR: Final = {
     "linear plant": (), "linear plant, sensor noise": NOISE, "linear plant, sensor bias": CONDITIONS["sensor bias"],
 }  # fmt: skip
@@ -81,14 +81,14 @@ HELD_PCT: Final = 1.0
 
 
 class HoursUnder(NamedTuple):
-    """What one controller did under one condition, hour by hour; shape (n,) each."""
+    """Results of one controller under one condition, hour by hour; shape (n,) each."""
 
     costs: Series
     """J_BF."""
     level_pct: Series
     """Share of the time that L1 is outside its band."""
     temperature_pct: Series
-    """The same of T5."""
+    """Share of the time that T5 is outside its band."""
 
     @classmethod
     def of(cls, runs: Sequence[Indicators]) -> Self:
@@ -109,7 +109,7 @@ class HoursUnder(NamedTuple):
 Case = tuple[str, str, Load, RunRequest]
 """Condition, controller, load and request of a run."""
 Found = Mapping[tuple[str, str], HoursUnder]
-"""By condition and controller."""
+"""Results by condition and controller."""
 
 
 def controllers_remarks(options: StudyOptions, found: Found) -> list[str]:

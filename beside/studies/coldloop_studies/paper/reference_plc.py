@@ -37,7 +37,7 @@ ACTIVE: Final = operations.ACTIVE_ROWS
 N: Final = 49
 """Variables of the paper's problem."""
 SIZES: Final = dense_sizes(N, 94, 21)
-"""Of the paper's problem, zeros counted."""
+"""Sizes of the paper's problem, zeros counted."""
 REPEATS = 20
 
 
@@ -160,7 +160,7 @@ def _speed_figure(rows: list[tuple[Cell, ...]]) -> Figure:
 
 PERIOD_S: Final = 2.5
 LONGEST_TICKS: Final = 2 * HOUR_TICKS
-"""Of the eight hours: more draws say more than longer ones, for it is single steps that roundings change."""
+"""Longest run of each of the eight hours: rounding changes single steps, so more draws say more than longer runs."""
 INPUTS: Final = {"CV155": "%", "NCR22_A": "W", "CV156": "%"}
 
 

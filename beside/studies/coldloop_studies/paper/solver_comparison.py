@@ -44,7 +44,7 @@ def throttled(
 
 
 PAIRED_DRAWS: Final = 10
-"""Of the eight hours' families, an hour each, unless another number is asked for."""
+"""Draws of each of the eight hours' families, an hour each, unless the command sets another number."""
 FEW_POWERS: Final = (0.2, 0.6, 1.0, 2.0, 4.0, 10.0)
 QUICK_POWERS: Final = (0.2, 1.0, 25.0)
 LABELS: Final = {
@@ -127,7 +127,7 @@ def _open_loop_figure(found: OpenLoop) -> Figure:
 
 
 HARSH_DRAWS: Final = 3
-"""Of six hours: they have more than 300 harsh problems."""
+"""Draws of each of six hours: together they have more than 300 harsh problems."""
 
 
 def _harsh_loads(options: StudyOptions) -> list[Load]:
@@ -213,7 +213,8 @@ SOLVERS: Final = {"ode": "ODE", "qpoases": "qpOASES"}
 INDICATORS: Final = ("J_dev", "J_cst", "J_total", "c1", "c2", "J_BF")
 CLOSED_DRAWS: Final = 6
 CLOSED_TICKS: Final = 2 * HOUR_TICKS
-"""Of the eight hours, in the closed loop: six draws of two hours say more than one and a half of eight."""
+"""Longest run of each of the eight hours in the closed loop: six draws of two hours say more than one and a half of
+eight."""
 COLUMNS: Final = ("part", "load", "solver", "power", *INDICATORS, "J_total over the lowest")
 
 

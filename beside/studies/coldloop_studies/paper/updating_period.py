@@ -20,7 +20,7 @@ from coldloop_studies.study import NOISE, PROGRAM, Load, Outcomes, StudyOptions,
 NINE: Final = tuple(published.updating_period()["a"]["tau_u_s"].tolist())
 """Periods of the paper, s."""
 SHORTER: Final = (0.5, 0.75)
-"""Below the paper's, where the optimum of a fast solver may lie."""
+"""Periods below the paper's, s, where the optimum of a fast solver may lie."""
 FEW: Final = (1.0, 2.5, 5.0)
 ADAPTIVE: Final = 0.0
 RULE: Final = f"{PROGRAM}adaptive.rule="

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 COLUMNS: Final = ("number", "boot", "utc", "tick", "plant_time_s", "kind", "subject", "cause", "value", "who")
 LOOK_AGAIN_S: Final = 1.0
-"""With --follow: time between two looks at the journal."""
+"""Interval at which the journal is polled with --follow, s."""
 
 
 def _declare_events(parser: argparse.ArgumentParser) -> None:
@@ -55,7 +55,7 @@ def _declare_events(parser: argparse.ArgumentParser) -> None:
 
 
 class Since(NamedTuple):
-    """From where on the journal is read."""
+    """Place from which on the journal is read."""
 
     number: int
     utc: float

@@ -14,7 +14,7 @@ from coldloop_rig.cli.commands.options import Command, configuration
 HEADING: Final = re.compile(r"^(#+) +(.+)$")
 FENCE: Final = "```"
 INSTALLED: Final = Path(__file__).parents[2] / "pages"
-"""Where a wheel has them."""
+"""Folder of the pages in a wheel."""
 CHECKOUT: Final = Path(__file__).parents[4] / "docs"
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 FILES: Final = ("process.toml", "my_plant.py")
 INSTALLED: Final = Path(__file__).parents[2] / "examples"
-"""Of a wheel; a clone has them beside the packages."""
+"""Folder of the examples in a wheel; a clone has them beside the packages."""
 EXAMPLES: Final = (
     "cool_down", "efficient_refrigerator", "optimiser_by_registers", "optimiser_with_do_mpc", "outside_package",
     "quadruple_tank", "smaller_turbine", "wood_berry",

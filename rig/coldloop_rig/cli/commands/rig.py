@@ -58,7 +58,7 @@ def _declare_up(parser: argparse.ArgumentParser) -> None:
                         help="put a proxy into each link, for `coldloop fault cut`")  # fmt: skip
     parser.add_argument("--detach", action="store_true", help="return when it is up; `coldloop down` ends it")
     parser.add_argument("--quiet", action="store_true", help="do not print addresses and commands")
-    parser.add_argument("--locked", type=int, help=argparse.SUPPRESS)  # what --detach has locked for this process
+    parser.add_argument("--locked", type=int, help=argparse.SUPPRESS)  # the lock file that --detach holds
     parser.set_defaults(mode="realtime")
 
 

@@ -110,7 +110,7 @@ def _do(job: "Job", options: argparse.Namespace, figure: "FigureProcess") -> int
     from coldloop_rig.runs.remarks import remarks
     from coldloop_rig.runs.running import plain_arguments, run_into
 
-    told = [] if job.way in (Way.RECORDED, Way.ATTACHED) else remarks(job.effective)  # of a PLC that is ours
+    told = [] if job.way in (Way.RECORDED, Way.ATTACHED) else remarks(job.effective)  # remarks are for a PLC of ours
     name = "session" if job.way is Way.RECORDED else Path(job.effective.settings.plant.load).stem
     out = options.out or claim_folder_of_now(Path("runs"), name)
     claim_folder(out, force=options.force)

@@ -56,11 +56,11 @@ class RefrigeratorState(NamedTuple):
     x: Array
     """States of the cold box, the first 28 of `memory.x`."""
     y: Array
-    """As in `BoxState`."""
+    """Array as in `BoxState`."""
     station: Array
     """Signals, mode and alarms of the station, shape (21,)."""
     noise: Array
-    """As in `BoxState`."""
+    """Array as in `BoxState`."""
     memory: RefrigeratorMemory
     ahead: Array
     """Disturbances at each tick of the trace and at the one behind it, without load, shape (N + 1, 16)."""
@@ -68,7 +68,7 @@ class RefrigeratorState(NamedTuple):
 
 @advances(BoxConstants)
 @kernel
-def advance_box(c: BoxConstants, plant: BoxState, u: Array, load: float, row: int) -> None:  # noqa: ARG001 of others
+def advance_box(c: BoxConstants, plant: BoxState, u: Array, load: float, row: int) -> None:  # noqa: ARG001 others use it
     """Go one tick forward with a cold box alone; its slope is known where inputs and load stand."""
     held = plant.held[3] == load
     for i in range(3):

@@ -1,4 +1,4 @@
-"""Ticks and updates of the three programs as one compiled loop, for as long as nothing has to be told.
+"""Ticks and updates of the three programs as one compiled loop, which runs until something has to be reported.
 
 A tick is: outputs, the plant's step, the measurement observed. The control PLC's part is its own functions, which take
 records in the place of its objects. The loop ends with a tick that `observe` has found something in, which the program
@@ -59,7 +59,7 @@ LATCHED: Final = 4
 COOLING: Final = False
 """Whether the plant is being cooled down: then the classical loops drive, and not this one."""
 LATE: Final = False
-"""How answers come."""
+"""Whether answers come late."""
 
 
 @kernel

@@ -28,7 +28,7 @@ class OwnState(NamedTuple):
     met: Array
     """Disturbances beside the load at each tick of the trace and at the one behind it, shape (N + 1, k)."""
     memory: Any
-    """Of lags: that of the program itself."""
+    """Memory of the lags, shared with the program; () for other plants."""
     first: int
     """Tick of the trace's first row."""
 

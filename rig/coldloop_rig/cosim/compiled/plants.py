@@ -17,8 +17,8 @@ class CompiledPlant(Protocol):
     """The program of a plant whose ticks are compiled."""
 
     @property
-    def constants(self) -> Any:  # noqa: ANN401 of its kind
-        """What does not change in a session."""
+    def constants(self) -> Any:  # noqa: ANN401 differs by kind
+        """Constants of the plant in a session."""
 
     def state(self, noise: Array, ticks: int) -> PlantState:
         """Return the present state, and what the next `ticks` ticks bring."""

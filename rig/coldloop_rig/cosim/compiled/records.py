@@ -1,4 +1,4 @@
-"""What compiled loops take and overwrite: the state of the scan as records, constants, the trace, reports."""
+"""Arguments that compiled loops read and overwrite: the state of the scan as records, constants, the trace, reports."""
 
 from collections.abc import Sequence
 from dataclasses import fields
@@ -89,19 +89,19 @@ for the sensors, a row for each tick of the trace, or no rows.
 
 
 class World(NamedTuple):
-    """What does not change in a run."""
+    """Constants of a run: plant, sensors, load and scan."""
 
     plant: Any
-    """Of its kind."""
+    """Plant constants; the type depends on the plant kind."""
     biases: Array
-    """What the sensors show too much, shape (outputs,)."""
+    """Sensor biases, added to the outputs, shape (outputs,)."""
     deviations: Array
     """Standard deviations of the sensors' noise, shape (outputs,)."""
     load_ticks: NDArray[np.int64]
     """First tick of each step of the load."""
     load_watts: Array
     scan: ScanConstants
-    """With arrays."""
+    """Constants of the scan, with arrays in the place of sequences."""
 
 
 class Optimizer(NamedTuple):
@@ -109,11 +109,11 @@ class Optimizer(NamedTuple):
 
     constants: Constants
     method: Any
-    """Of a solver of our own."""
+    """Solver constants; the type depends on the solver, which is one of our own."""
     rule: UpdatingRule
     starts: Starts
     memory: OptimizerState
-    """Its state, which is overwritten."""
+    """State of the optimiser, which is overwritten."""
     latched: Latched
     """Room for an update."""
 
@@ -137,7 +137,7 @@ class Trace(NamedTuple):
 
 
 class Reports(NamedTuple):
-    """What the optimiser did, a row an update."""
+    """Reports of the optimiser, one row per update."""
 
     counts: NDArray[np.int64]
     """Update, tick, tau_u, q, iterations."""

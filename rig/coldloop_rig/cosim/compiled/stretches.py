@@ -122,7 +122,7 @@ class CompiledStretches:
         block = SampleBlock(first, load, u, y, x, station if station.size else NO_STATION)
         return Stretch(block, _optimizations(self._reports, int(counts[SOLVED])), latched)
 
-    def _run(self, loop: Callable[..., int], *arguments: Any) -> int:  # noqa: ANN401 of each loop
+    def _run(self, loop: Callable[..., int], *arguments: Any) -> int:  # noqa: ANN401 arguments differ by loop
         """Run a loop and return how it ended; it may have to be compiled: whether it is there is asked once."""
         if not self._may_compile:
             if loop not in self._is_there:
@@ -156,7 +156,7 @@ class CompiledStretches:
 
 def _is_compiled(program: OptimizerProgram) -> bool:
     """Tell whether the program's updates have a compiled form: solver, rule and estimator of our own, no forecast."""
-    if type(program) is not OptimizerProgram:  # who has made another kind of it wants to be asked
+    if type(program) is not OptimizerProgram:  # a subclass may behave differently
         return False
     return isinstance(program.solver, KernelSolver) and not (program.plans_by_steps or program.process.forecasts)
 
