@@ -1,4 +1,4 @@
-"""What more than one service needs, and the front door: `coldloop.simulate(...)`, `coldloop.Process.read(...)`."""
+"""Shared parts of the services, and the front door: `coldloop.simulate(...)`, `coldloop.Process.read(...)`."""
 
 from importlib import import_module
 from importlib.metadata import entry_points

@@ -34,9 +34,9 @@ LISTING: Final = "`coldloop config` lists the keys"
 MOST_BYTES: Final = 1_000_000
 """Size of a configuration file, at most."""
 WHOLE: Final = "configuration"
-"""What is wrong if no key is, but several together."""
+"""Place of an error that is not in one key, but in several together."""
 LARGEST: Final = 3.4e38
-"""Of a number: registers and records have single precision."""
+"""Largest number: registers and records have single precision."""
 MOST_SHOWN: Final = 200
 """Characters of a wrong value that a message shows."""
 M = TypeVar("M", bound=BaseModel)

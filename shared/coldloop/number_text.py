@@ -10,7 +10,7 @@ PLAIN: Final = range(-4, 7)
 LONGEST_FRACTION: Final = 7
 """Digits after the point of a mark; marks that need more have an exponent."""
 NEAR: Final = 1e-3
-"""What the label of a mark may be off, in steps of the marks."""
+"""Tolerance of the label of a mark, in steps of the marks."""
 
 
 def number_text(value: float, digits: int = 4) -> str:

@@ -26,7 +26,7 @@ QUOTED: Final = 80
 """Characters of a file in a message."""
 NUMBER: Final = re.compile(r"(?=[+-]?[.,]?\d)[+-]?(\d{1,3}([.,' \xa0]\d{3})+|\d*)([.,]\d*)?([eE][+-]?\d+)?")
 READING: Final = re.compile(rf"{NUMBER.pattern}$|[+-]?(nan|inf)|\d+[-./]\w+[-./]|.*\d:\d\d", re.IGNORECASE)
-"""What a number, a date or a time begins with, and the name of a unit does not."""
+"""Pattern that a number, a date or a time begins with, and the name of a unit does not."""
 QUALITY: Final = re.compile(r"(.*[\W_])?(qual|qlty|q|opcquality|status ?(code)?|qualit(y|ät|aet|é))")
 """Names of columns that say how good readings are."""
 GOOD: Final = {"good", "ok", "g", "gut", "valid", "normal", "true"}
@@ -54,7 +54,7 @@ class Table:
     where: str
     """Names it in messages."""
     names: tuple[str, ...]
-    """Of the columns."""
+    """Names of the columns."""
     rows: tuple[tuple[int, list[str]], ...]
     """Number of the line and cells, as many as there are names or more."""
     decimal: str

@@ -44,7 +44,7 @@ LOW, MEDIUM, HIGH, CRITICAL = AlarmPriority
 
 
 class AlarmRule(NamedTuple):
-    """How one alarm is treated. Delays are seconds of plant time."""
+    """Treatment of one alarm. Delays are seconds of plant time."""
 
     priority: AlarmPriority
     on_delay_s: float = 0.0
@@ -97,7 +97,7 @@ Delay = Annotated[FiniteFloat, within(lambda process: (0, 345_600 * process.tick
 
 
 class RuleSettings(BaseModel):
-    """What differs from the default rule of an alarm; what is not given stays."""
+    """Changes to the default rule of an alarm; what is not given keeps its default."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -134,14 +134,15 @@ def _with_declared(given: object) -> object:
 
 
 class AlarmSettings(ProcessSettings):
-    """When the alarms are raised, how urgent they are, and how long they may be shelved."""
+    """Settings of the alarms: when they are raised, how urgent they are, and how long they may be shelved."""
 
     bands: Annotated[dict[str, tuple[FiniteFloat, FiniteFloat]], BeforeValidator(_with_declared)] = declared(_bands_of)
-    """Of each output that has one, by its name; those that are not given are as the process declares them."""
+    """Bands of the outputs that have one, by the output's name; those that are not given are as the process declares
+    them."""
     band_delay_s: Delay = stretched(5.0)
     """On-delay of their alarms: how long an output must be outside, plant time."""
     rules: dict[Annotated[str, AfterValidator(_known_name)], RuleSettings] = Field(default_factory=dict)
-    """By name of the alarm, such as `sensor_bad`."""
+    """Rules that differ from the default, by name of the alarm, such as `sensor_bad`."""
     shelving_s: Annotated[FiniteFloat, Field(ge=1, le=65_535)] = 900.0
     """How long an alarm is shelved by a command that gives no time, plant time."""
     longest_shelving_s: Annotated[FiniteFloat, Field(ge=1, le=65_535)] = 28_800.0
@@ -233,7 +234,7 @@ COMMANDED: Final[Mapping[int, EventKind]] = {
 
 
 NOT: Final = 2**62
-"""In the place of the tick since which a condition differs."""
+"""Sentinel for the tick since which a condition differs: it does not differ."""
 
 
 class AlarmConstants(NamedTuple):
@@ -247,12 +248,12 @@ class AlarmConstants(NamedTuple):
     low: Numbers
     high: Numbers
     dead: Numbers
-    """By which the band is wider while its alarm is not active."""
+    """Deadband: how much wider the band is while its alarm is not active."""
 
 
 @dataclass(slots=True)
 class AlarmConditions:
-    """What is known of the conditions, by number of the alarm."""
+    """State of the conditions, by number of the alarm."""
 
     active: list[bool]
     """Whether it is active: its condition held for longer than its on-delay, and has not ended for its off-delay."""
@@ -312,7 +313,7 @@ class AlarmPanel(AlarmConditions):
         """Causes for which an active alarm has been raised since its last acknowledgement."""
         self._now = 0
         self.rows = [Alarm(priority=rule.priority) for rule in self._rules]
-        """What the registers show, by number of the alarm."""
+        """Alarms as the registers show them, by number of the alarm."""
         self.changes = 0
         """Rises with every change, so that who shows the alarms knows when to."""
 
@@ -486,7 +487,7 @@ OPTIMIZER_DRIVES: Final = (Mode.MPC, Mode.REST)
 
 
 class ScanSummary(NamedTuple):
-    """What the alarms of a scan depend on, beside those of bands."""
+    """Conditions of one scan that its alarms depend on, beside those of bands."""
 
     mode: Mode
     cause: Cause

@@ -120,7 +120,7 @@ class PiController:
         """Return the wanted input for a measured output.
 
         Args:
-            measured: The output. One that is no number leaves the input as it is.
+            measured: The output. NaN leaves the input unchanged.
             applied: The input applied until now.
             elapsed_s: Time since the execution before, s; the nominal time by default.
         """

@@ -21,7 +21,7 @@ from coldloop.safety.sequence import Inputs
 
 
 class CoolDownSettings(BaseModel):
-    """When the cool-down begins, and when its steps end."""
+    """Settings of the cool-down: when it begins, and when its steps end."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

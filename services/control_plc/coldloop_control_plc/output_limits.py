@@ -55,7 +55,7 @@ class Limits(NamedTuple):
     rate: tuple[float, ...]
     """Largest change in a sampling period of 5 s."""
     slack: tuple[float, ...]
-    """By which a sequence may miss a bound or a rate."""
+    """Tolerance for the violation of a bound or a rate by a sequence."""
     slew_ticks: int
     """Within fewer ticks than this an output moves by at most its rate."""
     ticks_per_sample: int
@@ -75,7 +75,7 @@ def plain(limits: InputLimits) -> Limits:
 
 @dataclass(slots=True)
 class GuardState:
-    """What the guard remembers.
+    """State of the guard.
 
     The rate window: outputs may stray from `anchor` by `share` of the rate until it ends, one sampling period of 5 s
     after `start` or when the next sequence begins.

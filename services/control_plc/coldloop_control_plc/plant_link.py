@@ -78,11 +78,11 @@ class PlantLink:
         self.is_confirmed = False
         """The last reading said what the one before had said."""
         self._known_place: float | None = None
-        """Where the rack was, in ticks of the session, when it was last synchronised."""
+        """Position of the rack, in ticks of the session, when it was last synchronised."""
         self._old_since: float | None = None
         """Since when readings are of a time before that."""
         self.session = 0
-        """That of the rack when it last answered; so the tick."""
+        """Session of the rack when it last answered; so the tick."""
         self.tick = 0
         self._moved_at: float | None = None
         self.refused = 0

@@ -32,7 +32,7 @@ ABANDONED: Final = 5
 
 @dataclass(slots=True)
 class PlayerState:
-    """Where the player is; lists of two are of a sequence each, `slot` of the one that is played."""
+    """State of the player; lists of two have one element per sequence, `slot` of the one that is played."""
 
     updates: int
     """Number of the next update."""
@@ -46,7 +46,7 @@ class PlayerState:
     load_step: float = 0.0
     """Change of the load (W) that interrupts the update under way; 0 is never."""
     shortage: float = 0.0
-    """What the load is above what can be held by the last plan, W; negative: below what is needed."""
+    """Excess of the load over what can be held by the last plan, W; negative: below what is needed."""
     suspects: int = 0
     """Outputs that the last plan does without: bit i is output i; then inputs that have no effect."""
     missed: int = -1
@@ -64,7 +64,7 @@ class PlayerState:
     """The update that each answers."""
     first_ticks: list[int] = field(default_factory=lambda: [0, 0])
     lengths: list[int] = field(default_factory=lambda: [0, 0])
-    """In ticks; 0 where there is no sequence."""
+    """Length of each sequence in ticks; 0 where there is none."""
     periods: list[int] = field(default_factory=lambda: [0, 0])
     """Updating period before each, in ticks."""
     accepted: int = 0

@@ -61,7 +61,7 @@ LOST_TICKS = 4
 
 @dataclass(frozen=True, slots=True)
 class OperatingPoint:
-    """What the control PLC knows of the model: its inputs and outputs at rest, and its digest."""
+    """The model as the control PLC knows it: its inputs and outputs at rest, and its digest."""
 
     inputs: tuple[float, ...]
     outputs: tuple[float, ...]
@@ -69,7 +69,7 @@ class OperatingPoint:
 
 
 class ScanConstants(NamedTuple):
-    """What does not change in a session."""
+    """Constants of a scan in one session."""
 
     limits: Limits
     sensors: SensorConstants

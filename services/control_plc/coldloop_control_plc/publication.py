@@ -1,4 +1,4 @@
-"""What the control PLC shows: registers, log and telemetry, made from the program's state."""
+"""Publication of the control PLC's state: registers, log and telemetry, made from the program's state."""
 
 import logging
 import math
@@ -47,12 +47,12 @@ class ControlPublication:
         self.overruns = 0
         """Scans that began too late."""
         self.lateness = LatenessRecord()
-        """That of all scans of this session in real time."""
+        """Lateness of all scans of this session in real time."""
         self.skew = Skew(0.0, math.inf)
         """How much faster the rack's clock is than ours, and its phase error."""
         self.offset_ms = 0.0
         self.lease: WriterLease | None = None
-        """That of the optimiser."""
+        """Lease of the optimiser."""
         bank.keep_fresh(Identity, self._identity)
         bank.keep_fresh(ProcessNow, lambda: program.process)
         bank.keep_fresh(Status, self._status)

@@ -74,7 +74,7 @@ class SkewEstimator:
 
 
 class RackClock:
-    """When our scans are due, by a schedule that follows the rack.
+    """Schedule of our scans, which follows the rack.
 
     Args:
         factor: Seconds of plant time in a second of real time, nominally.

@@ -1,4 +1,4 @@
-"""What the control PLC does while the link to the rack is out of step: it reads what the rack applies, until it is."""
+"""Search for the rack while the link to it is out of step: the control PLC reads what the rack applies, until it is."""
 
 import asyncio
 import contextlib

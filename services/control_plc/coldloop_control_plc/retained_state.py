@@ -1,4 +1,4 @@
-"""What the control PLC keeps over a restart."""
+"""State of the control PLC that is retained over a restart."""
 
 import base64
 import logging
@@ -26,7 +26,7 @@ log = logging.getLogger("coldloop.control_plc")
 OWNER: Final = "control_plc/6"
 """Who retained states belong to, and the version of what they hold."""
 OF_THE_SESSION: Final = ("session", "tick", "pace", "updates", "playing", "cool_down")
-"""What is retained of a session."""
+"""Keys of the retained state that belong to a session."""
 
 Count = Annotated[int, Field(ge=0, lt=2**32)]
 

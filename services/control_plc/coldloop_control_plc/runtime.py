@@ -167,7 +167,7 @@ class ControlPlc:
         self._lost_lines = 0
         self._awaiting_since: float | None = None
         self._repaced = -REPACED_S
-        """When the time base was changed last, s."""
+        """Time of the last change of the time base, s."""
         self.bank.put(program.operator)
         self.bank.put(WatchdogTime(program.watchdog.time))
         program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None), int(self._store.refused))

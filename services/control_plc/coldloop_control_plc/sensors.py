@@ -1,6 +1,6 @@
-"""Measurements that cannot be right: found, replaced by the last good value, and reported.
+"""Sensor check: bad measurements are detected, replaced by the last good value, and reported.
 
-A measurement is bad when it is no number, outside its sensor's range, or frozen: it does not change by a bit for a
+A measurement is bad when it is NaN, outside its sensor's range, or frozen: it does not change by a bit for a
 while in which most of the others move. When nothing at all changes, load and states included, the image is an old one:
 a plant that rests is known by its inputs, which rest too. A turbine without a pressure difference may stand still.
 
@@ -20,19 +20,19 @@ from coldloop_control_plc.output_limits import Numbers
 
 Range = tuple[FiniteFloat, FiniteFloat]
 STANDSTILL_RATIO = 1.1
-"""Of the pressures before and behind the turbine's nozzle, below which it may stand; it is some ten in operation."""
+"""Ratio of the pressures before and behind the turbine's nozzle, below which it may stand; some ten in operation."""
 MOVES = 240
 """Ticks in which an output that is not controlled must have moved before it can be frozen."""
 UNKNOWN, NOT_MOVED = -2, -1
-"""In the place of the tick since which the inputs have moved."""
+"""Sentinels for the tick since which the inputs have moved: it is not known; they have not moved."""
 NONE = -1
-"""In the place of another tick."""
+"""Sentinel for another tick: the event has not occurred."""
 RECOVERY_TICKS = 8
-"""A sensor is good again when its measurements have been good for so long."""
+"""Ticks in which all measurements of a sensor must be good until it counts as good again."""
 
 
 class Kinds(NamedTuple):
-    """Where outputs of a kind begin: other outputs are one kind, and both are 0."""
+    """Index of the first output of each kind: other outputs are one kind, and both are 0."""
 
     temperatures: int
     """The first temperature; they end where the pressures begin."""
@@ -52,7 +52,7 @@ class SensorCheckSettings(ProcessSettings):
     pressure: Range = (-1.0, 100.0)
     """bar."""
     frozen_s: Annotated[float, Field(gt=0)] = stretched(20.0)
-    """A controlled output that does not change for so long, while others move, is frozen."""
+    """Time without a change, while others move, after which a controlled output is frozen."""
     resting_s: Annotated[float, Field(gt=0)] = stretched(60.0)
     """Another one, that has moved for a minute before, is if it rests for so long and for twice as long as ever before:
     what is constant in a plant with exact sensors is not taken for frozen."""
@@ -83,7 +83,7 @@ class SensorCheckSettings(ProcessSettings):
 
 
 class SensorConstants(NamedTuple):
-    """What does not change in a session; tuples of an element an output, of `moves` an input."""
+    """Constants of the sensor check in one session; tuples have one element per output, `moves` one per input."""
 
     low: Numbers
     """Range of the sensor."""
@@ -111,10 +111,10 @@ class SensorConstants(NamedTuple):
 
 @dataclass(slots=True)
 class SensorState:
-    """What the check remembers; lists of an element an output, of `inputs` a row. Ticks are plant time."""
+    """State of the sensor check; lists have one element per output, `inputs` one row each. Ticks are plant time."""
 
     tick: int
-    """Of the last check; `NONE` after a leap back."""
+    """Tick of the last check; `NONE` after a leap back."""
     now: int
     good: list[float]
     """Last good values."""
@@ -134,7 +134,7 @@ class SensorState:
     """Since which tick the measurements of a substituted output have been good again."""
     bad_count: int
     standing: list[bool]
-    """Which may be constant while others move."""
+    """Mask of the outputs that may be constant while others move."""
     x: list[float]
     """States and load that were measured last: with the outputs the image."""
     load: float

@@ -1,4 +1,4 @@
-"""Which session the control PLC is in, and by which time base.
+"""Session and time base of the control PLC.
 
 It is the one requested by an operator, the one retained over a restart, or with `session.autostart` that of the rack.
 """

@@ -23,7 +23,7 @@ SHOWN: Final = (
     "control_plc.classical", "control_plc.cool_down", "control_plc.ladder", "control_plc.sensors",
     "control_plc.alarms",
 )  # fmt: skip
-"""What of the configuration decides results: shown in the registers."""
+"""Keys of the configuration that decide results; the registers show them."""
 
 
 class ControlServer(ServerSettings):
@@ -33,7 +33,7 @@ class ControlServer(ServerSettings):
 
 
 class PlantEndpoint(Endpoint):
-    """Where the plant's rack is."""
+    """Address of the plant's rack."""
 
     port: Annotated[int, Field(ge=1, le=0xFFFF)] = PLANT_PORT
     """TCP port."""
@@ -87,7 +87,7 @@ class ControlSection(ProcessSettings):
     driver: ControlStrategy = ControlStrategy.MPC
     classical: ClassicalSettings = Field(default_factory=ClassicalSettings)
     cool_down: CoolDownSettings = CoolDownSettings()
-    """Of a cold box that is warm at the beginning."""
+    """Cool-down of a cold box that is warm at the beginning."""
     ladder: LadderSettings = Field(default_factory=LadderSettings)
     sensors: SensorCheckSettings = Field(default_factory=SensorCheckSettings)
     alarms: AlarmSettings = Field(default_factory=AlarmSettings)
@@ -95,7 +95,7 @@ class ControlSection(ProcessSettings):
 
 
 class ControlSettings(RootSettings):
-    """What the control PLC reads of a configuration."""
+    """Settings that the control PLC reads of a configuration."""
 
     limits: InputLimits = Field(default_factory=InputLimits)
     session: SessionSettings = SessionSettings()

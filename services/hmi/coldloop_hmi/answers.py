@@ -1,4 +1,4 @@
-"""How the page answers: files, compression, one stream of changes for all browsers, and turns of long requests."""
+"""Answers of the page: files, compression, one stream of changes for all browsers, and turns of long requests."""
 
 import asyncio
 import gzip
@@ -33,7 +33,7 @@ def _digest(*parts: bytes) -> str:
 
 
 VERSION: Final = _digest(*(part for name, path in _FILES.items() for part in (name.encode(), path.read_bytes())))
-"""Of all files, in their addresses: a browser keeps them, and asks for others when one has changed."""
+"""Digest of all files, in their addresses: a browser keeps them, and asks for others when one has changed."""
 
 
 def static_files() -> list[web.RouteDef]:
@@ -104,7 +104,7 @@ class StreamCompression:
 
 
 class Stream:
-    """What one browser is sent.
+    """Messages to one browser.
 
     Args:
         party: Whose browser it is.

@@ -32,7 +32,7 @@ Entry = dict[str, Any]
 
 
 class _Kind(NamedTuple):
-    """What refusals have in common."""
+    """Fields that refusals of one kind have in common."""
 
     what: str
     who: str

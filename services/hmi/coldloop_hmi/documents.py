@@ -1,4 +1,4 @@
-"""What the page and other programs are sent: JSON (`docs/operator-page.md` describes every field), and metrics."""
+"""Documents for the page and other programs: JSON (`docs/operator-page.md` describes every field), and metrics."""
 
 import json
 import math
@@ -41,7 +41,7 @@ LIMITS: Final[Mapping[str, tuple[str | None, str | None]]] = {
     "L_N2": ("nitrogen_low", None),
     "lost": (None, "helium_lost_kg"),
 }
-"""Where the station's alarms begin, by signal: below, above."""
+"""Limits at which the station's alarms begin, by signal: below, above."""
 MARKED: Final = {
     EventKind.ALARM_RAISED.word: "alarm",
     EventKind.LIVE_LOAD.word: "load",

@@ -75,11 +75,11 @@ class Increments(NamedTuple):
 
 @dataclass(frozen=True)
 class Alternative:
-    """What another q would have meant, to first order."""
+    """Expected effect of another q, to first order."""
 
     q: int
     iterations: int
-    """That fit into its period."""
+    """Number of iterations that fit into its period."""
     period_s: float
     contraction: float
     response_s: float | None
@@ -88,7 +88,7 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Budget:
-    """How the PLC spends the period, s from its beginning."""
+    """Use of the period by the PLC, s from its beginning."""
 
     preparation: float
     """End of the preparation."""
@@ -101,7 +101,7 @@ class Budget:
 
     @property
     def slack(self) -> float:
-        """What is left; negative when the answer is late."""
+        """Time that is left; negative when the answer is late."""
         return self.period - self.answer
 
 
@@ -119,7 +119,7 @@ class Explanation:
     """How much longer the period is than that of q: answers have been late."""
     period_before_s: float | None
     elapsed_s: float | None
-    """Of the period before, until this one began."""
+    """Elapsed time of the period before, until this one began."""
     period_s: float
     increments: Increments | None
     alternatives: tuple[Alternative, ...]

@@ -1,4 +1,4 @@
-"""What every request passes: its connection, whose it is, where it comes from, how often, and the answer's headers."""
+"""Checks of every request: its connection, whose it is, where it comes from, how often, and the answer's headers."""
 
 import asyncio
 import logging
@@ -44,9 +44,9 @@ SAFE: Final = frozenset({hdrs.METH_GET, hdrs.METH_HEAD})
 BY_ITSELF: Final = frozenset(
     {"/api/stream", "/api/trend", "/api/events", "/api/audit", "/api/me", "/api/explanation", "/api/replay"}
 )
-"""What a page asks for without a hand on it: no sign of life of its user."""
+"""Requests that a page sends without its user's action: they are no sign of life of the user."""
 OPEN: Final = frozenset({"/", "/healthz", "/metrics", "/api/catalog", "/api/login", "/api/me", "/favicon.ico"})
-"""What is served without a login; `/metrics` looks at it itself."""
+"""Paths that are served without a login; `/metrics` checks it itself."""
 FILES: Final = frozenset({"/", "/api/catalog", "/favicon.ico"})
 UNLIMITED: Final = frozenset({"/api/login", "/healthz"})
 """Attempts to log in have a limit of their own; the health check costs no more than a refusal."""
@@ -62,10 +62,10 @@ _RUN: Final = re.compile(r"\A/run/\d+/")
 
 @dataclass
 class Use:
-    """What a connection is used for."""
+    """Use of a connection."""
 
     since: float
-    """When its last request began or ended; without one, when it was seen first. Monotonic clock, s."""
+    """Time at which its last request began or ended; without one, when it was seen first. Monotonic clock, s."""
     is_busy: bool = False
     is_stream: bool = False
     has_session: bool = False
@@ -205,7 +205,7 @@ class Guard:
         self.sessions = LoginSessions(time.monotonic, login.idle_minutes * 60, login.longest_minutes * 60)
         self.logins = LoginLimit(time.monotonic)
         self.scrapes = LoginLimit(time.monotonic)
-        """Of `/metrics`: a scraper with an old password keeps nobody from logging in."""
+        """Limit of the logins at `/metrics`: a scraper with an old password keeps nobody from logging in."""
         self._requests = ClientLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
         self._files = ClientLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
         self._hosts = LOCAL_NAMES | {settings.host, *map(str.lower, settings.allowed_hosts)}

@@ -95,7 +95,7 @@ def differences(before: Premises, now: Premises) -> str:
 
 
 class Preview(NamedTuple):
-    """What a command would do, what it would change as it is now, and the token that confirms it."""
+    """Preview of a command: what it would do, what it would change as it is now, and the token that confirms it."""
 
     token: str
     text: str
@@ -113,7 +113,7 @@ class Prepared(NamedTuple):
 
 
 class PremisesChangedError(UsageError):
-    """What a command was prepared for has changed since."""
+    """The state that a command was prepared for has changed since."""
 
     def __init__(self, reason: str, preview: Preview) -> None:
         super().__init__(reason)
@@ -121,11 +121,11 @@ class PremisesChangedError(UsageError):
 
 
 class CommandResult(NamedTuple):
-    """What became of a command: one of the last three says it."""
+    """Result of a command: one of the last three fields says it."""
 
     asked: str
     applied: str = ""
-    """What was read back."""
+    """Value that was read back."""
     refused_because: str = ""
     """It was not done, and why."""
     uncertain_because: str = ""

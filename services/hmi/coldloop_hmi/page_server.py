@@ -401,7 +401,7 @@ class PageServer:
 
     @property
     def address(self) -> str:
-        """Where a browser finds the page."""
+        """Address of the page for a browser."""
         name = "127.0.0.1" if self._settings.host in {"0.0.0.0", "::"} else self._settings.host  # noqa: S104
         host = f"[{name}]" if ":" in name else name
         return f"{'https' if self._settings.https else 'http'}://{host}:{self.port}/"

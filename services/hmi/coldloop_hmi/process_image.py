@@ -1,4 +1,4 @@
-"""What the page knows: the newest record of each block, trends (thinned), updates, predictions and events.
+"""Process image of the page: the newest record of each block, trends (thinned), updates, predictions and events.
 
 Readers of a rig or of a recorded run write into it; the pages are made from it. No sockets here.
 """
@@ -75,7 +75,7 @@ class TrendStore:
         self._kept_ticks = round(kept_s / process.tick_s)
         self.station_names = STATION_NAMES if process.has_station else ()
         self.names = ("load", *process.input_names, *process.output_names, "mode", *self.station_names)
-        """Of its columns; `mode` is that of the fail-safe ladder."""
+        """Names of its columns; `mode` is that of the fail-safe ladder."""
         self._places = tuple(map(STATION_SIGNAL_NAMES.index, self.station_names))
         self._no_station = [math.nan] * len(self._places)
         self.ticks = array("q")
@@ -278,20 +278,20 @@ class Source:
     """One service, as far as it has been heard."""
 
     heard: float | None = None
-    """When it answered last, on the monotonic clock, s."""
+    """Time of its last answer, on the monotonic clock, s."""
     reason: str = "not found yet"
     """Why it is silent; empty while it answers."""
     records: dict[str, tuple[Any, ...]] = field(default_factory=dict)
     """Newest record by block."""
     tick: int = -1
     moved: float = 0.0
-    """When its tick moved last."""
+    """Time at which its tick moved last, on the same clock, s."""
     was_silent: bool = False
     """It has been silent since its process was last read."""
 
 
 class Model:
-    """What the page knows of one rig.
+    """State of one rig as the page knows it.
 
     Args:
         process: Which process it has.
@@ -321,7 +321,7 @@ class Model:
         self.faulty_sensors = 0
         """Outputs that a fault was put into for training, a bit for each."""
         self.recorded_doubts: Doubts | None = None
-        """Of a recorded run; None on a rig that is up."""
+        """Doubts of a recorded run; None on a rig that is up."""
         self.commands = 0
         """Commands that were carried out here."""
         self.replay: dict[str, object] | None = None
@@ -432,7 +432,7 @@ class Model:
 
     @property
     def rule(self) -> UpdatingRuleStatus:
-        """What decides the updating period."""
+        """Rule that decides the updating period."""
         return self.record("optimizer_plc", UpdatingRuleStatus) or UpdatingRuleStatus()
 
     @property

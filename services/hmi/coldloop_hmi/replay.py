@@ -39,11 +39,11 @@ class ReplayFrame(NamedTuple):
     doubts: Doubts = SOUND
     """Outputs whose readings were in doubt. The process has the true value."""
     station: StationSample | None = None
-    """Of a whole refrigerator."""
+    """Sample of the station of a whole refrigerator."""
 
 
 class RecordedRun(Protocol):
-    """What a replay needs of a run."""
+    """Recorded run, as a replay needs it."""
 
     name: str
     process: Process
@@ -51,12 +51,12 @@ class RecordedRun(Protocol):
     """Ticks that were recorded, from 0 on."""
     updates: Sequence[Optimization]
     events: Sequence[JournalEntry]
-    """In the order of their ticks."""
+    """Events in the order of their ticks."""
     rule: UpdatingRuleStatus
-    """What decided the updating period."""
+    """Rule that decided the updating period."""
     limits: OperatingLimits
     configuration: Mapping[str, Any]
-    """By dotted key."""
+    """Values of the configuration by dotted key."""
 
     def frame(self, tick: int) -> ReplayFrame | None:
         """Return one tick; None if it is missing in the recording."""
@@ -66,7 +66,7 @@ class RecordedRun(Protocol):
 
 
 class ReplayRequest(BaseModel):
-    """What a browser asks of a replay."""
+    """Request of a browser to a replay."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -86,7 +86,7 @@ class Replay:
         self._speed = 20.0
         self._tick = -1
         self._in_gap = False
-        """What was read last is missing in the recording."""
+        """The data read last are missing in the recording."""
         model.put("control_plc", Identity(session=1))
         model.configuration = run.configuration
         model.put("optimizer_plc", run.rule)

@@ -16,7 +16,7 @@ TIMEOUT_S = 1.0
 
 
 class PolledPlant(Endpoint):
-    """Where the plant is."""
+    """Address of the plant."""
 
     port: PortNumber = PLANT_PORT
     """TCP port."""
@@ -24,7 +24,7 @@ class PolledPlant(Endpoint):
 
 
 class PolledControl(Endpoint):
-    """Where the control PLC is."""
+    """Address of the control PLC."""
 
     port: PortNumber = CONTROL_PORT
     """TCP port."""
@@ -32,7 +32,7 @@ class PolledControl(Endpoint):
 
 
 class PolledOptimizer(Endpoint):
-    """Where the optimiser PLC is."""
+    """Address of the optimiser PLC."""
 
     port: PortNumber = OPTIMIZER_PORT
     """TCP port."""
@@ -130,6 +130,6 @@ class HmiSection(BaseModel):
 
 
 class HmiSettings(RootSettings):
-    """What the page reads of a configuration: the model file says of which process the rig is."""
+    """Settings that the page reads of a configuration: the model file says of which process the rig is."""
 
     hmi: HmiSection = HmiSection()

@@ -15,7 +15,7 @@ from coldloop.registers.declaration import Block, Kind, RegisterMap
 from coldloop.registers.text import from_words
 
 BESIDE_BAND: Final = 1.5
-"""What a bar shows beside a band, on each side, over the width of the band."""
+"""Margin of a bar beside a band, on each side, over the width of the band."""
 BESIDE_BOUNDS: Final = 0.125
 """The same of the bounds of an input."""
 READABLE: Final = 1e-3
@@ -26,13 +26,13 @@ DECIMALS: Final = {
 """Digits after the point: of PLCs, links, states and a refrigerator's station. Those of the process come first."""
 DIGITS: Final = 7
 TICKS: Final = {"Tick": "time", "Ticks": "ticks"}
-"""What a register counts whose description begins with this word."""
+"""Quantity that a register counts, by the first word of its description."""
 RAW = ("plant.measurement.y.", "control_plc.update.y.")  # have a bad reading as it is; elsewhere it is replaced
 STATES = ("plant.measurement.x.", "control_plc.update.x.")  # are of the simulation: no sensor measures them
 
 
 def process_document(process: Process) -> dict[str, Any]:
-    """Return the process as the page is told: bars of signals with their ends, words and unit of the load, if any."""
+    """Return the process as the page gets it: bars of signals with their ends, words and unit of the load, if any."""
     load = process.load
     shown = {"word": load.title, "unit": load.unit, "span": load.span, "bar": load.bar or load.span}
     return {

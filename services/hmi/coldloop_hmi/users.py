@@ -30,7 +30,7 @@ SHORTEST_PASSWORD: Final = 8
 MOST_MEMORY: Final = 64 * 1024 * 1024
 COSTS: Final = range(10, 17)
 BLOCK_SIZES: Final = range(1, 17)
-"""Of hashes: cost as a power of 2, and block size. The largest take the memory above and half a second."""
+"""Block sizes of hashes; costs above are exponents of 2. The largest take the memory above and half a second."""
 COMMENT: Final = "#"
 MOST_SESSIONS: Final = 200
 MOST_ADDRESSES: Final = 1000
@@ -47,7 +47,7 @@ REQUEST_BURST: Final = 150.0
 
 
 class PageRole(StrEnum):
-    """What a user may do."""
+    """Role of a user: what the user may do."""
 
     VIEW = "view"
     OPERATE = "operate"
@@ -279,7 +279,7 @@ class ClientLimit:
 
 
 class LoginLimit:
-    """Which attempts to log in are looked at: by address and name, and by address.
+    """Limit of the attempts to log in: by address and name, and by address.
 
     Who has logged in from an address before comes first there: others who try from it, behind a proxy perhaps, do not
     keep such users out. Nothing here depends on whether a name exists.

@@ -22,14 +22,14 @@ and `design.violation_weight` wherever it is not set."""
 
 
 def signals_of(process: Process) -> tuple[str, ...]:
-    """Return what may have a constant error, in the order of their states: outputs, then inputs."""
+    """Return what may have a bias, in the order of their states: outputs, then inputs."""
     return (*process.output_names, *process.input_names)
 
 
 def groups_of(process: Process) -> dict[str, tuple[str, ...]]:
-    """Return what `estimator.disturbances` calls all outputs, or inputs, that may have a constant error.
+    """Return what `estimator.disturbances` calls all outputs, or inputs, that may have a bias.
 
-    Of the cold box no sensor tells a constant error of L1 from liquid helium, nor one of the heater from the load.
+    Of the cold box no sensor tells a bias of L1 from liquid helium, nor one of the heater from the load.
     """
     return {
         "outputs": process.constants, "inputs": tuple(one.name for one in process.inputs if one.has_constant)
@@ -44,14 +44,14 @@ class Arithmetic(StrEnum):
 
 
 class EstimatorKind(StrEnum):
-    """Which estimator."""
+    """Kind of the estimator."""
 
     KALMAN = "kalman"
     STATE_FEEDBACK = "state-feedback"
 
 
 class NoiseReference(StrEnum):
-    """What the standard deviations of the sensors are of."""
+    """Reference of the standard deviations of the sensors."""
 
     MEASUREMENT = "measurement"
     TIME = "time"
@@ -72,7 +72,7 @@ class EstimatorSettings(ProcessSettings):
     temperature_noise_k: PositiveFloat = 0.05
     """Process noise of states in K."""
     mass_noise_kg: PositiveFloat = 1e-4
-    """Of a line of the compression station, where the model has it, as the next two."""
+    """Process noise of a line of the compression station, where the model has it, as the next two."""
     flow_noise_kg_s: PositiveFloat = 1e-5
     """Process noise of states in kg/s."""
     integral_noise_bar_s: PositiveFloat = 1e-5
@@ -86,8 +86,9 @@ class EstimatorSettings(ProcessSettings):
     pressure_sensor: PositiveFloat = 1e-3
     """Noise of the sensors of pressure, bar."""
     noise_reference: NoiseReference = NoiseReference.MEASUREMENT
-    """Of one measurement, whatever the updating period; or of a mean over a sampling period, so that measurements which
-    follow each other sooner count for less: a model error is then not taken for more load the shorter the period is."""
+    """Reference of the sensors' noise: one measurement, whatever the updating period; or a mean over a sampling period,
+    so that measurements which follow each other sooner count for less: a model error is then not taken for more load
+    the shorter the period is."""
     disturbances: tuple[str, ...] = ()
     """Signals, by name or group (`outputs`, `inputs`), with an unknown constant that is estimated, so that there is no
     offset on a plant that is not the model. That of an output is added to its reading, that of an input acts like
@@ -120,7 +121,7 @@ class EstimatorSettings(ProcessSettings):
 
     @property
     def disturbed(self) -> tuple[int, ...]:
-        """Which of the outputs, and then inputs, have a disturbance, rising."""
+        """Indices of the outputs, and then inputs, that have a disturbance, rising."""
         return tuple(sorted(map(signals_of(self.process).index, _members(self.disturbances, self.process))))
 
     @model_validator(mode="after")
@@ -133,14 +134,15 @@ class EstimatorSettings(ProcessSettings):
 
 
 class PlausibilitySettings(ProcessSettings):
-    """When the Kalman filter does without a reading, because prediction and other readings contradict it."""
+    """Plausibility check: when the Kalman filter masks a reading that prediction and other readings contradict."""
 
     sigmas: Annotated[float, Field(ge=0)] = 0.0
     """Largest residual over its standard deviation; 0: any is plausible. With 6 a good sensor is suspected by noise
     alone once in 5e8 updates, which is one of the 22 in two years at updates every 2.5 s."""
     level_allowance: Annotated[float, Field(ge=0)] = 0.05
-    """What a plant that is not its model adds to a residual, %, Hz, K and bar: from the hours a to f of plants that are
-    20 % off, whose residuals are below 5 sigmas and 0.02 %, 0 Hz, 0 K, 0.009 bar (`docs/fail-safe.md`)."""
+    """Allowance for a residual of a plant that differs from its model, %, Hz, K and bar: from the hours a to f of
+    plants that are 20 % off, whose residuals are below 5 sigmas and 0.02 %, 0 Hz, 0 K, 0.009 bar (`docs/fail-safe.md`).
+    """
     speed_allowance: Annotated[float, Field(ge=0)] = 5.0
     """The same of a speed, Hz."""
     temperature_allowance: Annotated[float, Field(ge=0)] = 0.0
@@ -150,9 +152,9 @@ class PlausibilitySettings(ProcessSettings):
     settled_s: Annotated[float, Field(ge=0)] = stretched(60.0)
     """A reading is judged when it has been used for so long: until then the filter learns how the plant differs."""
     agreeing_s: Annotated[float, Field(ge=0)] = stretched(60.0)
-    """A suspect that agrees with the others for so long is taken back."""
+    """Time after which a suspect that agrees with the others is reinstated."""
     longest_s: Annotated[float, Field(ge=0)] = stretched(1800.0)
-    """It is taken back after so long in any case: what the others say of it is then no better."""
+    """Time after which it is reinstated in any case: the others' prediction of it is then no better."""
     most: Annotated[int, within(lambda process: (0, len(process.outputs) - 1))] = declared(
         lambda process: min(2, len(process.outputs) - 1)
     )
@@ -160,8 +162,8 @@ class PlausibilitySettings(ProcessSettings):
     the supply see a compressor trip."""
     model_sigmas: Annotated[float, Field(gt=0)] = 4.0
     """The model holds while no reading's residual is larger, over its standard deviation, as a root mean square over a
-    minute (and but for its allowance). While it does not, no other reading is suspected, and suspects are taken back:
-    what contradicts them is wrong itself. L1, which has no constant error, is taken back where two or more say so."""
+    minute (and but for its allowance). While it does not, no other reading is suspected, and suspects are reinstated:
+    what contradicts them is wrong itself. L1, which has no bias, is reinstated where two or more say so."""
 
     spike_s: Annotated[float, Field(ge=0)] = stretched(7.5)
     """A reading that contradicts the others is left out at once, and a suspect when it has done so for longer than
@@ -169,7 +171,7 @@ class PlausibilitySettings(ProcessSettings):
     level_span: tuple[float, float] = (5.0, 95.0)
     """A level that is predicted outside of this, %, is not judged: a bath that runs dry or full is not as its model."""
     movement_sigmas: Annotated[float, Field(ge=0)] = 10.0
-    """A reading without a constant error (L1) is stuck when it shows only its noise while the prediction without it
+    """A reading without a bias (L1) is stuck when it shows only its noise while the prediction without it
     moves about its trend by so many standard deviations of its sensor for `settled_s`, or by more for less; 0: never.
     """
 
@@ -189,7 +191,7 @@ class PlausibilitySettings(ProcessSettings):
 
     @property
     def allowances(self) -> tuple[float, ...]:
-        """Of each output."""
+        """Allowance of each output, in its unit."""
         return _by_quantity(self, "allowance", [output.allowance for output in self.process.outputs])
 
 
@@ -207,7 +209,7 @@ def _members(names: tuple[str, ...], process: Process) -> list[str]:
 
 
 SLOT_S = 0.25
-"""Of the reference PLC, with the problem of the cold box."""
+"""Length of a slot of the reference PLC with the problem of the cold box, s."""
 
 
 class BudgetSettings(ProcessSettings):
@@ -311,7 +313,7 @@ class OsqpSettings(ProcessSettings):
     rho: PositiveFloat = 10.0
     """Step size of the multipliers: with less, truncated answers are worse, with more, convergence is slower."""
     relaxation: Annotated[float, Field(ge=0.1, lt=2.0)] = 1.6
-    """What OSQP calls alpha; it moves an iterate by this share."""
+    """Relaxation factor, OSQP's alpha: an iterate moves by this share."""
     tau_1_s: PositiveFloat = declared(lambda process: 0.05 * process.share("osqp"))
     """25,763 operations, dense, at 0.529 Mflop/s (`docs/budget.md`)."""
 
@@ -339,7 +341,7 @@ class DaqpSettings(ProcessSettings):
 
 
 class OutsideSettings(BaseModel):
-    """What is installed beside this package, by the names of entry points: `coldloop.solvers` and so on."""
+    """Parts that are installed beside this package, by the names of entry points: `coldloop.solvers` and so on."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -356,7 +358,7 @@ class OutsideSettings(BaseModel):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Those that are used."""
+        """Names of the entry points that are used."""
         return tuple(filter(None, (self.solver, self.rule, self.estimator)))
 
 

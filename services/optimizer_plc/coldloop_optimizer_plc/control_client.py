@@ -1,4 +1,4 @@
-"""What the optimiser asks of the control PLC, and how it asks again for what got lost or damaged on the way."""
+"""Client of the control PLC: the optimiser's requests, repeated when one was lost or damaged on the way."""
 
 from collections.abc import Awaitable, Callable
 from typing import Final, TypeVar

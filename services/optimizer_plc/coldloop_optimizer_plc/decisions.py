@@ -39,9 +39,9 @@ some ticks are needed for good, one answer in nine is late."""
 LONGEST_GAP_TICKS: Final = 4 * SEQUENCE_ROWS
 """After a longer time without an update nothing is predicted from the last one."""
 FIRST: Final = -1
-"""In the place of a q: that of a first period."""
+"""Sentinel for q: there is none before a first period."""
 AFTER_A_STEP: Final = -2
-"""That of a period which begins with a load step."""
+"""Sentinel for q: the period begins with a load step."""
 
 
 class Latched(NamedTuple):
@@ -61,7 +61,7 @@ class Latched(NamedTuple):
     x: Array
     """States, shape (28,), which only state feedback looks at."""
     ahead: Array
-    """What is forecast, as the last states of the model."""
+    """Forecast, as the last states of the model."""
 
 
 class Starts(NamedTuple):
@@ -93,7 +93,7 @@ def shortage(
 
     The estimate w (a deviation) has what the plant lacks beside its model, so it is compared with what the model holds
     at rest within the inputs' bounds and the limit of the feed, less a reserve, and with the least that it holds
-    without the turbine's outlet getting too cold, by the constant error of that. The load itself (W), where it is
+    without the turbine's outlet getting too cold, by the bias of that. The load itself (W), where it is
     measured, is compared with what the plant holds that is as its model. A shortage of the sign that was `before` ends
     where the estimate has twice the reserve: noise does not end it and begin it anew.
     """

@@ -54,7 +54,7 @@ UNDETECTABLE: Final = 1e-9
 
 
 class StationaryGains(NamedTuple):
-    """What a stationary Kalman filter corrects with after periods of 1, 2, ... ticks."""
+    """Gains of a stationary Kalman filter after periods of 1, 2, ... ticks."""
 
     gains: Array
     """Transposed, shape (ticks, n_y, n + 1); the load mismatch comes last."""
@@ -63,10 +63,10 @@ class StationaryGains(NamedTuple):
 
 
 class Estimator(NamedTuple):
-    """What an estimator computes with that does not change in a session, in the on-line floating-point type.
+    """Constants of an estimator in one session, in the on-line floating-point type.
 
     The Kalman filter is stationary, on the LTI model with one slow load-mismatch state; a load that is known is fed in.
-    State feedback believes the simulated state; it is not free of offset, for it does not know why the model is wrong.
+    State feedback takes the simulated state as its estimate; it has an offset, since it does not estimate model errors.
     """
 
     steps: Transition
@@ -82,12 +82,12 @@ class Estimator(NamedTuple):
     """Kalman filter, or else state feedback."""
     load_known: bool
     stationary: StationaryGains
-    """Of the Kalman filter."""
+    """Gains of the Kalman filter."""
     plausible: Plausibility
 
 
 class Belief(NamedTuple):
-    """What an estimator believes, as deviations from the operating point; kernels overwrite it."""
+    """Estimates, as deviations from the operating point; kernels overwrite them."""
 
     numbers: Any
     """A record, shape (1,): `w`, the load (W); `mismatch`, the share of it that no sensor saw; `since`, the ticks
@@ -325,7 +325,8 @@ RESIDUAL: Final = 1e-3
 """Change of the covariance of states and innovation by a step of the recursion, over the standard deviations of both,
 that a stationary one may have. One that still settles after thousands of steps has 1e-6, one that diverges 1."""
 GROWTH: Final = 1e-6
-"""Of an error in a period, that is rounding: of eigenvalues that are 1, and one another's."""
+"""Largest growth of an error in a period that is taken for rounding: eigenvalues of 1, and equal ones, are rounded so.
+"""
 ATTEMPTS: Final = 50
 """Runs of the recursion, each from where the last one ended: a mode that grows slowly and is hardly seen needs more."""
 

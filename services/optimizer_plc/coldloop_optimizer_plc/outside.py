@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 
 class Part(StrEnum):
-    """What may be somebody else's: a key of `optimizer_plc.program.outside`, and the group `coldloop.<part>s`."""
+    """Part of another project: a key of `optimizer_plc.program.outside`, and the group `coldloop.<part>s`."""
 
     SOLVER = "solver"
     RULE = "rule"
@@ -86,7 +86,7 @@ class PlantModel(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What is known at an updating instant, as deviations from the operating point."""
+    """Measurement at an updating instant, as deviations from the operating point."""
 
     ticks: int
     """Since the last measurement."""
@@ -99,7 +99,7 @@ class Measured(NamedTuple):
 
 
 class OutsideCorrection(Protocol):
-    """What an entry point makes for each session; the same measurements give the same bits."""
+    """Estimator that an entry point makes for each session; the same measurements give the same bits."""
 
     def __init__(self, model: PlantModel) -> None:
         """Begin at the operating point."""

@@ -1,10 +1,10 @@
-"""Readings against the prediction and against each other: the innovation of a Kalman filter, and what to believe of it.
+"""Readings against the prediction and against each other: the innovation of a Kalman filter, and the mask of suspects.
 
 The residual of an output is its innovation less what those of the others say of it; over its standard deviation it is
 standard normal where plant and sensors are as the filter takes them, and its square is what the quadratic form of all
 innovations loses without the output. So one wrong reading has the largest residual, and without it all others agree.
 
-A reading without a constant error (L1 of the cold box) decides the load mismatch, which explains why it does not move
+A reading without a bias (L1 of the cold box) decides the load mismatch, which explains why it does not move
 while it is stuck. It is watched against two predictions without it, which begin at the estimate and are corrected by
 the other readings: a balance of mass and energy. The younger begins again when the reading moves. One that shows only
 its noise although that prediction moves is stuck. The older one began earlier: it has not learnt what the filter learnt
@@ -26,9 +26,9 @@ from coldloop_optimizer_plc.qp.prediction import PredictionModel, Transition
 Array = NDArray[np.float64]
 
 USED: Final = 0
-"""A reading is believed."""
+"""A reading is used by the filter."""
 MISSING: Final = 1
-"""There is no number: the control PLC has taken it out."""
+"""The reading is NaN: the control PLC has masked it."""
 SUSPECT: Final = 2
 """It contradicts prediction and other readings, and is left out."""
 STUCK: Final = 3
@@ -36,7 +36,7 @@ STUCK: Final = 3
 FORGETTING: Final = 0.1
 """Share of the time without a spike that is taken off the time with one."""
 RESTART, LONGEST_WATCH = 0.5, 10.0
-"""Of `settled_s`."""
+"""Times to the restart and of the longest watch, in multiples of `settled_s`."""
 READING: Final = (
     ("state", "i8"), ("since_s", "real"), ("agreed_s", "real"), ("jump", "real"), ("jumped_to", "real"),
     ("difference", "real"), ("spikes_s", "real"),
@@ -48,16 +48,16 @@ long one that is used has been left out as a spike."""
 
 
 class Plausibility(NamedTuple):
-    """What is plausible, in the on-line floating-point type."""
+    """Limits of the plausibility check, in the on-line floating-point type."""
 
     sigmas: float
     """Largest residual over its standard deviation; 0: any is plausible."""
     allowance: Array
-    """What a plant that is not its model adds to a residual, shape (n_y,)."""
+    """Allowance for a residual of a plant that differs from its model, shape (n_y,)."""
     in_all: float
     """Largest quadratic form of the innovations that the outputs which are left may have."""
     longest_period_s: float
-    """Of those that inverse covariances are for."""
+    """Longest period that inverse covariances are for, s."""
     settled_s: float
     agreeing_s: float
     longest_s: float
@@ -65,7 +65,7 @@ class Plausibility(NamedTuple):
     model_sigmas: float
     """Largest residual over its standard deviation, root mean square, while the model holds."""
     constants: NDArray[np.int64]
-    """State that is the constant error of each output; below 0: it has none. Shape (n_y,)."""
+    """State that is the bias of each output; below 0: it has none. Shape (n_y,)."""
     spike_s: float
     forgetting: float
     low: Array
@@ -76,7 +76,7 @@ class Plausibility(NamedTuple):
     watched: int
     """Output that is judged by predictions without it, or -1."""
     origin: float
-    """What it shows at the operating point."""
+    """Value of its reading at the operating point."""
     movement: float
     """Integral of the square of that about its trend from which on the reading must move, squared unit times s."""
     restart_s: float
@@ -110,7 +110,7 @@ def plausibility_of(
 
 
 def watched_output(settings: PlausibilitySettings, prediction: PredictionModel) -> int:
-    """Return the controlled output that has no constant error, where readings are judged; or -1."""
+    """Return the controlled output that has no bias, where readings are judged; or -1."""
     without = [output for output in prediction.constrained if output not in prediction.disturbances]
     judged = settings.sigmas and settings.movement_sigmas and not prediction.ahead
     return without[0] if judged and without else -1
@@ -202,10 +202,10 @@ def judge(
     p: Plausibility, readings: Any, surprise: Array, predicted: Array, y: Array, innovation: Array, J: Array,  # noqa: ANN401
     elapsed_s: float,
 ) -> Array:  # fmt: skip
-    """Return the innovation (n_y,) of a measurement y (n_y,) without the elements of suspects, which are no number.
+    """Return the innovation (n_y,) of a measurement y (n_y,) with suspected sensors masked as NaN.
 
     `readings` is `new_readings`'s, `surprise` that of the readings so far, `elapsed_s` the time since the judgement
-    before. Constant errors in `predicted` are set to what a reading shows that is taken back. There are no new suspects
+    before. Biases in `predicted` are set to a reading that is reinstated. There are no new suspects
     after a longer time than J is for.
     """
     believed, returning = innovation.copy(), False
@@ -258,7 +258,7 @@ def take_back(
     """Take back suspects that agree again, wander off or have been out for the longest time, and what was missing.
 
     After a long time, or when others contradict the model, what they say of a reading is no better than the reading:
-    its constant error, if it has one, is set so that it agrees. One without (L1) counts again in full, and so only
+    its bias, if it has one, is set so that it agrees. One without (L1) counts again in full, and so only
     where two or more contradict: one of them may itself be wrong. One that is stuck must have moved before. One that
     agrees has been judged all the time, and no jump ends the longest time.
     """
@@ -472,9 +472,9 @@ def correct_apart(
     p: Plausibility, outputs: Transition, K: Array, J: Array, belief: Any, which: int, known: float, u: Array,  # noqa: ANN401
     y: Array, believed: Array,
 ) -> float:  # fmt: skip
-    """Correct a prediction by the readings that the filter believes but the watched one; return what that should show.
+    """Correct a prediction by the readings that the filter uses but the watched one; return what that should show.
 
-    Constant errors that the filter has just set to what a reading shows are the same in both.
+    Biases that the filter has just set to a reading are the same in both.
     """
     a, zero = belief.apart, y.dtype.type(0.0)
     for i in range(y.size):

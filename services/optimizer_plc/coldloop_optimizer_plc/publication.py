@@ -1,4 +1,4 @@
-"""What the optimiser PLC shows in its registers, and what operators write there."""
+"""Registers of the optimiser PLC: what it shows, and what operators write."""
 
 from collections.abc import Mapping
 from typing import Final

@@ -31,12 +31,12 @@ MEMORY: Final = 1
 
 
 class Observation(NamedTuple):
-    """What is known at t_{k+1} of the period that ends there; costs are positive (Assumption 1 of the paper)."""
+    """Observation at t_{k+1} of the period that ends there; costs are positive (Assumption 1 of the paper)."""
 
     q: int
     """q(t_k), the number of the period in the ladder."""
     iterations: int
-    """Those that it held: for the increments per iteration."""
+    """Number of iterations in the period: for the increments per iteration."""
     period_s: float
     """t_{k+1} - t_k."""
     effective_before: float
@@ -248,7 +248,7 @@ def decide_contraction(rule: ContractionRule, memory: Array, o: Observation, a: 
 
 
 class OutsideDecision(Protocol):
-    """What an entry point of the group `coldloop.rules` makes for each session; it is deterministic.
+    """Rule that an entry point of the group `coldloop.rules` makes for each session; it is deterministic.
 
     It may have `after_interruption()`, too: the q of a period that begins with a load step, which else is the first.
     """
@@ -264,7 +264,7 @@ class OutsideDecision(Protocol):
 
 
 class OutsideRule:
-    """One of these as a rule: what is no number of a period leaves q as it is, at a beginning at the longest."""
+    """Rule of an entry point: a result that is no period's number leaves q unchanged, at a beginning at the longest."""
 
     def __init__(self, name: str, budget: PlcBudget) -> None:
         self.name, self._most = name, len(budget.ladder)

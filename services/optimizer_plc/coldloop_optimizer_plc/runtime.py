@@ -61,7 +61,7 @@ class _Answer(NamedTuple):
     update: Update
     sequence: InputSequence
     ready: float
-    """When the PLC would have computed it, on the monotonic clock, s."""
+    """Time at which the PLC would have computed it, on the monotonic clock, s."""
     plan: Plan
     planned: bool
     """The control PLC has the plan: in real time it is sent at once, in lock-step with the sequence."""

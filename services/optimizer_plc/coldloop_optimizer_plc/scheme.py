@@ -37,15 +37,15 @@ Array = NDArray[np.float64]
 SLOW: Final = 0.05
 """Share of the turbine's speed at the operating point below which it may stand."""
 STANDSTILL_RATIO: Final = 1.1
-"""Of the pressures before and behind its nozzle, below which nothing flows; it is some ten in operation."""
+"""Ratio of the pressures before and behind its nozzle, below which nothing flows; it is some ten in operation."""
 ROOM: Final = 1e-3
 """Between a bound and an input that is held, scaled: methods of the interior need some. Sequences hold it exactly."""
 MOST_BITS: Final = 31
-"""Of the mask of suspects in an exported optimiser."""
+"""Largest number of bits of the mask of suspects in an exported optimiser."""
 
 
 class TurbineWatch(NamedTuple):
-    """How a turbine that stands is known; kernels are shared by processes, and have no places of theirs in them."""
+    """Test for a turbine at standstill; its indices are parameters, since kernels are shared by processes."""
 
     valve: int
     """Input before the turbine; -1: neither speed nor pressures are measured."""
@@ -58,9 +58,9 @@ class TurbineWatch(NamedTuple):
     slow: float
     """Speed below which it may stand."""
     ratio: float
-    """Of the pressures, below which nothing flows."""
+    """Ratio of the pressures, below which nothing flows."""
     bit: int
-    """Of the valve in the mask of suspects: it follows those of the outputs."""
+    """Bit of the valve in the mask of suspects: it follows those of the outputs."""
 
 
 def turbine_watch(process: Process, y0: Array, real: Real) -> TurbineWatch:
@@ -76,7 +76,7 @@ def turbine_watch(process: Process, y0: Array, real: Real) -> TurbineWatch:
 
 @kernel
 def stands(c: TurbineWatch, y: Array) -> bool:
-    """Return whether outputs (n_y,) say that the turbine stands; a reading that is no number says nothing."""
+    """Return whether outputs (n_y,) say that the turbine stands; a reading that is NaN does not count."""
     slow: bool = y[c.speed] < c.slow and y[c.before] < c.ratio * y[c.behind]
     return slow
 
@@ -133,7 +133,7 @@ class OptimizerState(NamedTuple):
     """`PERIOD`, shape (1,)."""
     belief: Belief
     playing: Delivery
-    """What the control PLC plays."""
+    """Sequence that the control PLC plays."""
     sent: Delivery
     """The last answer. An answer may be computed again from the same state, with the same bits."""
     u: Array
@@ -141,7 +141,7 @@ class OptimizerState(NamedTuple):
     target: Array
     """Inputs that the plant should come to rest at, scaled deviations, shape (3,)."""
     rule: Array
-    """What the rule of the updating period remembers, shape (1,)."""
+    """Memory of the rule of the updating period, shape (1,)."""
 
 
 def empty_state(n_states: int, n_inputs: int, n_outputs: int, size: int, real: Real) -> OptimizerState:
@@ -162,11 +162,11 @@ def empty_state(n_states: int, n_inputs: int, n_outputs: int, size: int, real: R
 
 
 LARGEST: Final = 1e38
-"""What registers carry, in single precision."""
+"""Largest number that registers carry, in single precision."""
 
 
 class Constants(NamedTuple):
-    """What an optimiser computes with that does not change in a session, in the on-line floating-point type."""
+    """Constants of an optimiser in one session, in the on-line floating-point type."""
 
     estimator: Estimator
     target: TargetSearch
@@ -181,7 +181,7 @@ class Constants(NamedTuple):
     """`rest_map`."""
     predicted: OutputMaps
     weights: Array
-    """Of the knots in each sample, shape (horizon, knots)."""
+    """Weights of the knots in each sample, shape (horizon, knots)."""
     input_scale: Array
     rate: Array
     scaled_rate: Array
@@ -194,12 +194,12 @@ class Constants(NamedTuple):
     floor: float
     """Constant added to J."""
     least_load: float
-    """That can be held, as a deviation, W."""
+    """Least load that can be held, as a deviation, W."""
     largest_load: float
     reserve: float
-    """Of what the model holds, W."""
+    """Reserve kept below the largest load that the model holds, W."""
     least_load_error: float
-    """Taken off the model's least load with the turbine's outlet in its band: it is too high until the constant error
+    """Taken off the model's least load with the turbine's outlet in its band: it is too high until the bias
     of that has followed, W."""
     approach: float
     """How much warmer than the bath helium before the feed is at which that is opened no further, K; infinite is any.
@@ -207,7 +207,7 @@ class Constants(NamedTuple):
     following_s: float
     """Time constant with which the limit of the feed follows that."""
     level: int
-    """Which output is the level of the bath, ..."""
+    """Index of the output that is the level of the bath, ..."""
     temperature: int
     """... which its temperature, ..."""
     feed_temperature: int
@@ -217,7 +217,7 @@ class Constants(NamedTuple):
     """A deviation, %."""
     turbine: TurbineWatch
     load_step: float
-    """What the load may move by until an updating period is interrupted, W; 0 is never."""
+    """Change of the load at which an updating period is interrupted, W; 0 is never."""
     sequence_ticks: int
     fixed_ticks: int
     """Fixed updating period; 0 is adaptive."""

@@ -48,10 +48,10 @@ from coldloop_optimizer_plc.qp.design import (
 )
 
 SHOWN: Final = ("limits", "optimizer_plc.program")
-"""What of the configuration decides results: shown in the registers."""
+"""Keys of the configuration that decide results; the registers show them."""
 ADAPTIVE = 0
 LARGEST: Final = 1e18
-"""Of a number in the program's settings."""
+"""Largest number in the program's settings."""
 WITH_ALPHA: Final = ("ode", "qpoases", "osqp", "fast_gradient", "interior_point", "daqp", "outside")
 """Sections that have a weight of broken constraints."""
 
@@ -69,9 +69,9 @@ class SolverName(StrEnum):
 
 
 BORROWED_SOLVERS: Final = (SolverName.QPOASES, SolverName.OSQP, SolverName.DAQP)
-"""Those of other projects, which compute in double precision."""
+"""Solvers of other projects, which compute in double precision."""
 SINGLE_PRECISION_SOLVERS: Final = tuple(name for name in SolverName if name not in BORROWED_SOLVERS)
-"""Those that are kernels of our own."""
+"""Solvers that are kernels of our own."""
 
 
 class RuleName(StrEnum):
@@ -105,7 +105,7 @@ class ContractionSettings(BaseModel):
 
 
 class AdaptiveSettings(BaseModel):
-    """Which rule adapts the updating period, and its parameters; those by their names are Algorithm 1's."""
+    """Rule that adapts the updating period, and its parameters; those by their names are Algorithm 1's."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -139,7 +139,7 @@ def left_out(key: str, estimator: EstimatorSettings) -> str:
 
 
 class ProgramSettings(ProcessSettings):
-    """What the optimiser's program is to do."""
+    """Settings of the optimiser's program."""
 
     model_config = ConfigDict(validate_default=True)
 
@@ -173,7 +173,7 @@ class ProgramSettings(ProcessSettings):
     budget: BudgetSettings = Field(default_factory=BudgetSettings)
     estimator: EstimatorSettings = Field(default_factory=EstimatorSettings)
     plausibility: PlausibilitySettings = Field(default_factory=PlausibilitySettings)
-    """Of readings; for the Kalman filter."""
+    """Plausibility check of readings; for the Kalman filter."""
     ode: OdeSettings = Field(default_factory=OdeSettings)
     qpoases: QpoasesSettings = Field(default_factory=QpoasesSettings)
     osqp: OsqpSettings = Field(default_factory=OsqpSettings)
@@ -185,7 +185,8 @@ class ProgramSettings(ProcessSettings):
     """Solver, rule and estimator of somebody else's, used instead of ours."""
 
     decides: ClassVar[Mapping[str, tuple[str, ...]]] = {}
-    """What follows from other settings, for `coldloop.config`; filled in below, from the fields."""
+    """Keys that follow from other settings, by the key that decides, for `coldloop.config`; filled in below, from the
+    fields."""
 
     @field_validator("updating_period_s")
     @classmethod
@@ -224,7 +225,7 @@ class ProgramSettings(ProcessSettings):
 
     @property
     def notes(self) -> dict[str, str]:
-        """What the preset has and is not applied, by key relative to this section, with the reason."""
+        """Values of the preset that are not applied, by key relative to this section, with the reason."""
         return {
             f"{section}.{key}": f"preset {self.preset} has {as_toml(value)}, not applied: {reason}"
             for section, keys in presets_of(self.process)[self.preset].items() for key, value in keys.items()
@@ -311,7 +312,7 @@ class OptimizerServer(ServerSettings):
 
 
 class ControlEndpoint(Endpoint):
-    """Where the control PLC is."""
+    """Address of the control PLC."""
 
     port: Annotated[int, Field(ge=1, le=0xFFFF)] = CONTROL_PORT
     """TCP port."""
@@ -328,7 +329,7 @@ class OptimizerSection(ProcessSettings):
 
 
 class OptimizerSettings(RootSettings):
-    """What the optimiser PLC reads of a configuration."""
+    """Settings that the optimiser PLC reads of a configuration."""
 
     limits: InputLimits = Field(default_factory=InputLimits)
     session: SessionSettings = SessionSettings()

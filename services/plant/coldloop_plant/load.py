@@ -19,7 +19,7 @@ SECOND_TICKS: Final = round(1.0 / REFERENCE_TICK_S)
 """Ticks of what is a second in the families below, of a process that is not stretched."""
 HOUR_TICKS: Final = 3600 * SECOND_TICKS
 LARGEST_STEP: Final = 200.0
-"""Of the six families, W."""
+"""Largest load step of the six families, W."""
 
 
 class LoadFamily(NamedTuple):

@@ -34,7 +34,7 @@ class MeasurementNoise:
     seed: int
     """Seed of the PCG64 generator, 0 or more."""
     biases: tuple[float, ...] = ()
-    """What each output shows too much, in its unit; shape (outputs,), or none."""
+    """Bias of each output: what its reading shows too much, in its unit; shape (outputs,), or none."""
 
     def __post_init__(self) -> None:
         if not all(0.0 <= sigma < inf for sigma in self.deviations):
@@ -74,7 +74,7 @@ class PlantProgram:
         self._noise = noise
         nothing = (0.0,) * len(process.outputs)
         self.biases = _vector(noise.biases or nothing if noise else nothing, process.outputs, "biases")
-        """What each output shows too much, shape (outputs,)."""
+        """Bias of each output: what its reading shows too much, shape (outputs,)."""
         self.deviations = _vector(noise.deviations if noise else nothing, process.outputs, "standard deviations")
         """Standard deviation of the noise on each output, shape (outputs,)."""
         self._generator = np.random.Generator(np.random.PCG64(noise.seed if noise else 0))
@@ -148,7 +148,7 @@ class PlantProgram:
 
     @property
     def model_range(self) -> int:
-        """What is outside the range of the simulation's tables at the current tick, bits of `ModelRange`; 0 without."""
+        """Parts outside the range of the simulation's tables at the current tick, bits of `ModelRange`; 0 without."""
         return 0
 
     @property
@@ -158,7 +158,7 @@ class PlantProgram:
 
     @property
     def surroundings(self) -> Surroundings | None:
-        """What a refrigerator is given at the current tick; others are given nothing."""
+        """Boundary conditions of a refrigerator at the current tick; other plants have none."""
         return None
 
     def give(self, surroundings: Surroundings) -> None:

@@ -30,7 +30,7 @@ SHOWN: Final = (
     "plant.kind", "plant.station", "plant.refrigerator", "plant.mismatch", "plant.sensors", "plant.clock_error_ppm",
     "plant.watchdog", "plant.rate_limited", "limits.rate",
 )  # fmt: skip
-"""What of the configuration decides results: shown in the registers. Load and seed are those of a session."""
+"""Keys of the configuration that decide results; the registers show them. Load and seed are those of a session."""
 
 Deviation = Annotated[float, Field(ge=0)]
 
@@ -38,7 +38,7 @@ Factor = Annotated[float, Field(ge=0.5, le=1.4)]
 
 
 class MismatchSettings(Section):
-    """What of the cold box is not as in its model: most are factors. It begins at the model's point of rest."""
+    """Mismatch of the cold box to its model: most values are factors. It begins at the model's point of rest."""
 
     heat_transfer: Factor = 1.0
     """UA of the three heat exchangers."""
@@ -53,7 +53,7 @@ class MismatchSettings(Section):
     load: Factor = 1.0
     """Heat load over what is announced."""
     level_gauge: Factor = 1.0
-    """What is shown of L1."""
+    """Factor of the reading of L1."""
     delay_ticks: Annotated[int, Field(ge=0, le=20)] = 0
     """Ticks by which inputs act later."""
 
@@ -75,7 +75,7 @@ class SensorSettings(ProcessSettings):
     pressure: Deviation = 0.0
     """bar."""
     declared: Deviation = 0.0
-    """Of other processes than the cold box: over the noise that the process declares."""
+    """Noise of other processes than the cold box: over the noise that the process declares."""
     level_bias: FiniteFloat = 0.0
     """%: that much is shown too much, as by the next two."""
     temperature_bias: FiniteFloat = 0.0
@@ -98,7 +98,7 @@ class SensorSettings(ProcessSettings):
 
 
 class SafeAction(StrEnum):
-    """What the rack does with its outputs when the control PLC is silent."""
+    """Action of the rack on its outputs when the control PLC is silent."""
 
     HOLD = "hold"
     """It leaves them as they are."""
@@ -113,7 +113,7 @@ class WatchdogSettings(ProcessSettings):
     """Plant time without new outputs after which it expires; 0 is never. In lock-step plant time then stops."""
     action: SafeAction = SafeAction.HOLD
     safe_state: PerInput = declared(lambda process: tuple(one.safe for one in process.inputs))
-    """Of each input: of the cold box CV155 %, NCR22_A W, CV156 %."""
+    """Safe value of each input: for the cold box CV155 %, NCR22_A W, CV156 %."""
 
     @field_validator("safe_state")
     @classmethod
@@ -137,18 +137,18 @@ class PlantServer(ServerSettings):
 
 
 class PlantKind(StrEnum):
-    """Which plant is simulated."""
+    """Kind of the simulated plant."""
 
     COLD_BOX = "cold-box"
     """S1 and S2; pressures and inlet temperature are constant."""
     REFRIGERATOR = "refrigerator"
     """S1 to S4: with nitrogen pre-cooler and compression station."""
     OF_PROCESS = "of-process"
-    """That of the process in the model file."""
+    """The plant of the process in the model file."""
 
 
 class RefrigeratorStart(StrEnum):
-    """How a refrigerator is at the beginning of a session."""
+    """State of a refrigerator at the beginning of a session."""
 
     OPERATING_POINT = "operating-point"
     """At rest, with the bath filled."""
@@ -167,7 +167,7 @@ class RefrigeratorSettings(Section):
     daily_swing_k: Annotated[float, Field(ge=0, le=20)] = 0.0
     """Amplitude of a day's sine about it; the first six hours are the warmer."""
     events: tuple[RefrigeratorEvent, ...] = ()
-    """What happens, and when: `{at_s = 600, target = "nc1", value = 0}` trips a compressor after ten minutes."""
+    """Events and their times: `{at_s = 600, target = "nc1", value = 0}` trips a compressor after ten minutes."""
 
 
 class PlantSection(ProcessSettings):
@@ -185,7 +185,7 @@ class PlantSection(ProcessSettings):
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
     """Seed of the sensors' noise."""
     mismatch: MismatchSettings = MismatchSettings()
-    """Of a cold box alone."""
+    """Mismatch of a cold box alone."""
     sensors: SensorSettings = Field(default_factory=SensorSettings)
     clock_error_ppm: Annotated[float, Field(ge=-50_000, le=50_000)] = 0.0
     """How much too fast the rack's clock is in real time, in millionths: for tests of those who follow it."""
@@ -196,7 +196,7 @@ class PlantSection(ProcessSettings):
 
 
 class PlantSettings(RootSettings):
-    """What the plant service reads of a configuration."""
+    """Settings that the plant service reads of a configuration."""
 
     limits: InputLimits = Field(default_factory=InputLimits)
     session: SessionSettings = SessionSettings()

@@ -40,7 +40,7 @@ VERSIONS: Final = (numba.__version__, llvmlite.__version__, np.__version__, sys.
 LONGEST_NAME: Final = 120
 """Characters of a kernel's name that the name of its file has."""
 cache_folder = CacheFolder(find_cache_folder())
-"""Where this process keeps its kernels."""
+"""Folder of this process's kernels."""
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
@@ -134,7 +134,7 @@ class KernelCache:
 
     @property
     def cache_path(self) -> str:
-        """Where the files are."""
+        """Folder of the files."""
         return str(cache_folder.path)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:  # noqa: ANN401

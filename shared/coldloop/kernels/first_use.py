@@ -1,4 +1,4 @@
-"""What a program does before it uses kernels: announce that they are compiled, load numba without what it takes along.
+"""Preparations for kernels: announce that they are compiled, load numba without what it takes along.
 
 Compiling takes long and happens once. A user of kernels names their owner with `kernels_of`; the cache of kernels
 reports each one that it does not have to `needs_compiling`. Nothing is announced if all are cached.
@@ -18,7 +18,7 @@ class Kernels:
     """Kernels that may have to be compiled."""
 
     owner: str
-    """Whose they are, such as "the refrigerator"."""
+    """Owner of the kernels, such as "the refrigerator"."""
     about_s: int
     """Seconds that compiling all of them takes."""
 
@@ -39,7 +39,7 @@ def write_line(*kernels: Kernels) -> None:
 
 
 _needed: ContextVar[Kernels | None] = ContextVar("kernels that are needed", default=None)
-"""What the user has asked for at present, in this thread; what it needs itself is a part of it."""
+"""Kernels that the user has asked for at present, in this thread; what they need themselves is a part of them."""
 _announced: set[str] = set()
 _announce: Announce = write_line
 

@@ -110,7 +110,7 @@ OF_CLASS: Final = frozenset({
 OF_MEMBER: Final = frozenset({"__objclass__", "_hash_", "_inverted_", "_name_", "_sort_order_", "_value_"})
 """Names in a member of an enumeration that do not count."""
 OF_FIELD: Final = ("annotation", "default", "default_factory", "alias", "validation_alias", "discriminator", "metadata")
-"""What counts of a field of a pydantic model."""
+"""Attributes of a pydantic model's field that count."""
 IMPORT: Final = dis.opmap["IMPORT_NAME"]
 HAS_DOCSTRING: Final = 0x4000000
 """Flag of code whose first constant is its docstring, from Python 3.13 on."""
@@ -363,7 +363,7 @@ class _Node:
 
 
 class _State:
-    """What has been read of this process.
+    """State of the reading of this process's modules.
 
     Attributes:
         finished: No node refers to a module that is being imported.

@@ -7,7 +7,7 @@ from typing import Final
 STEP: Final = 0.625 * 2.0**-23
 """Such a share of the number itself."""
 SMALLEST_STEP: Final = 0.625 * 2.0**-149
-"""Of the smallest numbers, which are all as far apart."""
+"""Step of the smallest numbers, which are all as far apart."""
 
 
 def single(value: float) -> float:

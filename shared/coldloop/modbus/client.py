@@ -176,11 +176,11 @@ class _Wire(asyncio.Protocol):
         self._buffer = bytearray()
         self._last_id = 0
         self._awaited: dict[int, int] = {}
-        """By transaction id: which of the requests is not answered yet."""
+        """Indices of the requests that are not answered yet, by transaction id."""
         self._answers: list[bytes] = []
         self._done: asyncio.Future[list[bytes]] | None = None
         self._deadline = 0.0
-        """Of the answers, by the clock of the event loop."""
+        """Deadline of the answers, by the clock of the event loop."""
         self._timer: asyncio.TimerHandle | None = None
         """Looks at the deadline: one timer for many requests, as hardly any answer is late."""
 
@@ -259,7 +259,7 @@ _READ: Final = struct.Struct(">BHH")
 _WRITE: Final = struct.Struct(">BHHB")
 _READ_WRITE: Final = struct.Struct(">BHHHHB")
 _WRITTEN: Final = slice(1, _READ.size)
-"""What the answer to a write repeats of it behind the function code: address and count."""
+"""Part of a write that its answer repeats behind the function code: address and count."""
 _EXCEPTIONS: Final = {
     1: "no such function, or not for the role of this client",
     2: "no such register, or read-only",

@@ -122,7 +122,7 @@ REQUESTS_AT_ONCE: Final = 16
 
 
 class Client(Protocol):
-    """What a connection offers to be served in turns."""
+    """Connection that is served in turns."""
 
     has_role: bool
 

@@ -1,4 +1,4 @@
-"""How a server is set up, who may do what with it, and where a client finds one."""
+"""Settings of servers: set-up, rights of clients, and the address for a client."""
 
 from ipaddress import IPv4Network, IPv6Network
 from pathlib import Path

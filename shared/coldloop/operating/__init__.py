@@ -1,1 +1,1 @@
-"""What an operator can ask of a rig: commands, and how they are carried out over its registers."""
+"""Operations on a rig: an operator's commands, and how they are carried out over its registers."""

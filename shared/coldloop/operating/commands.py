@@ -1,4 +1,4 @@
-"""What operators can ask for: checked here, described in words, and carried out elsewhere."""
+"""Commands of operators: checked here, described in words, and carried out elsewhere."""
 
 from typing import Annotated, Final, Literal
 
@@ -63,12 +63,12 @@ class SetSetpoint(_Command):
 
     @property
     def place(self) -> int:
-        """Which of the inputs."""
+        """Index of the input."""
         return self.process.input_names.index(self.input)
 
     @property
     def unit(self) -> str:
-        """Of the value."""
+        """Unit of the value."""
         return self.process.inputs[self.place].unit
 
     @property
@@ -123,7 +123,7 @@ class PlayLoad(_Command):
 
 
 class SetFactor(_Command):
-    """How fast plant time goes."""
+    """Speed of plant time."""
 
     kind: Literal["factor"]
     factor: Annotated[float, Field(ge=0.01, le=10_000)]
@@ -147,7 +147,7 @@ class SetPaused(_Command):
 
 
 class TreatAlarm(_Command):
-    """What is done with an alarm, or with all."""
+    """Action on an alarm, or on all."""
 
     kind: Literal["alarm"]
     alarm: int

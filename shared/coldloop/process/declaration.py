@@ -1,4 +1,4 @@
-"""What a process is to the PLCs: its signals, its time, what it may and what it should do.
+"""Declaration of a process for the PLCs: its signals, its time, what it may and what it should do.
 
 A program is given its process with its model file (`coldloop.process.settings`). A process is what a process file says
 (`docs/your-plant.md`), completed with what its model says; that of the cold box is `data/cold_box.toml`.
@@ -51,11 +51,11 @@ class Process(Section):
     ticks_per_sample: Annotated[int, Field(ge=2, le=100)] = 20
     """Ticks of a sampling period of the prediction model, which is the longest updating period."""
     plant: PlantSource = PlantSource()
-    """Where the plant comes from."""
+    """Source of the plant."""
     inputs: Annotated[tuple[Input, ...], Field(min_length=1, max_length=MOST_SIGNALS)]
-    """What the controller moves."""
+    """Inputs: what the controller moves."""
     outputs: Annotated[tuple[Output, ...], Field(min_length=1, max_length=MOST_SIGNALS)]
-    """What is measured; at least one has a band or a setpoint."""
+    """Outputs: what is measured; at least one has a band or a setpoint."""
     load: Load = NO_LOAD
     """The disturbance that operators and `--load` set."""
     disturbances: Annotated[tuple[Disturbance, ...], Field(max_length=MOST_SIGNALS)] = ()
@@ -63,13 +63,13 @@ class Process(Section):
     states: tuple[State, ...] = ()
     """Process noises of states by name; of others 1 % of what they move by with the inputs, a sample."""
     bath: Bath | None = None
-    """Which signals are those of a bath that the cold end of a refrigerator fills; leave it out for other plants."""
+    """Signals of a bath that the cold end of a refrigerator fills; leave it out for other plants."""
     prediction: Instants = Instants()
     """The problem that is solved on-line."""
     mimic: str | None = None
     """SVG file with a drawing for the operator's page, beside the process file."""
     constants: tuple[str, ...] = ()
-    """Outputs whose constant error is estimated by default; those that the model tells apart if not given."""
+    """Outputs whose bias is estimated by default; those that the model tells apart if not given."""
     moves_as_one: bool = False
     """Whether all outputs move when any do: one that rests meanwhile is frozen, whatever the inputs do."""
     tuned: dict[str, dict[str, Any]] = Field(default_factory=dict)
@@ -223,7 +223,7 @@ class Process(Section):
 
     @property
     def horizon_s(self) -> float:
-        """Of the prediction, in seconds."""
+        """Horizon of the prediction, s."""
         return self.decision_instants[-1] * self.tick_s * self.ticks_per_sample
 
     @property

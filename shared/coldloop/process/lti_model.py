@@ -25,7 +25,7 @@ RealArray: TypeAlias = NDArray[np.float64]
 UNNAMED: dict[str, Any] = {
     "plant": COLD_BOX, "note": "", "plant_parameters": {}, "plant_rest": {}, "process": {}, "declaration_digest": "",
 }  # fmt: skip
-"""What a model file leaves out."""
+"""Values of the keys that a model file leaves out."""
 MATRICES = ("A", "B", "F", "C", "D", "G", "A_tick", "B_tick", "F_tick")
 HALVINGS = 20
 LARGEST_DIFFERENCE = 1e-6
@@ -116,7 +116,7 @@ class LtiModel(ModelDescription):
 
     @property
     def short_digest(self) -> int:
-        """What services compare."""
+        """Short digest, which services compare."""
         return self.short_digest_of(self.digest)
 
     def save(self, path: Path) -> None:

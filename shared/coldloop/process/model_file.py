@@ -27,7 +27,7 @@ COLD_BOX = "cold-box"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ModelDescription:
-    """What a model file says about its model, without operating point and matrices."""
+    """Description of a model in its file, without operating point and matrices."""
 
     parameters_digest: str
     """SHA-256 of the plant's parameters and property tables that the model was made from, in hexadecimal."""
@@ -42,15 +42,15 @@ class ModelDescription:
     w0: float
     """Load at the operating point, in `load_unit`."""
     plant: str = COLD_BOX
-    """Which plant the model was made of."""
+    """Plant that the model was made of."""
     note: str = ""
-    """Where the model comes from, if not from the plant's equations."""
+    """Source of the model, if not the plant's equations."""
     plant_parameters: dict[str, Any] = field(default_factory=dict)
     """The plant's parameters by section, as in a plant file; none are those of the reference plant."""
     process: dict[str, Any] = field(default_factory=dict)
     """`coldloop.process.declaration.Process` as plain data; none is the cold box."""
     plant_rest: dict[str, Any] = field(default_factory=dict)
-    """Where a refrigerator is at rest, and the gains of its pressure controller; none are those that are shipped."""
+    """A refrigerator's operating point, and the gains of its pressure controller; none are those that are shipped."""
     declaration_digest: str = ""
     """SHA-256 of the process file that it was made from, and of the files that this names; empty: of none."""
 
@@ -70,7 +70,7 @@ class ModelDescription:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelHeader(ModelDescription):
-    """What a model file says about itself, without its matrices."""
+    """Header of a model file, without its matrices."""
 
     digest: str
     """SHA-256 of the content, in hexadecimal."""
@@ -81,11 +81,11 @@ class ModelHeader(ModelDescription):
     y0: tuple[float, ...]
     """Outputs at the operating point, in `output_units`."""
     file: Path = Path()
-    """Where it was read from."""
+    """File that it was read from."""
 
     @property
     def short_digest(self) -> int:
-        """What services compare."""
+        """Short digest, which services compare."""
         return self.short_digest_of(self.digest)
 
 

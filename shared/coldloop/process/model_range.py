@@ -12,11 +12,12 @@ from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.station import STATION_SIGNAL_NAMES, ModelRange
 
 SATURATION_BAR: Final = (0.3, 2.25)
-"""Of bath and return; helium's critical point is at 2.28 bar."""
+"""Pressures of bath and return, bar; helium's critical point is at 2.28 bar."""
 SUPPLY_BAR: Final = (5.0, 19.0)
-"""Of the high-pressure side, where its properties are fitted."""
+"""Pressures of the high-pressure side, where its properties are fitted, bar."""
 WARMEST_CELL_K: Final = 310.0
-"""Of the exchangers: the tables end at 300 K, and up to 340 K helium is perfect within 3 mK and 0.2 %."""
+"""Warmest cell of the exchangers, K: the tables end at 300 K, and up to 340 K helium is perfect within 3 mK and 0.2 %.
+"""
 WARMEST_BATH_M3: Final = -6.37
 """V_l of a dry bath that is at 310 K."""
 COLD_BOX_BAR: Final = (16.0, 1.05)

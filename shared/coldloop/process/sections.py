@@ -31,7 +31,7 @@ the other terms of the cost are below the 7 digits of single precision.
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}$")]
 Range = tuple[FiniteFloat, FiniteFloat]
 Limits = tuple[int | FiniteFloat, int | FiniteFloat]
-"""Of registers, whose digest knows whole numbers."""
+"""Limits of registers, whose digest knows whole numbers."""
 
 
 class Section(BaseModel):
@@ -62,9 +62,9 @@ class Loop(Section):
     """A PI loop of the fallback, u = gain (e + 1/T_i integral of e) with e = setpoint - y."""
 
     input: Name
-    """That it moves; each loop has its own."""
+    """Input that it moves; each loop has its own."""
     gain: FiniteFloat
-    """In the unit of the input per unit of the output, with the sign of the process."""
+    """Gain, in the unit of the input per unit of the output, with the sign of the process."""
     integral_time_s: PositiveFloat
     """T_i, s."""
 
@@ -83,7 +83,7 @@ class Input(Section):
     unit: str = ""
     """Shown with every value; an FMU may have it."""
     description: str = Field(default_factory=lambda given: given["name"])
-    """Of its register; its name if not given."""
+    """Description of its register; its name if not given."""
     at: FiniteFloat
     """At the operating point."""
     low: FiniteFloat
@@ -93,19 +93,19 @@ class Input(Section):
     rate: PositiveFloat
     """Largest change in a sampling period."""
     safe: FiniteFloat = Field(default_factory=lambda given: given["at"])
-    """What the rack applies when nobody drives it, if so configured; the operating point if not given."""
+    """Safe value, which the rack applies when nobody drives it, if so configured; the operating point if not given."""
     weight: PositiveFloat = Field(default_factory=lambda given: _usual_weight(given["low"], given["high"]))
-    """In the cost, per square of its deviation; 0.01 over the square of a quarter of its range if not given."""
+    """Weight in the cost, per square of its deviation; 0.01 over the square of a quarter of its range if not given."""
     scale: PositiveFloat = Field(default_factory=lambda given: (given["high"] - given["low"]) / 4)
     """Size of it in the problem; a quarter of its range if not given."""
     walk: PositiveFloat = Field(default_factory=lambda given: given["rate"] / 10)
-    """Random walk of its constant error, per square root of a sampling period; a tenth of `rate` if not given."""
+    """Random walk of its bias, per square root of a sampling period; a tenth of `rate` if not given."""
     has_constant: bool = True
-    """Whether its constant error is told from the load."""
+    """Whether an input bias is observable separately from the load."""
     tag: str = Field(default_factory=lambda given: given["name"].lower())
     """Its name in commands; its name in small letters if not given."""
     span: Limits = Field(default_factory=lambda given: (min(given["low"], 0.0), max(given["high"], 0.0)))
-    """What its registers take; its range and 0 if not given."""
+    """Range of its registers; its range and 0 if not given."""
     bar: Range | None = None
     """Ends of its bar on the operator's page; from its range if not given."""
 
@@ -151,17 +151,17 @@ class Output(Section):
     unit: str = ""
     """Shown with every value; an FMU may have it."""
     range: Range
-    """Of its sensor: what is outside is no measurement."""
+    """Range of its sensor: a reading outside is no measurement."""
     noise: PositiveFloat
     """Standard deviation of its sensor."""
     at: FiniteFloat | None = None
     """At the operating point; found from the equations where the plant has them."""
     band: Range | None = None
-    """What it is to be kept within."""
+    """Band that it is to be kept within."""
     setpoint: FiniteFloat | None = None
-    """What it is to be kept at, instead of a band."""
+    """Setpoint that it is to be kept at, instead of a band."""
     tolerance: PositiveFloat | None = Field(default_factory=_usual_tolerance)
-    """Deviation from the setpoint that is none to indicators, figures and alarms; 1 % of `range` if not given."""
+    """Deadband on either side of the setpoint, for indicators, figures and alarms; 1 % of `range` if not given."""
     penalty: PositiveFloat | None = Field(default_factory=_usual_penalty)
     """rho, per square of what band or setpoint is missed by and sample; if not given 1 over the square of a twentieth
     of the band, or of the tolerance."""
@@ -171,15 +171,15 @@ class Output(Section):
     """Excess over the band up to which it does not count as outside, for alarms, indicators and the page; if not given
     3 times `noise`, and 1 % of the band at least; a setpoint's is its tolerance."""
     weight: NonNegativeFloat = 0.0
-    """In the cost, per square of its deviation from the operating point."""
+    """Weight in the cost, per square of its deviation from the operating point."""
     loop: Loop | None = None
     """The PI loop of the fallback that controls it; none if not given."""
     alarm_word: str = ""
-    """What its alarm is called; `NAME outside its band` if not given."""
+    """Name of its alarm; `NAME outside its band` if not given."""
     quantity: str = ""
     """level, speed, temperature or pressure: range and noise are then those of the settings of this kind of sensor."""
     allowance: NonNegativeFloat = 0.0
-    """What a plant that is not its model adds to a residual."""
+    """Allowance for a residual of a plant that differs from its model, in its unit."""
     bar: Range | None = None
     """Ends of its bar on the operator's page; from its band, or the range of its sensor, if not given."""
 
@@ -221,7 +221,7 @@ class Output(Section):
 
     @cached_property
     def kept(self) -> "Band | None":
-        """What it is to be kept within; None where it is only measured."""
+        """Band that it is to be kept within; None where it is only measured."""
         if self.edges is None or self.penalty is None:
             return None
         low, high = self.edges
@@ -235,7 +235,7 @@ class Output(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class Band:
-    """What an output is to be kept within, as controllers take it."""
+    """Band that an output is to be kept within, as controllers take it."""
 
     low: float
     high: float
@@ -254,7 +254,7 @@ class Band:
 
 
 class Outside(Section):
-    """What acts on the plant and is no input."""
+    """Quantity that acts on the plant and is no input."""
 
     name: Name
     """Letters, digits and underscores; of all signals another one."""
@@ -267,8 +267,8 @@ class Outside(Section):
     span: Limits
     """Within which it stays."""
     walk: PositiveFloat = Field(default_factory=lambda given: 0.01 * (given["span"][1] - given["span"][0]))
-    """Random walk that the estimator expects, of the load of what is not measured of it, per square root of a sampling
-    period; 1 % of the span if not given."""
+    """Random walk that the estimator expects of the part of the load that is not measured, per square root of a
+    sampling period; 1 % of the span if not given."""
     forecast: str | None = None
     """CSV file with the columns time_s and `name`, steps held: what the optimiser expects; it holds if not given."""
 
@@ -284,9 +284,9 @@ class Load(Outside):
     """The load: a disturbance that is measured, and that operators and `--load` set; leave it out if there is none."""
 
     noun: str = "Load"
-    """What descriptions call it."""
+    """Noun for it in descriptions."""
     word: str = ""
-    """What operators call it; its name if not given."""
+    """Operators' name for it; its name if not given."""
     bar: Range | None = None
     """Ends of its bar on the operator's page; its span if not given."""
     has_named_loads: bool = False
@@ -294,7 +294,7 @@ class Load(Outside):
 
     @property
     def title(self) -> str:
-        """What operators call it."""
+        """Operators' name for it."""
         return self.word or self.name
 
     @property
@@ -326,19 +326,19 @@ class Lag(Section):
     """gain exp(-delay s) / (time constant s + 1) from an input, the load or another disturbance, to an output."""
 
     output: Name
-    """That it moves."""
+    """Output that it moves."""
     source: Name
     """An input, the load or another disturbance."""
     gain: FiniteFloat
     """At rest, in the unit of the output per unit of the source."""
     time_constant_s: PositiveFloat
-    """Of the lag, s."""
+    """Time constant of the lag, s."""
     delay_s: NonNegativeFloat = 0.0
     """Dead time, s; whole ticks on the simulated plant."""
 
 
 class PlantSource(Section):
-    """Where the plant comes from: one of the first six."""
+    """Source of the plant: one of the first six."""
 
     python: Annotated[str, Field(pattern=r"^[^:]+\.py:[A-Za-z_]\w*$")] | None = None
     """`file.py:Class`, the file beside the process file."""
@@ -378,7 +378,7 @@ class State(Section):
     """A state of the model; a file names those whose process noise it gives."""
 
     name: str
-    """Of the plant's states."""
+    """Name of one of the plant's states."""
     unit: str = ""
     """As the plant has it."""
     walk: PositiveFloat | None = None
@@ -386,14 +386,14 @@ class State(Section):
 
 
 class Forecast(Section):
-    """What the optimiser expects of the load or of another disturbance, steps held."""
+    """Forecast of the load or of another disturbance, as the optimiser expects it, steps held."""
 
     name: str
-    """Of the load, or of a state that is a disturbance."""
+    """Name of the load, or of a state that is a disturbance."""
     ticks: tuple[int, ...]
-    """From 0, rising."""
+    """Ticks from 0, rising."""
     values: tuple[FiniteFloat, ...]
-    """From each tick on."""
+    """Values from each of these ticks on."""
 
 
 def rising_instants(instants: tuple[int, ...]) -> tuple[int, ...]:
@@ -409,9 +409,10 @@ class Instants(Section):
     step_test: str | None = None
     """CSV file as of `plant.step_test`: the controller's model is found in it, and the plant hides its states."""
     decision_instants: tuple[Annotated[int, Field(ge=1, le=400)], ...] = (1, 2, 4, 8, 16, 30, 60)
-    """At which the inputs are free, rising; the last one is the horizon."""
+    """Sampling periods at which the inputs are free, rising; the last one is the horizon."""
     constraint_instants: tuple[Annotated[int, Field(ge=1, le=400)], ...] = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 44, 60)
-    """At which bands and setpoints count, rising, within the horizon; `coldloop design` compares sets."""
+    """Sampling periods at which bands and setpoints count, rising, within the horizon; `coldloop design` compares sets.
+    """
 
     _rising = field_validator("decision_instants", "constraint_instants")(rising_instants)
 
@@ -456,9 +457,9 @@ class Bath(Section):
     holdable_load: Range | None = None
     """Loads that some inputs hold at rest within the bands, in the load's unit; its span where it is not known."""
     load_reserve: float = 0.0
-    """How near an estimated load may come to the largest one that the linear model holds."""
+    """Reserve of an estimated load below the largest one that the linear model holds."""
     least_load_error: float = 0.0
-    """What the least load that the linear model holds is too high by, until the error of the turbine's outlet is known.
+    """Error of the least load that the linear model holds (too high), until the error of the turbine's outlet is known.
     """
 
     @property

@@ -94,7 +94,7 @@ def stretched(seconds: float, least: float = 0.0) -> Any:  # noqa: ANN401 as abo
 
 @dataclass(frozen=True)
 class Checked:
-    """What the process says of a value: a check after its type's own, and what the JSON schema shows of it."""
+    """Check of a value by the process, after its type's own, and what the JSON schema shows of it."""
 
     check: Callable[[Process, Any], None]
     """Raises ValueError."""
@@ -168,11 +168,11 @@ class ProcessSettings(BaseModel):
 
 
 LARGEST: Final = 1e38
-"""Of a bound."""
+"""Largest magnitude of a bound."""
 
 
 class RateReference(StrEnum):
-    """What the rate limit of an update is measured against; the paper leaves it open (`studies/slips.md`, 15)."""
+    """Reference of the rate limit of an update; the paper leaves it open (`studies/slips.md`, 15)."""
 
     PER_UPDATE = "per-update"
     """The full limit of a sampling period of 5 s at each update, however soon the next one follows."""
@@ -198,7 +198,7 @@ class InputLimits(ProcessSettings):
 
     @property
     def slew_ticks(self) -> int:
-        """That time, in ticks."""
+        """Time of the slew limit, in ticks."""
         return max(1, round(self.slew_s / self.process.tick_s))
 
     def rate_share(self, elapsed_ticks: int) -> float:
@@ -232,7 +232,7 @@ class ModelSettings(BaseModel):
 
 
 class RootSettings(ProcessSettings):
-    """What a program reads of a configuration, all for the process of its model file.
+    """Settings that a program reads of a configuration, all for the process of its model file.
 
     Raises:
         ModelFileError: The model file cannot be read, or its process is none.

@@ -12,7 +12,7 @@ STATION_SIGNAL_NAMES: Final = (
 STATION_SIGNAL_UNITS: Final = (
     *["bar"] * 3, "K", "K", *["g/s"] * 6, "kW", "kW", "%", "%", "g/s", "kg", "kg", "K",
 )  # fmt: skip
-"""Of the compression station and the nitrogen pre-cooler, where the plant is the whole refrigerator.
+"""Units of the signals of compression station and nitrogen pre-cooler, where the plant is the whole refrigerator.
 
 P11, T11: low-pressure line; P12, M12: high-pressure line, and its flow to the cold box; P13: buffer; T13: cold end of
 NEF6; M_NC, E_NC, Q_NC: compressors' flow, electrical power, heat to the surroundings; M_out: relief valves and leak;
@@ -21,7 +21,7 @@ L_N2, M_GN2: level and boil-off of the nitrogen bath; helium, lost: in the circu
 
 
 class ModelRange(IntFlag):
-    """What of the simulation is outside its property tables, one bit each."""
+    """Parts of the simulation outside its property tables, one bit each."""
 
     BATH_PRESSURE = 1
     SUPPLY_PRESSURE = 2

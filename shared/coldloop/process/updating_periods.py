@@ -1,4 +1,4 @@
-"""Which updating periods there are, and what a PLC computes in each."""
+"""Updating periods, and what a PLC computes in each."""
 
 import math
 from typing import Final, NamedTuple
@@ -23,7 +23,7 @@ class ComputingTimes(NamedTuple):
     iteration: float
     tick_s: float
     longest_ticks: int
-    """Of an updating period: a sampling period."""
+    """Longest updating period: a sampling period."""
 
     def iterations(self, ticks: int) -> int:
         """Return the iterations that fit into an updating period; at least one is always done."""

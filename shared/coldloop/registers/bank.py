@@ -105,7 +105,7 @@ class RegisterBank:
         self._spans: dict[tuple[int, int], _Span] = {}
         self._judges: dict[type[tuple[Any, ...]], tuple[Judge, bool]] = {}
         self._live: dict[type[tuple[Any, ...]], Callable[[], None]] = {}
-        """What brings a record up to date."""
+        """Functions that bring a record up to date, by its type."""
         self._read_spans: dict[tuple[int, int], list[Callable[[], None]]] = {}
         """The same for the words that clients read."""
         for block in register_map.blocks:
@@ -305,7 +305,7 @@ class RegisterBank:
 
 
 class _Span(NamedTuple):
-    """What is known of a writable range of words, whatever is written to it."""
+    """Properties of a writable range of words, whatever is written to it."""
 
     first: int
     """Address of the first record that it falls in."""

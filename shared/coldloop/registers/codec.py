@@ -18,7 +18,7 @@ from coldloop.registers.declaration import Block, Field, Kind, RegisterMap
 R = TypeVar("R", bound=tuple[Any, ...])
 
 WIDEST: Final = {Kind.U16: (0, 0xFFFF), Kind.U32: (0, 0xFFFF_FFFF), Kind.F32: (-math.inf, math.inf)}
-"""What a register can hold."""
+"""Range of the values that a register can hold."""
 
 
 class DomainError(ValueError):
@@ -107,7 +107,7 @@ def domain_of(block: Block) -> Domain:
 
 
 class WordOrder(StrEnum):
-    """Which half of a 32-bit value is at the lower address."""
+    """Order of the halves of a 32-bit value: which is at the lower address."""
 
     HIGH_FIRST = "high-first"
     LOW_FIRST = "low-first"  # the habit of Schneider's PLCs
@@ -259,7 +259,7 @@ CRC_BYTES = 4
 
 
 class Seal(Enum):
-    """What the seal of a record says.
+    """Result of the check of a record's seal.
 
     TCP's checksum does not see what a gateway, a proxy or a memory does to a value. A sealed record ends with the
     CRC-32 of all before it, as big-endian words whatever the word order of the link; 0 is "not sealed", as a simple

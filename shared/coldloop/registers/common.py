@@ -9,14 +9,14 @@ MAGIC: Final = 123.456
 
 
 class ServiceState(Worded):
-    """What a service is doing, in `Identity.state`."""
+    """State of a service, in `Identity.state`."""
 
     READY = 0
     RUNNING = 1
 
 
 class TimeBaseKind(Worded):
-    """How the plant time of a session advances."""
+    """Kind of the time base: how the plant time of a session advances."""
 
     LOCK_STEP = 0, "lock-step"
     REAL_TIME = 1
@@ -25,7 +25,7 @@ class TimeBaseKind(Worded):
 
 
 class PaceCommand(Worded):
-    """What is written to pause or to resume."""
+    """Command that pauses or resumes plant time."""
 
     PAUSE = 1
     RESUME = 0
@@ -81,7 +81,7 @@ def pace_subject(pace: TimeBase) -> TimeBaseKind:
 
 
 class ServerStatistics(NamedTuple):
-    """What the server has done since it started; all counts wrap."""
+    """Statistics of the server since it started; all counts wrap."""
 
     connections: Annotated[int, u16("Open connections")] = 0
     accepted: Annotated[int, u32("Connections accepted")] = 0

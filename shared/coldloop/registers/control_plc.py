@@ -75,7 +75,7 @@ class CoolDownStep(Worded):
 
 
 class OperatorMode(Worded):
-    """What an operator wants."""
+    """Operating mode that an operator requests."""
 
     AUTO = 0
     """MPC, and the ladder when MPC is unavailable."""
@@ -193,7 +193,7 @@ class LadderStatus(NamedTuple):
 
 
 class Update(NamedTuple):
-    """What is latched at an updating instant for the optimiser."""
+    """Record for the optimiser, latched at an updating instant."""
 
     session: Annotated[int, u32("Session")]
     update: Annotated[int, u32("Number of the update; 0 is the one at tick 0", high=LAST_NUMBER)]
@@ -265,7 +265,7 @@ class Heartbeat(NamedTuple):
 
 
 class LatchedUpdate(NamedTuple):
-    """Which update is the newest: what an optimiser that computes looks at."""
+    """Number and tick of the newest update, read by an optimiser while it computes."""
 
     session: Annotated[int, u32("Session")] = 0
     update: Annotated[int, u32("Number of the newest update", high=LAST_NUMBER)] = 0
@@ -274,7 +274,7 @@ class LatchedUpdate(NamedTuple):
 
 
 class Operator(NamedTuple):
-    """What an operator wants. Setpoints count in manual mode; they are clamped and rate-limited."""
+    """Request of an operator: mode and setpoints. Setpoints count in manual mode; they are clamped and rate-limited."""
 
     mode: Annotated[int, u16("{}", values=OperatorMode)]
     u: Annotated[tuple[float, ...], each_input("Setpoint: {}")]

@@ -1,4 +1,4 @@
-"""How a register is declared.
+"""Declaration of registers.
 
 A *record* is a `NamedTuple` whose fields are annotated with what the bus needs to know of them, some of it by the
 process: names, units, ranges and the sizes of arrays. A *block* gives a record its place in the address space and its
@@ -44,7 +44,7 @@ class Worded(IntEnum):
     """An enumeration of registers, whose members carry their texts: `MPC = 1, "MPC"`; without one, it is the word."""
 
     text: str
-    """What registers, page and documentation call it."""
+    """Name of the member in registers, page and documentation."""
 
     def __new__(cls, value: int, _text: str = "") -> Self:
         """Make a member of its number."""
@@ -73,7 +73,7 @@ class Worded(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """What the bus knows of one field of a record: type, unit, range and meaning.
+    """Declaration of one field of a record: type, unit, range and meaning.
 
     A field with `elements` is an array: its value is a tuple with one number for each named element, and `units`
     gives each its unit.
@@ -93,7 +93,7 @@ class Field:
     finite: bool = True
     """No NaN and no infinity; where they are allowed, the user of the value checks it."""
     each: tuple["Field", ...] = ()
-    """Of an array whose elements are registers of their own names, meanings and ranges: their declarations."""
+    """Declarations of the elements of an array whose elements are registers of their own names, meanings and ranges."""
 
     @property
     def registers(self) -> Iterator[tuple[str, "Field"]]:
@@ -290,7 +290,7 @@ class Block:
     sealed: bool = False
     """Each row ends with the CRC-32 of the words before it (`coldloop.registers.codec`)."""
     process: Process = COLD_BOX
-    """By which sizes, names, units and ranges are."""
+    """Process that sizes, names, units and ranges are of."""
 
     def __hash__(self) -> int:
         return hash((self.name, self.address, self.record, self.process))  # codecs are found by it in each tick

@@ -97,7 +97,7 @@ class ControlLinkStatus(NamedTuple):
 
 
 class Optimization(NamedTuple):
-    """What the optimiser did between two updating instants. Costs are those of the augmented cost function J.
+    """Result of the optimiser between two updating instants. Costs are those of the augmented cost function J.
 
     A cost may be infinite, and a rate no number, where nothing was iterated.
     """
@@ -124,7 +124,7 @@ class Optimization(NamedTuple):
 
 
 class UpdatingRuleKind(Worded):
-    """What decides the updating period."""
+    """Kind of rule that decides the updating period."""
 
     FIXED = 0, "fixed period"
     """It is always the same."""
@@ -150,7 +150,7 @@ class UpdatingRuleStatus(NamedTuple):
 
 
 class OperatingLimits(NamedTuple):
-    """What the optimiser keeps the process within: bands of the constrained outputs, bounds and rates of the inputs."""
+    """Limits that the optimiser keeps the process within: bands of constrained outputs, bounds and rates of inputs."""
 
     output_low: Annotated[tuple[float, ...], of_banded("Low end of the band")]
     output_high: Annotated[tuple[float, ...], of_banded("High end of the band")]
@@ -160,12 +160,12 @@ class OperatingLimits(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """What the last delivered sequence is expected to lead to. Behind the horizon: the value at its end."""
+    """Prediction for the last delivered sequence. Behind the horizon: the value at its end."""
 
     update: Annotated[int, u32("Update that the prediction belongs to")]
     tick: Annotated[int, u32('Tick at which its sequence begins, t_{i+1}; element "5s" is 5 s later')]
     y: Annotated[tuple[float, ...], _predicted]
-    """Of one output that has a band after the other, at `PREDICTED_SAMPLES`."""
+    """Values of one output that has a band after the other, at `PREDICTED_SAMPLES`."""
     u: Annotated[tuple[float, ...], _planned]
     crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
 
@@ -177,7 +177,7 @@ def outputs_of(prediction: Prediction) -> tuple[tuple[float, ...], ...]:
 
 
 class ModelDeviation(NamedTuple):
-    """By how much the plant differs from its model, as the filter estimates it; also 0 where nothing is estimated."""
+    """Deviation of the plant from its model, as the filter estimates it; also 0 where nothing is estimated."""
 
     load: Annotated[float, of_load("{word} beyond what is measured or, unmeasured, usual", finite=False)]
     u: Annotated[tuple[float, ...], of_inputs("Acts like so much more of the input", finite=False)]

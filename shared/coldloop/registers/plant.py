@@ -102,7 +102,7 @@ class Measurement(NamedTuple):
 
 
 class SensorFaultKind(Worded):
-    """What is wrong with a sensor, on purpose."""
+    """Kind of a fault that is put on a sensor on purpose."""
 
     NONE = 0
     NOT_A_NUMBER = 1
@@ -217,7 +217,7 @@ class PlantSample(NamedTuple):
 
 
 class StationMode(Worded):
-    """What the controller of the compression station can do about the pressures."""
+    """Mode of the compression station's controller: what it can do about the pressures."""
 
     AUTOMATIC = 0
     """All valves are within their ranges."""
@@ -313,7 +313,7 @@ def _blocking(exchanger: str) -> Field:
 
 
 class Surroundings(NamedTuple):
-    """What a refrigerator is given, from the next tick on; refused by a cold box alone."""
+    """Boundary conditions of a refrigerator, from the next tick on; refused by a cold box alone."""
 
     nc1: Annotated[int, u16("1: compressor NC1 runs, 0: it has tripped", high=1)] = 1
     nc2: Annotated[int, u16("1: compressor NC2 runs, 0: it has tripped", high=1)] = 1

@@ -8,7 +8,7 @@ from coldloop.registers.declaration import Worded, in_ticks, text, u16, u32
 
 
 class WatchdogState(Worded):
-    """What a watchdog is doing."""
+    """State of a watchdog."""
 
     OFF = 0
     RUNNING = 1
@@ -149,7 +149,7 @@ class AlarmPriority(Worded):
 
 
 class AlarmAction(Worded):
-    """What an operator does with an alarm."""
+    """Action of an operator on an alarm."""
 
     ACKNOWLEDGE = 1
     SHELVE = 2
@@ -174,7 +174,7 @@ class Alarm(NamedTuple):
 
 
 class AlarmCommand(NamedTuple):
-    """What an operator wants done with an alarm; done when written."""
+    """Command of an operator for an alarm; done when written."""
 
     alarm: Annotated[int, u16("Number of the alarm; 65535 is all")]
     action: Annotated[int, u16("{}", values=AlarmAction)]

@@ -1,1 +1,1 @@
-"""What keeps the plant safe when a peer, a writer or a disk fails: watchdog, leases, sequences, retained states."""
+"""Safety of the plant when a peer, a writer or a disk fails: watchdog, leases, sequences, retained states."""

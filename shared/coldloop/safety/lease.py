@@ -47,9 +47,9 @@ class WriterLease:
         self._note = note
         self._now = now
         self._name: str | None = None
-        """Of the holder, until the end of its lease has been noted."""
+        """Name of the holder, until the end of its lease has been noted."""
         self._refused_at: dict[int, float] = {}
-        """When each connection was last noted as a second writer."""
+        """Time at which each connection was last noted as a second writer."""
         self._caller: Caller | None = None
         self._holder = SIMPLE_CLIENT
         self._heard_at = 0.0

@@ -42,7 +42,7 @@ class RetainedStateError(ColdloopError):
 
 
 class RetainSettings(BaseModel):
-    """Where the state is kept."""
+    """Folder of the retained state."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

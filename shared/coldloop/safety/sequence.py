@@ -14,7 +14,7 @@ from coldloop.registers.control_plc import SequenceHeader
 from coldloop.registers.declaration import Block
 
 Inputs: TypeAlias = tuple[float, ...]
-"""Of one tick, in their order."""
+"""Inputs of one tick, in their order."""
 _HEADER = codec_of(Block("sequence header", 0, SequenceHeader, ""))
 _CRC_BYTES = 4
 

@@ -1,1 +1,1 @@
-"""What every service is besides its program: its start, journal, logs, metrics and telemetry."""
+"""Parts of every service besides its program: its start, journal, logs, metrics and telemetry."""

@@ -72,16 +72,16 @@ SUPPRESSIONS: Final = frozenset(
 
 
 class _Wording(NamedTuple):
-    """How the fields of one kind of event are put into words."""
+    """Wording of the fields of one kind of event."""
 
     subject: Words = _nothing
     cause: Words = _nothing
     unit: str | None = None
-    """Of the value; None when the kind has none."""
+    """Unit of the value; None when the kind has none."""
 
 
 class _Words:
-    """How events of a process are put into words."""
+    """Wording of the events of a process."""
 
     def __init__(self, process: Process) -> None:
         self.process = process
@@ -172,7 +172,7 @@ class EventText(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """What happened, in one line."""
+        """Sentence that says what happened, in one line."""
         details = f" ({self.cause})" if self.cause else ""
         value = f", {self.value} {self.unit}".rstrip() if self.value else ""
         who = f", by {self.who}" if self.who else ""

@@ -174,7 +174,7 @@ class QueueingHandler(logging.Handler):
         super().__init__()
         self.writer = writer
         self._told = 0
-        """Of the dropped lines, how many a later line has reported."""
+        """Number of dropped lines that a later line has reported."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Let a record be written; called with the handler's lock held."""

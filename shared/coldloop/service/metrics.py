@@ -58,7 +58,7 @@ def metric_name(*parts: str) -> str:
 
 
 class _Families(Collector):
-    """What is shown, made anew for each answer."""
+    """Metrics, made anew for each answer."""
 
     def __init__(self, families: Iterable[Metric]) -> None:
         self._families = families

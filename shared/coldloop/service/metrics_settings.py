@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class MetricsSettings(BaseModel):
-    """Where a service serves its registers as metrics.
+    """Address at which a service serves its registers as metrics.
 
     Args:
         host: Address to listen on.

@@ -1,4 +1,4 @@
-"""How a service starts as a program: options, configuration, logs, event loop, signals, exit code."""
+"""Start of a service as a program: options, configuration, logs, event loop, signals, exit code."""
 
 import argparse
 import asyncio

@@ -10,7 +10,7 @@ from coldloop.text_file import read_text
 
 
 class TelemetrySettings(BaseModel):
-    """Where to publish to."""
+    """Settings of the broker to publish to."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -24,7 +24,7 @@ class TelemetrySettings(BaseModel):
     """File that holds the password for it, on one line. It is read at each connection; without TLS it is sent as it
     is, so this is for a private network."""
     prefix: Annotated[str, Field(pattern=r"^[^#+]+$")] = "coldloop"
-    """Of topics; a rig at other ports than the usual ones adds its first port, unless this is set."""
+    """Prefix of topics; a rig at other ports than the usual ones adds its first port, unless this is set."""
     period_s: PositiveFloat = 1.0
     """Real time between snapshots."""
     queue: Annotated[int, Field(ge=1)] = 100

@@ -15,7 +15,7 @@ BINS = 4000
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """When ticks are due: tick n at `start` + n * `tick_s` / `factor` of the monotonic clock, s."""
+    """Schedule of ticks: tick n at `start` + n * `tick_s` / `factor` of the monotonic clock, s."""
 
     start: float
     factor: float

@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class TimeMode(StrEnum):
-    """What advances plant time."""
+    """Mode in which plant time advances."""
 
     LOCKSTEP = "lockstep"
     """The control PLC, as fast as the optimiser answers."""
@@ -16,7 +16,7 @@ class TimeMode(StrEnum):
 
 
 class SessionSettings(BaseModel):
-    """What a service does when it starts, before the first command."""
+    """Settings of the session that a service begins when it starts, before the first command."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -28,7 +28,7 @@ class SessionSettings(BaseModel):
 
 
 class TimeBase(NamedTuple):
-    """In lock-step the factor has no meaning."""
+    """Time base of a session; in lock-step the factor has no meaning."""
 
     realtime: bool
     factor: float

@@ -132,7 +132,7 @@ class ProfileCosts(NamedTuple):
 
 
 class OutputMaps(NamedTuple):
-    """How the constrained outputs over the horizon of N samples follow from a profile and the parameters."""
+    """Maps from a profile and the parameters to the constrained outputs over the horizon of N samples."""
 
     resting: Array
     """The b outputs with a band in turn at the operating point, shape (b N,)."""
@@ -145,7 +145,7 @@ class OutputMaps(NamedTuple):
     bands: Array
     """Low, high and weight of each, shape (3, b)."""
     row_gains: Array
-    """What the rows of Gamma were multiplied by, shape (m,)."""
+    """Factors that the rows of Gamma were multiplied by, shape (m,)."""
 
 
 def output_maps(problem: PredictiveProblem) -> OutputMaps:
@@ -226,7 +226,7 @@ class Solution(NamedTuple):
     z: Array
     """Shape (n,)."""
     multipliers: Array
-    """Of the rows, lambda >= 0, shape (m,)."""
+    """Multipliers of the rows, lambda >= 0, shape (m,)."""
     base_cost: float
     """J_0."""
     cost: float

@@ -41,7 +41,7 @@ ODE-based solver is so short that the inputs of the cold box hardly move."""
 
 
 class Target(StrEnum):
-    """What the cost is about: where the plant should come to rest."""
+    """Target of the cost: where the plant should come to rest."""
 
     OPERATING_POINT = "operating-point"
     MISMATCH = "mismatch"
@@ -79,7 +79,7 @@ class ControlDesign(ProcessSettings):
     pressure_scale: PositiveFloat = 2000.0
     """Size of a pressure in the cost, Pa."""
     level_scale: PositiveFloat = 1.0
-    """In % of the vessel."""
+    """Size of a level in the cost, % of the vessel."""
     temperature_scale: PositiveFloat = 1.0
     """Size of a temperature in the cost, K."""
     state_weight: PositiveFloat = 0.1
@@ -188,18 +188,19 @@ class Preset(StrEnum):
     """Sets of settings by name; what is set explicitly in the same place comes before the preset's."""
 
     TUNED = "tuned"
-    """As good as this project knows how to make it: the paper's preset and an estimator of constant errors; of the cold
+    """As good as this project knows how to make it: the paper's preset and an estimator of biases; of the cold
     box also a limit of CV155 where opening it further cools less, and rows that keep outputs inside their bands at
     rest."""
     PAPER = "paper"
     """The paper's problem and estimator, with the truncated solver as good as this project knows how to make it."""
     AS_PRINTED = "as-printed"
-    """What the paper prints and no more. Of the numbers that it leaves open, alpha is rho, all rows have the same alpha
-    in their own units, and cost_scale is the one whose costs come down with the iterations as in the paper's figure."""
+    """The paper's printed values and no more. Of the numbers that it leaves open, alpha is rho, all rows have the same
+    alpha in their own units, and cost_scale is the one whose costs come down with the iterations as in the paper's
+    figure."""
 
 
 UNMEASURED: Final = "unmeasured"
-"""What section `estimator` of a process's preset `tuned` has instead where the load is not measured."""
+"""Key that section `estimator` of a process's preset `tuned` has instead where the load is not measured."""
 
 
 def presets_of(process: Process) -> Mapping[Preset, Mapping[str, Mapping[str, Any]]]:

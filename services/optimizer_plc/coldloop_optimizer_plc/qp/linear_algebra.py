@@ -34,7 +34,7 @@ class Columns(NamedTuple):
     transposed: Array
     """Shape (k, n), the columns of A as rows."""
     first: Indices
-    """Of each column the first index that is not zero, shape (k,)."""
+    """Index of the first element of each column that is not zero, shape (k,)."""
     end: Indices
     """And the one behind the last, shape (k,)."""
 

@@ -46,7 +46,7 @@ class Ahead(NamedTuple):
     """Sample, counted from 1."""
     last: int
     states: Array
-    """What 1 of it adds to the states in a sample, shape (n,)."""
+    """Change of the states by one unit of it in a sample, shape (n,)."""
     outputs: Array
     """The same of the outputs, shape (n_y,)."""
 

@@ -208,9 +208,9 @@ class OutputRows(NamedTuple):
     bounds: Array
     """gamma at the operating point, shape (rows,)."""
     states: Array
-    """How gamma depends on s = (x, w), shape (n_x + 1, rows)."""
+    """Derivative of gamma with respect to s = (x, w), shape (n_x + 1, rows)."""
     gains: Array
-    """What the rows were multiplied by, shape (rows,): 1 for the output of the larger rho."""
+    """Factors that the rows were multiplied by, shape (rows,): 1 for the output of the larger rho."""
 
 
 class RateRows(NamedTuple):
@@ -226,9 +226,9 @@ class RateRows(NamedTuple):
     first: Array
     """1.0 for the rows of the first interval, shape (rows,)."""
     before: Array
-    """How gamma depends on the input before, shape (inputs, rows)."""
+    """Derivative of gamma with respect to the input before, shape (inputs, rows)."""
     gains: Array
-    """What the rows were multiplied by, shape (rows,)."""
+    """Factors that the rows were multiplied by, shape (rows,)."""
 
 
 def output_rows(condensed: Condensed, design: ControlDesign, weights: Array, y0: Array) -> OutputRows:
@@ -289,7 +289,7 @@ def rate_rows(design: ControlDesign, limits: InputLimits, penalties: PenaltySett
 
 
 class Maps(NamedTuple):
-    """How an instance follows from the parameters; the state and the load are stacked as s = (x, w)."""
+    """Maps from the parameters to an instance; the state and the load are stacked as s = (x, w)."""
 
     phi: Array
     """Shape (n_s, n)."""
@@ -391,7 +391,7 @@ class QuadraticProblem(NamedTuple):
 
 
 class QpParameters(NamedTuple):
-    """What an instance depends on, as deviations from the operating point."""
+    """Parameters of an instance, as deviations from the operating point."""
 
     x: Array
     w: float

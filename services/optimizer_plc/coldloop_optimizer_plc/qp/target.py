@@ -25,24 +25,24 @@ from coldloop_optimizer_plc.qp.prediction import PredictionModel, rest_map, stat
 Array = NDArray[np.float64]
 
 TOLERANCES = {8: 1e-8, 4: 1e-4}
-"""What a bound may be missed by, scaled, by the bytes of a number: in single precision a corner of bounds is met no
-better than within 1e-5."""
+"""Tolerances for the violation of a bound, scaled, by the bytes of a number: in single precision a corner of bounds is
+met no better than within 1e-5."""
 NO_EFFECT = 1e-9
 """K of the turbine's outlet per W held: an input that warms it by less does so by rounding, whose sign is another on
 another machine."""
 
 
 class Rest(NamedTuple):
-    """What is at rest with the level at its operating point, by the scaled inputs."""
+    """Values at rest with the level at its operating point, by the scaled inputs."""
 
     states: Array
     """States and load held: as a map of the inputs, shape (3, n_x + 1). Disturbances are none."""
     temperature: Array
-    """Of the turbine's outlet, shape (3,)."""
+    """Temperature of the turbine's outlet, shape (3,)."""
 
 
 class TargetSearch(NamedTuple):
-    """What targets are found with, in the on-line floating-point type."""
+    """Constants of the search for targets, in the on-line floating-point type."""
 
     followed: bool
     """Whether there is a target other than the operating point."""
@@ -61,18 +61,18 @@ class TargetSearch(NamedTuple):
     temperature: Array
     """Shape (3,)."""
     low: Array
-    """Of inputs and the turbine's outlet, shape (4,)."""
+    """Low bounds of inputs and the turbine's outlet, shape (4,)."""
     high: Array
     margin: float
     """How far inside its band the rows of the turbine's outlet are, K."""
     constants: NDArray[np.int64]
-    """Which states are the constants of inputs and the turbine's outlet, shape (4,); -1 is none."""
+    """Indices of the states that are the biases of inputs and the turbine's outlet, shape (4,); -1 is none."""
     scale: Array
-    """Of the constants: input_scale and 1, shape (4,)."""
+    """Scales of these biases: input_scale and 1, shape (4,)."""
     tolerance: float
-    """What a bound may be missed by."""
+    """Tolerance for the violation of a bound."""
     feed: int
-    """Which input fills the bath; kernels are shared by processes, and have no places of theirs in them."""
+    """Index of the input that fills the bath; kernels are shared by processes, and have no places of theirs in them."""
 
 
 def rest_of(prediction: PredictionModel, design: ControlDesign, bath: Bath) -> Rest:

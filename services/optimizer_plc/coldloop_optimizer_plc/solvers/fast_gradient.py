@@ -25,11 +25,11 @@ Array = NDArray[np.float64]
 
 POWER_ITERATIONS = 200
 BOUND_MARGIN = 1.02
-"""On the largest eigenvalue, which power iteration approaches from below."""
+"""Margin on the largest eigenvalue, which power iteration approaches from below."""
 
 
 class Momentum(NamedTuple):
-    """What is carried from one iteration to the next besides z."""
+    """State of an iteration besides z."""
 
     extrapolated: Array
     """Point at which the gradient is taken, shape (n,)."""
@@ -38,7 +38,7 @@ class Momentum(NamedTuple):
 
 
 class FastGradientMethod(NamedTuple):
-    """What the solver computes with that does not change from problem to problem."""
+    """Constants of the solver, the same for all problems."""
 
     matrices: Matrices
     steps: Array

@@ -35,7 +35,7 @@ ROUNDING = 1_000_000_000
 
 
 class HybridMethod(NamedTuple):
-    """What the solver computes with that does not change from problem to problem."""
+    """Constants of the solver, the same for all problems."""
 
     ode: ode.OdeMethod
     interior_point: interior_point.InteriorPointMethod

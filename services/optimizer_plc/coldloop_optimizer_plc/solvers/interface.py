@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 
 class Costs(NamedTuple):
-    """Of the problem before, with constant and floor; infinite where there was none."""
+    """Costs of the problem before, with constant and floor; infinite where there was none."""
 
     guessed: float
     """J+, of the guess."""
@@ -34,18 +34,19 @@ class Costs(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What a solver makes of a problem, after each of k counts of iterations; costs are without the constant."""
+    """Answer of a solver to a problem, after each of k counts of iterations; costs are without the constant."""
 
     guessed: float
     """Augmented cost of the guess inside the box."""
     points: Array
-    """What would be delivered, shape (k, n)."""
+    """Points that would be delivered, shape (k, n)."""
     costs: Array
     """Augmented costs of the points, shape (k,)."""
     iterations: NDArray[np.int64]
     """Iterations done, shape (k,): fewer than allowed when more would change nothing."""
     multipliers: Array
-    """Of the rows at the last point, shape (m,); (0,) of a penalty method, whose multipliers follow from the point."""
+    """Multipliers of the rows at the last point, shape (m,); (0,) of a penalty method, whose multipliers follow from
+    the point."""
 
     @property
     def z(self) -> Array:
@@ -164,7 +165,7 @@ class KernelSolver:
 
 
 class OutsideMethod(Protocol):
-    """What an entry point makes: min z' Phi z + z' phi under Gamma z <= gamma and low <= z <= high, cut off anywhere.
+    """Solver of an entry point: min z' Phi z + z' phi under Gamma z <= gamma and low <= z <= high, cut off anywhere.
 
     There is no factor 1/2 before Phi. The same problem, guess and count give the same bits. If it has an attribute
     `alpha`, that is set to the weight of broken rows that its answers are judged with.

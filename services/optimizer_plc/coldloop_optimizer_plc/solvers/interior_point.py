@@ -41,17 +41,17 @@ class Structure(NamedTuple):
     """The constant matrices, variables in the order of elimination."""
 
     order: Indices
-    """Which variable of the problem comes first, second, ..., shape (n,)."""
+    """Variables of the problem in the order of elimination, shape (n,)."""
     hessian: Array
     """2 Phi, shape (n, n)."""
     Gamma: Array
     """Shape (m, n)."""
     columns: Indices
-    """Of each row of Gamma the columns that are not zero, rising, filled up with -1, shape (m, at most n)."""
+    """Columns of each row of Gamma that are not zero, rising, filled up with -1, shape (m, at most n)."""
 
 
 class Point(NamedTuple):
-    """Where the method is, in the order of elimination."""
+    """Iterate of the method, in the order of elimination."""
 
     z: Array
     """Shape (n,)."""
@@ -68,7 +68,7 @@ class Path(NamedTuple):
 
     alpha: float
     softness: float
-    """Of the rows, 1 / (2 alpha)."""
+    """Softness of the rows, 1 / (2 alpha)."""
     first_mu: float
     least_mu: float
     margin: float
@@ -92,7 +92,7 @@ def path_in(settings: InteriorPointSettings, size: int, real: Real) -> Path:
 
 
 class InteriorPointMethod(NamedTuple):
-    """What the solver computes with that does not change from problem to problem."""
+    """Constants of the solver, the same for all problems."""
 
     structure: Structure
     path: Path

@@ -71,7 +71,7 @@ def flow_in(settings: OdeSettings, penalties: PenaltySettings | None, real: Real
 
 
 class OdeMethod(NamedTuple):
-    """What the solver computes with that does not change from problem to problem."""
+    """Constants of the solver, the same for all problems."""
 
     matrices: Matrices
     flow: Flow

@@ -319,7 +319,7 @@ class Library(ABC):
     """
 
     name: ClassVar[str]
-    """Of the module, of the extra and of the entry point."""
+    """Name of the module, of the extra and of the entry point."""
 
     def __init__(self) -> None:
         self.alpha = PENALTY_WEIGHT

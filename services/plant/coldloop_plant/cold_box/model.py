@@ -37,7 +37,7 @@ SIZES: Final = {
 }  # fmt: skip
 """An ordinary deviation of a state, by its unit; of the liquid volume 1 % of level."""
 FURTHER_SIZES: Final = (10.0, 50.0, 10.0, 50.0)
-"""Of CV155 (%), NCR22_A (W), CV156 (%) and the load (W)."""
+"""Ordinary deviations of CV155 (%), NCR22_A (W), CV156 (%) and the load (W)."""
 RELAXATION_S, RELAXATION_STEP_S = 3000.0, 0.5
 LEVEL_GAIN: Final = 100.0
 """W of load per % of level, while relaxing, for the CV155 of the reference plant."""
@@ -273,7 +273,7 @@ def _levers(found: Equilibrium, file: PlantFile, helium: Helium) -> str:
 Range = tuple[float, float]
 
 LOOP_MARGIN: Final = 39.0
-"""What the optimiser leaves of the largest load, W: its rows are soft, and let L1 rest beyond its band before CV156 is
+"""Margin of the optimiser below the largest load, W: its rows are soft, and let L1 rest beyond its band before CV156 is
 open. The reference plant rests at 554 W; it stays in its bands, with their dead bands, up to 515 W."""
 
 

@@ -96,9 +96,9 @@ class Streams(NamedTuple):
     P_turbine: float
     """Between CV156 and the nozzle, Pa."""
     P_mix: float
-    """Where the turbine's exhaust joins the return, Pa."""
+    """Pressure where the turbine's exhaust joins the return, Pa."""
     exhaust: Expansion
-    """What leaves the turbine."""
+    """State of the gas that leaves the turbine."""
 
 
 @inlined

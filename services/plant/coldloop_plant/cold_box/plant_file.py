@@ -67,11 +67,11 @@ class BathSection(Section):
     """The phase separator NS1."""
 
     volume_m3: Annotated[float, within(0.005, 10)] = 0.2
-    """Of the vessel; 1 % of level is a hundredth of it."""
+    """Volume of the vessel, m3; 1 % of level is a hundredth of it."""
     wall_kg: Annotated[float, within(0.1, 10_000)] = 50.0
     """Aluminium that warms when the vessel is dry."""
     relief_pressure_bar: Annotated[float, within(*SATURATION_BAR)] = 1.8
-    """At which its relief valve begins to open."""
+    """Pressure at which its relief valve begins to open, bar."""
     relief_span_bar: Annotated[float, within(0.01, 2)] = 0.3
     """Rise above it at which that valve is fully open."""
     relief_area_mm2: Annotated[float, within(1, 100_000)] = 400.0
@@ -106,9 +106,9 @@ class ExchangerSection(Section):
     ua_w_per_k: HeatTransfer
     """Heat transfer coefficient times area."""
     volume_l: Litres
-    """Of the high-pressure passes."""
+    """Volume of the high-pressure passes, l."""
     aluminium_kg: Mass
-    """Of the walls."""
+    """Mass of the walls, kg."""
 
     def component(self, cells: int) -> HeatExchanger:
         """Return the exchanger in SI units."""
@@ -154,7 +154,7 @@ class ReturnLineSection(Section):
 
 
 class BoundariesSection(Section):
-    """What the cold box is given."""
+    """Boundary conditions of the cold box."""
 
     p_hp_bar: Annotated[float, within(*SUPPLY_BAR)] = 16.0
     """Supply pressure."""
@@ -165,7 +165,7 @@ class BoundariesSection(Section):
 
 
 class OperatingPointSection(Section):
-    """Where the plant is at rest, and its model linear."""
+    """Operating point at which the plant is at rest and its model linearised."""
 
     cv155_pct: Annotated[float, within(0, 100)] = OPERATING_INPUTS[0]
     ncr22_a_w: Annotated[float, within(0, 1000)] = OPERATING_INPUTS[1]
@@ -221,7 +221,7 @@ class PlantFile(BoxParameters):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """What a model file says of the plant; nothing where it is the reference plant."""
+        """Parameters of the plant in a model file; empty for the reference plant."""
         return {} if self.box == REFERENCE else self.model_dump(exclude={"operating_point"})
 
     def scaled(self, key: str, factor: float) -> ColdBox:

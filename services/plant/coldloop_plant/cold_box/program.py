@@ -48,7 +48,7 @@ class ColdBoxProgram(PlantProgram):
 
     @property
     def model_range(self) -> int:
-        """What is outside the property tables at the current tick, bits of `ModelRange`."""
+        """Parts outside the property tables at the current tick, bits of `ModelRange`."""
         return present_model_range(self._x, self.box.P_HP / PA_PER_BAR, self.box.P_LP / PA_PER_BAR)
 
     def advance(self) -> None:

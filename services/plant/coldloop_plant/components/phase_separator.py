@@ -49,7 +49,7 @@ class PhaseSeparator(NamedTuple):
     wall: float
     """Aluminium of the vessel and what is in it, kg, that warms when the vessel is dry."""
     relief_pressure: float
-    """At which the relief valve to the recovery line begins to open, Pa."""
+    """Pressure at which the relief valve to the recovery line begins to open, Pa."""
     relief_span: float
     """Rise above it at which the valve is fully open, Pa."""
     relief_area: float
@@ -57,7 +57,7 @@ class PhaseSeparator(NamedTuple):
 
 
 class Content(NamedTuple):
-    """What the vessel holds, and its derivatives with respect to P (per Pa) and to V_l (per m3)."""
+    """Content of the vessel, and its derivatives with respect to P (per Pa) and to V_l (per m3)."""
 
     mass: float
     """kg."""
@@ -74,7 +74,7 @@ class Content(NamedTuple):
 
 
 class Outflow(NamedTuple):
-    """What leaves at the top of the vessel."""
+    """Flow that leaves at the top of the vessel."""
 
     T: float
     """K."""
@@ -196,7 +196,7 @@ def separate(
 
 
 class Account(NamedTuple):
-    """What a bath held at the start of a step, and the sum of its weighted rates over the stages.
+    """Content of a bath at the start of a step, and the sum of its weighted rates over the stages.
 
     Mass and energy are curved functions of P and V_l, with bends where the vessel runs dry or a flow stops: integrating
     the two states keeps them to 1e-14 kg a step in ordinary operation, and not there. An account does everywhere.

@@ -66,7 +66,7 @@ class Turbine(NamedTuple):
 
 
 class Back(NamedTuple):
-    """What the exhaust meets."""
+    """Conditions behind the turbine, which the exhaust meets."""
 
     line: ReturnLine
     P_bath: float
@@ -74,11 +74,11 @@ class Back(NamedTuple):
     P_suction: float
     """Pa."""
     thinness: float
-    """Of the vapour, see `return_flow`."""
+    """Thinness of the vapour, see `return_flow`."""
 
 
 class Expansion(NamedTuple):
-    """What the turbine makes of the gas."""
+    """Exhaust of the turbine and its shaft speed."""
 
     h_out: float
     """Enthalpy of the exhaust, J/kg."""

@@ -40,7 +40,7 @@ class Port(NamedTuple):
 
     reference: int
     type: str
-    """Of the functions that set and get it."""
+    """Type of the functions that set and get it."""
     place: int = 0
     size: int = 1
     """Elements of the array, which are set and read together."""
@@ -74,7 +74,7 @@ class Fmu:
             raise ModelFileError(f"{path}: no such file; plant.fmu names an FMU beside the process file")
         self._folder = self._unpacked(MOST_UNPACKED)
         self.findings: tuple[str, ...] = ()
-        """What of its description breaks the standard, and does not keep it from being run."""
+        """Violations of the standard in its description that do not keep it from being run."""
         with foreign(f"{path}: not a readable FMU", "get it anew from the tool that made it"):
             try:
                 self.description = fmpy.read_model_description(self._folder)
@@ -263,7 +263,7 @@ log = logging.getLogger("coldloop.plant")
 
 @dataclass(frozen=True)
 class Wiring:
-    """Which variables of an FMU are which signals, and how it is run; what a model file says of it."""
+    """Variables of an FMU that are signals, and how it is run; what a model file says of it."""
 
     inputs: Sequence[str]
     outputs: Sequence[str]

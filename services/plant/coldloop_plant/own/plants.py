@@ -133,7 +133,7 @@ class DisturbedPlant(PlantProgram):
 
 
 class Matrices(NamedTuple):
-    """Those of `LtiModel` for a tick."""
+    """Matrices of `LtiModel` for a tick."""
 
     A_tick: RealArray
     B_tick: RealArray
@@ -205,11 +205,11 @@ class LagTable(NamedTuple):
     places: NDArray[np.int64]
     """Outputs that they move."""
     sources: NDArray[np.int64]
-    """What they follow: inputs, then load and disturbances."""
+    """Sources that they follow: inputs, then load and disturbances."""
     delays: NDArray[np.int64]
     """Ticks."""
     decay: RealArray
-    """Of what each has reached, in a tick."""
+    """Share of each lag's response that remains after a tick."""
     gain: RealArray
     about: RealArray
     """Inputs, load and disturbances at the operating point."""
@@ -220,12 +220,12 @@ class LagTable(NamedTuple):
 
 
 class LagMemory(NamedTuple):
-    """What a tick changes."""
+    """State of the lags, which a tick changes."""
 
     response: RealArray
-    """Of each lag."""
+    """Response of each lag."""
     under_way: RealArray
-    """What each source was in the ticks of the longest dead time and now, in turn; shape (sources, ticks)."""
+    """Values of each source in the ticks of the longest dead time and now, in turn; shape (sources, ticks)."""
 
 
 @kernel
@@ -305,16 +305,16 @@ class TransferFunctionPlant(DisturbedPlant):
 
 
 NAME: Final = r"[A-Za-z][A-Za-z0-9_]{0,31}"
-"""Of a signal or a state."""
+"""Pattern of the name of a signal or a state."""
 
 
 class Equations(Protocol):
-    """What the class has: dx/dt = f(x, u, w) and y = h(x, u, w), in physical units and seconds."""
+    """Equations of a plant's class: dx/dt = f(x, u, w) and y = h(x, u, w), in physical units and seconds."""
 
     states: Mapping[str, str]
     """Name and unit of each state, in order."""
     guess: Sequence[float]
-    """Where the search for the operating point begins."""
+    """Start of the search for the operating point."""
     steps_per_tick: int
     """Steps of the integration in a tick."""
 

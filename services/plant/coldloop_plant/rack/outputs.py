@@ -1,4 +1,4 @@
-"""What the rack applies, whose it is, and whether outputs that arrive may replace it. No registers, no clock."""
+"""Outputs of the rack: which it applies, whose they are, and whether those that arrive may replace them."""
 
 from typing import Final
 
@@ -40,7 +40,7 @@ class AppliedOutputs:
         self.u = u
         self._rate = rate
         self._at_beginning = u
-        """What was applied when the present tick began."""
+        """Outputs that were applied when the present tick began."""
         self.holder = holder
         self.generation = generation
         self.verdict = OutputVerdict.NONE

@@ -105,7 +105,7 @@ class Rack:
         self.faults = SensorFaults(len(self.process.outputs))
         self.watchdog.set(self.watchdog.time, 0)
         self.model_range = ModelRangeStatus(self._program.model_range, self._program.tick)
-        """What of the simulation is outside its property tables, and since when."""
+        """Parts of the simulation outside its property tables, and since when."""
         self.moving = False
         """The plant is due to move: in lock-step by one tick, in real time by the clock from now on."""
 
@@ -242,12 +242,12 @@ class Rack:
 
     @property
     def station_status(self) -> StationStatus | None:
-        """What the registers show of the station; None for a cold box alone."""
+        """Status of the station, as the registers show it; None for a cold box alone."""
         return self._program.station_status
 
     @property
     def surroundings(self) -> Surroundings | None:
-        """What a refrigerator is given now; None for a cold box alone."""
+        """Boundary conditions of a refrigerator now; None for a cold box alone."""
         return self._program.surroundings
 
     def _watchdog_expired(self) -> None:

@@ -40,7 +40,7 @@ class RetainedPlantState(BaseModel):
     watts: tuple[float, ...]
     seed: Count
     program: dict[str, Any]
-    """What `PlantProgram.resume` takes."""
+    """Argument of `PlantProgram.resume`."""
 
     @model_validator(mode="after")
     def _possible(self) -> Self:

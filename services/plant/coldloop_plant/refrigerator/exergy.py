@@ -1,4 +1,4 @@
-"""Where a refrigerator at rest loses the work that it is given: the exergy destroyed in each component.
+"""Exergy balance of a refrigerator at rest: the exergy destroyed in each component.
 
 Exergies are about the surroundings, at their temperature T0. Helium goes round, so that only differences of h - T0 s
 count; nitrogen comes from outside, so that its exergy is about 1 atm, too. Every row is what enters a component less
@@ -74,9 +74,9 @@ class ExergyBalance(NamedTuple):
     """The exergy (W) that a refrigerator at rest is given, what of it is useful, and where the difference is lost."""
 
     electricity: float
-    """Of the compressors."""
+    """Exergy of the compressors' electricity, W."""
     nitrogen: float
-    """Of the liquid that is fed."""
+    """Exergy of the liquid nitrogen that is fed, W."""
     cold_power: float
     """Load and heater, W."""
     T_bath: float

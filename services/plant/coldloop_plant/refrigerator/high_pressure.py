@@ -44,8 +44,8 @@ CUBICS = 18
 """Columns of `supply_cubics`."""
 H, CAPACITY, EXPANSION, COMPRESSION, WORK, MASS, ENERGY, M_IN, M_IN_P, H_IN, INFLOW, GAIN = range(12)
 COLUMNS = 12
-"""Of a cell: h (J/kg), C (J/K), v rho_T/C (kg/J), v rho_P (kg/Pa), v (1 - rho h_P) (J/Pa), M (kg), U (J); m_in at
-constant pressure (kg/s), its slope in dP/dt (kg/Pa), h_in (J/kg); dM/dt (kg/s), dU/dt (W)."""
+"""Number of columns of a cell: h (J/kg), C (J/K), v rho_T/C (kg/J), v rho_P (kg/Pa), v (1 - rho h_P) (J/Pa), M (kg), U
+(J); m_in at constant pressure (kg/s), its slope in dP/dt (kg/Pa), h_in (J/kg); dM/dt (kg/s), dU/dt (W)."""
 MOST_FILLING = 0.8
 """Share of what enters that a cell keeps at most because that is colder; more, and cells of one temperature each cannot
 be solved from the cold end. What enters then brings the heat that remains from the cell before."""
@@ -211,9 +211,10 @@ COARSE_PRESSURE: Final = 20.0
 COARSE_CELL: Final = 0.0004
 """Pa and K; where a step moves the pressure and all cells by less, nothing is corrected."""
 MOST_STEPS: Final = 40
-"""Of Newton's method for the pressure."""
+"""Largest number of steps of Newton's method for the pressure."""
 MOST_CORRECTIONS: Final = 30
-"""Of the temperatures after a step; one to three are enough but where the tables end, at 5 and 19 bar."""
+"""Largest number of corrections of the temperatures after a step; one to three are enough but where the tables end, at
+5 and 19 bar."""
 SETTLED_ENERGY: Final = 1e-4
 """J that was missing in a cell, from which on the correction for it is the last: it leaves a hundredth or so."""
 MOST_TURNS: Final = 6
@@ -239,7 +240,7 @@ class Held(NamedTuple):
     """Properties of the gas in the passes."""
 
     cubics: Array
-    """Of cells and coil, `supply_cubics`, shape (states up to the coil, 18)."""
+    """Coefficients for cells and coil, `supply_cubics`, shape (states up to the coil, 18)."""
     mass: Array
     """Cubic of the mass in all passes in bar from 16 bar, kg, shape (4,)."""
     cells: Array
@@ -247,22 +248,22 @@ class Held(NamedTuple):
 
 
 class Filling(NamedTuple):
-    """How the high-pressure side takes and gives helium."""
+    """Flows of helium into and out of the high-pressure side."""
 
     P: float
     """Pa."""
     P_rate: float
     """Pa/s."""
     entering: float
-    """From the line into NEF6, kg/s; below 0 the passes give back."""
+    """Flow from the line into NEF6, kg/s; below 0 the passes give back."""
     h: float
     """Enthalpy that this carries, J/kg."""
     cells: Array
-    """What the cells hold and gain, see `Held`."""
+    """Content and gains of the cells, see `Held`."""
 
 
 class Gains(NamedTuple):
-    """What the cells held at the start of a step, and the sums of their weighted gains over its stages."""
+    """Content of the cells at the start of a step, and the sums of their weighted gains over its stages."""
 
     start: Array
     """Columns from `H` on at the first stage."""

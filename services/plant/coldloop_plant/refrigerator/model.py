@@ -313,7 +313,7 @@ class Found(NamedTuple):
 
     rest: Rest
     model: LtiModel
-    """Of the refrigerator with its pressure loop closed; it carries the plant, its rest and its gains."""
+    """Model of the refrigerator with its pressure loop closed; it carries the plant, its rest and its gains."""
 
 
 def refrigerator_operating_point(file: RefrigeratorPlantFile, helium: Helium, weights: LqWeights) -> Found:

@@ -88,17 +88,17 @@ class Crossing(NamedTuple):
     high: HighPressureFlow
     """Through CV155 and CV156, as it would come from the compressors, were nothing stored on the way."""
     filling: Filling
-    """How line and passes take and give helium."""
+    """Flows of helium into and out of line and passes."""
     cold: Streams
-    """Of the cold box."""
+    """Streams of the cold box."""
     leaving: LowPressureFlow
-    """From the cold box to NEF6."""
+    """Low-pressure flow from the cold box to NEF6."""
     relief: float
-    """From the bath into the recovery line, kg/s."""
+    """Flow from the bath into the recovery line, kg/s."""
     bath: Content
-    """What the bath holds."""
+    """Content of the bath."""
     cooling: Precooling
-    """What NEF6 and NEF5 do."""
+    """Flows of NEF6 and NEF5."""
     heater: float
     """W."""
 

@@ -46,13 +46,13 @@ class Nef5Section(Section):
     """The nitrogen bath with its feed valve CV167."""
 
     ua_w_per_k: Annotated[float, within(1, 100_000)] = 336.44
-    """Of the wetted coil."""
+    """UA of the wetted coil, W/K."""
     volume_l: Litres = 30.0
-    """Of the vessel."""
+    """Volume of the vessel, l."""
     wet_level_pct: Annotated[float, within(1, 100)] = 25.0
     """Level above which the whole coil is wet."""
     capacity_kj_per_k: Annotated[float, within(0.1, 10_000)] = 20.0
-    """Of the coil and the helium in it."""
+    """Heat capacity of the coil and the helium in it, kJ/K."""
     cv167_area_mm2: Annotated[float, within(0.01, 1000)] = 1.3
     """Effective flow area of CV167 when fully open."""
     cv167_lag_s: Lag = 2.0
@@ -73,7 +73,7 @@ class CompressorSection(Section):
     isothermal_efficiency: Annotated[float, within(0.2, 1)] = 0.55
     """At the built-in pressure ratio."""
     built_in_ratio: Annotated[float, within(1.1, 100)] = 10.0
-    """That the rotors' ports are made for."""
+    """Ratio that the rotors' ports are made for."""
     mismatch: Annotated[float, within(0, 1)] = 0.05
     """Loss of isothermal efficiency per squared logarithm of the ratio over the built-in one."""
     motor_efficiency: Share = 0.95
@@ -83,11 +83,11 @@ class StationSection(Section):
     """Volumes, valves and cooler of the compression station."""
 
     hp_volume_m3: CubicMetres = 2.0
-    """Of the high-pressure line."""
+    """Volume of the high-pressure line, m3."""
     lp_volume_m3: CubicMetres = 1.5
-    """Of the low-pressure line."""
+    """Volume of the low-pressure line, m3."""
     buffer_volume_m3: CubicMetres = 20.0
-    """Of the medium-pressure vessel."""
+    """Volume of the medium-pressure vessel, m3."""
     buffer_bar: Annotated[float, within(1, 20)] = 6.0
     """Its pressure at rest."""
     cv956_area_mm2: Area = 34.0
@@ -101,7 +101,7 @@ class StationSection(Section):
     valve_fastest_pct_per_s: Speed = 20.0
     """Largest speed of these drives."""
     cooler_approach_k: Annotated[float, within(0, 50)] = 5.0
-    """By how much the compressed gas is warmer than the surroundings."""
+    """Excess of the compressed gas's temperature over the surroundings, K."""
     run_up_s: Lag = 6.0
     """Time constant of a compressor that starts,"""
     run_down_s: Lag = 1.5
@@ -112,7 +112,7 @@ class ReliefSection(Section):
     """A relief valve into the atmosphere."""
 
     pressure_bar: ReliefPressure
-    """At which it begins to open."""
+    """Pressure at which it begins to open, bar."""
     span_bar: ReliefSpan
     """Rise above it at which it is fully open."""
     area_mm2: Area
@@ -126,7 +126,7 @@ class ReliefSection(Section):
 
 
 class HpReliefSection(ReliefSection):
-    """That of the high-pressure line."""
+    """Relief valve of the high-pressure line."""
 
     pressure_bar: ReliefPressure = 18.0
     span_bar: ReliefSpan = 1.0
@@ -134,7 +134,7 @@ class HpReliefSection(ReliefSection):
 
 
 class LpReliefSection(ReliefSection):
-    """That of the low-pressure line."""
+    """Relief valve of the low-pressure line."""
 
     pressure_bar: ReliefPressure = 1.5
     span_bar: ReliefSpan = 0.2
@@ -142,7 +142,7 @@ class LpReliefSection(ReliefSection):
 
 
 class BufferReliefSection(ReliefSection):
-    """That of the buffer."""
+    """Relief valve of the buffer."""
 
     pressure_bar: ReliefPressure = 13.0
     span_bar: ReliefSpan = 1.0
@@ -185,7 +185,7 @@ class RefrigeratorPlantFile(RefrigeratorParameters, PlantFile):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """What a model file says of the plant; nothing where it is the reference plant."""
+        """Parameters of the plant in a model file; empty for the reference plant."""
         own = self.refrigerator == REFERENCE_REFRIGERATOR
         return {} if own else self.model_dump(exclude={"operating_point"})
 

@@ -36,9 +36,9 @@ class NitrogenBath(NamedTuple):
     """NEF5, its vessel and its feed valve."""
 
     UA: float
-    """Of the wetted coil, W/K."""
+    """UA of the wetted coil, W/K."""
     volume: float
-    """Of the vessel, m3."""
+    """Volume of the vessel, m3."""
     wet_level: float
     """Level (%) above which the whole coil is wet."""
     capacity: float
@@ -48,7 +48,7 @@ class NitrogenBath(NamedTuple):
 
 
 class Boiling(NamedTuple):
-    """What the bath does."""
+    """Heat and flows of the nitrogen bath."""
 
     heat: float
     """Taken from the helium, W."""
@@ -161,11 +161,11 @@ class Precooler(NamedTuple):
     nef5: NitrogenBath
     """The bath."""
     actuator: Actuator
-    """Of CV167."""
+    """Actuator of CV167."""
 
 
 class Precooling(NamedTuple):
-    """What the pre-cooler does."""
+    """Flows of the pre-cooler."""
 
     warm_end: LowPressureFlow
     """The low-pressure flow as it leaves for the compressors."""

@@ -26,7 +26,7 @@ STEPS: Final = (
     ("CV956", 5.0), ("CV952", 20.0), ("CV953", 20.0), ("CV167", 10.0), ("CV155", 2.0), ("NCR22_A", 20.0),
     ("CV156", 3.0), (LOAD, 60.0), (LOAD, -60.0),
 )  # fmt: skip
-"""What steps, and by how much: openings in %, heater and load in W."""
+"""Stepped signals and the sizes of their steps: openings in %, heater and load in W."""
 SETTLED_BAR: Final = (0.01, 0.001)
 """High and low pressure have settled when they stay within these of their last value."""
 AMBIENT_K: Final = 300.0
@@ -36,7 +36,7 @@ OPENINGS: Final = tuple(STATE_NAMES.index(name) for name in ("CV956", "CV952", "
 
 
 class Response(NamedTuple):
-    """Of one pressure to one step."""
+    """Response of one pressure to one step."""
 
     peak: float
     """Deviation from rest that is largest in amount, with its sign, bar."""

@@ -69,7 +69,7 @@ class RefrigeratorFile(BaseModel):
     state_names: tuple[str, ...] = STATE_NAMES
     command_names: tuple[str, ...] = COMMAND_NAMES
     weights: LqWeights
-    """What the gains were designed with."""
+    """Weights that the gains were designed with."""
     parameters_digest: str
     """SHA-256 of the parameters and tables that it was made from."""
     w0: float
@@ -164,7 +164,7 @@ def warm_state(
 
 AMBIENT: Final = GIVEN_NAMES.index("T_ambient")
 RETAINED: Final = ("x", "y", "signals", "commands", "integrals", "equipment")
-"""Of the memory; the rest follows from it."""
+"""Fields of the memory that are retained; the rest follows from them."""
 
 
 class RefrigeratorProgram(ColdBoxProgram):
@@ -193,7 +193,7 @@ class RefrigeratorProgram(ColdBoxProgram):
         self.plant = plant
         self._plant, self._tables = plain_tuples(plant), plain_tuples(load_helium())
         self.law = station_law(station, file.gains, file.v0, plant.station)
-        """Of the station's controller."""
+        """Control law of the station."""
         self._law = plain_tuples(self.law)
         self._events = events
         self._gauge_deviation, self._seed = station.noise_bar, seed
@@ -223,7 +223,7 @@ class RefrigeratorProgram(ColdBoxProgram):
 
     @property
     def model_range(self) -> int:
-        """What is outside the property tables at the current tick, bits of `ModelRange`."""
+        """Parts outside the property tables at the current tick, bits of `ModelRange`."""
         signals = self._memory.signals
         return present_model_range(self._x, float(signals[HP]), float(signals[LP]))
 
@@ -235,7 +235,7 @@ class RefrigeratorProgram(ColdBoxProgram):
 
     @property
     def surroundings(self) -> Surroundings:
-        """What is given at the current tick."""
+        """Boundary conditions at the current tick."""
         return self._events.at(self.tick)
 
     def give(self, surroundings: Surroundings) -> None:

@@ -17,7 +17,7 @@ Percent = Annotated[float, Field(ge=0, le=100)]
 
 
 class StationControlKind(StrEnum):
-    """How the two pressures are held."""
+    """Kind of control of the two pressures."""
 
     LQ = "lq"
     """Both by both valves, with state feedback and integral action."""
@@ -26,7 +26,7 @@ class StationControlKind(StrEnum):
 
 
 class LqWeights(Section):
-    """What the LQ controller weighs: 1 over the square of each of these."""
+    """Weights of the LQ controller: 1 over the square of each of these."""
 
     hp_bar: PositiveFloat = 0.1
     """Deviation of the high pressure, bar."""
@@ -52,7 +52,7 @@ class PiTuning(Section):
 
 
 class StationAlarmSettings(Section):
-    """Where the station's alarms begin."""
+    """Limits at which the station's alarms begin."""
 
     hp_high_bar: Bar = 16.8
     """High pressure, bar, above."""
@@ -67,7 +67,7 @@ class StationAlarmSettings(Section):
     helium_lost_kg: PositiveFloat = 0.5
     """Helium that is gone from the circuit, kg."""
     bath_relief_bar: Bar = 1.8
-    """Of the bath; its relief valve opens at 1.8 bar."""
+    """Pressure of the bath, bar; its relief valve opens at 1.8 bar."""
 
     @model_validator(mode="after")
     def _low_is_below_high(self) -> "StationAlarmSettings":
@@ -77,7 +77,7 @@ class StationAlarmSettings(Section):
 
 
 class CompressorStart(Section):
-    """How a compressor starts: it idles with the bypass open, then it is loaded in a ramp."""
+    """Start of a compressor: it idles with the bypass open, then it is loaded in a ramp."""
 
     idle: Annotated[float, Field(gt=0, lt=1)] = 0.25
     """Share of its flow while it idles."""
@@ -110,7 +110,7 @@ class PressureProtection(Section):
 
 
 class TurbineProtection(Section):
-    """How the turbine starts, and how fast it may turn."""
+    """Start of the turbine, and its largest speed."""
 
     run_up_s: Annotated[float, Field(ge=1, le=3600)] = 60.0
     """Shortest time in which CV156 opens to what is asked."""
@@ -137,7 +137,7 @@ class StationSettings(Section):
     nitrogen_level: Annotated[float, Field(ge=5, le=95)] = 60.0
     """Set point of the nitrogen level, %."""
     weights: LqWeights = LqWeights()
-    """Of the LQ design. The gains are those of the refrigerator's file, which must be of these weights."""
+    """Weights of the LQ design. The gains are those of the refrigerator's file, which must be of these weights."""
     anti_windup_s: PositiveFloat = 5.0
     """Time constant with which integrals follow what the valves can do."""
     pi_hp: PiTuning = PiTuning(gain=0.024, integral_s=50.0)
@@ -165,7 +165,7 @@ class StationSettings(Section):
 
 
 class EventTarget(StrEnum):
-    """What an event changes."""
+    """Target of an event: what it changes."""
 
     NC1 = "nc1"
     """1: the compressor runs, 0: it has tripped."""
@@ -173,7 +173,7 @@ class EventTarget(StrEnum):
     NITROGEN = "nitrogen"
     """1: there is nitrogen in the tank, 0: there is none."""
     LEAK = "leak"
-    """From the high-pressure line, g/s at 16 bar."""
+    """Leak from the high-pressure line, g/s at 16 bar."""
     AMBIENT = "ambient"
     """Temperature of the surroundings, K."""
     TURBINE = "turbine"
@@ -199,17 +199,17 @@ RANGES = {
     EventTarget.HEATER: (0.0, 2.0),
 }
 MEASURED = {EventTarget.LEAK, EventTarget.AMBIENT, *BLOCKING}
-"""What has a value; the others are in one of a few states, numbered from 0."""
+"""Targets with a value; the others are in one of a few states, numbered from 0."""
 
 
 class RefrigeratorEvent(Section):
-    """From a time on, something is otherwise."""
+    """Change of one boundary condition or piece of equipment from a time on."""
 
     at_s: Annotated[float, Field(ge=0, le=1e9)]
     """Plant time, in multiples of 0.25 s."""
     target: EventTarget
     value: float
-    """What it is from then on, in the unit of the target."""
+    """Value of the target from then on, in its unit."""
 
     @model_validator(mode="after")
     def _is_possible(self) -> "RefrigeratorEvent":
@@ -230,7 +230,7 @@ class RefrigeratorEvent(Section):
 
 
 class EventSchedule:
-    """What holds at each tick: of two events for one time and target the later in the list.
+    """Boundary conditions at each tick: of two events for one time and target the later in the list holds.
 
     `ambient` (K) is the temperature without an event, `daily_swing` (K) the amplitude of its sine over a day, whose
     first six hours are the warmer.
@@ -249,7 +249,7 @@ class EventSchedule:
 
     @property
     def puts(self) -> list[tuple[int, Surroundings]]:
-        """What `put` has taken."""
+        """Ticks and boundary conditions that `put` has taken."""
         return list(self._put)
 
     def at(self, tick: int) -> Surroundings:

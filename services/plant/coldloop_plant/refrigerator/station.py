@@ -72,7 +72,7 @@ class ScrewCompressor(NamedTuple):
 
 
 class Compression(NamedTuple):
-    """What a compressor does."""
+    """Flow and power of a compressor."""
 
     mass_flow: float
     """kg/s."""
@@ -120,12 +120,12 @@ class CompressionStation(NamedTuple):
     charge: Valve
     """CV953, from the buffer to the low-pressure line."""
     actuator: Actuator
-    """Of each of the three valves."""
+    """Actuator of each of the three valves."""
     hp_relief: ReliefValve
     lp_relief: ReliefValve
     buffer_relief: ReliefValve
     cooler_approach: float
-    """By how much the compressed gas is warmer than the surroundings, K."""
+    """Excess of the compressed gas's temperature over the surroundings, K."""
     run_up: float
     """Time constant of a compressor that starts, s."""
     run_down: float

@@ -40,8 +40,9 @@ DECISION_S: Final = 5.0
 SHUT: Final = 0.5
 """%, to which a valve of the buffer has to shut before the other one opens."""
 HP_INTEGRAL, LP_INTEGRAL, NITROGEN_INTEGRAL, SMOOTHED, DIRECTION = range(5)
-"""What the controller remembers: integrals of the errors of HP and LP (bar s) and of the nitrogen's level (% s); with a
-dead band the smoothed inventory flow (kg/s), and 1 while the charge valve may be open, -1 for the discharge valve."""
+"""Indices of the controller's memory: integrals of the errors of HP and LP (bar s) and of the nitrogen's level (% s);
+with a dead band the smoothed inventory flow (kg/s), and 1 while the charge valve may be open, -1 for the discharge
+valve."""
 MEMORY_SIZE: Final = 5
 COMPRESSORS: Final = 2
 LEAST_PRESSURE: Final = 0.5
@@ -50,7 +51,7 @@ AUTOMATIC, LIMITED, CHARGE_STOPPED, ONE_COMPRESSOR, STOPPED, STARTING, OVERRIDE 
 
 
 class StationMeasurement(NamedTuple):
-    """What the station's sensors show at a tick."""
+    """Readings of the station's sensors at a tick."""
 
     hp: float
     """bar."""
@@ -102,7 +103,7 @@ class Loop(NamedTuple):
 
 
 class AlarmLimits(NamedTuple):
-    """Where alarms begin: bar, % and kg."""
+    """Limits at which alarms begin: bar, % and kg."""
 
     hp_high: float
     hp_low: float
@@ -156,7 +157,7 @@ class StationLaw(NamedTuple):
     charge_ends: float
     """So far above its set point (bar) does the low pressure close the charge valve."""
     share: float
-    """Of what valves could not do, that the integrals follow in a tick."""
+    """Anti-windup: share of the valves' saturation that the integrals follow in a tick."""
     gains: RealArray
     """K of the LQ controller, shape (2, 6)."""
     nominal: float
@@ -167,11 +168,11 @@ class StationLaw(NamedTuple):
     discharge: Valve
     charge: Valve
     over_hp: Loop
-    """From the high pressure to the inventory flow, kg/s per bar."""
+    """Loop from the high pressure to the inventory flow, kg/s per bar."""
     over_lp: Loop
-    """From the low pressure to the bypass flow, kg/s per bar."""
+    """Loop from the low pressure to the bypass flow, kg/s per bar."""
     over_nitrogen: Loop
-    """From the level to the feed valve, % per %."""
+    """Loop from the level to the feed valve, % per %."""
     nitrogen: float
     """Set point of the level, %."""
     feed: float

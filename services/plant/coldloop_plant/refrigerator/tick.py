@@ -43,8 +43,8 @@ GIVEN_NAMES: Final = (
     *DISTURBANCE_NAMES, "HP_noise", "LP_noise", "turbine", "cv155", "cv156", "heater",
     "blocked_nef1", "blocked_nef2", "blocked_nef34", "blocked_nef6",
 )  # fmt: skip
-"""What is given in a tick: the disturbances; by how much the station's gauges are off (bar); 1 or 0: the turbine may
-run, CV155 and CV156 move; the heater, `HEATER_FOLLOWS` or another; how fast exchangers block up (1/h)."""
+"""Names of what is given in a tick: the disturbances; by how much the station's gauges are off (bar); 1 or 0: the
+turbine may run, CV155 and CV156 move; the heater, `HEATER_FOLLOWS` or another; how fast exchangers block up (1/h)."""
 NC1, NC2, HP_NOISE, LP_NOISE, TURBINE, CV155_MOVES, CV156_MOVES, HEATER, BLOCKING = (
     GIVEN_NAMES.index(name)
     for name in ("NC1", "NC2", "HP_noise", "LP_noise", "turbine", "cv155", "cv156", "heater", "blocked_nef1")
@@ -53,7 +53,7 @@ HEATER_OFF, HEATER_FOLLOWS, HEATER_ON = range(3)
 
 START, ADMISSION, TRIPPED, CV155, CV156, BLOCKED, ACTING, DEVIATING = 0, 2, 3, 4, 5, 6, 10, 13
 LOW_SUCTION: Final = -1.0
-"""In the place of a start: the low pressure has tripped the compressor."""
+"""Sentinel for a start: the low pressure has tripped the compressor."""
 EQUIPMENT_SIZE: Final = 14
 """The equipment's memory: how far each compressor's start has come (2, 1 is loaded, -1 tripped by
 the low pressure), the share of CV156's opening that
@@ -61,12 +61,12 @@ the turbine's governor allows, 1 after an overspeed trip, positions of CV155 and
 NEF2, NEF34 and NEF6 (4), the inputs that act on the cold box (3), and 1 where one is not as it is asked."""
 
 FULL_HEATER_W: Final = 150.0
-"""Of a heater that is stuck on."""
+"""Power of a heater that is stuck on, W."""
 MOST_BLOCKED: Final = 0.98
 CLEAN_DROP_BAR: Final = 0.05
 """Pressure drop of the high-pressure side of each exchanger at the operating point, of which only the rise counts."""
 VALVE_DROP_BAR: Final = (14.77, 4.62)
-"""Those of CV155 and CV156 there."""
+"""Pressure drops of CV155 and CV156 at the operating point, bar."""
 NOMINAL_OPENING: Final = (43.0, 36.0)
 """%, of CV155 and CV156."""
 GOVERNOR_S: Final = 5.0
@@ -77,7 +77,7 @@ DEVIATION: Final = 1.0
 
 
 class Acting(NamedTuple):
-    """What acts on the plant in a tick."""
+    """Inputs and disturbances that act on the plant in a tick."""
 
     u: RealArray
     """Inputs of the cold box, shape (3,)."""
@@ -244,18 +244,18 @@ LEAST_FLOW: Final = 0.1
 
 
 class RefrigeratorMemory(NamedTuple):
-    """What a tick changes."""
+    """State of a refrigerator, which a tick changes."""
 
     x: RealArray
     """States, shape (48,)."""
     y: RealArray
     """Outputs of the cold box, without noise, shape (22,)."""
     signals: RealArray
-    """Of the station and the nitrogen bath, shape (19,)."""
+    """Signals of the station and the nitrogen bath, shape (19,)."""
     commands: RealArray
     """Openings asked of the warm valves, %, shape (4,)."""
     integrals: RealArray
-    """Of the controller, shape (5,): `control_station`."""
+    """Integrals of the controller, shape (5,): `control_station`."""
     equipment: RealArray
     """Memory of the machinery, shape (14,), from `START` on."""
     status: NDArray[np.int64]
@@ -265,7 +265,7 @@ class RefrigeratorMemory(NamedTuple):
     cells: RealArray
     """`coldloop_plant.refrigerator.high_pressure.Filling.cells` then."""
     acted: RealArray
-    """What acted then, shape (13,): inputs, disturbances, blocked shares of the exchangers; NaN before any reading."""
+    """Inputs, disturbances and blocked shares of the exchangers at that time, shape (13,); NaN before any reading."""
 
 
 def begin_memory(x: RealArray, v: RealArray, equipment: RealArray) -> RefrigeratorMemory:
