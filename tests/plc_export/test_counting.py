@@ -128,7 +128,7 @@ def test_an_export_says_what_does_not_fit_a_plc_and_the_budget_says_the_same(
 
 @pytest.mark.usefixtures("compiles")
 def test_what_fits_is_said(recorded: GoldenVectors, tmp_path: Path) -> None:
-    count = counted_iterations(recorded.method, recorded.vectors[:1]).recorded._asdict()
+    count = counted_iterations(recorded.method, recorded.vectors[:1]).recorded.model_dump(exclude_none=True)
     (tmp_path / "manifest.json").write_text(
         json.dumps({"variables": 49, "operations": {"iteration": count}, "bytes": {"constants": 5, "self-test": 10**9}})
     )
