@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from coldloop.process.cold_box import TICK_S
-from coldloop_rig.durations import duration
+from coldloop.process.updating_periods import duration
 from coldloop_studies.catalogue import STUDIES
 from coldloop_studies.execution import Workers
 from coldloop_studies.results import conduct

@@ -8,7 +8,7 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from coldloop.errors import ColdloopError
-from coldloop_rig.process_file.mimic import drawing_of
+from coldloop_rig.process_file.reading import drawing_of
 
 SIGNALS: Final = ("h1", "v1", "load")
 TEXTS: Final = ("text", "tspan")

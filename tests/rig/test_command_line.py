@@ -24,6 +24,7 @@ from coldloop_rig.cli.commands.rig import COMMANDS as RIG_COMMANDS
 from coldloop_rig.cli.registers import EXPORTS, FORMATS
 from coldloop_studies import commands
 from coldloop_studies.catalogue import APART, STUDIES
+from tests.harness.installed import installed
 from tests.harness.processes import Ended, Processes
 from tests.harness.records import MAPS
 
@@ -80,6 +81,50 @@ def test_help_imports_nothing_that_takes_time(python: Python) -> None:
     of_the_process = commands.index(["set", "--help"])  # its inputs are those of the process, a validated model
     for place, (words, loaded) in enumerate(zip(commands, done.err.splitlines(), strict=True)):
         assert not (HEAVY - {"pydantic"} if place >= of_the_process else HEAVY) & set(loaded.split()), words
+
+
+OUTSIDE = {
+    "broken.py": "import nowhere_to_be_found",
+    "nameless.py": "COMMANDS = {}",
+    "unequal.py": """
+def declare(parser): parser.add_argument("--help")
+def greet(options): "A greeting."; print("hello"); return 0
+COMMANDS = {"unequal": (declare, greet), "greet": (lambda parser: None, greet)}
+GROUP = SAID = dict.fromkeys(COMMANDS, "says hello")
+""",
+}
+POINTS = {"crashing": "broken", "nameless": "nameless", "unequal": "unequal", "greet": "unequal", "run": "broken"}
+LOOKED_UP = """
+import sys
+from importlib import metadata
+found, groups = metadata.entry_points, []
+metadata.entry_points = lambda **what: groups.append(what) or found(**what)
+from coldloop_rig.cli import main
+main([]), main(["greet"])
+print("looked up", len(groups))
+"""
+
+
+def test_a_command_that_cannot_be_loaded_leaves_the_others_alone(tmp_path: Path, python: Python) -> None:
+    environment = installed(tmp_path / "site", OUTSIDE, {"coldloop.commands": POINTS})
+    helped, greeted = (python("-m", "coldloop_rig", word, **environment) for word in ("--help", "greet"))
+    assert (helped.code, helped.err, greeted.out) == (0, "", "hello\n")
+    unloaded = helped.out.partition("commands that cannot be loaded:\n")[2].partition("\n\n")[0].splitlines()
+    assert [line.split()[0] for line in unloaded] == ["crashing", "nameless"]
+    assert "from broken (package outside): ModuleNotFoundError: No module named 'nowhere_to_be_found'" in unloaded[0]
+    assert "  run           run the loop" in helped.out
+    assert "  study         " in helped.out
+    for name, what in (
+        ("crashing", "nowhere_to_be_found"),
+        ("nameless", "KeyError: 'nameless'"),
+        ("unequal", "--help"),
+    ):
+        refused = python("-m", "coldloop_rig", name, **environment)
+        (line,) = refused.err.splitlines()
+        assert (refused.code, refused.out, what in line) == (2, "", True)
+        assert line.startswith(f"coldloop: {name}: cannot be loaded from {POINTS[name]} (package outside): ")
+        assert line.endswith("; update that package, or uninstall it")
+    assert python("-c", LOOKED_UP, **environment).out.endswith("looked up 1\n")
 
 
 TYPOS = [

@@ -9,8 +9,8 @@ from coldloop.process.cold_box import COLD_BOX, L1, OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.plant import SensorFaultKind
+from coldloop_rig.results.file_sinks import DrivingHistory
 from coldloop_rig.results.recording import CONTROL, PLANT
-from coldloop_rig.results.tables import DrivingHistory
 
 
 def mode(tick: int, subject: Mode, cause: Cause = Cause.NONE) -> Event:

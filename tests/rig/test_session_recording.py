@@ -15,7 +15,7 @@ from coldloop.registers.safety import AlarmState
 from coldloop_hmi.process_image import JournalEntry
 from coldloop_optimizer_plc.publication import NO_UPDATE
 from coldloop_rig.cosim.session import Lateness, state_of
-from coldloop_rig.results.recorded_alarms import alarms_after
+from coldloop_rig.live.recorded_page import alarms_after
 from coldloop_rig.results.recording import LinkStatistics
 
 NOW = 1000

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import NOT_FINITE, UsageError
+from coldloop.process.updating_periods import duration
 from coldloop.service.command_line import add_configuration_options
 from coldloop_rig.cli.commands.options import Command, check_load, configuration, positive_count
-from coldloop_rig.durations import duration
 
 if TYPE_CHECKING:
     from coldloop_studies.execution import Workers

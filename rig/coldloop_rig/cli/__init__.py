@@ -7,15 +7,16 @@ import os
 import platform
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from contextvars import ContextVar
+from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from coldloop import __version__
-from coldloop.errors import ColdloopError, UsageError, printable
+from coldloop.errors import ColdloopError, UsageError, foreign, printable
 from coldloop.service.command_line import add_configuration_options
 from coldloop_rig.interruption import INTERRUPTION
 
@@ -148,11 +149,13 @@ MODULES: Final = {
     "runs": ("run", "record", "rerun", "plot", "report", "compare", "chaos"),
     "rig": ("up", "down", "status", "set", "fault", "page"),
     "bus": ("events", "proxy", "certificates", "registers"),
-    "plant": ("new", "process", "import", "model", "identify", "exergy"),
+    "plant": ("new", "process", "import", "budget", "model", "identify", "exergy"),
     "help": ("docs", "config", "completion"),
 }
+BROKEN: Final = "commands that cannot be loaded"
+"""Group in `coldloop --help` of commands whose package is damaged, or for another version."""
 MODULE_OF: Final = {name: module for module, names in MODULES.items() for name in names}
-"""Modules of `coldloop_rig.cli.commands`; a command that is not here has one of its own."""
+"""Modules of `coldloop_rig.cli.commands`."""
 QUESTION: Final = """Can this predictive controller run on that PLC, and how often should it update?
 A networked PLC rig for fast MPC."""
 EXTRAS: Final = {
@@ -189,7 +192,7 @@ class OneLineParser(argparse.ArgumentParser):
 def make_parser(chosen: str | None) -> argparse.ArgumentParser:
     """Return the parser of all commands, with the options of the chosen one; other commands are not imported."""
     parser = OneLineParser(
-        prog="coldloop", description=QUESTION, epilog="" if chosen in COMMANDS else _by_group(),
+        prog="coldloop", description=QUESTION, epilog="" if chosen in command_names() else _by_group(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("--version", action="version", version=_version())
@@ -201,7 +204,8 @@ def make_parser(chosen: str | None) -> argparse.ArgumentParser:
         command = commands.add_parser(name)
         if name == chosen:
             declare, execute, command.description = _command(name)
-            declare(command)
+            with _of_its_package(name):
+                declare(command)
             command.set_defaults(execute=execute)
     version = commands.add_parser("version")
     version.set_defaults(execute=_print_version)
@@ -210,34 +214,49 @@ def make_parser(chosen: str | None) -> argparse.ArgumentParser:
 
 def _command(name: str) -> tuple[Any, Any, str]:
     """Return what declares the options of a command, what does it, and what describes it."""
-    if name not in COMMANDS:
-        module = _beside()[name].load()
-    else:
-        module = import_module(f"coldloop_rig.cli.commands.{MODULE_OF.get(name, name)}")
-    if name in COMMANDS and name not in MODULE_OF:
-        return module.declare, module.execute, str(module.__doc__)
-    declare, execute = module.COMMANDS[name]
-    said = str(execute.__doc__)
-    return declare, execute, f"`coldloop {name}`: {said[0].lower()}{said[1:]}"
+    with _of_its_package(name):
+        own = name in COMMANDS
+        module = import_module(f"coldloop_rig.cli.commands.{MODULE_OF[name]}") if own else _beside()[name].load()
+        declare, execute = module.COMMANDS[name]
+        said = str(execute.__doc__)
+        return declare, execute, f"`coldloop {name}`: {said[0].lower()}{said[1:]}"
 
 
+@cache
 def _beside() -> dict[str, EntryPoint]:
     """Return the entry points of commands that are not the rig's own: modules with `GROUP`, `SAID` and `COMMANDS`."""
-    return {point.name: point for point in entry_points(group="coldloop.commands")}
+    return {point.name: point for point in entry_points(group="coldloop.commands") if point.name not in COMMANDS}
+
+
+def _of_its_package(name: str) -> AbstractContextManager[None]:
+    """Report what code of another package raises as a usage error of one line that names command and package."""
+    if name in COMMANDS:
+        return nullcontext()
+    point = _beside()[name]
+    package = f"package {point.dist.name}" if point.dist else "unknown package"
+    return foreign(f"{name}: cannot be loaded from {point.value} ({package})", "update that package, or uninstall it",
+                   kind=UsageError)  # fmt: skip
 
 
 def command_names() -> list[str]:
     """Return the names of all commands, also of those that other packages bring."""
-    return [*COMMANDS, *(name for name in _beside() if name not in COMMANDS)]
+    return [*COMMANDS, *_beside()]
 
 
 def command_groups() -> dict[str, dict[str, str]]:
-    """Return the commands by what they are for, with a line about each; those of other packages, too."""
+    """Return the commands by what they are for, with a line about each; those of other packages, too.
+
+    A command whose package cannot be loaded is in the group `BROKEN`, with the reason.
+    """
     groups = {group: dict(commands) for group, commands in GROUPS.items()}
     for name, point in _beside().items():
-        if name not in COMMANDS:
-            module = point.load()
-            groups.setdefault(module.GROUP[name], {})[name] = module.SAID[name]
+        try:
+            with _of_its_package(name):
+                module = point.load()
+                group, said, _ = str(module.GROUP[name]), str(module.SAID[name]), module.COMMANDS[name]
+        except UsageError as error:
+            group, said = BROKEN, str(error).removeprefix(f"{name}: cannot be loaded ")
+        groups.setdefault(group, {})[name] = said
     return groups
 
 

@@ -2,7 +2,7 @@
 
 import math
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, cached_property
 from typing import Any, Final
 
@@ -10,13 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.config import load_configuration
+from coldloop.process.declaration import Process
+from coldloop.process.settings import settings_of
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Mode, ProcessNow
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization
 from coldloop.registers.plant import SensorFaultKind, StationSample
-from coldloop.registers.safety import Alarm
-from coldloop.service.event_text import EventText
+from coldloop.registers.safety import Alarm, AlarmState, alarms_of
+from coldloop.service.event_text import EventText, alarm_cause, alarm_word
+from coldloop_control_plc.alarms import TRANSITIONS, AlarmSettings
 from coldloop_hmi.process_image import JournalEntry
 from coldloop_hmi.replay import ReplayFrame
 from coldloop_hmi.signals import Doubts
@@ -25,7 +28,6 @@ from coldloop_optimizer_plc.rules import make_rule
 from coldloop_optimizer_plc.settings import OptimizerSettings
 from coldloop_optimizer_plc.solvers import make_solver
 from coldloop_rig.results.columns import STATION
-from coldloop_rig.results.recorded_alarms import alarms_after
 from coldloop_rig.results.run_folder import MOST_IN_MEMORY, MOST_LISTED, RunFolder
 
 SECTIONS: Final = ("limits", "session", "optimizer_plc", "telemetry")
@@ -149,3 +151,44 @@ def _entry(row: Mapping[str, Any]) -> JournalEntry:
     value = "" if row["value"] is None else f"{row['value']:.7g}"
     text = EventText(row["kind"], row["subject"], row["cause"], value, row["unit"], row["who"])
     return JournalEntry(row["service"], row["number"], row["boot"], row["utc"], row["tick"], text)
+
+
+_KINDS: Final = {event.word: event for events in TRANSITIONS.values() for event in events}
+
+
+@cache
+def _alarms(process: Process) -> dict[str, tuple[int, dict[str, int]]]:
+    """Return the alarms by their words, each with its causes by theirs."""
+    return {
+        alarm_word(kind, process): (kind, {alarm_cause(kind, cause, process): cause for cause in range(64)})
+        for kind in alarms_of(process)
+    }
+
+
+def alarms_after(events: Iterable[JournalEntry], process: Process) -> list[Alarm]:
+    """Return the alarms of a process after these events, by number."""
+    with settings_of(process):
+        settings = AlarmSettings()
+    rows = [Alarm(priority=settings.rule(kind).priority) for kind in alarms_of(process)]
+    for entry in events:
+        event, alarm = _KINDS.get(entry.text.kind), _alarms(process).get(entry.text.subject)
+        if event is not None and alarm is not None:
+            kind, causes = alarm
+            rows[kind] = _after(rows[kind], event, causes, entry, process.tick_s)
+    return rows
+
+
+def _after(row: Alarm, event: EventKind, causes: dict[str, int], entry: JournalEntry, tick_s: float) -> Alarm:
+    state = TRANSITIONS[AlarmState(row.state)].get(event, AlarmState(row.state))
+    row = row._replace(state=state)
+    match event:
+        case EventKind.ALARM_RAISED:
+            cause = causes.get(entry.text.cause, 0)
+            return row._replace(active=1, cause=cause, times=row.times + 1, raised=entry.tick)
+        case EventKind.ALARM_RETURNED:
+            return row._replace(active=0, returned=entry.tick)
+        case EventKind.ALARM_SHELVED:
+            return row._replace(shelved_until=entry.tick + round(float(entry.text.value or 0.0) / tick_s))
+        case EventKind.ALARM_UNSHELVED:
+            return row._replace(shelved_until=0)
+    return row

@@ -4,24 +4,32 @@ Space on the disk is reserved for ending a run in good order when the disk is fu
 """
 
 import errno
+import math
 import os
 import tempfile
+from bisect import bisect_right
 from collections import deque
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO, Final, Generic, TypeVar
+from typing import Any, BinaryIO, Final, Generic, NamedTuple, TypeVar
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from coldloop.errors import ResultsError, UsageError
 from coldloop.process.declaration import Process
-from coldloop.registers.audit import Event
+from coldloop.process.model_range import recorded_model_range
+from coldloop.registers.audit import Event, EventKind
+from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop_rig.results.columns import EVENTS, STATION, TRACE, UPDATES, files_of
+from coldloop.registers.plant import SensorFaultKind
+from coldloop.service.event_text import describe, utc_text
+from coldloop_rig.results.columns import EVENTS, STATION, TRACE, UPDATES, RunFile, files_of, number_array, text_array
 from coldloop_rig.results.indicators import StageCost
-from coldloop_rig.results.recording import SampleBlock, Sink, joined
-from coldloop_rig.results.tables import DrivingHistory, events_table, station_table, trace_table, updates_table
+from coldloop_rig.results.recording import PLANT, SampleBlock, Sink, joined
 
 RESERVED_BYTES: Final = 24 * 1024**2
 """A row group of the trace (9 MB), the index of 1,000 h (4 MB), the summary and the figures."""
@@ -244,3 +252,203 @@ class EventsSink(_FileSink[tuple[str, Event]]):
 
     def _table(self, parts: list[tuple[str, Event]]) -> pa.Table:
         return events_table(parts, self._process)
+
+
+DRIVERS: Final[Mapping[int, str]] = {
+    Mode.MPC: "optimizer",
+    Mode.REST: "optimizer",
+    Mode.HOLD: "nobody",
+    Mode.CLASSICAL: "loops",
+    Mode.MANUAL: "operator",
+}
+"""Source of the applied inputs in each mode; "nobody" while the last ones are held."""
+
+
+class Driving(NamedTuple):
+    """State of the control PLC from one tick on."""
+
+    tick: int = 0
+    mode: int | None = None
+    cause: int = Cause.NONE
+    bad: frozenset[int] = frozenset()
+    """Outputs whose measurement was substituted."""
+
+
+class SensorFaultRecord(NamedTuple):
+    """Fault of a sensor from one tick on."""
+
+    tick: int
+    kind: int
+    value: float
+
+
+class DrivingHistory:
+    """Takes events of a process in the order of each journal; returns the columns of ticks that do not come back.
+
+    A restarted control PLC may resume some ticks back: its later events hold from there on.
+    """
+
+    def __init__(self, process: Process) -> None:
+        self.process = process
+        self._states = [Driving()]
+        self._faults: dict[int, list[SensorFaultRecord]] = {output: [] for output in process.controlled}
+        self._held = dict.fromkeys(process.controlled, math.nan)
+        """Values that frozen sensors show, by output."""
+
+    def event(self, service: str, event: Event) -> None:
+        """Take an event."""
+        if service == PLANT:
+            if event.kind == EventKind.SESSION:  # it begins with healthy sensors
+                self._faults = {output: [] for output in self._faults}
+            elif event.kind == EventKind.SENSOR_FAULT and event.subject in self._faults:
+                self._faults[event.subject].append(SensorFaultRecord(event.tick, event.cause, event.value))
+            return
+        last = self._states[-1]
+        if event.kind == EventKind.MODE:
+            self._change(last._replace(tick=event.tick, mode=event.subject, cause=event.cause))
+        elif event.kind == EventKind.SENSOR and event.subject < len(self.process.outputs):
+            bad = last.bad | {event.subject} if event.cause else last.bad - {event.subject}
+            self._change(last._replace(tick=event.tick, bad=bad))
+
+    def _change(self, state: Driving) -> None:
+        while self._states[-1].tick >= state.tick and len(self._states) > 1:
+            self._states.pop()
+        self._states.append(state)
+
+    def columns(self, ticks: NDArray[np.int64]) -> list[pa.Array]:
+        """Return mode, cause, driver and bad sensors at these ticks, which are in a row."""
+        starts = [state.tick for state in self._states[1:]]
+        places = np.searchsorted(starts, ticks, side="right")
+        texts = [_texts(state, self.process.output_names) for state in self._states]
+        return [text_array([text[name] for text in texts], places) for name in _TEXTS]
+
+    def measured(self, ticks: NDArray[np.int64], y: NDArray[np.float32]) -> list[pa.Array]:
+        """Return what the sensors of banded outputs showed at N ticks in a row; null where it was no number.
+
+        `y` are outputs without faults, shape (N, outputs).
+        """
+        shown = [self._shown(output, ticks, y[:, output].copy()) for output in self._faults]
+        return [number_array(column, pa.float32(), np.isnan(column)) for column in shown]
+
+    def _shown(self, output: int, ticks: NDArray[np.int64], values: NDArray[np.float32]) -> NDArray[np.float32]:
+        first, end = int(ticks[0]), int(ticks[-1]) + 1
+        faults = self._faults[output]
+        for place, fault in enumerate(faults):
+            until = faults[place + 1].tick if place + 1 < len(faults) else end
+            begin = min(max(fault.tick - first, 0), len(values))
+            stop = min(max(until - first, 0), len(values))
+            if fault.kind == SensorFaultKind.FROZEN and first <= fault.tick < end:
+                # the value shown then: the output itself, or that of the previous fault
+                before = faults[place - 1] if place else None
+                self._held[output] = _shown_by(before, values[fault.tick - first], self._held[output])
+            if fault.kind and begin < stop:
+                values[begin:stop] = _shown_by(fault, 0.0, self._held[output])
+        return values
+
+    def forget(self, tick: int) -> None:
+        """Forget what concerns ticks before `tick` only."""
+        keep = bisect_right([state.tick for state in self._states[1:]], tick)
+        del self._states[:keep]
+        for faults in self._faults.values():
+            del faults[: max(0, bisect_right([fault.tick for fault in faults], tick) - 1)]
+
+
+_TEXTS: Final = ("mode", "cause", "driver", "bad_sensors")
+
+
+def _texts(state: Driving, output_names: Sequence[str]) -> dict[str, str | None]:
+    bad = " ".join(output_names[output] for output in sorted(state.bad))
+    if state.mode is None:
+        return dict(zip(_TEXTS, (None, None, None, bad), strict=True))
+    words = (Mode.word_of(state.mode), Cause.word_of(state.cause), DRIVERS.get(state.mode), bad)
+    return dict(zip(_TEXTS, words, strict=True))
+
+
+def _shown_by(fault: SensorFaultRecord | None, true: float, held: float) -> float:
+    if fault is None or fault.kind == SensorFaultKind.NONE:
+        return float(true)
+    if fault.kind == SensorFaultKind.NOT_A_NUMBER:
+        return math.nan
+    return held if fault.kind == SensorFaultKind.FROZEN else fault.value
+
+
+def trace_table(
+    block: SampleBlock, updates: Sequence[Optimization], cost: StageCost, driving: DrivingHistory
+) -> pa.Table:
+    """Return the trace of a block.
+
+    The updates are those whose sequence was played, from the last one before the block on; `driving` has the events.
+    """
+    ticks, process = block.first + np.arange(len(block.load)), driving.process
+    outside: Any = recorded_model_range(block.x, block.station) if process.has_station else np.zeros(len(ticks))
+    columns = [
+        ticks, ticks * process.tick_s, *block.rows.T, *driving.measured(ticks, block.y), *driving.columns(ticks),
+        cost.of(block), *_held(ticks, updates, process.tick_s), (outside, np.isnan(block.load)),
+    ]  # fmt: skip
+    return _of_arrays(columns, files_of(process)[TRACE])
+
+
+def station_table(block: SampleBlock, process: Process) -> pa.Table:
+    """Return what is known of the station at the ticks of a block that has one."""
+    ticks = block.first + np.arange(len(block.load))
+    unknown = np.isnan(block.station[:, 0])
+    known = ((np.nan_to_num(column), unknown) for column in block.station.T)
+    return _of_arrays([ticks, ticks * process.tick_s, *known], files_of(process)[STATION])
+
+
+def _of_arrays(columns: Sequence[Any], file: RunFile) -> pa.Table:
+    """Return the table of columns: Arrow arrays, numbers, or numbers with a mask of those that are unknown."""
+    schema = file.schema
+    arrays = [
+        data if isinstance(data, pa.Array)
+        else number_array(data[0], field.type, data[1]) if isinstance(data, tuple)
+        else number_array(data, field.type)
+        for field, data in zip(schema, columns, strict=True)
+    ]  # fmt: skip
+    return pa.table(arrays, schema)
+
+
+def _held(ticks: Any, updates: Sequence[Optimization], tick_s: float) -> list[Any]:  # noqa: ANN401 an array of integers
+    """Return the columns that change at updating instants only, with a mask of the ticks before the first.
+
+    The time of an update that a load step has cut off belongs to the one before.
+    """
+    latest = np.searchsorted([row.tick for row in updates], ticks, side="right") - 1
+    none = latest < 0
+    values: list[list[float]] = [
+        [row.update for row in updates],
+        [row.tau_u * tick_s for row in updates],
+        [row.iterations for row in updates],
+        [row.j_effective for row in updates],
+    ]
+    return [(np.asarray(column or [0])[np.maximum(latest, 0)], none) for column in values]
+
+
+def updates_table(updates: Sequence[Optimization], process: Process) -> pa.Table:
+    """Return the table of updates."""
+    tick_s = process.tick_s
+    rows = [{**row._asdict(), "time_s": row.tick * tick_s, "tau_u_s": row.tau_u * tick_s} for row in updates]
+    return _of_rows(rows, files_of(process)[UPDATES])
+
+
+def events_table(events: Sequence[tuple[str, Event]], process: Process) -> pa.Table:
+    """Return the table of events."""
+    rows = [
+        {
+            **text._asdict(), "service": service, "number": event.number, "boot": event.boot, "utc": utc_text(event),
+            "tick": event.tick, "time_s": event.tick * process.tick_s, "value": event.value if text.value else None,
+        }
+        for service, event in events for text in [describe(event, process)]
+    ]  # fmt: skip
+    return _of_rows(rows, files_of(process)[EVENTS])
+
+
+def _of_rows(rows: Sequence[dict[str, Any]], file: RunFile) -> pa.Table:
+    return pa.table([_array([row[column.name] for row in rows], column.kind) for column in file.columns], file.schema)
+
+
+def _array(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
+    if pa.types.is_string(kind):
+        return text_array(values)
+    unknown = np.array([value is None for value in values], bool)
+    return number_array([0 if value is None else value for value in values], kind, unknown)

@@ -15,7 +15,7 @@ from scipy.special import stdtrit
 
 from coldloop.errors import UsageError
 from coldloop.process.lti_model import LtiModel, RealArray
-from coldloop_rig.durations import LONGEST_TICKS
+from coldloop.process.updating_periods import LONGEST_TICKS
 from coldloop_rig.results.run_folder import RunFolder
 from coldloop_rig.text_tables import aligned
 

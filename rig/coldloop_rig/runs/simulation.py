@@ -24,10 +24,9 @@ from coldloop.config import Configuration
 from coldloop.errors import UsageError
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.updating_periods import whole_ticks
+from coldloop.process.updating_periods import duration, whole_ticks
 from coldloop.registers.audit import Event
 from coldloop_rig.cosim.one_process import OneProcessRig
-from coldloop_rig.durations import duration
 from coldloop_rig.figures.plot import (
     Bounds,
     RunCurves,
@@ -38,12 +37,11 @@ from coldloop_rig.figures.plot import (
     save_figure,
     title_of,
 )
+from coldloop_rig.results.file_sinks import DrivingHistory, events_table, station_table, trace_table, updates_table
 from coldloop_rig.results.indicators import RunEvaluation, StageCost
 from coldloop_rig.results.recording import MemorySink, Recorder, Recording
 from coldloop_rig.results.run_folder import batch_series, units_of
-from coldloop_rig.results.tables import DrivingHistory, events_table, station_table, trace_table, updates_table
-from coldloop_rig.runs.remarks import certificate, enforced, too_slow
-from coldloop_rig.runs.running import make_scenario, summary_of
+from coldloop_rig.runs.running import certificate, enforced, make_scenario, summary_of, too_slow
 from coldloop_rig.settings import Period, Settings, configured
 
 

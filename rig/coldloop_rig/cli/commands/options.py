@@ -307,7 +307,7 @@ def configuration(options: argparse.Namespace) -> "Configuration[Settings]":
         | {key: (given[name], flag) for name, (key, flag) in KEYS.items() if given.get(name) is not None},
     )
     if given.get("enforce"):
-        from coldloop_rig.runs.remarks import enforced
+        from coldloop_rig.runs.running import enforced
 
         return enforced(effective)
     return effective

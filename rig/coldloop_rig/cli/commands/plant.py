@@ -1,18 +1,23 @@
 """Commands about a plant and its controller."""
 
 import argparse
+import math
 import sys
+from importlib.metadata import entry_points
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from coldloop.errors import UsageError
 from coldloop.service.command_line import add_configuration_options
-from coldloop_rig.cli.commands.options import Command, configuration, positive_count
-from coldloop_rig.text_tables import fitted, width
+from coldloop.text_file import require_regular_file, whole_text
+from coldloop_rig.cli.commands.options import Command, check_load, configuration, fixed_updating_period, positive_count
+from coldloop_rig.text_tables import aligned, fitted, width
 
 if TYPE_CHECKING:
+    from coldloop_optimizer_plc.qp.problem import PredictiveProblem
     from coldloop_plant.refrigerator.exergy import ExergyBalance
-
+    from coldloop_rig.settings import Settings
 
 FILES: Final = ("process.toml", "my_plant.py")
 INSTALLED: Final = Path(__file__).parents[2] / "examples"
@@ -31,11 +36,12 @@ def _declare_new(parser: argparse.ArgumentParser) -> None:
 
 def execute_new(options: argparse.Namespace) -> int:
     """A folder with a process file and a plant to begin with, commented, or with an example."""
-    from coldloop.errors import UsageError
-    from coldloop.text_file import whole_text
-
     folder: Path = options.folder
-    texts = _template() if options.example is None else _example(options.example)
+    if options.example is None:
+        place = files("coldloop_rig.process_file") / "template"
+        texts = {name: (place / f"{name}.txt").read_text(encoding="utf-8") for name in FILES}
+    else:
+        texts = _example(options.example)
     present = next((name for name in texts if (folder / name).exists()), None)
     if present is not None:
         raise UsageError(f"{folder / present}: is there already; name another folder")
@@ -50,14 +56,7 @@ def execute_new(options: argparse.Namespace) -> int:
     return 0
 
 
-def _template() -> dict[str, str]:
-    place = files("coldloop_rig.process_file").joinpath("template")
-    return {name: place.joinpath(f"{name}.txt").read_text(encoding="utf-8") for name in FILES}
-
-
 def _example(name: str) -> dict[str, str]:
-    from coldloop.errors import UsageError
-
     folder = INSTALLED if INSTALLED.is_dir() else Path(__file__).parents[4] / "examples"
     found = sorted(file for file in folder.rglob("*.*") if name in (file.parent.name, file.name[: len(name)]))
     texts = {file.name: file.read_text(encoding="utf-8") for file in found if file.suffix != ".pyc"}
@@ -78,9 +77,7 @@ def _declare_process(parser: argparse.ArgumentParser) -> None:
 
 def execute_process(options: argparse.Namespace) -> int:
     """A process file checked, linearised and judged, and made into the model file of all programs."""
-    from coldloop.errors import UsageError
     from coldloop.process.declaration import Process
-    from coldloop.text_file import require_regular_file
     from coldloop_rig.cli.listings import key_listing
     from coldloop_rig.process_file.judgement import described
     from coldloop_rig.process_file.making import made_from
@@ -134,8 +131,6 @@ def execute_import(options: argparse.Namespace) -> int:
     """
     from zoneinfo import available_timezones
 
-    from coldloop.errors import UsageError
-    from coldloop.text_file import require_regular_file, whole_text
     from coldloop_rig.process_file.historian import Request, record_of
     from coldloop_rig.results.folders import writing
 
@@ -167,9 +162,7 @@ def _declare_model(parser: argparse.ArgumentParser) -> None:
 
 def execute_model(options: argparse.Namespace) -> int:
     """The plant at its operating point, and its linear model as both PLCs run it."""
-    from coldloop.errors import UsageError
     from coldloop.process.lti_model import load
-    from coldloop.text_file import require_regular_file
     from coldloop_plant.cold_box.plant_file import PlantFile
     from coldloop_plant.equilibrium import NoEquilibriumError
     from coldloop_plant.refrigerator.plant_file import RefrigeratorPlantFile, read_plant_file
@@ -219,9 +212,7 @@ def execute_identify(options: argparse.Namespace) -> int:
 
     They are fitted on the first half of the record and judged on the second. The model of a run is never changed.
     """
-    from coldloop.errors import UsageError
     from coldloop.process.lti_model import load
-    from coldloop.text_file import require_regular_file
     from coldloop_rig.results.folders import writing
     from coldloop_rig.results.run_folder import RunFolder
     from coldloop_rig.runs.identification import describe, identify, note_of, read_record, scaled
@@ -258,7 +249,6 @@ def _declare_exergy(parser: argparse.ArgumentParser) -> None:
 
 def execute_exergy(options: argparse.Namespace) -> int:
     """Specific power of a refrigerator at rest, and where the exergy that it is given is lost."""
-    from coldloop.errors import UsageError
     from coldloop_plant.equilibrium import NoEquilibriumError
     from coldloop_plant.helium.properties import load_helium
     from coldloop_plant.refrigerator.exergy import exergy_balance
@@ -299,10 +289,140 @@ def _row(name: str, exergy: float, whole: float) -> str:
     return f"{name:26} {kilowatts:9.3f} {share:8.2f}"
 
 
+USUAL_SCENARIOS: Final = 100
+
+
+def _declare_budget(parser: argparse.ArgumentParser) -> None:
+    add_configuration_options(parser)
+    speed = parser.add_mutually_exclusive_group()
+    speed.add_argument("--power", type=_power, metavar="P",
+                       help="one power relative to the paper's PLC (default: as configured)")  # fmt: skip
+    speed.add_argument("--plc", type="name", metavar="PLC",
+                       help="a PLC instead: a profile (TOML) or one that is shipped, and a sentence that says whether "
+                       "the controller runs there; --list names them")  # fmt: skip
+    add = parser.add_argument
+    add("--export", type="folder", metavar="FOLDER",
+        help="what an export for a PLC costs: operations of its calls and bytes; with --plc also times there, and what"
+        " does not fit")  # fmt: skip
+    add("--took", type=_power, metavar="US",
+        help="with --export: a PLC took so many microseconds for the iterations of the solver's self-test; prints its"
+        " profile")  # fmt: skip
+    add("--list", action="store_true", help="list the shipped PLCs")
+    add("--keys", action="store_true", help="list the keys of a PLC's profile, as Markdown")
+    add("--load", type="name", dest="loads", nargs="+", metavar="LOAD", default=[],
+        help="with --plc: whether an adaptive updating period pays there under these loads, against --updating-period "
+        "or the best fixed one")  # fmt: skip
+    add("--updating-period", dest="period", type=fixed_updating_period, metavar="SECONDS",
+        help="one updating period (default: a fifth, a half and all of a sampling period)")  # fmt: skip
+    add("--certify", type=positive_count, nargs="?", const=USUAL_SCENARIOS, metavar="N",
+        help="how many iterations are enough, by N sampled scenarios, with its confidence "
+        f"(default: {USUAL_SCENARIOS})")  # fmt: skip
+    add("--tolerance", type=_percent, default=5.0, metavar="PERCENT",
+        help="with --certify: enough is within this of the optimum (default: 5)")  # fmt: skip
+    add("--confidence", type=_percent, default=99.9, metavar="PERCENT",
+        help="with --certify: of the bounds (default: 99.9)")  # fmt: skip
+
+
+def _power(text: str) -> float:
+    return _number_below(math.inf, "a positive number", text)
+
+
+def _percent(text: str) -> float:
+    return _number_below(100.0, "a percentage above 0 and below 100", text)
+
+
+def _number_below(end: float, what: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < end:
+        raise argparse.ArgumentTypeError(f"'{text}' is not {what}")
+    return value
+
+
+def execute_budget(options: argparse.Namespace) -> int:
+    """What a PLC can do in an updating period, and whether its memory holds the problem."""
+    if options.loads and options.plc is None:
+        raise UsageError("--load: says whether an adaptive period pays on a PLC; name one with --plc")
+    if options.took and not options.export:
+        raise UsageError("--took: is of an export's self-test; name its folder with --export")
+    sys.stdout.write(fitted(_budget_text(options), width()))
+    return 0
+
+
+def _budget_text(options: argparse.Namespace) -> str:
+    from coldloop_rig.cli.listings import key_listing
+    from coldloop_rig.plc_sizing.plc import PlcProfile, find_profile, shipped_profiles
+
+    if options.list:
+        return aligned([(name, find_profile(name).name) for name in shipped_profiles()])
+    if options.keys:
+        return key_listing(PlcProfile)
+    if options.export:
+        from coldloop_rig.plc_sizing.exported import cost_text, profile_of, read_cost
+
+        cost = read_cost(options.export)
+        if options.took:
+            return profile_of(cost, options.took)
+        return cost_text(cost, find_profile(options.plc) if options.plc else None)
+    if options.certify:
+        from coldloop_rig.plc_sizing.certification import certification_table
+
+        if any(value is not None for value in (options.power, options.plc, options.period)):
+            raise UsageError("--certify: uses the configured PLC; leave out --power, --plc and --updating-period")
+        settings = configuration(options).settings
+        return certification_table(settings, options.certify, options.tolerance, options.confidence)
+    return _budget_tables(options)
+
+
+def _budget_tables(options: argparse.Namespace) -> str:
+    from coldloop_rig.plc_sizing.adaptive_gain import adaptive_gain
+    from coldloop_rig.plc_sizing.budget import budget_tables, plc_tables, with_power
+    from coldloop_rig.plc_sizing.plc import find_profile
+    from coldloop_rig.progress import make_console
+    from coldloop_rig.runs.running import certificate
+
+    if len(set(options.loads)) < len(options.loads):
+        raise UsageError("--load: a load is named twice; two of the same are no evidence")
+    for name in options.loads:
+        check_load(name)
+    profile = None if options.plc is None else find_profile(options.plc)
+    settings = configuration(options).settings
+
+    def costs(there: "Settings") -> str:
+        if not options.loads:
+            return ""
+        with make_console().status("") as status:
+            return adaptive_gain(
+                there, options.loads, options.period, lambda done, of: status.update(f"{done} of {of} runs")
+            )
+
+    def executed(problem: "PredictiveProblem") -> str:
+        counters = entry_points(group="coldloop.counters", name="ode")
+        if not counters:
+            return ""
+        counter = counters["ode"].load()(problem, settings.optimizer_plc.program)
+        return (
+            f"ode as exported, an iteration a call, executed: {counter.unconstrained():,} operations with no row "
+            f"active, {counter.worst():,} in the worst case (every row active, a bound cuts the step)\n"
+        )
+
+    if profile is not None:
+        return plc_tables(
+            settings, options.period, profile, lambda there: f"{certificate(there)}\n{costs(there)}".strip()
+        )
+    if options.power is not None:
+        settings = with_power(settings, options.power)
+    held, tables = certificate(settings), budget_tables(settings, options.period, executed)
+    return f"{held}\n\n{tables}" if held else tables
+
+
 COMMANDS: Final = {
     "new": Command(_declare_new, execute_new),
     "process": Command(_declare_process, execute_process),
     "import": Command(_declare_import, execute_import),
+    "budget": Command(_declare_budget, execute_budget),
     "model": Command(_declare_model, execute_model),
     "identify": Command(_declare_identify, execute_identify),
     "exergy": Command(_declare_exergy, execute_exergy),

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import UsageError
+from coldloop.process.updating_periods import LONGEST_TICKS
 from coldloop.service.command_line import add_configuration_options
 from coldloop_rig.cli.commands.options import (
     PLACES,
@@ -28,7 +29,6 @@ from coldloop_rig.cli.commands.options import (
     say,
     tell,
 )
-from coldloop_rig.durations import LONGEST_TICKS
 from coldloop_rig.interruption import run_until_interrupted
 from coldloop_rig.text_tables import coloured, cut, fitted, width
 
@@ -66,8 +66,7 @@ def execute_up(options: argparse.Namespace) -> int:
     """The rig on fixed ports, in real time, until Ctrl-C."""
     check_load(options.load)
     from coldloop_rig.live.started_rigs import RigLock, check_ports, detached, ports_from
-    from coldloop_rig.runs.remarks import remarks
-    from coldloop_rig.runs.running import check_certificates
+    from coldloop_rig.runs.running import check_certificates, remarks
 
     effective = configuration(options)
     refuse_ineffective(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from coldloop.errors import NOT_FINITE, LinkError, UsageError
+from coldloop.process.updating_periods import duration
 from coldloop.service.command_line import add_configuration_options
 from coldloop_rig.cli.commands.options import (
     FIGURE_FORMATS,
@@ -28,7 +29,6 @@ from coldloop_rig.cli.commands.options import (
     refuse_ineffective,
     rig_endpoints,
 )
-from coldloop_rig.durations import duration
 
 if TYPE_CHECKING:
     from coldloop.config import Configuration
@@ -107,8 +107,7 @@ def _do(job: "Job", options: argparse.Namespace, figure: "FigureProcess") -> int
     """
     from coldloop_rig.results.folders import claim_folder, claim_folder_of_now
     from coldloop_rig.results.recording import Way
-    from coldloop_rig.runs.remarks import remarks
-    from coldloop_rig.runs.running import plain_arguments, run_into
+    from coldloop_rig.runs.running import plain_arguments, remarks, run_into
 
     told = [] if job.way in (Way.RECORDED, Way.ATTACHED) else remarks(job.effective)  # remarks are for a PLC of ours
     name = "session" if job.way is Way.RECORDED else Path(job.effective.settings.plant.load).stem
