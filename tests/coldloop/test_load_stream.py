@@ -11,7 +11,7 @@ from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.maps import maps_of
 from coldloop.registers.plant import LoadAhead, LoadStatus
-from coldloop_plant.rack.load_schedule import MOST_UPCOMING, LoadSchedule
+from coldloop_plant.load import MOST_UPCOMING, LoadSchedule
 
 
 class FakePlant:

@@ -40,7 +40,7 @@ from coldloop_control_plc.rack_clock import PHASE, RackClock
 from coldloop_control_plc.retained_state import ControlStateStore, RetainedControlState
 from coldloop_control_plc.scan_cycle import ScanCycle
 from coldloop_control_plc.settings import ControlSection
-from coldloop_plant.rack.rack import Rack, Session
+from coldloop_plant.rack import Rack, Session
 from coldloop_plant.settings import SafeAction, WatchdogSettings
 from tests.harness.records import Row, as_transmitted
 

@@ -29,7 +29,7 @@ from coldloop_control_plc.program import make_program
 from coldloop_control_plc.runtime import ControlPlc
 from coldloop_control_plc.scan_cycle import ScanCycle
 from coldloop_control_plc.settings import ControlSection, ControlSettings
-from coldloop_plant.rack.outputs import AppliedOutputs
+from coldloop_plant.rack import AppliedOutputs
 from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP, as_transmitted, sealed
 from tests.link.poison import values_of
 

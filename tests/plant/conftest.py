@@ -21,7 +21,7 @@ from coldloop_plant.cold_box.plant_file import REFERENCE
 from coldloop_plant.helium.properties import Helium, load_helium
 from coldloop_plant.kinds import plant_maker
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.rack.registers import RackRegisters
+from coldloop_plant.runtime import RackRegisters
 from coldloop_plant.settings import PlantSettings
 from tests.harness.records import PLANT_MAP, sealed
 

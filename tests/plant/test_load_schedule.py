@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.plant import LoadStep
-from coldloop_plant.rack.load_schedule import MOST_UPCOMING, LoadSchedule
+from coldloop_plant.load import MOST_UPCOMING, LoadSchedule
 
 
 def schedule(*steps: tuple[int, float]) -> LoadSchedule:

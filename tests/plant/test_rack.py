@@ -111,7 +111,7 @@ def test_in_real_time_what_a_network_held_up_is_not_applied(switch_on: "SwitchOn
 def test_a_session_ends_at_its_last_tick_and_another_one_begins(switch_on: "SwitchOn", mode: str) -> None:
     rack = switch_on(session={"mode": mode})
     plc = rack.client("control PLC", 77)
-    rack.registers.rack._program.tick = LAST_TICK - 1  # noqa: SLF001 - 34 years are too long
+    rack.registers.rack.program.tick = LAST_TICK - 1  # 34 years are too long
     assert plc.send(*U).verdict == OutputVerdict.ACCEPTED
     if mode == "realtime":
         rack.registers.advance()

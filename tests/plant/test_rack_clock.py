@@ -9,8 +9,7 @@ from coldloop.errors import ColdloopError
 from coldloop.registers.bank import ANYBODY
 from coldloop.registers.plant import Actuators, PlantSession
 from coldloop.session.clock import Pacer
-from coldloop_plant.rack.registers import RackRegisters
-from coldloop_plant.runtime import PlantRuntime
+from coldloop_plant.runtime import PlantRuntime, RackRegisters
 from coldloop_plant.settings import PlantSettings
 from tests.harness.records import PLANT_MAP
 

@@ -8,7 +8,7 @@ import pytest
 from coldloop.registers.audit import EventKind
 from coldloop.registers.plant import OutputVerdict, PlantSession
 from coldloop.safety.retained import RetainedFile
-from coldloop_plant.rack.retained_state import OWNER
+from coldloop_plant.runtime import OWNER
 from tests.plant.conftest import HEADER
 
 if TYPE_CHECKING:

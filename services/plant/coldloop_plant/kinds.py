@@ -29,8 +29,7 @@ from coldloop.kernels.first_use import kernels_of
 from coldloop_plant.cold_box.plant_file import REFERENCE
 from coldloop_plant.cold_box.program import ColdBoxProgram, MismatchedPlant
 from coldloop_plant.components.valve import Valve
-from coldloop_plant.program import HeatLoad, MeasurementNoise, PlantProgram
-from coldloop_plant.rack.rack import MakePlant
+from coldloop_plant.program import HeatLoad, MakePlant, MeasurementNoise, PlantProgram
 from coldloop_plant.refrigerator.settings import EventSchedule, StationControlKind
 from coldloop_plant.settings import MismatchSettings, PlantKind, PlantSection, RefrigeratorStart, SensorSettings
 

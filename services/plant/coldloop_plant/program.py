@@ -1,6 +1,6 @@
 """The plant as a program: inputs in, one tick forward, measurements out. No sockets, no clock."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import inf, isfinite
@@ -197,3 +197,7 @@ def _vector(values: Sequence[float], signals: Sequence[object], what: str) -> Re
     if len(values) != len(signals) or not all(isfinite(value) for value in values):
         raise ValueError(f"expected {len(signals)} finite {what}, not {list(values)}")
     return np.array(values, dtype=np.float64)
+
+
+MakePlant = Callable[[HeatLoad, int], PlantProgram]
+"""Returns the plant at tick 0, for a load and a seed of the sensors' noise."""

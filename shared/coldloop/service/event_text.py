@@ -218,7 +218,8 @@ def log_event(log: logging.Logger, event: Event, process: Process) -> None:
         subject = "alarm" if event.kind in OF_ALARMS | SUPPRESSIONS else "subject"
     fields = {subject: text.subject, "cause": text.cause, "value": text.value, "who": text.who}
     given = {name: field for name, field in fields.items() if field}
-    level = logging.WARNING if event.kind in WARNINGS else logging.INFO
+    grave = event.kind in WARNINGS or (event.kind, event.subject) == (EventKind.LEASE, LeaseEvent.REFUSED)
+    level = logging.WARNING if grave else logging.INFO
     log.log(level, text.kind, extra={**given, "tick": event.tick, "number": event.number})
 
 

@@ -29,8 +29,7 @@ from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import ModelHeader
 from coldloop.process.sections import Lag
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.program import HeatLoad, MeasurementNoise, PlantProgram
-from coldloop_plant.rack.rack import MakePlant
+from coldloop_plant.program import HeatLoad, MakePlant, MeasurementNoise, PlantProgram
 
 PYTHON: Final = "python"
 """Kinds of plants: `ModelHeader.plant`."""
