@@ -9,29 +9,10 @@ import numpy as np
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop_export import tree
-from coldloop_export.c_printer import (
-    GENERATED,
-    Array,
-    ConstantRecords,
-    KernelFiles,
-    Printer,
-    golden_files,
-    identifier,
-)
+from coldloop_export.c_printer import GENERATED, Array, ConstantRecords, KernelFiles, Printer, golden_files, identifier
 from coldloop_export.golden import GoldenCall, GoldenUpdate, GoldenVector, arrays_in, tables_of, update_tables
 from coldloop_export.kernels import PER_PROBLEM, GuardKernels, OdeProgram, OptimizerKernels, crc, leaves
-from coldloop_export.tree import (
-    ArrayType,
-    Function,
-    Invoke,
-    Kind,
-    RecordType,
-    StructType,
-    Type,
-    filled,
-    template,
-    walk,
-)
+from coldloop_export.tree import ArrayType, Function, Invoke, Kind, RecordType, StructType, Type, filled, template, walk
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.interface import Costs

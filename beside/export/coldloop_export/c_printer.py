@@ -9,18 +9,7 @@ from numpy.typing import NDArray
 
 from coldloop_export import tree
 from coldloop_export.kernels import crc
-from coldloop_export.tree import (
-    Expression,
-    Function,
-    Kind,
-    Literal,
-    Name,
-    RecordType,
-    RowsType,
-    StructType,
-    Type,
-    View,
-)
+from coldloop_export.tree import Expression, Function, Kind, Literal, Name, RecordType, RowsType, StructType, Type, View
 
 Array = NDArray[Any]
 

@@ -7,29 +7,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 from numba.core.dispatcher import Dispatcher
 
 from coldloop_export import expressions, tree
-from coldloop_export.expressions import (
-    FUNCTIONS,
-    NEW_ARRAYS,
-    DType,
-    Elementwise,
-    Kernel,
-    Known,
-    Python,
-    Record,
-    Value,
-)
-from coldloop_export.tree import (
-    ArrayType,
-    Expression,
-    Field,
-    Function,
-    Item,
-    Kind,
-    Literal,
-    Name,
-    RecordType,
-    Storage,
-)
+from coldloop_export.expressions import FUNCTIONS, NEW_ARRAYS, DType, Elementwise, Kernel, Known, Python, Record, Value
+from coldloop_export.tree import ArrayType, Expression, Field, Function, Item, Kind, Literal, Name, RecordType, Storage
 
 if TYPE_CHECKING:
     from coldloop_export.statements import Program

@@ -17,18 +17,7 @@ from coldloop_control_plc.output_limits import GuardState, Limits, beginning
 from coldloop_export import tree
 from coldloop_export.golden import ITERATIONS, Call, GoldenCall, GoldenUpdate, GoldenVector
 from coldloop_export.kernels import Array, GuardKernels, OdeProgram, OptimizerKernels
-from coldloop_export.tree import (
-    ArrayType,
-    Declare,
-    Expression,
-    For,
-    Function,
-    Kind,
-    Operation,
-    Return,
-    Statement,
-    While,
-)
+from coldloop_export.tree import ArrayType, Declare, Expression, For, Function, Kind, Operation, Return, Statement
 from coldloop_optimizer_plc.computing_settings import Arithmetic
 from coldloop_optimizer_plc.decisions import Latched
 from coldloop_optimizer_plc.program import OptimizerProgram
@@ -127,7 +116,7 @@ class _Printer:
         return [f" {line}" for each in statements for line in self._statement(each)] or [" pass"]
 
     def _statement(self, statement: Statement) -> Iterator[str]:  # noqa: C901, PLR0912 one case a statement
-        if not isinstance(statement, While) and (count := sum(map(operations_in, expressions_of(statement)))):
+        if not isinstance(statement, tree.While) and (count := sum(map(operations_in, expressions_of(statement)))):
             yield f"_n[0] += {count}"
         match statement:
             case Declare(tree.Name(ArrayType(kind, shape), name), _):
@@ -150,7 +139,7 @@ class _Printer:
             case For(variable, start, stop, step, body):
                 yield f"for {variable.name} in range({self._of(start)}, {self._of(stop)}, {step}):"
                 yield from self._body(body)
-            case While(condition, body):
+            case tree.While(condition, body):
                 yield "while True:"
                 yield f" _n[0] += {operations_in(condition)}"
                 yield f" if not {self._of(condition)}: break"

@@ -16,18 +16,7 @@ from numba.core.dispatcher import Dispatcher
 
 from coldloop.kernels.single_precision import single
 from coldloop_export import tree
-from coldloop_export.tree import (
-    ArrayType,
-    Expression,
-    Field,
-    Kind,
-    Literal,
-    Name,
-    Operation,
-    RowsType,
-    StructType,
-    View,
-)
+from coldloop_export.tree import ArrayType, Expression, Field, Kind, Literal, Name, Operation, RowsType, View
 
 Kernel: TypeAlias = Dispatcher | Callable[..., Any]
 """A kernel, or a function of plain Python that is one for the exporter."""
@@ -269,7 +258,7 @@ class ExpressionReader:
                 raise self.refusal(node, f"{base.name or 'a tuple'} has no {node.attr}")
             return part
         base_type = base.type
-        if isinstance(base_type, tree.RecordType | StructType):
+        if isinstance(base_type, tree.RecordType | tree.StructType):
             for name, kind in base_type.fields:
                 if name == node.attr:
                     return self._field(kind, base, name)
@@ -285,7 +274,7 @@ class ExpressionReader:
 
     @staticmethod
     def _field(kind: object, base: Value, name: str) -> Value:
-        if isinstance(kind, Kind) and isinstance(base, Name | tree.Item) and isinstance(base.type, StructType):
+        if isinstance(kind, Kind) and isinstance(base, Name | tree.Item) and isinstance(base.type, tree.StructType):
             return tree.Member(kind, base, name)
         return Field(cast("Kind", kind), cast("Name", base), name)
 

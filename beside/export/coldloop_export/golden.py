@@ -17,17 +17,8 @@ from coldloop.process.settings import InputLimits
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, Update, control_map
 from coldloop.safety.sequence import InputSequence
-from coldloop_control_plc.output_limits import (
-    Limits,
-    admit,
-    begin,
-    beginning,
-    copy_state,
-    in_range,
-    judge,
-    plain,
-    resume,
-)
+from coldloop_control_plc import output_limits
+from coldloop_control_plc.output_limits import Limits, admit, begin, beginning, copy_state, in_range, judge, plain
 from coldloop_export.kernels import PER_PROBLEM, Array
 from coldloop_optimizer_plc import scheme
 from coldloop_optimizer_plc.computing_settings import Arithmetic
@@ -329,7 +320,7 @@ class _Drawing:
         found = self._row(-0.2, 1.2) if self._chance(0.4) else self._row(0.0, 1.0)
         if self._chance(0.4):
             found = self._changed(self._applied(), (*NOT_FINITE, *found))
-        resume(self.state, self.limits, self.tick, found)
+        output_limits.resume(self.state, self.limits, self.tick, found)
         yield GoldenCall(Call.RESUME, self.tick, found, self._applied())
         for _ in range(self.random.randrange(1, 4)):
             yield self._scanned(self._applied() if self._chance(0.5) else self._wanted())

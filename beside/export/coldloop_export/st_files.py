@@ -15,41 +15,12 @@ from coldloop.registers.declaration import Block as RegisterBlock
 from coldloop.registers.declaration import Register, RegisterMap
 from coldloop_control_plc.output_limits import beginning
 from coldloop_export import st_printer, tree
-from coldloop_export.golden import (
-    GoldenCall,
-    GoldenUpdate,
-    GoldenVector,
-    answered,
-    arrays_in,
-    tables_of,
-    update_tables,
-)
+from coldloop_export.golden import GoldenCall, GoldenUpdate, GoldenVector, answered, arrays_in, tables_of, update_tables
 from coldloop_export.kernels import PER_PROBLEM, Array, GuardKernels, OdeProgram, OptimizerKernels, leaves
 from coldloop_export.st_lowering import VALUE, Entry, Lowering, Place, Record, Rows, dotted, zeroed
 from coldloop_export.st_pausing import ANEW, PIECE, Pausing, an_answer_in_calls, one_iteration_a_call
-from coldloop_export.st_printer import (
-    Constants,
-    interface_names,
-    memory,
-    portable,
-    scalar_of,
-    section,
-    sum_of,
-    types_in,
-)
-from coldloop_export.tree import (
-    ArrayType,
-    Block,
-    Kind,
-    Literal,
-    Name,
-    Path,
-    RecordType,
-    Type,
-    filled,
-    template,
-    type_of,
-)
+from coldloop_export.st_printer import Constants, interface_names, memory, portable, scalar_of, section, sum_of
+from coldloop_export.tree import ArrayType, Block, Kind, Literal, Name, Path, RecordType, filled, template, type_of
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.ode import OdeMethod
@@ -83,7 +54,7 @@ class StructuredTextExport:
         self.vectors = [bounded(method, each) for each in vectors]
         program = OdeProgram(method, problem, np.arange(1, len(self.vectors[0].answer.costs) + 1))
         constants = {path: np.asarray(values) for path, values in program.constants().items()}
-        self.printer = st_printer.StructuredTextPrinter(types_in(constants))
+        self.printer = st_printer.StructuredTextPrinter(st_printer.types_in(constants))
         function, lowering = one_iteration_a_call(program.entry), Lowering(constants)
         records = {each.name: Record((each.name,)) for each in function.parameters if isinstance(each.type, RecordType)}
         whole = lowering.block(function, records)
@@ -189,7 +160,7 @@ class OptimizerText:
         constants, split = st_printer.in_pieces(constants_of(kernels))
         self.state = {**dict(state_types(STATE, type_of(optimizer.state))), FIXED_TICKS: Kind.INT, BEGUN: Kind.BOOL,
                       JOBS: Kind.INT, JOB: Kind.INT}  # fmt: skip
-        self.printer = st_printer.StructuredTextPrinter({**types_in(constants), **self.state})
+        self.printer = st_printer.StructuredTextPrinter({**st_printer.types_in(constants), **self.state})
         lowering = Lowering({*constants, *split, *self.state}, split)
         of_session, periods = Name(Kind.INT, dotted(FIXED_TICKS)), len(kernels.rules)
         places: dict[str, Place] = {
@@ -333,7 +304,7 @@ def constants_of(kernels: OptimizerKernels) -> dict[Path, Array]:
     return {path: np.asarray(values) for path, values in found.items()}
 
 
-def state_types(path: Path, kind: Type) -> Iterator[tuple[Path, Kind | ArrayType]]:
+def state_types(path: Path, kind: tree.Type) -> Iterator[tuple[Path, Kind | ArrayType]]:
     """Yield the variables of a state with their types: an array for each number of several records."""
     match kind:
         case RecordType(_, fields):
@@ -380,7 +351,7 @@ class GuardText:
         constants |= {("c", f"golden_{name}"): values for name, values in self._tables.items()}
         state = type_of(beginning(kernels.limits, kernels.limits.low))
         self.state = {**dict(state_types(GUARD_STATE, state)), **dict(state_types(TWIN, state)), GUARD_BEGUN: Kind.BOOL}
-        self.printer = st_printer.StructuredTextPrinter({**types_in(constants), **self.state}, np.float64)
+        self.printer = st_printer.StructuredTextPrinter({**st_printer.types_in(constants), **self.state}, np.float64)
         lowering = Lowering({*constants, *self.state})
         self.entries = [
             lowering.block(each, {one.name: PLACES[one.name] for one in each.parameters if one.name in PLACES})

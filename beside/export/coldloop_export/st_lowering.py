@@ -12,19 +12,7 @@ from types import MappingProxyType
 from typing import Final, NamedTuple, TypeAlias, cast
 
 from coldloop_export import tree
-from coldloop_export.tree import (
-    ArrayType,
-    Assign,
-    Element,
-    Expression,
-    If,
-    Kind,
-    Literal,
-    Name,
-    Operation,
-    Path,
-    Target,
-)
+from coldloop_export.tree import ArrayType, Assign, Element, Expression, If, Kind, Literal, Name, Operation, Path
 
 ZERO = Literal(Kind.INT, 0)
 
@@ -206,7 +194,7 @@ class FunctionLowering:
             case tree.Declare(variable, value):
                 yield from self._declared(variable, value)
             case Assign(target, value):
-                yield from self._assigned(cast("Target", self._expression(target)), value)
+                yield from self._assigned(cast("tree.Target", self._expression(target)), value)
             case tree.Point(variable, part):
                 self.places[variable.name] = self._place(part)
             case tree.Make(variable, parts):
@@ -214,7 +202,7 @@ class FunctionLowering:
             case tree.Copy(target, source):
                 one, other = self._place(target), self._place(source)
                 for name, kind in target.type.fields:  # type: ignore[union-attr]
-                    pair = (cast("Target", part_of(each, name, kind)) for each in (one, other))
+                    pair = (cast("tree.Target", part_of(each, name, kind)) for each in (one, other))
                     yield Assign(*map(self._noted, pair))  # type: ignore[arg-type]
             case tree.Invoke(function, arguments, results):
                 yield self._call(function, arguments, results)
@@ -237,7 +225,7 @@ class FunctionLowering:
         else:
             yield from self._assigned(variable, value or Literal(cast("Kind", variable.type), 0))
 
-    def _assigned(self, target: Target, value: Expression) -> Iterator[tree.Statement]:
+    def _assigned(self, target: tree.Target, value: Expression) -> Iterator[tree.Statement]:
         """Yield an assignment; of a choice, a decision between two."""
         if not isinstance(value, tree.Select):
             yield Assign(target, self._expression(value))

@@ -14,19 +14,7 @@ from typing import Final, TypeVar
 
 from coldloop_export import tree
 from coldloop_export.counting import COUNTED
-from coldloop_export.tree import (
-    Assign,
-    Block,
-    Call,
-    Function,
-    If,
-    Invoke,
-    Kind,
-    Literal,
-    Name,
-    Operation,
-    Statement,
-)
+from coldloop_export.tree import Assign, Block, Call, Function, If, Invoke, Kind, Literal, Name, Operation, Statement
 
 Node = TypeVar("Node")
 START: Final = Name(Kind.BOOL, "start")

@@ -13,20 +13,7 @@ import numpy as np
 from coldloop_export import tree
 from coldloop_export.kernels import Array
 from coldloop_export.st_lowering import Split
-from coldloop_export.tree import (
-    ArrayType,
-    Block,
-    Call,
-    Convert,
-    If,
-    Kind,
-    Literal,
-    Name,
-    Path,
-    Statement,
-    Type,
-    type_of,
-)
+from coldloop_export.tree import ArrayType, Block, Call, Convert, Kind, Literal, Name, Path, Statement, Type, type_of
 from coldloop_rig.text_tables import markdown_table
 
 LONGEST: Final = 32
@@ -257,7 +244,7 @@ class StructuredTextPrinter(tree.TreePrinter):
                 yield f"WHILE {self.expression(condition)} DO"
                 yield from self._body(body, 1)
                 yield "END_WHILE;"
-            case If(condition, body, other):
+            case tree.If(condition, body, other):
                 yield f"IF {self.expression(condition)} THEN"
                 yield from self._body(body, 1)
                 if other:

@@ -9,19 +9,7 @@ from typing import Any, Final, cast
 from coldloop_export import expressions, tree
 from coldloop_export.calls import CallReader, Generic, Returned, rooted
 from coldloop_export.expressions import Elementwise, Kernel, Known, Record, Source, Value, element_of, named
-from coldloop_export.tree import (
-    ArrayType,
-    Assign,
-    Expression,
-    Field,
-    Kind,
-    Literal,
-    Name,
-    Return,
-    Statement,
-    Type,
-    View,
-)
+from coldloop_export.tree import ArrayType, Assign, Expression, Field, Kind, Literal, Name, Statement, Type, View
 
 SAME: Final = "an array has one name and one type: copy() makes another"
 RECORDS: Final = (tree.RecordType, tree.StructType, tree.RowsType)
@@ -365,7 +353,7 @@ class KernelReader(CallReader):
 
     def _return(self, node: ast.Return, value: ast.expr | None) -> list[Statement]:
         if value is None:
-            return [Return()]
+            return [tree.Return()]
         if isinstance(value, ast.Call) and (kernel := self.kernel(value)):
             return self._return_call(node, value, kernel)
         read = self.typed(value, self.read(value))
@@ -377,7 +365,7 @@ class KernelReader(CallReader):
                         for place, part in enumerate(kept))  # fmt: skip
         self._agree(node, results, returned, None)
         stored = [each for target, part in zip(results, kept, strict=True) for each in self.store(target, part)]
-        return [*stored, Return()]
+        return [*stored, tree.Return()]
 
     def _return_call(self, node: ast.Return, value: ast.Call, kernel: Kernel) -> list[Statement]:
         function, arguments = self.call(value, kernel)
@@ -394,11 +382,11 @@ class KernelReader(CallReader):
         if function.returned is None:
             raise self.refusal(node, f"{function.name} has no result")
         self._agree(node, function.results, rerooted(function.returned), None)
-        return [tree.Invoke(function, arguments, function.results), Return()]
+        return [tree.Invoke(function, arguments, function.results), tree.Return()]
 
     def _return_number(self, node: ast.Return, number: Expression) -> list[Statement]:
         self._agree(node, (), None, cast("Kind", number.type))
-        return [Return(number)]
+        return [tree.Return(number)]
 
     def _agree(
         self, node: ast.Return, results: tuple[Name, ...], returned: Returned | None, value: Kind | None

@@ -26,15 +26,7 @@ from coldloop_optimizer_plc.solvers import make_solver
 from coldloop_rig.interruption import INTERRUPTION
 from coldloop_rig.progress import make_console
 from coldloop_rig.results.folders import prepare_folder, writing
-from coldloop_studies.request import (
-    Outcome,
-    Procedure,
-    RunRequest,
-    check,
-    decisive_digest,
-    perform,
-    programs_digest,
-)
+from coldloop_studies.request import Outcome, Procedure, RunRequest, check, decisive_digest, perform, programs_digest
 from coldloop_studies.settings import settings_of
 from coldloop_studies.study import RUNS, Study, StudyOptions
 

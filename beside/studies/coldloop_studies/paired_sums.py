@@ -8,12 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import StudyError
-from coldloop_rig.plc_sizing.intervals import (
-    Interval,
-    crossing,
-    interval_of_mean,
-    jackknife,
-)
+from coldloop_rig.plc_sizing.intervals import Interval, crossing, interval_of_mean, jackknife
 from coldloop_studies.request import Outcome, RunRequest, Series
 from coldloop_studies.study import Load, Outcomes
 
