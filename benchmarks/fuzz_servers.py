@@ -31,8 +31,8 @@ from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers.common import STATISTICS_BLOCK
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.maps import maps_of
+from coldloop_chaos.sequencer import resident_mb
 from coldloop_rig import cli
-from coldloop_rig.chaos.sequencer import resident_mb
 from coldloop_rig.cli.certificates import CLIENTS
 from coldloop_rig.cosim.local_services import LocalServices
 from coldloop_rig.cosim.wiring import SERVICES

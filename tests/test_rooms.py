@@ -14,7 +14,7 @@ FLOORS = {
     "services/plant/coldloop_plant": [["helium"], ["components"], ["cold_box"], ["refrigerator"], ["own"]],
     "services/optimizer_plc/coldloop_optimizer_plc": [["qp"], ["solvers"]],
     "rig/coldloop_rig": [
-        ["results"], ["figures", "cosim"], ["plc_sizing"], ["runs"], ["chaos", "process_file"], ["live"], ["testing"],
+        ["results"], ["figures", "cosim"], ["plc_sizing"], ["runs"], ["process_file"], ["live"], ["testing"],
         ["cli"],
     ],
 }  # fmt: skip

@@ -5,8 +5,8 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop_rig.chaos.faults import Delay, Direction, Drop, Duplicate, Flip, FrameFault, Reorder, Truncate
-from coldloop_rig.chaos.proxy import FrameAction, Mangler, take_frames
+from coldloop_chaos.faults import Delay, Direction, Drop, Duplicate, Flip, FrameFault, Reorder, Truncate
+from coldloop_chaos.proxy import FrameAction, Mangler, take_frames
 
 PDUS = st.binary(min_size=1, max_size=253)
 FRAMES = st.lists(

@@ -8,10 +8,10 @@ from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.plant import PlantSample
 from coldloop.registers.safety import AlarmKind
+from coldloop_chaos.evaluation import ChaosTrace, Evaluation, Mark, RaisedAlarm, evaluate
+from coldloop_chaos.faults import Kill, Reset
+from coldloop_chaos.report import table
 from coldloop_optimizer_plc.qp.design import ControlDesign
-from coldloop_rig.chaos.evaluation import ChaosTrace, Evaluation, Mark, RaisedAlarm, evaluate
-from coldloop_rig.chaos.faults import Kill, Reset
-from coldloop_rig.chaos.report import table
 
 TICKS = 400
 RATE = (0.5, 10.0, 0.1)

@@ -15,8 +15,8 @@ from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import Grant
 from coldloop.registers.declaration import Block
-from coldloop_rig.chaos.faults import Delay, Direction, Drop, Duplicate, Freeze, Reset, Truncate
-from coldloop_rig.chaos.proxy import MOST_FROZEN, LinkProxy
+from coldloop_chaos.faults import Delay, Direction, Drop, Duplicate, Freeze, Reset, Truncate
+from coldloop_chaos.proxy import MOST_FROZEN, LinkProxy
 from tests.harness.records import CONTROL_MAP
 
 COMMON = {"link": "optimizer", "duration_s": 1.0}

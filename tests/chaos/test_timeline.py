@@ -1,7 +1,7 @@
 """When faults begin and end."""
 
-from coldloop_rig.chaos.faults import Freeze, Kill
-from coldloop_rig.chaos.sequencer import Timeline
+from coldloop_chaos.faults import Freeze, Kill
+from coldloop_chaos.sequencer import Timeline
 
 KILL = Kill(kind="kill", process="optimizer", at_s=10, duration_s=20)
 FREEZE = Freeze(kind="freeze", link="plant", at_s=15, duration_s=5)

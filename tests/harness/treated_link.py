@@ -5,8 +5,8 @@ from collections.abc import Callable
 from typing import Self
 
 from coldloop.modbus.settings import Endpoint
-from coldloop_rig.chaos.faults import Direction
-from coldloop_rig.chaos.proxy import LinkProxy, Mangler, reset
+from coldloop_chaos.faults import Direction
+from coldloop_chaos.proxy import LinkProxy, Mangler, reset
 
 Treatment = Callable[[Direction, bytes], bytes | None]
 """Takes a frame; returns what goes on of it. None resets the connection."""

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from coldloop.registers.codec import RecordCodec, Seal, codec_of, seal_of, sealed_bytes
 from coldloop.registers.declaration import Block, Field, Kind, RegisterMap
-from coldloop_rig.chaos.faults import Direction
+from coldloop_chaos.faults import Direction
 from tests.harness.records import map_of
 
 READS: Final = (3, 23)

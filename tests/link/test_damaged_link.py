@@ -9,7 +9,7 @@ import pytest
 from coldloop.registers.audit import EventKind
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import LinkCause
-from coldloop_rig.chaos.faults import Direction
+from coldloop_chaos.faults import Direction
 
 if TYPE_CHECKING:
     from tests.link.conftest import Control, Field, FieldAt

@@ -14,8 +14,8 @@ from coldloop.registers.control_plc import Cause, CoolDownStep, LadderStatus, Li
 from coldloop.registers.plant import Actuators
 from coldloop.registers.safety import AlarmKind, WatchdogTime
 from coldloop.safety.retained import RetainedFile
+from coldloop_chaos.faults import Direction
 from coldloop_control_plc.retained_state import OWNER
-from coldloop_rig.chaos.faults import Direction
 from tests.harness.records import PLANT_MAP
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import LinkCause
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import AlarmKind
-from coldloop_rig.chaos.faults import Direction
+from coldloop_chaos.faults import Direction
 from tests.harness.records import PLANT_MAP
 from tests.link.poison import Change, changed, poisons
 

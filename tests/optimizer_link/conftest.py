@@ -31,10 +31,10 @@ from coldloop.registers.declaration import Block, RegisterMap
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
 from coldloop.safety.lease import WriterLease
 from coldloop.safety.sequence import InputSequence, checksum
+from coldloop_chaos.faults import Direction
+from coldloop_chaos.proxy import reset
 from coldloop_optimizer_plc.runtime import OptimizerPlc
 from coldloop_optimizer_plc.settings import OptimizerSettings
-from coldloop_rig.chaos.faults import Direction
-from coldloop_rig.chaos.proxy import reset
 from tests.harness.records import CONTROL_MAP, PLANT_MAP, sealed
 from tests.harness.treated_link import TreatedLink
 

@@ -14,10 +14,11 @@ from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.sections import NO_LOAD
 from coldloop.process.settings import settings_of
 from coldloop.session.settings import TimeMode
+from coldloop_chaos.commands import plans
+from coldloop_chaos.plan import shipped_plans
 from coldloop_optimizer_plc.qp.design import Preset
 from coldloop_optimizer_plc.settings import SolverName
 from coldloop_plant.load import NAMED
-from coldloop_rig.chaos.plan import shipped_plans
 from coldloop_rig.cli import EXTRAS, command_names, make_parser
 from coldloop_rig.cli.commands import options
 from coldloop_rig.cli.commands.rig import COMMANDS as RIG_COMMANDS
@@ -59,7 +60,7 @@ def test_the_names_that_are_offered_are_those_that_exist() -> None:
     assert sorted(options.REGISTER_FORMATS) == sorted(FORMATS)
     assert sorted(options.TAG_FORMATS) == sorted(EXPORTS)
     assert (*STUDIES, *APART) == commands.STUDIES
-    assert options.plans() == [plan.name for plan in shipped_plans()]
+    assert plans() == [plan.name for plan in shipped_plans()]
 
 
 ONE_AFTER_THE_OTHER = """

@@ -14,6 +14,7 @@ import pytest
 from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.control_plc import Operator, OperatorMode
+from coldloop_chaos.proxy import LinkProxies
 from coldloop_rig import cli
 from coldloop_rig.live.started_rigs import running_rig, state_folder
 from coldloop_rig.live.up import CUT_FILES, CuttableLinks
@@ -227,14 +228,16 @@ def test_a_link_is_cut_for_a_while_and_the_rig_finds_back(coldloop: Coldloop, up
 )
 def test_a_cut_that_makes_no_sense_is_taken_away(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     async def looked() -> None:
-        async with CuttableLinks(tmp_path) as links:
-            file = tmp_path / CUT_FILES.replace("*", "1")
-            file.write_text(text)
-            keeping = asyncio.create_task(links.keep())
-            while file.exists():  # noqa: ASYNC110 it is a file
-                await asyncio.sleep(0)
-            assert not keeping.done()
-            keeping.cancel()
+        proxies = LinkProxies("up")
+        links = CuttableLinks(tmp_path, proxies)
+        file = tmp_path / CUT_FILES.replace("*", "1")
+        file.write_text(text)
+        keeping = asyncio.create_task(links.keep())
+        while file.exists():  # noqa: ASYNC110 it is a file
+            await asyncio.sleep(0)
+        assert not keeping.done()
+        keeping.cancel()
+        await proxies.close()
 
     asyncio.run(looked())
     assert capsys.readouterr().err.count("\n") == 1

@@ -124,7 +124,7 @@ def test_the_links_of_a_rig_in_real_time_can_be_disturbed_and_its_ports_closed_b
 @pytest.mark.usefixtures("processes")
 def test_a_service_that_ends_by_itself_is_named_with_its_log(tmp_path: Path) -> None:
     with up(load="e", folder=tmp_path) as rig:
-        rig._proxied.services.processes["plant"].kill()  # noqa: SLF001 nobody ends a service by itself otherwise
+        rig._services.processes["plant"].kill()  # noqa: SLF001 nobody ends a service by itself otherwise
         with pytest.raises(LinkError, match=r"the plant service was ended by SIGKILL .*plant\.log"):
             rig.advance(60)
 

@@ -114,7 +114,6 @@ GROUPS: Final = {
         "plot": "draw a recorded run again, as PNG, PDF or SVG",
         "report": "one HTML page of a recorded run, with interactive plots",
         "compare": "a table and a figure of several recorded runs",
-        "chaos": "a run with injected faults, and its evaluation",
     },
     "a rig that stays up": {
         "up": "start a rig in real time, on fixed ports",
@@ -125,7 +124,6 @@ GROUPS: Final = {
         "record": "record a session that is under way, to be replayed",
         "page": "the operator's page of a rig, or of recorded runs",
         "events": "the journal of a running service",
-        "proxy": "delays, loses, damages, cuts or refuses Modbus/TCP traffic",
         "certificates": "certificates for Modbus/TCP Security on a test site",
         "registers": "the register maps",
     },
@@ -146,9 +144,9 @@ GROUPS: Final = {
 }
 COMMANDS: Final = {name: said for group in GROUPS.values() for name, said in group.items()}
 MODULES: Final = {
-    "runs": ("run", "record", "rerun", "plot", "report", "compare", "chaos"),
+    "runs": ("run", "record", "rerun", "plot", "report", "compare"),
     "rig": ("up", "down", "status", "set", "fault", "page"),
-    "bus": ("events", "proxy", "certificates", "registers"),
+    "bus": ("events", "certificates", "registers"),
     "plant": ("new", "process", "import", "budget", "model", "identify", "exergy"),
     "help": ("docs", "config", "completion"),
 }

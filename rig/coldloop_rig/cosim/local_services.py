@@ -20,7 +20,7 @@ from coldloop.service.start import COMPILING, SERVING
 from coldloop_rig import PYTHON
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.cosim.session import SessionClient
-from coldloop_rig.cosim.wiring import SERVICES, START_PATIENCE_S, Detours, ReservedPorts, endpoints_on, wired
+from coldloop_rig.cosim.wiring import SERVICES, START_PATIENCE_S, Links, ReservedPorts, endpoints_on, wired
 from coldloop_rig.results.recording import Recorder
 from coldloop_rig.settings import Settings
 
@@ -139,7 +139,7 @@ class LocalServices:
     Args:
         settings: Their configuration.
         log_folder: Their logs go to `<folder>/<service>.log`.
-        detours: Where something is between clients and servers.
+        links: Proxies between clients and servers, not connected yet; they are closed with the services.
         ports: Where they listen; by default on free ports.
         services: Which ones are started; the others are somebody else's.
         optimizer: The command of a service that takes the place of our optimiser.
@@ -150,15 +150,17 @@ class LocalServices:
         settings: Settings,
         log_folder: Path,
         *,
-        detours: Detours | None = None,
+        links: Links | None = None,
         ports: Sequence[int] | None = None,
         services: Sequence[str] = SERVICES,
         optimizer: Sequence[str] = (),
     ) -> None:
         self._ports = ReservedPorts(len(SERVICES) if ports is None else 0)
         self.endpoints = endpoints_on(ports or self._ports.numbers, settings)
-        placed = wired(settings, self.endpoints, detours)
-        self._environment = to_environment(placed)
+        self._links = links
+        if links is not None:
+            links.put_before(self.endpoints)
+        self._environment = to_environment(wired(settings, self.endpoints, None if links is None else links.detours))
         self._commands: dict[str, tuple[str, ...]] = {
             service: (*PYTHON, "-m", f"coldloop_{service}") for service in services
         }
@@ -193,6 +195,8 @@ class LocalServices:
         for process in processes.values():
             await wait_for_end(process)
         await asyncio.gather(*self._watchers)
+        if self._links is not None:
+            await self._links.close()
         self._ports.release()
 
     async def start(self, service: str, environment: Mapping[str, str] | None = None, *, may_end: bool = False) -> None:

@@ -5,10 +5,11 @@ import socket
 import sys
 from collections.abc import AsyncIterator, Sequence
 from contextlib import AbstractContextManager, asynccontextmanager
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
-from coldloop.errors import PeerUnreachableError
+from coldloop.errors import PeerUnreachableError, UsageError
 from coldloop.modbus.settings import PLANT_PORT, Endpoint
 from coldloop.safety.retained import RetainSettings
 from coldloop_rig.settings import Settings
@@ -94,6 +95,36 @@ class Detours(NamedTuple):
     """Port of the plant, for the control PLC."""
     control_plc: int
     """Port of the control PLC, for the optimiser."""
+
+
+class Links(Protocol):
+    """Proxies in the two links of a rig."""
+
+    detours: Detours
+
+    def put_before(self, ends: RigEndpoints) -> None:
+        """Make them, for these servers."""
+
+    async def connect(self) -> None:
+        """Start them: until then no client reaches a server."""
+
+    async def close(self) -> None:
+        """Close them."""
+
+    def cut(self, link: str) -> AbstractContextManager[None]:
+        """Let nothing pass in a link, `plant` or `optimizer`, in this context; its connections stay open."""
+
+
+def fault_injection(part: str) -> Any:  # noqa: ANN401 a class
+    """Return the part of this name that injects faults, by entry point: `links`, called with a seed, or `injector`.
+
+    Raises:
+        UsageError: No package brings one.
+    """
+    found = entry_points(group="coldloop.faults", name=part)
+    if not found:
+        raise UsageError(f"no package brings {part} to inject faults with (entry point coldloop.faults)")
+    return found[part].load()
 
 
 def endpoints_on(ports: Sequence[int], settings: Settings) -> RigEndpoints:

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import nullcontext, suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple, Self
+from typing import Annotated, Final, Literal, NamedTuple, Self
 
 from pydantic import Field, TypeAdapter, ValidationError
 
@@ -29,8 +29,6 @@ from coldloop.registers.plant import Measurement
 from coldloop_hmi.settings import HmiSection, HmiSettings
 from coldloop_hmi.users import PageRole, write_user
 from coldloop_rig import PYTHON
-from coldloop_rig.chaos.faults import Freeze, Link
-from coldloop_rig.chaos.proxy import LinkProxies
 from coldloop_rig.cosim.local_services import (
     LocalServices,
     end_of,
@@ -43,7 +41,15 @@ from coldloop_rig.cosim.local_services import (
 )
 from coldloop_rig.cosim.scenario import with_copied_load
 from coldloop_rig.cosim.session import SessionClient
-from coldloop_rig.cosim.wiring import RETAINING, SERVICES, START_PATIENCE_S, RigEndpoints, retaining
+from coldloop_rig.cosim.wiring import (
+    RETAINING,
+    SERVICES,
+    START_PATIENCE_S,
+    Links,
+    RigEndpoints,
+    fault_injection,
+    retaining,
+)
 from coldloop_rig.live.started_rigs import (
     DEFAULT_PORTS,
     STATE_FILE,
@@ -74,7 +80,7 @@ LOOKING: Final = (PlantLinkState.SEARCHING, PlantLinkState.JOINING)
 class Cut(NamedTuple):
     """A link through which nothing passes for a while; its connections stay open, as when a cable is pulled."""
 
-    link: Link
+    link: Literal["plant", "optimizer"]
     seconds: Annotated[float, Field(gt=0, le=3600)]
     """Duration in real time, s."""
 
@@ -91,12 +97,11 @@ class Cut(NamedTuple):
             raise ValueError("not what `coldloop fault cut` writes") from None
 
 
-class CuttableLinks(LinkProxies):
-    """Proxies that pass everything on, but what is cut on request."""
+class CuttableLinks:
+    """Cuts links on request, by files in the folder of their rig."""
 
-    def __init__(self, folder: Path) -> None:
-        super().__init__("up")
-        self._folder = folder
+    def __init__(self, folder: Path, proxies: Links) -> None:
+        self._folder, self.proxies = folder, proxies
         for file in folder.glob(CUT_FILES):
             file.unlink(missing_ok=True)
 
@@ -125,18 +130,13 @@ class CuttableLinks(LinkProxies):
                 file.unlink(missing_ok=True)
 
     async def _cut(self, cut: Cut) -> None:
-        proxy = self.by_link[cut.link]
-        fault = Freeze(kind="freeze", link=cut.link, at_s=0.0, duration_s=cut.seconds)
-        proxy.begin(fault)
-        say(f"the {cut.link} link is cut for {cut.seconds:g} s")
-        try:
+        with self.proxies.cut(cut.link):
+            say(f"the {cut.link} link is cut for {cut.seconds:g} s")
             await asyncio.sleep(cut.seconds)
-        finally:
-            proxy.end(fault)
         say(f"the {cut.link} link is restored")
 
 
-async def cut(first_port: int | None, link: Link, seconds: float) -> None:
+async def cut(first_port: int | None, link: str, seconds: float) -> None:
     """Cut a link of the rig that was started here on these ports, or of the only one; return when it is cut.
 
     Raises:
@@ -328,7 +328,7 @@ class UpRig:
         self._services = tuple(services)
         self._ports = tuple(ports)
         self._tls = tls
-        self._links = CuttableLinks(self.folder) if cuttable else None
+        self._links = CuttableLinks(self.folder, fault_injection("links")("up")) if cuttable else None
         self._sessions = asyncio.Lock()
         """One session is begun at a time."""
 
@@ -343,14 +343,13 @@ class UpRig:
             with_copied_load(self._settings, self._scenario.load, self.folder),
             make_private(self.folder / "logs"),
             ports=self._ports,
-            detours=None if links is None else links.detours,
+            links=None if links is None else links.proxies,
             services=self._services,
             optimizer=self._optimizer,
         )
-        async with links or nullcontext(), services:
+        async with services:
             if links is not None:
-                links.put_before(services.endpoints)
-                await links.connect()
+                await links.proxies.connect()
             rig = SessionClient(services.endpoints, self._settings, services=self._services)
             page = PageProcess(self._settings, services.endpoints, self.folder) if self._page else None
             try:

@@ -11,20 +11,23 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
-
 from coldloop.errors import LinkError, PeerUnreachableError, UnfitValueError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.settings import Endpoint
-from coldloop.process.settings import settings_of
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap
 from coldloop.registers.maps import maps_of
-from coldloop_rig.chaos.faults import AnyFault, WrongModel
-from coldloop_rig.chaos.proxy import ProxiedServices
-from coldloop_rig.chaos.sequencer import WRONG_MODEL, Injector, save_wrong_model
+from coldloop_rig.cosim.local_services import LocalServices
 from coldloop_rig.cosim.session import SessionClient
-from coldloop_rig.cosim.wiring import QUIET_S, SERVICES, START_PATIENCE_S, RigEndpoints
+from coldloop_rig.cosim.wiring import (
+    QUIET_S,
+    SERVICES,
+    START_PATIENCE_S,
+    Links,
+    RigEndpoints,
+    fault_injection,
+    retaining,
+)
 from coldloop_rig.runs.running import check_certificates, make_scenario
 from coldloop_rig.settings import Period, Settings, configured
 
@@ -35,7 +38,6 @@ END_S: Final = 1.0
 """Longest time from a closed connection until the end of its process is known, s."""
 FEED_S: Final = 0.5
 """Interval at which the load known to the plant is polled in a session in real time, s."""
-_FAULT: Final[TypeAdapter[AnyFault]] = TypeAdapter(AnyFault)
 
 
 class BackgroundLoop:
@@ -181,8 +183,9 @@ class LiveRig:
         maps, self._tick_s = maps_of(settings.process), settings.process.tick_s
         self._scenario = make_scenario(settings)
         self._folder = folder
-        self._proxied = ProxiedServices(settings, folder, str(settings.plant.seed))
-        self.endpoints: RigEndpoints = self._proxied.services.endpoints
+        self._links: Links = fault_injection("links")(str(settings.plant.seed))
+        self._services = LocalServices(retaining(settings, folder, always=True), folder / "logs", links=self._links)
+        self.endpoints: RigEndpoints = self._services.endpoints
         """Endpoints of the services."""
         self._loop = BackgroundLoop()
         self._stack = AsyncExitStack()
@@ -195,7 +198,7 @@ class LiveRig:
             NamedRegisters(register_map, endpoint, self._clients[service], self._call)
             for service, register_map, endpoint in zip(SERVICES, maps, self.endpoints, strict=True)
         )
-        self._injector = Injector(self._proxied.services, self._proxied.proxies, self._clients["plant"], folder)
+        self._injector = fault_injection("injector")(self._services, self._links, self._clients["plant"], folder)
 
     # -- time ----------------------------------------------------------------------------------------------------------
 
@@ -286,17 +289,14 @@ class LiveRig:
         Raises:
             UsageError: There is no such fault, or a parameter is missing or wrong.
         """
-        with settings_of(self.settings.process):
-            fault = _parsed(kind, parameters)
-        if isinstance(fault, WrongModel):
-            save_wrong_model(self.settings.model.file, self._folder / WRONG_MODEL)
+        fault = self._injector.prepared(kind, parameters, self.settings.model.file)
         self._call(self._injector.begin(fault))
         try:
             yield
         finally:
             self._call(self._ended(fault))
 
-    async def _ended(self, fault: AnyFault) -> None:
+    async def _ended(self, fault: object) -> None:
         service = await self._injector.end(fault)
         if service is not None:
             await self._clients[service].connect(START_PATIENCE_S)
@@ -305,12 +305,12 @@ class LiveRig:
         """Return the log of `plant`, `control_plc` or `optimizer_plc`: one JSON object a line."""
         if service not in SERVICES:
             raise UsageError(f"unknown service '{service}'; choose from {', '.join(SERVICES)}")
-        return self._proxied.services.log(service)
+        return self._services.log(service)
 
     # -- start and end -------------------------------------------------------------------------------------------------
 
     def _call(self, work: Coroutine[Any, Any, T]) -> T:
-        services = self._proxied.services
+        services = self._services
         try:
             return self._loop.call(services.during(work))
         except PeerUnreachableError:
@@ -322,10 +322,10 @@ class LiveRig:
         self._loop.call(self._started())
 
     async def _started(self) -> None:
-        await self._stack.enter_async_context(self._proxied)
-        await self._proxied.services.during(self._driver.connect(START_PATIENCE_S))
-        await self._proxied.connect_links()
-        await self._proxied.services.during(self._driver.start(self._scenario))
+        await self._stack.enter_async_context(self._services)
+        await self._services.during(self._driver.connect(START_PATIENCE_S))
+        await self._links.connect()
+        await self._services.during(self._driver.start(self._scenario))
         if self._scenario.realtime:
             task = asyncio.create_task(self._fed(), name="load of the session")
             self._stack.callback(task.cancel)
@@ -347,20 +347,6 @@ class LiveRig:
             client.close()
         self._driver.close()
         await self._stack.aclose()
-
-
-def _parsed(kind: str, parameters: Mapping[str, object]) -> AnyFault:
-    for name in ("at_s", "duration_s", "offset_ms"):
-        if name in parameters:
-            raise UsageError(
-                f"fault '{kind}': {name} belongs to a plan; here the context decides when it begins and ends"
-            )
-    try:
-        return _FAULT.validate_python({"kind": kind, "duration_s": 1.0, **parameters})
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"] if part != kind)
-        raise UsageError(f"fault '{kind}': {f'{where}: ' if where else ''}{first['msg']}") from None
 
 
 @contextmanager

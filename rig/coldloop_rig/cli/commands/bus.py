@@ -24,7 +24,6 @@ from coldloop_rig.cli.commands.options import (
     operator_settings,
     port_base,
     rig_endpoints,
-    say,
 )
 from coldloop_rig.interruption import run_until_interrupted
 
@@ -213,31 +212,6 @@ def _cells(event: "Event", process: "Process") -> list[str]:
     ]  # fmt: skip
 
 
-def _declare_proxy(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("plan", type="read", metavar="PLAN", help="TOML file with the faults (`coldloop docs chaos`)")
-    parser.add_argument("--listen", type=_listener, required=True, metavar="[HOST:]PORT",
-                        help="where clients connect; at 127.0.0.1 unless an address is named")  # fmt: skip
-    parser.add_argument("--to", type=endpoint, required=True, metavar="HOST:PORT", help="the server behind it")
-    parser.add_argument("--seed", type=int, help="decides which frames are hit, instead of the plan's")
-
-
-def _listener(text: str) -> HostPort:
-    return endpoint(text if ":" in text else f"127.0.0.1:{text}")
-
-
-def execute_proxy(options: argparse.Namespace) -> int:
-    """A link to any Modbus/TCP server, disturbed by plan: late, lost, doubled, damaged, cut, refused."""
-    from coldloop.modbus.settings import Endpoint
-    from coldloop_rig.chaos.plan import find_link_plan
-    from coldloop_rig.chaos.proxy import disturb
-
-    plan = find_link_plan(options.plan, {} if options.seed is None else {"seed": options.seed})
-    if options.listen == options.to:
-        raise UsageError(f"--listen {options.to.host}:{options.to.port} is the server itself; listen at another port")
-    target = Endpoint(host=options.to.host, port=options.to.port)
-    return 130 if run_until_interrupted(lambda: disturb(plan, options.listen, target, say)) else 0
-
-
 def _declare_certificates(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type="into", required=True, metavar="DIR", help="folder for the files")
     parser.add_argument("--host", dest="hosts", action="append", default=[], type=_host, metavar="NAME",
@@ -309,7 +283,6 @@ def execute_registers(options: argparse.Namespace) -> int:
 
 COMMANDS: Final = {
     "events": Command(_declare_events, execute_events),
-    "proxy": Command(_declare_proxy, execute_proxy),
     "certificates": Command(_declare_certificates, execute_certificates),
     "registers": Command(_declare_registers, execute_registers),
 }

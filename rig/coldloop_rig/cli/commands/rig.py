@@ -329,10 +329,9 @@ async def _pause(options: argparse.Namespace) -> None:
 
 
 async def _cut(options: argparse.Namespace) -> None:
-    from coldloop_rig.chaos.faults import Link
     from coldloop_rig.live.up import cut
 
-    await cut(first_port_here(options), Link(options.link), options.seconds)
+    await cut(first_port_here(options), options.link, options.seconds)
     sys.stdout.write(f"the {options.link} link is cut for {options.seconds:g} s\n")
 
 

@@ -1,14 +1,13 @@
 """Commands about a run: done, recorded, repeated, drawn, compared."""
 
 import argparse
-import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from coldloop.errors import NOT_FINITE, LinkError, UsageError
+from coldloop.errors import NOT_FINITE, UsageError
 from coldloop.process.updating_periods import duration
 from coldloop.service.command_line import add_configuration_options
 from coldloop_rig.cli.commands.options import (
@@ -24,19 +23,15 @@ from coldloop_rig.cli.commands.options import (
     configuration,
     endpoint,
     exported,
-    number_within,
-    plans,
     refuse_ineffective,
     rig_endpoints,
 )
 
 if TYPE_CHECKING:
-    from coldloop.config import Configuration
     from coldloop.process.declaration import Process
     from coldloop_rig.cosim.scenario import Job
     from coldloop_rig.figures.worker import FigureProcess
     from coldloop_rig.results.recording import Sink
-    from coldloop_rig.settings import Settings
 
 
 def _declare_run(parser: argparse.ArgumentParser) -> None:
@@ -278,94 +273,6 @@ def execute_compare(options: argparse.Namespace) -> int:
     return 0
 
 
-def _declare_chaos(parser: argparse.ArgumentParser) -> None:
-    add_configuration_options(parser)
-    plan = parser.add_argument("plan", type="name", nargs="?", metavar="PLAN", help="a shipped plan, or a TOML file")
-    plan.completer = lambda **_: plans()  # type: ignore[attr-defined]  # argcomplete looks for it
-    parser.add_argument("--list", action="store_true", help="list the shipped plans")
-    parser.add_argument("--out", type="into", help="folder for the results (default: chaos/<plan>-<time>)")
-    parser.add_argument("--force", action="store_true", help="write into a folder that is not empty")
-    parser.add_argument("--seed", type=_seed, dest="plan_seed", help="instead of the plan's")
-    parser.add_argument("--duration", type=duration, help="plant time, such as 2h or 90s, instead of the plan's")
-    parser.add_argument("--load", type="name", dest="plan_load",
-                        help="a named load or a CSV file, instead of the plan's")  # fmt: skip
-    parser.add_argument("--mode", choices=MODES, dest="plan_mode",
-                        help="instead of the plan's")  # fmt: skip
-    parser.add_argument("--factor", type=float, dest="plan_factor", help="instead of the plan's")
-    parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png"], metavar="FORMAT",
-                        help="of the run's picture: png, pdf, svg (default: png)")  # fmt: skip
-
-
-def _seed(text: str) -> int:
-    return number_within(text, 0, math.inf, "a whole number of at least 0")
-
-
-def execute_chaos(options: argparse.Namespace) -> int:
-    """A run with faults on purpose, and what the fail-safe side made of them."""
-    if options.list:
-        from coldloop_rig.chaos.plan import shipped_plans
-
-        sys.stdout.write("".join(f"{plan.name:20} {plan.description}\n" for plan in shipped_plans()))
-        return 0
-    check_load(options.plan_load)
-    if options.plan is None:
-        raise UsageError("name a plan; `coldloop chaos --list` lists the shipped ones")
-    from coldloop.process.settings import settings_of
-    from coldloop_rig.chaos.plan import find_plan
-
-    effective, changes = configuration(options), _changes(options)
-    with settings_of(effective.settings.process):
-        plan = find_plan(options.plan, changes)
-    _refuse_what_has_no_effect(effective)
-    from coldloop_rig.chaos.experiment import perform
-    from coldloop_rig.chaos.report import ChaosProgress, plot_chaos, summary_lines, table, write_report
-    from coldloop_rig.results.folders import claim_folder, claim_folder_of_now, writing
-    from coldloop_rig.runs.running import plain_arguments
-
-    out = options.out or claim_folder_of_now(Path("chaos"), plan.name)
-    claim_folder(out, force=options.force)
-    with ChaosProgress(plan) as progress:
-        experiment = perform(
-            plan, effective, out, progress, arguments=plain_arguments(options), formats=options.figures
-        )
-    with writing(out, "no report was written, choose another --out"):
-        write_report(out, experiment)
-        plot_chaos(out / "chaos.png", experiment)
-    sys.stdout.write(table(experiment.evaluation.rows, plan.process))
-    lines = (*summary_lines(experiment.trace, experiment.evaluation), f"results in {out}")
-    sys.stdout.write("".join(f"{line}\n" for line in lines))
-    if experiment.failure is not None:
-        raise LinkError(experiment.failure)
-    return 0
-
-
-def _refuse_what_has_no_effect(effective: "Configuration[Settings]") -> None:
-    """Refuse a value from the command line that the plan's own, or that of the command, would replace."""
-    from coldloop_rig.chaos.plan import OF_PLAN
-
-    refuse_ineffective(
-        effective,
-        {
-            **{key: f"the plan has its own value; change it with {option}" for key, option in OF_PLAN.items()},
-            **dict.fromkeys(PLACES, OWN_PORTS),
-            "session.autostart": "it begins a session",
-            "plant.retain.file": "the states are retained in the folder of the results",
-            "control_plc.retain.file": "the states are retained in the folder of the results",
-        },
-    )
-
-
-def _changes(options: argparse.Namespace) -> dict[str, Any]:
-    given = {
-        "seed": options.plan_seed,
-        "duration_s": options.duration and options.duration.seconds,
-        "load": options.plan_load,
-        "mode": options.plan_mode,
-        "factor": options.plan_factor,
-    }
-    return {name: value for name, value in given.items() if value is not None}
-
-
 COMMANDS: Final = {
     "run": Command(_declare_run, execute_run),
     "record": Command(_declare_record, execute_record),
@@ -373,5 +280,4 @@ COMMANDS: Final = {
     "plot": Command(_declare_plot, execute_plot),
     "report": Command(_declare_report, execute_report),
     "compare": Command(_declare_compare, execute_compare),
-    "chaos": Command(_declare_chaos, execute_chaos),
 }

@@ -9,16 +9,17 @@ from typing import Any, Final, NamedTuple
 from coldloop.config import Configuration
 from coldloop.errors import LinkError
 from coldloop.process.lti_model import load as load_model
+from coldloop_chaos.evaluation import ChaosTrace, Evaluation, evaluate
+from coldloop_chaos.faults import WrongModel
+from coldloop_chaos.plan import ChaosPlan
+from coldloop_chaos.proxy import LinkProxies
+from coldloop_chaos.sequencer import WRONG_MODEL, FaultSequencer, Injector, Progress, save_wrong_model
 from coldloop_optimizer_plc.qp.design import ControlDesign
-from coldloop_rig.chaos.evaluation import ChaosTrace, Evaluation, evaluate
-from coldloop_rig.chaos.faults import WrongModel
-from coldloop_rig.chaos.plan import ChaosPlan
-from coldloop_rig.chaos.proxy import ProxiedServices
-from coldloop_rig.chaos.sequencer import WRONG_MODEL, FaultSequencer, Injector, Progress, save_wrong_model
+from coldloop_rig.cosim.local_services import LocalServices
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Job, Scenario, with_copied_load
 from coldloop_rig.cosim.session import SessionClient
-from coldloop_rig.cosim.wiring import START_PATIENCE_S
+from coldloop_rig.cosim.wiring import START_PATIENCE_S, retaining
 from coldloop_rig.figures.worker import FigureProcess
 from coldloop_rig.results.recording import Recorder, Recording, Way
 from coldloop_rig.runs.running import run_into
@@ -46,14 +47,15 @@ async def conduct(
         await asyncio.to_thread(save_wrong_model, settings.model.file, folder / WRONG_MODEL)
     copied = with_copied_load(settings, scenario.load, folder)
     async with AsyncExitStack() as stack:
-        proxied = await stack.enter_async_context(ProxiedServices(copied, folder, str(plan.seed)))
-        services = proxied.services
+        links = LinkProxies(str(plan.seed))
+        retained = retaining(copied, folder, always=True)
+        services = await stack.enter_async_context(LocalServices(retained, folder / "logs", links=links))
         client = SessionClient(services.endpoints, settings, tolerant=True)
         stack.callback(client.close)
         await services.during(client.connect(START_PATIENCE_S))
-        await proxied.connect_links()
+        await links.connect()
         await services.during(client.begin(scenario, recorder))
-        injector = Injector(services, proxied.proxies, client.plant, folder)
+        injector = Injector(services, links, client.plant, folder)
         driver = FaultSequencer(plan, services, client, injector, trace, progress)
         try:
             async with asyncio.timeout(_patience_s(plan)):

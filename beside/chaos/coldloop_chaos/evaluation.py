@@ -12,8 +12,8 @@ from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import LadderStatus, Mode
 from coldloop.registers.plant import PlantSample
 from coldloop.registers.safety import Alarm, alarm_key
+from coldloop_chaos.faults import AnyFault
 from coldloop_optimizer_plc.qp.design import ControlDesign
-from coldloop_rig.chaos.faults import AnyFault
 from coldloop_rig.results.indicators import excess_of
 from coldloop_rig.results.recording import CONTROL, LinkStatistics, Recording, Sink
 

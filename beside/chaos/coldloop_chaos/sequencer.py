@@ -11,23 +11,25 @@ from pathlib import Path
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from coldloop.config import PREFIX
-from coldloop.errors import LinkError, PeerUnreachableError, RequestRefusedError
+from coldloop.errors import LinkError, PeerUnreachableError, RequestRefusedError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.cold_box import L1, TICK_S
 from coldloop.process.lti_model import discretise, load
+from coldloop.process.settings import settings_of
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import LadderStatus
 from coldloop.registers.plant import SensorFault, SensorFaultKind, Surroundings
 from coldloop.registers.safety import Alarm, alarms_of
+from coldloop_chaos import faults
+from coldloop_chaos.evaluation import ChaosTrace, Mark, Resources
+from coldloop_chaos.plan import ChaosPlan
+from coldloop_chaos.proxy import LinkProxies
 from coldloop_plant.cold_box.model import find_equilibrium, linearise
 from coldloop_plant.helium.properties import load_helium
 from coldloop_plant.kinds import box_of
-from coldloop_rig.chaos import faults
-from coldloop_rig.chaos.evaluation import ChaosTrace, Mark, Resources
-from coldloop_rig.chaos.plan import ChaosPlan
-from coldloop_rig.chaos.proxy import LinkProxy
 from coldloop_rig.cosim.local_services import LocalServices
 from coldloop_rig.cosim.session import CONTACT_S, SessionClient
 from coldloop_rig.cosim.wiring import SERVICES
@@ -60,23 +62,46 @@ def save_wrong_model(right: Path, wrong: Path) -> None:
 T = TypeVar("T")
 
 ATTEMPTS: Final = 20
+_FAULT: Final[TypeAdapter[faults.AnyFault]] = TypeAdapter(faults.AnyFault)
 _SHOWN: Final = {"nan": SensorFaultKind.NOT_A_NUMBER, "frozen": SensorFaultKind.FROZEN, "value": SensorFaultKind.VALUE}
 
 
 @dataclass
 class Injector:
-    """Acts on the processes, the proxies and the plant's sensors of one run, in whose folder is a wrong model."""
+    """Acts on the processes, the links and the plant's sensors of one run, in whose folder is a wrong model."""
 
     services: LocalServices
-    proxies: Mapping[faults.Link, LinkProxy]
+    links: LinkProxies
     plant: RegisterClient
     folder: Path
     _given_before: dict[str, float] = field(default_factory=dict)
 
+    def prepared(self, kind: str, parameters: Mapping[str, object], model: Path) -> faults.AnyFault:
+        """Return a fault whose times the caller decides, and write the wrong model that it may need for this one.
+
+        Raises:
+            UsageError: There is no such fault, or a parameter is missing or wrong.
+        """
+        for name in ("at_s", "duration_s", "offset_ms"):
+            if name in parameters:
+                raise UsageError(
+                    f"fault '{kind}': {name} belongs to a plan; here the context decides when it begins and ends"
+                )
+        try:
+            with settings_of(self.plant.process):
+                fault = _FAULT.validate_python({"kind": kind, "duration_s": 1.0, **parameters})
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"] if part != kind)
+            raise UsageError(f"fault '{kind}': {f'{where}: ' if where else ''}{first['msg']}") from None
+        if isinstance(fault, faults.WrongModel):
+            save_wrong_model(model, self.folder / WRONG_MODEL)
+        return fault
+
     async def begin(self, fault: faults.AnyFault) -> None:
         """Bring a fault about."""
         if isinstance(fault, faults.LinkFault):
-            self.proxies[fault.link].begin(fault)
+            self.links.by_link[fault.link].begin(fault)
         elif isinstance(fault, faults.Kill):
             await self.services.stop(faults.SERVICE_OF[fault.process], signal.SIGKILL)
         elif isinstance(fault, faults.Restart):
@@ -98,7 +123,7 @@ class Injector:
     async def end(self, fault: faults.AnyFault) -> str | None:
         """Take a fault back; return the service that has been started again, if one has."""
         if isinstance(fault, faults.LinkFault):
-            self.proxies[fault.link].end(fault)
+            self.links.by_link[fault.link].end(fault)
         elif isinstance(fault, faults.Kill | faults.Restart):
             service = faults.SERVICE_OF[fault.process]
             await self.services.start(service)

@@ -15,9 +15,9 @@ from coldloop.process.settings import ProcessSettings, one_of, settings_process,
 from coldloop.process.updating_periods import whole_ticks
 from coldloop.session.settings import TimeMode
 from coldloop.text_file import read_text
+from coldloop_chaos.faults import AnyFault, AnyLinkFault, BoundaryFault, Link, LinkFault
 from coldloop_plant.load import concatenated, find_load, named_families, telegraph
 from coldloop_plant.settings import PlantKind
-from coldloop_rig.chaos.faults import AnyFault, AnyLinkFault, BoundaryFault, Link, LinkFault
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.settings import Settings
 
@@ -74,7 +74,7 @@ def _completed(fault: object) -> object:
 
 P = TypeVar("P", bound=BaseModel)
 
-SHIPPED: Final = files("coldloop_rig.chaos") / "plans"
+SHIPPED: Final = files("coldloop_chaos") / "plans"
 
 OF_PLAN: Final = {
     "plant.load": "--load", "plant.seed": "--seed", "session.mode": "--mode", "session.factor": "--factor",

@@ -21,9 +21,9 @@ from coldloop.registers.control_plc import LadderStatus, Mode
 from coldloop.registers.safety import AlarmState, alarm_key, alarms_of
 from coldloop.service.event_text import alarm_word
 from coldloop.text_file import whole_file, whole_text
-from coldloop_rig.chaos.evaluation import ChaosTrace, Evaluation, RaisedAlarm, Row
-from coldloop_rig.chaos.experiment import Experiment
-from coldloop_rig.chaos.plan import ChaosPlan
+from coldloop_chaos.evaluation import ChaosTrace, Evaluation, RaisedAlarm, Row
+from coldloop_chaos.experiment import Experiment
+from coldloop_chaos.plan import ChaosPlan
 from coldloop_rig.figures import plot
 from coldloop_rig.progress import PlantTimeBar, clock, make_console
 from coldloop_rig.results.folders import write_json

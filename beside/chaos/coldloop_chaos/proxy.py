@@ -5,20 +5,15 @@ import contextlib
 import random
 import socket
 import struct
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import AsyncExitStack
-from pathlib import Path
-from types import TracebackType
-from typing import Final, NamedTuple, Self
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Final, NamedTuple
 
 from coldloop.errors import UsageError
 from coldloop.modbus.requests import MalformedFrameError, next_frame
 from coldloop.modbus.settings import Endpoint
-from coldloop_rig.chaos import faults
-from coldloop_rig.chaos.plan import LinkPlan
-from coldloop_rig.cosim.local_services import LocalServices
-from coldloop_rig.cosim.wiring import Detours, ReservedPorts, RigEndpoints, retaining
-from coldloop_rig.settings import Settings
+from coldloop_chaos import faults
+from coldloop_chaos.plan import LinkPlan
+from coldloop_rig.cosim.wiring import Detours, ReservedPorts, RigEndpoints
 
 Replacing = faults.Drop | faults.Duplicate | faults.ExceptionAnswer | faults.Flip | faults.WrongUnit
 UNIT: Final = 6
@@ -314,7 +309,7 @@ async def disturb(plan: LinkPlan, listen: tuple[str, int], target: Endpoint, say
 
 
 class LinkProxies:
-    """A proxy in each of the two links; a context that has their ports. The seed decides which frames are hit."""
+    """A proxy in each of the two links, on ports of their own. The seed decides which frames are hit."""
 
     def __init__(self, seed: str) -> None:
         self._seed = seed
@@ -334,45 +329,19 @@ class LinkProxies:
         for proxy in self.by_link.values():
             await proxy.start()
 
-    async def __aenter__(self) -> Self:
-        """Return them, not started yet."""
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
+    async def close(self) -> None:
         """Close them."""
         for proxy in self.by_link.values():
             await proxy.close()
         self._reserved.release()
 
-
-class ProxiedServices:
-    """Processes of the three services, whose clients are pointed at proxies; an async context in which they run.
-
-    The control PLC and the plant keep their state in the folder: one that is killed and restarted resumes. Logs are in
-    `logs` there.
-    """
-
-    def __init__(self, settings: Settings, folder: Path, seed: str) -> None:
-        self._proxies = LinkProxies(seed)
-        self.services = LocalServices(
-            retaining(settings, folder, always=True), folder / "logs", detours=self._proxies.detours
-        )
-        self._proxies.put_before(self.services.endpoints)
-        self.proxies = self._proxies.by_link
-        self._stack = AsyncExitStack()
-
-    async def __aenter__(self) -> Self:
-        """Start the services."""
-        await self._stack.enter_async_context(self._proxies)
-        await self._stack.enter_async_context(self.services)
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """End services and proxies."""
-        await self._stack.__aexit__(kind, error, trace)
-
-    async def connect_links(self) -> None:
-        """Start the proxies: until then no service reaches another one."""
-        await self._proxies.connect()
+    @contextlib.contextmanager
+    def cut(self, link: str) -> Iterator[None]:
+        """Let nothing pass in a link in this context; its connections stay open."""
+        proxy = self.by_link[faults.Link(link)]
+        fault = faults.Freeze(kind="freeze", link=faults.Link(link), duration_s=1.0)
+        proxy.begin(fault)
+        try:
+            yield
+        finally:
+            proxy.end(fault)
