@@ -15,10 +15,9 @@ import numpy as np
 
 from coldloop.process.lti_model import load
 from coldloop.process.settings import InputLimits
-from coldloop_optimizer_plc.qp.design import ControlDesign, trivial_design
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, state_weights
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
-from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
+from coldloop_optimizer_plc.settings import ControlDesign, ProgramSettings, SolverName, trivial_design
 from coldloop_optimizer_plc.solvers import make_solver
 from coldloop_rig.settings import Settings
 

@@ -17,7 +17,7 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.maps import maps_of
-from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.load import find_load
 from coldloop_plant.program import PlantProgram

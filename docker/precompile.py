@@ -134,7 +134,7 @@ def in_one_process(**changes: Any) -> Callable[[], None]:  # noqa: ANN401 sectio
 def linear_models() -> None:
     """Linearise both plants, which takes kernels of complex numbers."""
     from coldloop.process.settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
-    from coldloop_optimizer_plc.qp.design import ControlDesign  # noqa: PLC0415
+    from coldloop_optimizer_plc.settings import ControlDesign  # noqa: PLC0415
     from coldloop_plant.cold_box.plant_file import PlantFile  # noqa: PLC0415
     from coldloop_plant.refrigerator.model import make_refrigerator_file  # noqa: PLC0415
     from coldloop_rig.cli.model_listing import describe_model  # noqa: PLC0415 not in the images

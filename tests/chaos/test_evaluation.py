@@ -11,7 +11,7 @@ from coldloop.registers.safety import AlarmKind
 from coldloop_chaos.evaluation import ChaosTrace, Evaluation, Mark, RaisedAlarm, evaluate
 from coldloop_chaos.faults import Kill, Reset
 from coldloop_chaos.report import table
-from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.settings import ControlDesign
 
 TICKS = 400
 RATE = (0.5, 10.0, 0.1)

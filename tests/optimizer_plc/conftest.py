@@ -19,10 +19,9 @@ from coldloop.safety.sequence import InputSequence
 from coldloop_control_plc.program import make_program
 from coldloop_control_plc.settings import ControlSection
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.qp.design import ControlDesign, Preset
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
-from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.settings import ControlDesign, Preset, ProgramSettings
 from coldloop_optimizer_plc.solvers import Answer, Solver, make_solver
 from coldloop_plant.cold_box.plant_file import REFERENCE
 from coldloop_plant.cold_box.program import ColdBoxProgram

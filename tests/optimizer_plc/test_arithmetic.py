@@ -15,10 +15,9 @@ from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.computing_settings import Arithmetic, EstimatorKind, OdeSettings
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.qp.costs import augmented_cost
-from coldloop_optimizer_plc.qp.design import Preset
 from coldloop_optimizer_plc.qp.linear_algebra import real_of
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
-from coldloop_optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings
+from coldloop_optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, Preset, ProgramSettings
 from coldloop_optimizer_plc.solvers.ode import ode_solver
 from tests.harness.processes import Processes
 from tests.optimizer_plc.single_precision import code, has_double
@@ -30,7 +29,7 @@ Array = NDArray[np.float64]
 
 SINGLE = real_of(Arithmetic.FLOAT32)
 
-ON_LINE = {"qp.instance.instance", "qp.profile.inputs_of", "decisions.take_update", "scheme.solve"}
+ON_LINE = {"qp.problem.instance", "qp.problem.inputs_of", "decisions.take_update", "scheme.solve"}
 """Kernels that the program calls; those that they call, solvers and rules among them, are part of their code."""
 
 

@@ -6,10 +6,9 @@ from pydantic import ValidationError
 
 from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.qp.costs import indicators
-from coldloop_optimizer_plc.qp.design import ControlDesign, Preset
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
-from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.settings import ControlDesign, Preset, ProgramSettings
 from coldloop_rig import simulate
 
 LIMITS = InputLimits()

@@ -12,9 +12,8 @@ from coldloop.process.lti_model import LtiModel
 from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.decisions import limit_of_feed, most_open
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.qp.design import Preset
 from coldloop_optimizer_plc.scheme import Constants, problem_at
-from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.settings import Preset, ProgramSettings
 
 pytestmark = pytest.mark.usefixtures("compiles")  # these kernels are called by others alone
 

@@ -24,10 +24,10 @@ from coldloop_optimizer_plc.estimator import (
     predict,
     stationary_gains,
 )
-from coldloop_optimizer_plc.qp.design import ControlDesign
 from coldloop_optimizer_plc.qp.linear_algebra import respond
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
+from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_rig import simulate
 from coldloop_rig.testing import LiveRig, up
 

@@ -12,10 +12,9 @@ from coldloop.process.settings import InputLimits, settings_of
 from coldloop_optimizer_plc.computing_settings import EstimatorSettings
 from coldloop_optimizer_plc.estimator import estimator_of
 from coldloop_optimizer_plc.program import Forecasts, OptimizerProgram
-from coldloop_optimizer_plc.qp.design import ControlDesign
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import condense, interpolation
-from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.settings import ControlDesign, ProgramSettings
 
 DESIGN = ControlDesign()
 WEIGHTS = interpolation(DESIGN.decision_instants, np.arange(1.0, DESIGN.horizon + 1))

@@ -9,18 +9,20 @@ import pytest
 from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
-from coldloop_optimizer_plc.qp.design import Preset
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem
-from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
-from coldloop_optimizer_plc.solvers import Answer, Solver, hybrid, make_solver
-from coldloop_optimizer_plc.solvers.hybrid import (
+from coldloop_optimizer_plc.settings import Preset, ProgramSettings, SolverName
+from coldloop_optimizer_plc.solvers import (
+    Answer,
     HybridMethod,
+    Solver,
     allowed_in,
     in_slots,
     is_far,
     iterations_in,
+    make_solver,
     picoseconds,
     slots_begun,
+    solve_hybrid,
 )
 from coldloop_optimizer_plc.solvers.interface import KERNELS, Costs
 
@@ -37,11 +39,11 @@ def choices(monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, Costs]]:
 
     def noted(switch: float, guessed: float, before: Costs) -> bool:
         made.append((float(guessed), Costs(*map(float, before))))
-        return bool(hybrid.is_far(switch, guessed, before))
+        return bool(is_far(switch, guessed, before))
 
     plain = types.FunctionType(
-        hybrid.solve.py_func.__code__,  # type: ignore[attr-defined] # of a kernel
-        hybrid.solve.py_func.__globals__ | {"is_far": noted},  # type: ignore[attr-defined]
+        solve_hybrid.py_func.__code__,  # type: ignore[attr-defined] # of a kernel
+        solve_hybrid.py_func.__globals__ | {"is_far": noted},  # type: ignore[attr-defined]
     )
     monkeypatch.setitem(KERNELS, HybridMethod, plain)
     return made

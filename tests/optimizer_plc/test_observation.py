@@ -23,10 +23,9 @@ from coldloop.safety.sequence import InputSequence
 from coldloop_optimizer_plc import solvers
 from coldloop_optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.qp.design import Preset
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 from coldloop_optimizer_plc.rules import Assessment, Observation, decides_by
-from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.settings import Preset, ProgramSettings
 
 pytestmark = pytest.mark.usefixtures("compiles")
 

@@ -17,10 +17,9 @@ from coldloop_optimizer_plc.plausibility import (
     suspects_of,
     watched_output,
 )
-from coldloop_optimizer_plc.qp.design import Preset
 from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real, real_of, respond
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
-from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.settings import Preset, ProgramSettings
 
 Array = NDArray[np.float64]
 

@@ -10,9 +10,8 @@ from scipy.linalg import solve_triangular
 
 from coldloop_optimizer_plc.computing_settings import OdeSettings
 from coldloop_optimizer_plc.qp import costs, linear_algebra
-from coldloop_optimizer_plc.qp.design import PenaltySettings
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
-from coldloop_optimizer_plc.settings import SolverName
+from coldloop_optimizer_plc.settings import PenaltySettings, SolverName
 from coldloop_optimizer_plc.solvers import fast_gradient, interior_point, ode
 from coldloop_optimizer_plc.solvers.ode import flow_in
 from coldloop_rig.plc_sizing import operations

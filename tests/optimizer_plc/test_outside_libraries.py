@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from coldloop.errors import ConfigurationError
-from coldloop_optimizer_plc import outside
-from coldloop_optimizer_plc.computing_settings import DaqpSettings, OutsideSettings
-from coldloop_optimizer_plc.outside import Part, made
+from coldloop_optimizer_plc import computing_settings
+from coldloop_optimizer_plc.computing_settings import DaqpSettings, OutsideSettings, Part, made
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.interface import OutsideSolver
 from coldloop_optimizer_plc.solvers.outside_libraries import DaqpSolver, softened
@@ -31,7 +30,7 @@ pytestmark = pytest.mark.parametrize("name", POINTS)
 def named(monkeypatch: pytest.MonkeyPatch) -> None:
     """The entry points of this tree, whatever is installed."""
     monkeypatch.setattr(
-        outside, "entry_points",
+        computing_settings, "entry_points",
         lambda group: EntryPoints(EntryPoint(name, value, group) for name, value in POINTS.items()),
     )  # fmt: skip
 

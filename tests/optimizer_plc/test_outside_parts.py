@@ -19,10 +19,9 @@ from coldloop.process.lti_model import LtiModel
 from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import Plan, Update
 from coldloop.registers.optimizer_plc import UpdatingRuleKind
-from coldloop_optimizer_plc import outside
+from coldloop_optimizer_plc import computing_settings
 from coldloop_optimizer_plc.computing_settings import BudgetSettings, OutsideSettings, PlcBudget
-from coldloop_optimizer_plc.estimator import no_belief
-from coldloop_optimizer_plc.outside import Measured, OutsideEstimator, PlantModel
+from coldloop_optimizer_plc.estimator import Measured, OutsideEstimator, PlantModel, no_belief
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
@@ -126,7 +125,7 @@ def named(monkeypatch: pytest.MonkeyPatch) -> None:
     names = [one.__name__ for one in classes] + ["Missing"]
     monkeypatch.setitem(sys.modules, __name__, sys.modules[__name__])
     monkeypatch.setattr(
-        outside, "entry_points",
+        computing_settings, "entry_points",
         lambda group: EntryPoints(EntryPoint(name, f"{__name__}:{name}", group) for name in names),
     )  # fmt: skip
 

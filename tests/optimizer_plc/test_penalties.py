@@ -16,10 +16,9 @@ from coldloop_optimizer_plc.computing_settings import (
     PlausibilitySettings,
 )
 from coldloop_optimizer_plc.qp.costs import augmented_cost, indicators
-from coldloop_optimizer_plc.qp.design import ControlDesign, PenaltySettings, Preset, presets_of
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
-from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.settings import ControlDesign, PenaltySettings, Preset, ProgramSettings, presets_of
 from coldloop_optimizer_plc.solvers.ode import ode_solver
 
 if TYPE_CHECKING:

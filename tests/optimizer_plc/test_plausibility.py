@@ -16,10 +16,9 @@ from coldloop_optimizer_plc.estimator import (
     predict,
 )
 from coldloop_optimizer_plc.plausibility import MISSING, USED, new_readings, suspects_of, wanders_off
-from coldloop_optimizer_plc.qp.design import Preset
 from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real, real_of, respond
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
-from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.settings import Preset, ProgramSettings
 
 Array = NDArray[np.float64]
 

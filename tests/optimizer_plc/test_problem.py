@@ -15,9 +15,9 @@ from coldloop.process.lti_model import LtiModel
 from coldloop.process.settings import InputLimits, RateReference
 from coldloop_optimizer_plc.qp import costs
 from coldloop_optimizer_plc.qp.costs import augmented_cost, indicators, matrices_of, quadratic_cost
-from coldloop_optimizer_plc.qp.design import ControlDesign, trivial_design
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
+from coldloop_optimizer_plc.settings import ControlDesign, trivial_design
 
 if TYPE_CHECKING:
     from tests.optimizer_plc.conftest import Optimum, Situations

@@ -14,9 +14,8 @@ from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Verdict
 from coldloop_optimizer_plc.computing_settings import FastGradientSettings, InteriorPointSettings, QpoasesSettings
-from coldloop_optimizer_plc.qp.design import Preset
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
-from coldloop_optimizer_plc.settings import OptimizerSection, ProgramSettings, SolverName
+from coldloop_optimizer_plc.settings import OptimizerSection, Preset, ProgramSettings, SolverName
 from coldloop_optimizer_plc.solvers import Solver, judged, make_solver, outside_libraries
 from coldloop_optimizer_plc.solvers.fast_gradient import fast_gradient_solver, step_sizes, stiffest_hessian
 from coldloop_optimizer_plc.solvers.interior_point import interior_point_solver

@@ -17,12 +17,17 @@ from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.computing_settings import Arithmetic, EstimatorSettings
 from coldloop_optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
 from coldloop_optimizer_plc.qp.costs import quadratic_cost
-from coldloop_optimizer_plc.qp.design import ControlDesign, Preset, Target
 from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real, real_of
-from coldloop_optimizer_plc.qp.prediction import PredictionModel, state_weights
+from coldloop_optimizer_plc.qp.prediction import (
+    PredictionModel,
+    TargetSearch,
+    find_target,
+    rest_of,
+    state_weights,
+    target_search,
+)
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
-from coldloop_optimizer_plc.qp.target import TargetSearch, find_target, rest_of, target_search
-from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.settings import ControlDesign, Preset, ProgramSettings, Target
 from coldloop_rig import simulate
 
 Array = NDArray[np.float64]

@@ -7,8 +7,8 @@ from coldloop.process.cold_box import OUTPUT_NAMES, STATE_NAMES
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load
 from coldloop.process.settings import SHIPPED_MODELS, ModelSettings
-from coldloop_optimizer_plc.qp.design import ControlDesign
 from coldloop_optimizer_plc.qp.prediction import state_weights
+from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_plant.refrigerator.model import prediction_model
 from coldloop_plant.refrigerator.program import SHIPPED, RefrigeratorProgram, read_refrigerator_file
 from coldloop_plant.refrigerator.settings import EventSchedule, StationSettings

@@ -18,9 +18,8 @@ from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.ode import ode_solver
 from coldloop_rig.plc_sizing import operations
 from coldloop_rig.plc_sizing.budget import problem_of
-from coldloop_rig.plc_sizing.exported import cost_text, misfits, read_cost
 from coldloop_rig.plc_sizing.operations import Operations, dense_sizes
-from coldloop_rig.plc_sizing.plc import PlcProfile, find_profile
+from coldloop_rig.plc_sizing.plc import PlcProfile, cost_text, find_profile, misfits, read_cost
 from coldloop_rig.settings import Settings
 from tests.plc_export.recorded_optimizers import recorded_updates, recorder
 

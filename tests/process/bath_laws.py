@@ -17,8 +17,7 @@ from coldloop_control_plc.sensors import SensorCheckSettings, SensorMonitor, may
 from coldloop_optimizer_plc.computing_settings import signals_of
 from coldloop_optimizer_plc.decisions import Latched, begin_again, most_open, shortage
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.qp.prediction import state_weights
-from coldloop_optimizer_plc.qp.target import bounds_at, find_target, least_warm_load, loads_held
+from coldloop_optimizer_plc.qp.prediction import bounds_at, find_target, least_warm_load, loads_held, state_weights
 from coldloop_optimizer_plc.scheme import problem_at
 from coldloop_optimizer_plc.settings import ProgramSettings
 from tests.harness.records import Row

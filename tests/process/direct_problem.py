@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from coldloop.process.lti_model import load
 from coldloop.process.settings import InputLimits, settings_of
-from coldloop_optimizer_plc.qp.design import ControlDesign
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
+from coldloop_optimizer_plc.settings import ControlDesign
 from tests.harness.reference_qp import solved_by_daqp
 
 Array = NDArray[np.float64]

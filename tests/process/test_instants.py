@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.errors import StudyError
-from coldloop_optimizer_plc.qp.design import ControlDesign
-from coldloop_rig.plc_sizing.adaptive_gain import over_best_fixed
+from coldloop_optimizer_plc.settings import ControlDesign
+from coldloop_rig.plc_sizing.intervals import over_best_fixed
 from coldloop_studies.instants import Judged, candidates, drawn, losses, proposed, spread
 
 

@@ -13,8 +13,7 @@ from coldloop.process.model_file import read_header
 from coldloop.process.settings import InputLimits, RateReference
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Verdict
-from coldloop_optimizer_plc.qp.design import ControlDesign
-from coldloop_optimizer_plc.settings import OptimizerSection, ProgramSettings
+from coldloop_optimizer_plc.settings import ControlDesign, OptimizerSection, ProgramSettings
 from coldloop_plant.kinds import make_program
 from coldloop_plant.settings import SensorSettings
 from coldloop_rig.cosim.scenario import Scenario

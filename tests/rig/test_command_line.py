@@ -16,8 +16,7 @@ from coldloop.process.settings import settings_of
 from coldloop.session.settings import TimeMode
 from coldloop_chaos.commands import plans
 from coldloop_chaos.plan import shipped_plans
-from coldloop_optimizer_plc.qp.design import Preset
-from coldloop_optimizer_plc.settings import SolverName
+from coldloop_optimizer_plc.settings import Preset, SolverName
 from coldloop_plant.load import NAMED
 from coldloop_rig.cli import EXTRAS, command_names, make_parser
 from coldloop_rig.cli.commands import options

@@ -8,7 +8,7 @@ import pytest
 
 from coldloop.config import DERIVED, as_toml, load_configuration
 from coldloop.process.cold_box import COLD_BOX
-from coldloop_optimizer_plc.qp.design import OF_PRESETS, Preset, presets_of
+from coldloop_optimizer_plc.settings import OF_PRESETS, Preset, presets_of
 from coldloop_rig import simulate
 from coldloop_rig.settings import Settings
 

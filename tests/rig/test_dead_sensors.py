@@ -11,8 +11,7 @@ from coldloop.process.cold_box import L1, OUTPUT_NAMES, T5
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.control_plc import Plan, Update
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.qp.design import ControlDesign, Preset
-from coldloop_optimizer_plc.settings import OptimizerSection, ProgramSettings
+from coldloop_optimizer_plc.settings import ControlDesign, OptimizerSection, Preset, ProgramSettings
 from coldloop_plant.program import PlantProgram
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario

@@ -11,7 +11,7 @@ from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.settings import SHIPPED_MODELS
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_rig.results.indicators import Indicators, RunEvaluation, StageCost
 from coldloop_rig.results.recording import SampleBlock
 

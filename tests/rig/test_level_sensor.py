@@ -5,7 +5,7 @@ import pytest
 
 from coldloop.process.cold_box import COLD_BOX, L1, OUTPUT_UNITS
 from coldloop.registers.audit import EventKind
-from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_plant.load import find_load
 from coldloop_plant.program import PlantProgram
 from coldloop_rig.cosim.one_process import OneProcessRig

@@ -11,7 +11,7 @@ from coldloop.errors import ModelFileError
 from coldloop.process.cold_box import COLD_BOX, L1, T5, T5_BAND
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.settings import DEFAULT_MODEL_FILE, ModelSettings
-from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_plant.cold_box.plant_file import PlantFile
 from coldloop_plant.load import find_load
 from coldloop_plant.numeric import RealArray

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.settings import SolverName
 from coldloop_optimizer_plc.solvers import Answer, make_solver
-from coldloop_rig.plc_sizing.certification import (
+from coldloop_rig.plc_sizing.intervals import (
     LONGEST,
     Needs,
     Problem,
@@ -122,7 +122,7 @@ def test_an_exact_solver_needs_one_iteration_and_a_truncated_one_more() -> None:
 
 def test_the_command_prints_a_row_for_each_solver(coldloop: "Coldloop", monkeypatch: pytest.MonkeyPatch) -> None:
     """Of scenarios of three minutes."""
-    monkeypatch.setattr("coldloop_rig.plc_sizing.certification.SCENARIO_TICKS", 720)
+    monkeypatch.setattr("coldloop_rig.plc_sizing.intervals.SCENARIO_TICKS", 720)
     outcome = coldloop("budget", "--certify", "2", "--confidence", "90")
     assert outcome.code == 0, outcome.complaints
     rows = {line.split()[0]: line for line in outcome.out.splitlines() if line and line.split()[0] in set(SolverName)}

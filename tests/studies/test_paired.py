@@ -12,10 +12,9 @@ from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.settings import SHIPPED_MODELS, InputLimits
 from coldloop_optimizer_plc.computing_settings import QpoasesSettings
-from coldloop_optimizer_plc.qp.design import ControlDesign, Preset
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
-from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
+from coldloop_optimizer_plc.settings import ControlDesign, Preset, ProgramSettings, SolverName
 from coldloop_optimizer_plc.solvers import make_solver
 from coldloop_plant.load import find_load
 from coldloop_rig.cosim.scenario import Scenario

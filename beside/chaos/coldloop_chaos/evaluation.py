@@ -13,7 +13,7 @@ from coldloop.registers.control_plc import LadderStatus, Mode
 from coldloop.registers.plant import PlantSample
 from coldloop.registers.safety import Alarm, alarm_key
 from coldloop_chaos.faults import AnyFault
-from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_rig.results.indicators import excess_of
 from coldloop_rig.results.recording import CONTROL, LinkStatistics, Recording, Sink
 

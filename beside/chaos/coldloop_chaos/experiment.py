@@ -14,7 +14,7 @@ from coldloop_chaos.faults import WrongModel
 from coldloop_chaos.plan import ChaosPlan
 from coldloop_chaos.proxy import LinkProxies
 from coldloop_chaos.sequencer import WRONG_MODEL, FaultSequencer, Injector, Progress, save_wrong_model
-from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_rig.cosim.local_services import LocalServices
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Job, Scenario, with_copied_load

@@ -27,7 +27,7 @@ from coldloop_optimizer_plc.scheme import OptimizerState, empty_state
 from coldloop_optimizer_plc.settings import ProgramSettings
 from coldloop_optimizer_plc.solvers.interface import Costs
 from coldloop_optimizer_plc.solvers.ode import OdeMethod, ode_solver
-from coldloop_rig.plc_sizing.exported import CallCost
+from coldloop_rig.plc_sizing.plc import CallCost
 
 COUNTED: Final = {"+", "-", "*", "/", "sqrt", "power", "log"}
 INTEGERS: Final = {Kind.INT: np.int64, Kind.UNSIGNED: np.int64, Kind.BOOL: np.bool_}

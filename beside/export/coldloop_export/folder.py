@@ -29,8 +29,7 @@ from coldloop_export.tree import filled, template
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem
 from coldloop_rig.plc_sizing.budget import problem_of
-from coldloop_rig.plc_sizing.exported import ITERATION, ExportCost, cost_text
-from coldloop_rig.plc_sizing.plc import PlcProfile
+from coldloop_rig.plc_sizing.plc import ITERATION, ExportCost, PlcProfile, cost_text
 from coldloop_rig.settings import Settings
 from coldloop_rig.text_tables import markdown_table
 

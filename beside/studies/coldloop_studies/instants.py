@@ -12,12 +12,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from coldloop_optimizer_plc.computing_settings import PlcBudget
-from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_rig.cosim.ideal_loop import run_ideal_loop
 from coldloop_rig.figures.plot import COLOURS, DASHES, INK
-from coldloop_rig.plc_sizing.adaptive_gain import ADAPTIVE, loop_cost, require_costs
 from coldloop_rig.plc_sizing.budget import counted_sizes, estimator_memory, footprint, problem_of
-from coldloop_rig.plc_sizing.intervals import geometric_mean
+from coldloop_rig.plc_sizing.intervals import ADAPTIVE, geometric_mean, loop_cost, require_costs
 from coldloop_rig.plc_sizing.operations import SOLVERS
 from coldloop_rig.settings import Settings
 from coldloop_rig.text_tables import aligned

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.config import load_configuration
-from coldloop_optimizer_plc.computing_settings import OutsideSettings
-from coldloop_optimizer_plc.outside import Part, loaded
+from coldloop_optimizer_plc.computing_settings import OutsideSettings, Part, loaded
 from coldloop_rig.settings import Settings
 
 PAPER: Final = ("model.file=cold-box", "optimizer_plc.program.preset=paper")

@@ -10,7 +10,7 @@ from coldloop.process.cold_box import L1, T5
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.settings import InputLimits
 from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
-from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_plant.cold_box.model import (
     LOOP_MARGIN,
     Equilibrium,

@@ -11,11 +11,10 @@ from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop_optimizer_plc.computing_settings import Arithmetic, EstimatorKind, EstimatorSettings, PlcBudget
 from coldloop_optimizer_plc.estimator import check_detectability, stationary_gains
 from coldloop_optimizer_plc.plausibility import watched_output
-from coldloop_optimizer_plc.qp.design import ControlDesign, Target, trivial_design
 from coldloop_optimizer_plc.qp.linear_algebra import real_of
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, prediction_of
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem
-from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
+from coldloop_optimizer_plc.settings import ControlDesign, ProgramSettings, SolverName, Target, trivial_design
 from coldloop_rig.plc_sizing import operations
 from coldloop_rig.plc_sizing.operations import (
     ACTIVE_ROWS,

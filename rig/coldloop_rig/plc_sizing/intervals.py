@@ -1,15 +1,49 @@
-"""Statistics of some hours or draws with their 95 % intervals."""
+"""What sampled loops say, with confidence: 95 % intervals, certified iterations, whether an adaptive period pays.
 
+The certified number of iterations is by sampled scenarios and the binomial bound.
+
+A scenario is fifteen minutes under a random telegraph: a family of hour drawn from a to f, and a draw of it that no
+study uses. Scenarios are independent of each other. Each gives, for each solver, two figures: the iterations that its
+worst problem needs, and those that the problem at a random instant needs. A problem needs q iterations when from q on,
+up to `LONGEST`, J stays within a tolerance of its optimum.
+
+If k of N independent scenarios violate something, then with confidence 1 - beta the probability that a new one does is
+at most the epsilon at which the chance of k or fewer violations is beta (Clopper and Pearson, Biometrika 26, 1934; for
+k = 0 it is 1 - beta^(1/N), as in Tempo, Bai and Dabbene, Systems & Control Letters 30, 1997). For the number of
+iterations itself, the largest of N is one decision made by scenarios, and the same bound holds for it: Campi and
+Garatti, SIAM Journal on Optimization 19 (3), 2008, with one variable. The claim is about the distribution that the
+scenarios are drawn from, and about problems that a converged loop meets, hot-started from the optimum before.
+"""
+
+import random
 from collections.abc import Callable, Sequence
+from itertools import product
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import stdtrit
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import betaincinv, stdtrit
 
-from coldloop_rig.plc_sizing.certification import failure_bound
+from coldloop.errors import ConfigurationError, StudyError
+from coldloop.process.declaration import Process
+from coldloop.process.lti_model import load
+from coldloop.process.updating_periods import SHORTEST_TICKS
+from coldloop_optimizer_plc.computing_settings import PlcBudget
+from coldloop_optimizer_plc.qp.costs import augmented_cost
+from coldloop_optimizer_plc.qp.problem import QuadraticProblem
+from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
+from coldloop_optimizer_plc.solvers import Solver, make_solver
+from coldloop_plant.load import HOURS, drawn, find_load
+from coldloop_rig.cosim.ideal_loop import run_ideal_loop
+from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.cosim.scenario import Scenario, natural_ticks
+from coldloop_rig.progress import make_console
+from coldloop_rig.results.indicators import evaluate
+from coldloop_rig.results.recording import Recorder
+from coldloop_rig.settings import Settings
+from coldloop_rig.text_tables import aligned
 
-Series = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 TAIL: Final = 0.025
 """Probability on each side of an interval."""
@@ -42,6 +76,17 @@ class Interval(NamedTuple):
         """Write value and interval with so many significant digits."""
         value = f"{self.value:.{digits}g}" if np.isfinite(self.value) else "none"
         return value if np.isnan(self.low) else f"{value} [{self.low:.{digits}g} to {self.high:.{digits}g}]"
+
+
+def failure_bound(failures: int, scenarios: int, beta: float) -> float:
+    """Return the probability that is not exceeded with confidence 1 - beta, given failures among scenarios.
+
+    It is the upper end of the one-sided Clopper-Pearson interval: the epsilon with sum_{i <= k} C(N, i) epsilon^i
+    (1 - epsilon)^(N - i) = beta.
+    """
+    if failures >= scenarios:
+        return 1.0
+    return float(betaincinv(failures + 1, scenarios - failures, 1.0 - beta))
 
 
 def jackknife(statistic: Callable[[list[int]], float], draws: int, above: float = -np.inf) -> Interval:
@@ -93,12 +138,12 @@ def interval_of_share(of_interest: int, hours: int) -> Interval:
     return Interval(of_interest / hours, low, failure_bound(of_interest, hours, TAIL))
 
 
-def geometric_mean(ratios: Series) -> float:
+def geometric_mean(ratios: Array) -> float:
     """Return the geometric mean of positive numbers."""
     return float(np.exp(np.log(ratios).mean()))
 
 
-def mean_ratio(costs: Series, reference: Series) -> Interval:
+def mean_ratio(costs: Array, reference: Array) -> Interval:
     """Return the geometric mean over the hours of costs over reference, shape (n,) each."""
     ratios = costs / reference
     return jackknife(lambda which: geometric_mean(ratios[which]), len(ratios), above=0.0)
@@ -112,7 +157,7 @@ def interval_of_mean(values: Sequence[float], above: float = -np.inf) -> Interva
     return jackknife(lambda which: float(known[which].mean()), len(known), above)
 
 
-def crossing(powers: Series, one: Series, other: Series) -> float:
+def crossing(powers: Array, one: Array, other: Array) -> float:
     """Return the power from which on `one` is not above `other` any more; NaN if there is none."""
     above = np.log(one / other)
     if not np.isfinite(above).all():
@@ -123,3 +168,247 @@ def crossing(powers: Series, one: Series, other: Series) -> float:
     i = behind[-1]
     share = above[i] / (above[i] - above[i + 1])
     return float(np.exp(np.interp(share, [0, 1], np.log(powers[i : i + 2]))))
+
+
+# -- certified iterations ----------------------------------------------------------------------------------------------
+
+
+FAMILIES: Final = "abcdef"
+SCENARIO_TICKS: Final = 3600
+LONGEST: Final = 200
+"""Iterations after which a problem counts as not solved: those of 5 s at ten times the power of the PLC."""
+OWN_SEEDS: Final = 10**9
+"""First seed of the scenarios: no named load has one so large."""
+
+
+class Problem(NamedTuple):
+    """A problem that the loop met."""
+
+    qp: QuadraticProblem
+    guess: Array
+    """The shifted optimum of the problem before."""
+    optimum: Array
+
+
+class Needs(NamedTuple):
+    """Iterations that the problems of one scenario need; `LONGEST` + 1 means more."""
+
+    worst: int
+    at_random: int
+
+
+class Certificate(NamedTuple):
+    """Result of N scenarios for one solver."""
+
+    solver: SolverName
+    fitting: int
+    """Iterations in the longest updating period."""
+    failures: int
+    """Scenarios whose problem at a random instant needs more than that."""
+    failure_bound: float
+    worst: int
+    """Largest need of all problems of all scenarios."""
+    run_failures: int
+    """Scenarios that have a problem which needs more than fits."""
+    run_bound: float
+
+
+def iterations_needed(solver: Solver, problem: Problem, tolerance: float, floor: float) -> int:
+    """Return from which iteration on J stays within a tolerance of its optimum; `LONGEST` + 1 if from none.
+
+    Args:
+        solver: Begins from the problem's guess.
+        problem: With its optimum.
+        tolerance: Share of the optimal J.
+        floor: Constant that J has besides that of the problem, as in Algorithm 1.
+    """
+    qp = problem.qp
+    rest = qp.constant + floor
+    enough = (1.0 + tolerance) * (float(augmented_cost(qp, problem.optimum, solver.alpha)) + rest)
+    answer = solver.solve(qp, problem.guess, range(1, LONGEST + 1))
+    above = np.flatnonzero(np.array([answer.guessed, *answer.costs]) + rest > enough)
+    return int(above[-1]) + 1 if len(above) else 0
+
+
+def scenario_problems(settings: Settings, number: int) -> list[Problem]:
+    """Return the problems of a scenario, at instants of 5 s of the converged loop."""
+    draw = random.Random(OWN_SEEDS + number)  # noqa: S311 not for secrets; the one generator stable over versions
+    hour = draw.choice(FAMILIES)
+    family = HOURS[hour]._replace(seed=OWN_SEEDS + number)
+    profile = drawn(family, hour, load(settings.model.file).w0, settings.process)
+    problems: list[Problem] = []
+    scenario = Scenario(SCENARIO_TICKS, profile, 0.0, number)
+    run_ideal_loop(
+        settings, scenario, Recorder(SCENARIO_TICKS, []), settings.process.ticks_per_sample,
+        lambda qp, guess, optimum: problems.append(Problem(qp, guess, optimum)),
+    )  # fmt: skip
+    return problems[1:]  # the first is at rest, and a chain of qpOASES begins with it
+
+
+def scenario_needs(solver: Solver, problems: list[Problem], number: int, tolerance: float, floor: float) -> Needs:
+    """Return what a scenario needs of a solver, beginning without a hot start."""
+    solver.reset()
+    needs = [iterations_needed(solver, problem, tolerance, floor) for problem in problems]
+    return Needs(max(needs), needs[random.Random(number).randrange(len(needs))])  # noqa: S311
+
+
+def certify(
+    settings: Settings, scenarios: int, tolerance: float, beta: float, progress: Callable[[int], None]
+) -> list[Certificate]:
+    """Return a certificate for each solver that is installed.
+
+    Args:
+        settings: Of plant, problem and solvers.
+        scenarios: N.
+        tolerance: Share of the optimal J that an answer may cost more.
+        beta: One minus the confidence.
+        progress: Called with the number of scenarios done.
+    """
+    program = settings.optimizer_plc.program
+    solvers = {name: solver for name in SolverName if (solver := _solver(program, name)) is not None}
+    floor = program.adaptive.cost_floor
+    needs: dict[SolverName, list[Needs]] = {name: [] for name in solvers}
+    for number in range(scenarios):
+        problems = scenario_problems(settings, number)
+        for name, solver in solvers.items():
+            needs[name].append(scenario_needs(solver, problems, number, tolerance, floor))
+        progress(number + 1)
+    longest = program.process.ticks_per_sample
+    fitting = {name: PlcBudget(program.budget, one.tau_1_s).iterations(longest) for name, one in solvers.items()}
+    return [_certificate(name, fitting[name], needs[name], beta) for name in solvers]
+
+
+def _certificate(name: SolverName, fitting: int, needs: list[Needs], beta: float) -> Certificate:
+    failures = sum(one.at_random > fitting for one in needs)
+    run_failures = sum(one.worst > fitting for one in needs)
+    return Certificate(
+        name, fitting, failures, failure_bound(failures, len(needs), beta), max(one.worst for one in needs),
+        run_failures, failure_bound(run_failures, len(needs), beta),
+    )  # fmt: skip
+
+
+def _solver(program: ProgramSettings, name: SolverName) -> Solver | None:
+    """Return a solver; None if it is not installed."""
+    try:
+        return make_solver(program.model_copy(update={"solver": name}))
+    except ConfigurationError:
+        return None
+
+
+def certification_table(settings: Settings, scenarios: int, tolerance_pct: float, confidence_pct: float) -> str:
+    """Sample scenarios and return what they certify, as text.
+
+    Args:
+        settings: Of plant, problem, solvers and budget.
+        scenarios: N, 1 or more.
+        tolerance_pct: An answer is good when its J is within this of the optimum.
+        confidence_pct: Of the bounds.
+    """
+    beta = 1.0 - confidence_pct / 100.0
+    with make_console().status("") as status:
+        found = certify(
+            settings, scenarios, tolerance_pct / 100.0, beta,
+            lambda done: status.update(f"{done} of {scenarios} scenarios"),
+        )  # fmt: skip
+    none_failed = 100.0 * failure_bound(0, scenarios, beta)
+    power, period_s = settings.optimizer_plc.program.budget.power, settings.process.sampling_period_s
+    heading = (
+        f"{scenarios} independent scenarios of {SCENARIO_TICKS // 240} min under random telegraphs, problems "
+        f"every {period_s:g} s; good is an answer within {tolerance_pct:g} % of the optimal J\n"
+        f"with confidence {confidence_pct:g} %: at most so many problems at a random instant are not good after "
+        f"the iterations that fit into {period_s:g} s at P = {power:g};\n"
+        "at most so many scenarios have one that is not; and at most "
+        f"{none_failed:.2f} % have one that needs more iterations than the most needed\n\n"
+    )
+    fit = f"fit into {period_s:g} s"
+    header = ("solver", fit, "problems failed", "at most", "scenarios failed", "at most", "most needed")
+    rows = [
+        (one.solver, f"{one.fitting}", f"{one.failures} of {scenarios}", f"{100 * one.failure_bound:.1f} %",
+         f"{one.run_failures} of {scenarios}", f"{100 * one.run_bound:.1f} %",
+         f"{one.worst}" if one.worst <= LONGEST else f"over {LONGEST}")
+        for one in found
+    ]  # fmt: skip
+    return heading + aligned([header, *rows], numbers=True)
+
+
+# -- whether an adaptive period pays -----------------------------------------------------------------------------------
+
+
+ADAPTIVE: Final = 0.0
+"""An updating period, s."""
+
+
+def loop_cost(settings: Settings, name: str, period_s: float, run: Callable[[Scenario, Recorder], None]) -> float:
+    """Return J_BF under a load, a named one or a file, with what runs a scenario."""
+    model = load(settings.model.file)
+    profile = find_load(name, model.w0, settings.process)
+    scenario = Scenario(natural_ticks(name, profile), profile, period_s, settings.plant.seed)
+    recorder = Recorder(scenario.ticks)
+    run(scenario, recorder)
+    return evaluate(recorder.recording(), model, settings.optimizer_plc.program.design).J_BF
+
+
+def require_costs(costs: ArrayLike) -> None:
+    """Refuse costs of which a ratio would say nothing, those of loops in which nothing happens (`StudyError`)."""
+    if not np.all(np.asarray(costs) > 0.0):
+        raise StudyError(
+            "under some load the loop costs nothing (J_BF is 0): with the inputs at rest all outputs stay in their "
+            "bands. Give the process a load or disturbances that drive them out, or a setpoint where it does not rest"
+        )
+
+
+SHARES: Final = (0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
+"""Updating periods that are compared unless one is given, as shares of the sampling period."""
+
+
+def fixed_periods(process: Process) -> tuple[float, ...]:
+    """Return the updating periods, s, that are compared."""
+    ticks = sorted({round(share * process.ticks_per_sample) for share in SHARES})
+    return tuple(each * process.tick_s for each in ticks if each >= SHORTEST_TICKS)
+
+
+def adaptive_gain(
+    settings: Settings, names: Sequence[str], period_s: float | None, done: Callable[[int, int], None]
+) -> str:
+    """Return, as a sentence, J_BF of the adaptive period over that of the best fixed one.
+
+    The best is chosen on the same loads, which favours it.
+
+    Args:
+        settings: With the power of the PLC.
+        names: Loads, named ones or files.
+        period_s: The fixed period to compare with; None for the best of `fixed_periods` in which an iteration fits.
+        done: Is called with the number of runs done and that of all.
+    """
+    program = settings.optimizer_plc.program
+    budget = PlcBudget(program.budget, program.iteration_s)
+    periods = fixed_periods(settings.process)
+    fitting = [period for period in periods if budget.times.holds(round(period / settings.process.tick_s))]
+    fixed = fitting or [periods[-1]] if period_s is None else [period_s]
+    rig, runs = OneProcessRig(settings), list(product((ADAPTIVE, *fixed), names))
+    costs = []
+    for number, (period, name) in enumerate(runs):
+        done(number, len(runs))
+        costs.append(loop_cost(settings, name, period, rig.run))
+    best, ratio = over_best_fixed(np.array(costs).reshape(-1, len(names)))
+    which = f"a fixed {fixed[best - 1]:g} s" + (", the best fixed one" if len(fixed) > 1 else "")
+    loads = f"load{'s' if len(names) > 1 else ''} {', '.join(names)}"
+    return f"With {loads} an adaptive period costs {ratio.text()} of {which}: {pays(ratio)}."
+
+
+def over_best_fixed(costs: Array) -> tuple[int, Interval]:
+    """Return which row is the best fixed period, and the cost of the first row, the adaptive one, over its.
+
+    Costs have a row for each period, a column for each load.
+
+    Raises:
+        StudyError: A loop costs nothing.
+    """
+    require_costs(costs)
+    best = min(range(1, len(costs)), key=lambda which: geometric_mean(costs[which]))
+    return best, mean_ratio(costs[0], costs[best])
+
+
+def pays(ratio: Interval) -> str:
+    """Return whether it does, in words; of costs, those of the adaptive period over others."""
+    return ratio.in_words("it pays", "it does not pay", "one load has no interval; name several")

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop_optimizer_plc.qp.design import ControlDesign
 from coldloop_optimizer_plc.qp.prediction import state_weights
+from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_rig.results.columns import excess_keys
 from coldloop_rig.results.recording import BLOCK_TICKS, Recording, SampleBlock, Sink
 

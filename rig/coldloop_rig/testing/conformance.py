@@ -15,8 +15,8 @@ from coldloop.errors import ColdloopError
 from coldloop.process.declaration import REFERENCE_TICK_S, Process
 from coldloop.process.lti_model import load
 from coldloop.process.updating_periods import SHORTEST_TICKS
-from coldloop_optimizer_plc.computing_settings import DaqpSettings, OutsideSettings
-from coldloop_optimizer_plc.outside import Measured, OutsideCorrection, Part, PlantModel, made, plant_model
+from coldloop_optimizer_plc.computing_settings import DaqpSettings, OutsideSettings, Part, made
+from coldloop_optimizer_plc.estimator import Measured, OutsideCorrection, PlantModel, plant_model
 from coldloop_optimizer_plc.qp.costs import augmented_cost
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, prediction_of
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem

@@ -6,12 +6,15 @@ slot for the preparation of the problem, hence 4 tau_u - 1 iterations (section V
 
 from bisect import bisect_right
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from enum import StrEnum
 from functools import cached_property
-from typing import Annotated, Self
+from importlib.metadata import entry_points
+from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, field_validator, model_validator
 
+from coldloop.errors import ConfigurationError, foreign
 from coldloop.process.declaration import Process
 from coldloop.process.settings import PositivePerInput, ProcessSettings, declared, settings_process, stretched, within
 from coldloop.process.updating_periods import ComputingTimes
@@ -360,6 +363,47 @@ class OutsideSettings(BaseModel):
     def names(self) -> tuple[str, ...]:
         """Names of the entry points that are used."""
         return tuple(filter(None, (self.solver, self.rule, self.estimator)))
+
+
+class Part(StrEnum):
+    """Part of another project: a key of `optimizer_plc.program.outside`, and the group `coldloop.<part>s`."""
+
+    SOLVER = "solver"
+    RULE = "rule"
+    ESTIMATOR = "estimator"
+
+
+def made(part: Part, name: str, *given: object) -> Any:  # noqa: ANN401 the caller knows its protocol
+    """Return what the entry point of this name makes of what it is given.
+
+    Raises:
+        ConfigurationError: There is none, or it cannot be made.
+    """
+    with in_its_name(part, name, "cannot be made: "):
+        return loaded(part, name)(*given)
+
+
+def loaded(part: Part, name: str) -> Any:  # noqa: ANN401 as above
+    """Return what the entry point of this name points at, a class or a function.
+
+    Raises:
+        ConfigurationError: There is none, or it cannot be imported.
+    """
+    group = f"coldloop.{part}s"
+    there = entry_points(group=group)
+    if name not in there.names:
+        known = ", ".join(sorted(there.names)) or "none is installed"
+        raise ConfigurationError(
+            f"optimizer_plc.program.outside.{part}: no {part} '{name}' among the entry points {group}: {known}"
+        )
+    with in_its_name(part, name, "cannot be made: "):
+        return there[name].load()
+
+
+def in_its_name(part: Part, name: str, what: str = "") -> AbstractContextManager[None]:
+    """Call what is not ours: what it raises is a `ConfigurationError` of one line, with its name unless it is one."""
+    called = f"{part} {name}: {what}".removesuffix(": ")
+    return foreign(called, "the optimiser ends here: mend it, or choose another", kind=ConfigurationError)
 
 
 class InteriorPointSettings(ProcessSettings):

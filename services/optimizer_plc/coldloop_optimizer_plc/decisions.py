@@ -14,8 +14,8 @@ from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop_optimizer_plc.estimator import Belief, begin_at_rest, correct, forget
 from coldloop_optimizer_plc.plausibility import USED, suspects_of
 from coldloop_optimizer_plc.qp.costs import augmented_cost
+from coldloop_optimizer_plc.qp.prediction import bounds_at, find_target, least_warm_load, loads_held
 from coldloop_optimizer_plc.qp.problem import hold, shift, shifted
-from coldloop_optimizer_plc.qp.target import bounds_at, find_target, least_warm_load, loads_held
 from coldloop_optimizer_plc.rules import Assessment, Observation, UpdatingRule, assessed, decide_by
 from coldloop_optimizer_plc.scheme import (
     LARGEST,

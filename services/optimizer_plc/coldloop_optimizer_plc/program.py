@@ -27,14 +27,12 @@ from coldloop.registers.optimizer_plc import (
 )
 from coldloop.safety.sequence import InputSequence, with_checksum
 from coldloop_optimizer_plc import decisions, scheme
-from coldloop_optimizer_plc.computing_settings import Arithmetic, PlcBudget
+from coldloop_optimizer_plc.computing_settings import Arithmetic, Part, PlcBudget, in_its_name
 from coldloop_optimizer_plc.decisions import Latched, Starts
-from coldloop_optimizer_plc.estimator import correct, estimator_of
-from coldloop_optimizer_plc.outside import OutsideEstimator, Part, in_its_name
+from coldloop_optimizer_plc.estimator import OutsideEstimator, correct, estimator_of
 from coldloop_optimizer_plc.qp.linear_algebra import real_of
-from coldloop_optimizer_plc.qp.prediction import prediction_of, rest_map
+from coldloop_optimizer_plc.qp.prediction import prediction_of, rest_map, target_search
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
-from coldloop_optimizer_plc.qp.target import target_search
 from coldloop_optimizer_plc.rules import OutsideRule, UpdatingRule, decide_by, make_rule
 from coldloop_optimizer_plc.scheme import empty_state
 from coldloop_optimizer_plc.settings import ProgramSettings

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from coldloop.kernels.compiled import kernel
 from coldloop.kernels.intrinsics import Implementations
 from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
-from coldloop_optimizer_plc.computing_settings import PlcBudget
-from coldloop_optimizer_plc.outside import Part, in_its_name, made
+from coldloop_optimizer_plc.computing_settings import Part, PlcBudget, in_its_name, made
 from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real
 from coldloop_optimizer_plc.settings import ProgramSettings
 

@@ -18,6 +18,7 @@ from coldloop_optimizer_plc.estimator import Belief, Estimator, begin_prediction
 from coldloop_optimizer_plc.plausibility import are_finite
 from coldloop_optimizer_plc.qp.costs import OutputMaps, output_maps, predicted_indicators
 from coldloop_optimizer_plc.qp.linear_algebra import Real
+from coldloop_optimizer_plc.qp.prediction import TargetSearch
 from coldloop_optimizer_plc.qp.problem import (
     Maps,
     PredictiveProblem,
@@ -27,7 +28,6 @@ from coldloop_optimizer_plc.qp.problem import (
     shifted,
     write_inputs,
 )
-from coldloop_optimizer_plc.qp.target import TargetSearch
 from coldloop_optimizer_plc.rules import MEMORY
 from coldloop_optimizer_plc.settings import ProgramSettings, RuleName
 from coldloop_optimizer_plc.solvers.interface import Answer, Costs, solve_by

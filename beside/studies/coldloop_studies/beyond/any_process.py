@@ -13,8 +13,16 @@ from numpy.typing import NDArray
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
 from coldloop_rig.figures.plot import COLOURS
-from coldloop_rig.plc_sizing.adaptive_gain import ADAPTIVE, fixed_periods, over_best_fixed, pays, require_costs
-from coldloop_rig.plc_sizing.intervals import Interval, geometric_mean, mean_ratio
+from coldloop_rig.plc_sizing.intervals import (
+    ADAPTIVE,
+    Interval,
+    fixed_periods,
+    geometric_mean,
+    mean_ratio,
+    over_best_fixed,
+    pays,
+    require_costs,
+)
 from coldloop_rig.text_tables import markdown_table
 from coldloop_studies.drawing import legend_outside, panels, ratio_rows, ratio_scale, spans_decade
 from coldloop_studies.request import Outcome, RunRequest

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from coldloop_optimizer_plc.qp.design import Preset
+from coldloop_optimizer_plc.settings import Preset
 from coldloop_plant.load import HOUR_TICKS
 from coldloop_rig.figures.plot import ACCENT, DASHES, INK, THIRD
 from coldloop_rig.plc_sizing.intervals import Interval, crossing, interval_of_share, jackknife, mean_ratio

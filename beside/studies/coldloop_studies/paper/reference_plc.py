@@ -15,11 +15,10 @@ from coldloop.process.lti_model import load as load_model
 from coldloop.process.settings import SHIPPED_MODELS, InputLimits
 from coldloop_optimizer_plc.computing_settings import Arithmetic, EstimatorSettings
 from coldloop_optimizer_plc.qp import linear_algebra
-from coldloop_optimizer_plc.qp.design import ControlDesign, trivial_design
 from coldloop_optimizer_plc.qp.linear_algebra import real_of
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem
-from coldloop_optimizer_plc.settings import SolverName
+from coldloop_optimizer_plc.settings import ControlDesign, SolverName, trivial_design
 from coldloop_plant.load import HOUR_TICKS
 from coldloop_rig.figures.plot import COLOURS, legend_above
 from coldloop_rig.plc_sizing import operations

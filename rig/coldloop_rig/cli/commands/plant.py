@@ -360,14 +360,14 @@ def _budget_text(options: argparse.Namespace) -> str:
     if options.keys:
         return key_listing(PlcProfile)
     if options.export:
-        from coldloop_rig.plc_sizing.exported import cost_text, profile_of, read_cost
+        from coldloop_rig.plc_sizing.plc import cost_text, profile_of, read_cost
 
         cost = read_cost(options.export)
         if options.took:
             return profile_of(cost, options.took)
         return cost_text(cost, find_profile(options.plc) if options.plc else None)
     if options.certify:
-        from coldloop_rig.plc_sizing.certification import certification_table
+        from coldloop_rig.plc_sizing.intervals import certification_table
 
         if any(value is not None for value in (options.power, options.plc, options.period)):
             raise UsageError("--certify: uses the configured PLC; leave out --power, --plc and --updating-period")
@@ -377,8 +377,8 @@ def _budget_text(options: argparse.Namespace) -> str:
 
 
 def _budget_tables(options: argparse.Namespace) -> str:
-    from coldloop_rig.plc_sizing.adaptive_gain import adaptive_gain
     from coldloop_rig.plc_sizing.budget import budget_tables, plc_tables, with_power
+    from coldloop_rig.plc_sizing.intervals import adaptive_gain
     from coldloop_rig.plc_sizing.plc import find_profile
     from coldloop_rig.progress import make_console
     from coldloop_rig.runs.running import certificate

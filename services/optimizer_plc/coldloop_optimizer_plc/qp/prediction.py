@@ -1,7 +1,14 @@
-"""The discrete prediction model, at the sampling period and at every updating period, and where it rests.
+"""The discrete prediction model, at the sampling period and at every updating period, where it rests, and the target.
 
 One matrix triple for a tick comes with the model file; those of longer periods are its powers, so no matrix
 exponential is needed on line.
+
+The target is where the plant, as it is estimated to be, should rest: of the inputs at which it rests with the level of
+its bath at the operating point those that cost least, as deviations from the operating point. They are within their
+bounds; within these they hold the load, or as much of it as they can; then they have the turbine's outlet (T5 of the
+cold box) within its rows, or as near as they can. Inputs are deviations over `input_scale`, and those that act: with
+the estimated constants of inputs added. Without a bath the target is the operating point, and what a process holds is
+not known.
 """
 
 from collections.abc import Sequence
@@ -12,9 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
+from coldloop.kernels.compiled import kernel
 from coldloop.process.lti_model import LtiModel
-from coldloop_optimizer_plc.qp.design import ControlDesign
+from coldloop.process.sections import Bath
+from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real, multiply
+from coldloop_optimizer_plc.settings import ControlDesign, Target
 
 Array = NDArray[np.float64]
 
@@ -242,3 +252,256 @@ def rest_map(prediction: PredictionModel, real: Real = DOUBLE) -> Array:
             "model.file: with constant inputs no load lets the model's states and the level rest; name another model"
         ) from error
     return found.astype(real, copy=False)
+
+
+TOLERANCES = {8: 1e-8, 4: 1e-4}
+"""Tolerances for the violation of a bound, scaled, by the bytes of a number: in single precision a corner of bounds is
+met no better than within 1e-5."""
+NO_EFFECT = 1e-9
+"""K of the turbine's outlet per W held: an input that warms it by less does so by rounding, whose sign is another on
+another machine."""
+
+
+class Rest(NamedTuple):
+    """Values at rest with the level at its operating point, by the scaled inputs."""
+
+    states: Array
+    """States and load held: as a map of the inputs, shape (3, n_x + 1). Disturbances are none."""
+    temperature: Array
+    """Temperature of the turbine's outlet, shape (3,)."""
+
+
+class TargetSearch(NamedTuple):
+    """Constants of the search for targets, in the on-line floating-point type."""
+
+    followed: bool
+    """Whether there is a target other than the operating point."""
+    limited: bool
+    """Whether it is known what can be held."""
+    of_load: float
+    """1 where the load counts, 0 where only its mismatch does."""
+    held: Array
+    """Load that an input holds, W, shape (3,)."""
+    cheapest: Array
+    """Inputs that hold a W at the least cost, shape (3,)."""
+    plane: Array
+    """Inputs that hold nothing, orthonormal in what they cost, shape (3, 2)."""
+    rows: Array
+    """The inputs and the turbine's outlet on that plane, shape (4, 2)."""
+    temperature: Array
+    """Shape (3,)."""
+    low: Array
+    """Low bounds of inputs and the turbine's outlet, shape (4,)."""
+    high: Array
+    margin: float
+    """How far inside its band the rows of the turbine's outlet are, K."""
+    constants: NDArray[np.int64]
+    """Indices of the states that are the biases of inputs and the turbine's outlet, shape (4,); -1 is none."""
+    scale: Array
+    """Scales of these biases: input_scale and 1, shape (4,)."""
+    tolerance: float
+    """Tolerance for the violation of a bound."""
+    feed: int
+    """Index of the input that fills the bath; kernels are shared by processes, and have no places of theirs in them."""
+
+
+def rest_of(prediction: PredictionModel, design: ControlDesign, bath: Bath) -> Rest:
+    """Return where the model of a plant with a bath rests."""
+    outlet, n_inputs = prediction.process.output_names.index(bath.turbine_outlet), design.n_inputs
+    n, scale = len(prediction.model.x0), np.array(design.input_scale)
+    by_inputs = rest_map(prediction)[:, :n_inputs] * scale
+    states = np.zeros((n_inputs, prediction.n_states + 1))
+    states[:, :n], states[:, -1] = by_inputs[:n].T, by_inputs[n]
+    C, D, G = (M[outlet] for M in (prediction.C, prediction.D, prediction.G))
+    return Rest(states, states[:, :-1] @ C + D * scale + states[:, -1] * G)
+
+
+def target_search(
+    prediction: PredictionModel, design: ControlDesign, limits: InputLimits, real: Real = DOUBLE
+) -> TargetSearch:
+    """Return what targets of this problem are found with."""
+    process = prediction.process
+    if process.bath is None:
+        return no_target_search(design.n_inputs, real)
+    outlet, feed = process.output_names.index(process.bath.turbine_outlet), process.input_names.index(process.bath.feed)
+    rest, n, scale = rest_of(prediction, design, process.bath), len(prediction.model.x0), np.array(design.input_scale)
+    held, states = rest.states[:, -1], rest.states[:, :n]
+    cost = states @ state_cost(prediction.model, design) @ states.T + np.diag(scale**2 * design.input_weight)
+    inverse = np.linalg.inv(cost)
+    across = np.linalg.svd(held[None])[2][1:].T
+    root = np.linalg.cholesky(across.T @ cost @ across)
+    plane = np.ascontiguousarray(np.linalg.solve(root, across.T).T)
+    band = process.controlled.index(outlet)
+    y0, margin, u0 = float(prediction.y0[outlet]), design.band_margin[band], np.array(prediction.u0)
+    places = {signal: n + place for place, signal in enumerate(prediction.disturbances)}
+    signals = (*range(len(prediction.y0), len(prediction.y0) + design.n_inputs), outlet)
+    arrays = {
+        "held": held,
+        "cheapest": inverse @ held / (held @ inverse @ held),
+        "plane": plane,
+        "rows": np.vstack([plane, rest.temperature @ plane]),
+        "temperature": rest.temperature,
+        "low": np.array([*(limits.low - u0) / scale, design.output_low[band] + margin - y0]),
+        "high": np.array([*(limits.high - u0) / scale, design.output_high[band] - margin - y0]),
+        "scale": np.array([*scale, 1.0]),
+    }
+    return TargetSearch(
+        followed=design.target is not Target.OPERATING_POINT,
+        limited=True,
+        of_load=real(design.target is Target.LOAD),
+        margin=real(margin),
+        constants=np.array([places.get(signal, -1) for signal in signals]),
+        tolerance=real(TOLERANCES[np.dtype(real).itemsize]),
+        feed=feed,
+        **{name: np.ascontiguousarray(array).astype(real, copy=False) for name, array in arrays.items()},
+    )
+
+
+def no_target_search(n_inputs: int, real: Real) -> TargetSearch:
+    """Return the search of a process that has no target but its operating point."""
+    inputs, rows = np.zeros(n_inputs, real), np.zeros(n_inputs + 1, real)
+    return TargetSearch(
+        followed=False, limited=False, of_load=real(0.0), held=inputs, cheapest=inputs,
+        plane=np.zeros((n_inputs, 2), real), rows=np.zeros((n_inputs + 1, 2), real), temperature=inputs, low=rows,
+        high=rows, margin=real(0.0), constants=np.full(n_inputs + 1, -1), scale=rows, tolerance=real(0.0), feed=0,
+    )  # fmt: skip
+
+
+@kernel
+def find_target(
+    c: TargetSearch, x: Array, w: float, mismatch: float, most_open: float, idle: int, at: float, target: Array
+) -> None:  # fmt: skip
+    """Write the target (3,) for estimated states (n_x,), load and its mismatch, and a limit of the feed.
+
+    The input that is `idle`, unless it is -1, stays `at` a scaled deviation.
+    """
+    if not c.followed:
+        return
+    low, high = bounds_at(c, x, most_open, idle, at)
+    least, most = loads_held(c, low, high)
+    load = min(max(mismatch + c.of_load * (w - mismatch), least), most)
+    bounds, last = np.empty((low.shape[0], 2), x.dtype), target.shape[0]
+    for i in range(last):
+        target[i] = c.cheapest[i] * load
+        bounds[i, 0], bounds[i, 1] = low[i] - target[i], high[i] - target[i]
+        low[last] -= c.temperature[i] * target[i]
+        high[last] -= c.temperature[i] * target[i]
+    bounds[last, 0], bounds[last, 1] = low[last], high[last]
+    point = nearest_point(c.rows, bounds, c.tolerance)
+    for i in range(last):
+        moved = target[i] + c.plane[i, 0] * point[0] + c.plane[i, 1] * point[1]
+        target[i] = min(max(moved, low[i]), high[i])
+
+
+@kernel
+def bounds_at(c: TargetSearch, x: Array, most_open: float, idle: int, at: float) -> tuple[Array, Array]:
+    """Return bounds (4,), (4,) of inputs that act, with a limit of the feed, and of the outlet less its constant.
+
+    Those of an input that is `idle` (-1: none is) collapse to where it is, within its range.
+    """
+    low, high = c.low.copy(), c.high.copy()
+    high[c.feed] = max(min(high[c.feed], most_open), low[c.feed])
+    if idle >= 0:
+        held = min(max(at, low[idle]), high[idle])
+        low[idle] = held
+        high[idle] = held
+    one = x.dtype.type(1.0)
+    for i in range(low.shape[0]):
+        if c.constants[i] >= 0:
+            constant = x[c.constants[i]] / c.scale[i]
+            sign = one if i < c.held.shape[0] else -one
+            low[i] += sign * constant
+            high[i] += sign * constant
+    return low, high
+
+
+@kernel
+def loads_held(c: TargetSearch, low: Array, high: Array) -> tuple[float, float]:
+    """Return the least and the largest load that inputs within these bounds hold at rest, deviations in W."""
+    least, most = low.dtype.type(0.0), low.dtype.type(0.0)
+    for i in range(c.held.shape[0]):
+        one, other = c.held[i] * low[i], c.held[i] * high[i]
+        least += min(one, other)
+        most += max(one, other)
+    return least, most
+
+
+@kernel
+def least_warm_load(c: TargetSearch, low: Array, high: Array) -> float:
+    """Return the least load that these bounds let hold with the turbine's outlet within its band, a deviation in W.
+
+    From the inputs that hold least those move that warm the outlet the most for each watt. Where that is not enough it
+    is the load with which it is warmest.
+    """
+    last = c.held.shape[0]
+    room, load, lacking = np.empty(last, low.dtype), low.dtype.type(0.0), low[last] - c.margin
+    for i in range(last):
+        room[i] = high[i] - low[i]
+        at = low[i] if c.held[i] > 0 else high[i]
+        load += c.held[i] * at
+        lacking -= c.temperature[i] * at
+    best = 0
+    while lacking > 0 and best >= 0:
+        best, most = -1, low.dtype.type(NO_EFFECT)
+        for i in range(last):
+            warms = c.temperature[i] * c.held[i] > 0  # in the direction in which it holds more
+            share = abs(c.temperature[i] / c.held[i])
+            if warms and room[i] > 0 and share > most:
+                best, most = i, share
+        if best >= 0:
+            moved = min(room[best], lacking / abs(c.temperature[best]))
+            load += abs(c.held[best]) * moved
+            lacking -= abs(c.temperature[best]) * room[best]
+            room[best] = low.dtype.type(0.0)
+    return load
+
+
+@kernel
+def nearest_point(rows: Array, bounds: Array, tolerance: float) -> Array:
+    """Return the point (2,) nearest to the origin with `rows` (4, 2) times it between `bounds` (4, 2).
+
+    Where there is none, the bounds of the first three rows come before those of the last. Of strips it is the origin,
+    its projection on a bound, or where two bounds meet.
+    """
+    best, missed = np.zeros(2, rows.dtype), np.empty(3, rows.dtype)
+    judge_point(rows, bounds, tolerance, best, missed)
+    point, found = np.empty(2, rows.dtype), np.empty(3, rows.dtype)
+    for i in range(rows.shape[0]):
+        square = rows[i, 0] * rows[i, 0] + rows[i, 1] * rows[i, 1]
+        for at in range(2):
+            share = bounds[i, at] / square
+            point[0], point[1] = share * rows[i, 0], share * rows[i, 1]
+            take_better(rows, bounds, tolerance, point, found, best, missed)
+            for j in range(i):
+                cross = rows[i, 0] * rows[j, 1] - rows[i, 1] * rows[j, 0]
+                for other in range(2):
+                    one, two = bounds[i, at] / cross, bounds[j, other] / cross
+                    point[0], point[1] = one * rows[j, 1] - two * rows[i, 1], two * rows[i, 0] - one * rows[j, 0]
+                    take_better(rows, bounds, tolerance, point, found, best, missed)
+    return best
+
+
+@kernel
+def take_better(
+    rows: Array, bounds: Array, tolerance: float, point: Array, found: Array, best: Array, missed: Array
+) -> None:
+    """Copy a point to `best` if it is better than that; `found` and `missed` (3,) are as `judge_point` judges them."""
+    judge_point(rows, bounds, tolerance, point, found)
+    for k in range(found.shape[0]):
+        if not found[k] <= missed[k]:
+            return
+        if found[k] < missed[k]:
+            best[:], missed[:] = point, found
+            return
+
+
+@kernel
+def judge_point(rows: Array, bounds: Array, tolerance: float, point: Array, missed: Array) -> None:
+    """Write what a point misses the bounds (4, 2) of the first three rows by, those of the last, and its square."""
+    n = rows.shape[0]
+    missed[0] = missed[1] = tolerance
+    for i in range(n):
+        value = rows[i, 0] * point[0] + rows[i, 1] * point[1]
+        k = 1 if i == n - 1 else 0
+        missed[k] = max(missed[k], bounds[i, 0] - value, value - bounds[i, 1])
+    missed[2] = point[0] * point[0] + point[1] * point[1]

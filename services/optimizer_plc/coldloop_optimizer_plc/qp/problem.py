@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from coldloop.process.settings import InputLimits, settings_of
-from coldloop_optimizer_plc.qp.design import ControlDesign, PenaltySettings, Target
 from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real, add_transposed_product, multiply
-from coldloop_optimizer_plc.qp.prediction import PredictionModel, state_cost
-from coldloop_optimizer_plc.qp.target import rest_of
+from coldloop_optimizer_plc.qp.prediction import PredictionModel, rest_of, state_cost
+from coldloop_optimizer_plc.settings import ControlDesign, PenaltySettings, Target
 
 Array = NDArray[np.float64]
 

@@ -16,8 +16,7 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from coldloop.kernels.intrinsics import Implementations
-from coldloop_optimizer_plc.computing_settings import OutsideSettings
-from coldloop_optimizer_plc.outside import Part, in_its_name, made
+from coldloop_optimizer_plc.computing_settings import OutsideSettings, Part, in_its_name, made
 from coldloop_optimizer_plc.qp.costs import Solution, augmented_cost, judge, penalty_multipliers
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 

@@ -20,9 +20,9 @@ from coldloop_optimizer_plc.qp.costs import (
     gradient_with_excess,
     matrices_of,
 )
-from coldloop_optimizer_plc.qp.design import PenaltySettings
 from coldloop_optimizer_plc.qp.linear_algebra import Real, cholesky, cholesky_solve
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
+from coldloop_optimizer_plc.settings import PenaltySettings
 from coldloop_optimizer_plc.solvers.interface import Answer, Costs, KernelSolver, solves_by
 
 Array = NDArray[np.float64]
