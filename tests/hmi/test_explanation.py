@@ -20,7 +20,7 @@ from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, UpdatingRuleKind, UpdatingRuleStatus
 from coldloop_hmi import explanation
 from coldloop_hmi.explanation import Branch, Explanation, increments_of, sentence
-from coldloop_optimizer_plc.rules import Algorithm1, Observation, assess, decide_algorithm_1
+from coldloop_optimizer_plc.rules import ALGORITHM_1, Observation, Rule, assess, decide
 from tests.harness.records import MAPS, as_transmitted
 
 getcontext().prec = 40
@@ -100,7 +100,7 @@ def decided_cases(wanted: int) -> list[Case]:
             continue
         observed = Observation(q, q, 0.25 * (1 + q), J_k, J_hot, J_last, J_hat, J_next)
         a = assess(observed)
-        decided = decide_algorithm_1(Algorithm1(9, 2, 19, 2), np.zeros(2), observed, a)
+        decided = decide(Rule(ALGORITHM_1, 9, 2, 19, 2), np.zeros(2), observed, a)
         assert decided == reference.q, "the program agrees with the reference"
         before = optimization(7, 100, q, j_effective=J_k, j_hot_start=J_hot, j_delivered=J_hat)
         update = optimization(

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 SINGLE = real_of(Arithmetic.FLOAT32)
 
-ON_LINE = {"qp.problem.instance", "qp.problem.inputs_of", "decisions.take_update", "scheme.solve"}
+ON_LINE = {"qp.problem.instance", "qp.problem.write_inputs", "decisions.take_update", "scheme.solve"}
 """Kernels that the program calls; those that they call, solvers and rules among them, are part of their code."""
 
 

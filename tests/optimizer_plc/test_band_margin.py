@@ -20,7 +20,9 @@ def test_both_rows_of_a_band_move_inwards_and_nothing_else(
     inside = PredictiveProblem(prediction, ControlDesign(band_margin=(0.1, 0.3)), LIMITS)
     at_rest = QpParameters(np.zeros(28), 0.0, np.zeros(3))
     wide, narrow = problem.at(at_rest), inside.at(at_rest)
-    moved = ((wide.gamma - narrow.gamma) / problem.row_gains)[:56].reshape(-1, 2, 2)  # instants, outputs, sides
+    moved = ((wide.gamma - narrow.gamma) / problem.predicted.row_gains)[:56].reshape(
+        -1, 2, 2
+    )  # instants, outputs, sides
     assert moved[:, 0] == pytest.approx(0.1)
     assert moved[:, 1] == pytest.approx(0.3)
     assert (wide.gamma[56:] == narrow.gamma[56:]).all()

@@ -171,7 +171,7 @@ def test_the_problem_keeps_the_reading_of_t5_within_its_band(
     rows = shift[:56].reshape(-1, 2, 2)  # instants, outputs, sides
     assert np.all(rows[:, 0] == 0.0)
     assert np.allclose(rows[:, 1, 0], -rows[:, 1, 1])
-    assert np.allclose(np.abs(rows[:, 1]), 0.4 * extended.row_gains[2])
+    assert np.allclose(np.abs(rows[:, 1]), 0.4 * extended.predicted.row_gains[2])
     assert np.all(shift[56:] == 0.0)
 
 

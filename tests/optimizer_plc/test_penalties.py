@@ -143,7 +143,7 @@ def test_a_row_keeps_its_share_of_a_violation(
 def test_the_output_of_the_smaller_weight_has_a_softer_row(prediction: PredictionModel) -> None:
     design = ControlDesign(violation_weight=(100.0, 25.0))
     problem = PredictiveProblem(prediction, design, InputLimits())
-    assert np.unique(problem.row_gains[:56].reshape(14, 2, 2), axis=0).tolist() == [[[1.0, 1.0], [0.5, 0.5]]]
+    assert np.unique(problem.predicted.row_gains[:56].reshape(14, 2, 2), axis=0).tolist() == [[[1.0, 1.0], [0.5, 0.5]]]
 
 
 # -- devices of the solver ---------------------------------------------------------------------------------------------

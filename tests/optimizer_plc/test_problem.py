@@ -291,7 +291,7 @@ def test_the_gradient_of_the_augmented_cost_is_that_of_its_formula(
     alpha, h = 3000.0, 1e-6
     gradient = 2 * qp.Phi @ z + qp.phi + 2 * alpha * qp.Gamma.T @ np.maximum(qp.Gamma @ z - qp.gamma, 0)
     computed, active = np.empty_like(z), np.empty_like(qp.gamma)
-    costs.gradient(matrices_of(qp), qp, z, alpha, computed, active)
+    costs.gradient(matrices_of(qp), qp, z, costs.row_excess(qp, z), alpha, computed, active)
     assert computed == pytest.approx(gradient, rel=1e-9, abs=1e-9 * np.abs(gradient).max())
     assert (active > 0).tolist() == (qp.Gamma @ z > qp.gamma).tolist()
     ahead, behind = (augmented_cost(qp, z + step * direction, alpha) for step in (h, -h))

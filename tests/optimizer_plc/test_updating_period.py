@@ -9,21 +9,23 @@ from hypothesis import strategies as st
 from coldloop.registers.optimizer_plc import UpdatingRuleKind
 from coldloop_optimizer_plc.computing_settings import BudgetSettings, PlcBudget
 from coldloop_optimizer_plc.rules import (
+    ALGORITHM_1,
+    CONTRACTION,
+    FIXED_PERIOD,
     MEMORY,
-    Algorithm1,
     Assessment,
-    ContractionRule,
-    FixedPeriod,
     Observation,
+    Rule,
     UpdatingRule,
     assess,
     assessed,
+    decide,
     decide_by,
     make_rule,
 )
-from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.settings import AdaptiveSettings, ProgramSettings, RuleName
 
-RULE = Algorithm1(q_first=9, q_min=2, q_max=19, delta=2)
+RULE = Rule(ALGORITHM_1, first=9, low=2, high=19, delta=2)
 
 
 class Deciding:
@@ -39,7 +41,7 @@ class Deciding:
 
 costs = st.floats(1.0, 1e8)
 rules = st.builds(
-    lambda bounds, delta: Algorithm1(q_first=bounds[0], q_min=bounds[0], q_max=bounds[1], delta=delta),
+    lambda bounds, delta: Rule(ALGORITHM_1, first=bounds[0], low=bounds[0], high=bounds[1], delta=delta),
     st.tuples(st.integers(1, 20), st.integers(1, 20)).map(lambda pair: (min(pair), max(pair))),
     st.integers(1, 20),
 )
@@ -140,12 +142,12 @@ def test_a_zero_gradient_changes_nothing() -> None:
 
 
 @given(rule=rules, observation=observations)
-def test_q_moves_by_delta_against_the_gradient_or_is_clipped(rule: Algorithm1, observation: Observation) -> None:
+def test_q_moves_by_delta_against_the_gradient_or_is_clipped(rule: Rule, observation: Observation) -> None:
     q, a = Deciding(rule).next(observation)
-    assert rule.q_min <= q <= rule.q_max
+    assert rule.low <= q <= rule.high
     sign = (a.gamma > 0) - (a.gamma < 0)
     wanted = observation.q - rule.delta * sign
-    assert q == min(rule.q_max, max(rule.q_min, wanted))
+    assert q == min(rule.high, max(rule.low, wanted))
     assert not math.isnan(a.gamma)
 
 
@@ -191,7 +193,7 @@ def test_the_response_increment_is_the_derivative_of_the_response_time(observati
 @pytest.mark.usefixtures("compiles")
 @given(observation=observations, q=st.integers(1, 19))
 def test_a_fixed_period_is_fixed_but_tells_the_quantities_all_the_same(observation: Observation, q: int) -> None:
-    rule = FixedPeriod(q)
+    rule = Rule(FIXED_PERIOD, q, q, q)
     assert rule.first == q
     assert Deciding(rule).next(observation) == (q, assess(observation))
 
@@ -200,7 +202,7 @@ def test_the_first_period_is_the_one_configured() -> None:
     assert RULE.first == 9
 
 
-OWN = ContractionRule(q_rest=2, q_max=5, band=10.0, least=5e-4, change=0.02)
+OWN = Rule(CONTRACTION, first=5, low=2, high=5, band=10.0, least=5e-4, change=0.02)
 
 
 def following(cost: float, q: int, before: float = 100.0) -> Observation:
@@ -262,23 +264,24 @@ def test_own_rule_stays_between_its_numbers(observed: list[Observation]) -> None
 
 @pytest.mark.usefixtures("compiles")
 @given(rule=rules, observation=observations)
-def test_compiled_and_plain_a_rule_is_assessed_the_same(rule: Algorithm1, observation: Observation) -> None:
+def test_compiled_and_plain_a_rule_is_assessed_the_same(rule: Rule, observation: Observation) -> None:
     """To the bit, and in single precision to its rounding."""
     assert assessed(observation) == assess(observation)
     single = Observation(*observation[:2], *map(np.float32, observation[2:]))
     rough, exact = assessed(single), assess(Observation(*single[:2], *map(float, single[2:])))
     assert rough.contraction == pytest.approx(exact.contraction, rel=1e-6)
-    assert rule.q_min <= decide_by(rule, np.zeros(MEMORY, np.float32), single, rough) <= rule.q_max
+    assert rule.low <= decide_by(rule, np.zeros(MEMORY, np.float32), single, rough) <= rule.high
 
 
 @pytest.mark.usefixtures("compiles")
 @pytest.mark.parametrize("kind", [kind for kind in UpdatingRuleKind if kind != UpdatingRuleKind.OUTSIDE])
 @given(observation=observations)
 def test_each_kind_is_decided_by_its_rule(kind: UpdatingRuleKind, observation: Observation) -> None:
-    rule = make_rule(ProgramSettings(), PlcBudget(BudgetSettings(), 0.25), 7)._replace(kind=int(kind))
-    assert rule.chosen.status.rule == kind
-    (of_all, a), (alone, _) = Deciding(rule).next(observation), Deciding(rule.chosen).next(observation)
-    assert of_all == alone
+    settings = ProgramSettings(adaptive=AdaptiveSettings(rule=RuleName[kind.name])) if kind else ProgramSettings()
+    rule = make_rule(settings, PlcBudget(BudgetSettings(), 0.25), 0 if kind else 7)
+    assert rule.status.rule == kind
+    decided, a = Deciding(rule).next(observation)
+    assert decided == decide.py_func(rule, np.zeros(MEMORY), observation, a)  # type: ignore[attr-defined]
     assert a == assess(observation)
 
 

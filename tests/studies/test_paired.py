@@ -125,8 +125,8 @@ def test_what_keeps_its_rates_is_played_as_it_is(problem: PredictiveProblem, pro
 def lowest_by_daqp(problem: PredictiveProblem, qp: QuadraticProblem, where: QpParameters) -> float:
     """Minimise the played cost as one quadratic problem: a slack for each output, side and sample, 421 variables."""
     n, samples = problem.n_inputs, problem.design.horizon
-    Y, y0 = problem.stacked_outputs_z[:n].T, problem.outputs(np.zeros(49), where).ravel()
-    low, high, weight = (np.tile(row, samples) for row in problem.bands)
+    Y, y0 = problem.predicted.of_z[:n].T, problem.outputs(np.zeros(49), where).ravel()
+    low, high, weight = (np.tile(row, samples) for row in problem.predicted.bands)
     m = len(Y)
     H = np.zeros((n + 2 * m, n + 2 * m))
     H[:n, :n] = 2.0 * problem.Phi[:n, :n]

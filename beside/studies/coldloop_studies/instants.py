@@ -90,7 +90,7 @@ def _judged(settings: Settings, label: str, names: Sequence[str], configured: fl
     problem, prediction = problem_of(settings)
     ticks = settings.process.ticks_per_sample
     run = partial(run_ideal_loop, settings, ticks=ticks)
-    flops = SOLVERS[program.solver].operations(counted_sizes(problem).without_zeros).flops
+    flops = SOLVERS[program.solver].operations(counted_sizes(problem)[1]).flops
     plc = PlcBudget(program.budget, program.iteration_s * flops / (configured or flops))
     costs = tuple(loop_cost(settings, name, ADAPTIVE, run) for name in names)
     require_costs(costs)

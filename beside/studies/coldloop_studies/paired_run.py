@@ -64,8 +64,8 @@ class PlayedProfiles:
         self._problem = problem
         self._hessian = 2.0 * problem.Phi[:n, :n]
         self._rates = np.ascontiguousarray(problem.Gamma[design.n_slacks * len(design.constraint_instants) :, :n])
-        self._outputs = np.ascontiguousarray(problem.stacked_outputs_z[:n].T)
-        self._low, self._high, self._weights = (np.tile(row, design.horizon) for row in problem.bands)
+        self._outputs = np.ascontiguousarray(problem.predicted.of_z[:n].T)
+        self._low, self._high, self._weights = (np.tile(row, design.horizon) for row in problem.predicted.bands)
         rate = np.asarray(problem.limits.rate) / np.asarray(design.input_scale)
         self._reach = np.outer(np.diff(design.decision_instants), rate)
 

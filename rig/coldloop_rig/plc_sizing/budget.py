@@ -16,54 +16,36 @@ from coldloop_optimizer_plc.qp.prediction import PredictionModel, prediction_of
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem
 from coldloop_optimizer_plc.settings import ControlDesign, ProgramSettings, SolverName, Target, trivial_design
 from coldloop_rig.plc_sizing import operations
-from coldloop_rig.plc_sizing.operations import (
-    ACTIVE_ROWS,
-    SOLVERS,
-    WORD,
-    Operations,
-    QpSizes,
-    dense_sizes,
-    sizes_without_zeros,
-)
+from coldloop_rig.plc_sizing.operations import ACTIVE_ROWS, SOLVERS, WORD, Operations, QpSizes
 from coldloop_rig.plc_sizing.plc import MEMORY_BYTES, PlcProfile, cholesky_times, reference_curve, residuals, slow_down
 from coldloop_rig.settings import Settings
 from coldloop_rig.text_tables import aligned
 
 
-class Workspace(NamedTuple):
-    """Workspace of a solver besides the problem, in numbers of single precision; zeros are stored.
+def workspaces(n: int, m: int) -> dict[SolverName, int]:
+    """Return the bytes of each solver's workspace besides the problem, for n variables and m rows; zeros are stored.
 
     Our own solvers as in their code, without copies of Phi and Gamma in another order; the others as their papers have
     them.
     """
-
-    matrices: int
-    """Elements of matrices."""
-    by_variable: int
-    """Vectors with an element for each variable."""
-    by_row: int
-    """Vectors with an element for each row of Gamma."""
-
-
-def workspaces(n: int, m: int) -> dict[SolverName, int]:
-    """Return the bytes of each solver's workspace for n variables and m rows."""
     triangle = n * (n + 1) // 2
-    held = {
+    held = {  # elements of matrices, vectors with an element for each variable, vectors with one for each row of Gamma
         # stage matrix; three points, four velocities, variables held; excess and three sets of active rows
-        SolverName.ODE: Workspace(n * n, 8, 4),
+        SolverName.ODE: (n * n, 8, 4),
         # Q, R, T; z, multipliers and data (gradient, bounds) with their steps, two products
-        SolverName.QPOASES: Workspace(3 * n * n, 12, 6),
+        SolverName.QPOASES: (3 * n * n, 12, 6),
         # L; z and z~ with scaling, five vectors of the rows of Gamma and of the n bounds, D of L D L'
-        SolverName.OSQP: Workspace(n * m + triangle, 10, 6),
+        SolverName.OSQP: (n * m + triangle, 10, 6),
         # z, the extrapolated point, gradient, change, step sizes; excess and active rows
-        SolverName.FAST_GRADIENT: Workspace(0, 5, 2),
+        SolverName.FAST_GRADIENT: (0, 5, 2),
         # Newton matrix; point, step, predicted point (z and two multipliers each), distances of both points, products,
         # gradient, best point
-        SolverName.INTERIOR_POINT: Workspace(n * n, 17, 8),
+        SolverName.INTERIOR_POINT: (n * n, 17, 8),
         # M, R^-1, L; nine vectors of variables, three of rows and bounds
-        SolverName.DAQP: Workspace(n * m + 2 * triangle + n + 1, 12, 3),
+        SolverName.DAQP: (n * m + 2 * triangle + n + 1, 12, 3),
     }
-    sizes = {name: WORD * (one.matrices + one.by_variable * n + one.by_row * m) for name, one in held.items()}
+    sizes = {name: WORD * (matrices + by_variable * n + by_row * m)
+             for name, (matrices, by_variable, by_row) in held.items()}  # fmt: skip
     return {**sizes, SolverName.HYBRID: max(sizes[SolverName.ODE], sizes[SolverName.INTERIOR_POINT])}
 
 
@@ -104,13 +86,10 @@ def footprint(problem: PredictiveProblem, estimator: int, solver: SolverName) ->
     if problem.Phi.dtype != np.float32:
         raise ValueError("the PLC computes in single precision")
     return Footprint(
-        hessian=problem.Phi.nbytes,
-        problem=problem.memory() - problem.Phi.nbytes,
-        shift=problem.Phi.nbytes,
-        solver=workspaces(problem.size, len(problem.Gamma))[solver],
-        estimator=estimator,
+        hessian=problem.Phi.nbytes, problem=problem.memory() - problem.Phi.nbytes, shift=problem.Phi.nbytes,
+        solver=workspaces(problem.size, len(problem.Gamma))[solver], estimator=estimator,
         sequence=2 * SEQUENCE_ROWS * problem.design.n_inputs * WORD,
-    )
+    )  # fmt: skip
 
 
 ROUNDING = 1e-9
@@ -200,13 +179,6 @@ def _calls(profile: PlcProfile, budget: PlcBudget) -> str:
     )
 
 
-class CountedSizes(NamedTuple):
-    """The sizes of a problem, counted in both ways."""
-
-    dense: QpSizes
-    without_zeros: QpSizes
-
-
 def budget_tables(settings: Settings, period_s: float | None, executed: Callable[[PredictiveProblem], str]) -> str:
     """Return the tables as text, for the configured power and one updating period or several.
 
@@ -218,8 +190,15 @@ def budget_tables(settings: Settings, period_s: float | None, executed: Callable
     problem, prediction = problem_of(settings)
     program = settings.optimizer_plc.program
     limited, apart = program.cold_end.approach_k > 0.0, predicted_apart(program, prediction)
+    curve, times = reference_curve(), cholesky_times()
+    speed = (
+        f"Cholesky factorisation on the PLC: {curve.c1 * 1e6:.3g} n + {curve.c2 * 1e6:.3g} n^2 "
+        f"+ {curve.c3 * 1e6:.3g} n^3 us, within {100 * np.abs(residuals(curve, times)).max():.2f} % of 25 times\n"
+        f"speed in loops of length {problem.size}: {curve.flops_per_s(problem.size) / 1e6:.3f} Mflop/s; "
+        f"slow-down against the laptop: {slow_down(times, problem.size):.0f}\n"
+    )
     return "\n".join([
-        _speed(problem.size),
+        speed,
         _operations(problem, prediction, apart, limited=limited) + executed(problem),
         _iterations(program, problem, period_s),
         _memory(settings, problem, prediction, MEMORY_BYTES),
@@ -276,21 +255,11 @@ def with_power(settings: Settings, power: float) -> Settings:
     return settings.with_program(budget=settings.optimizer_plc.program.budget.model_copy(update={"power": power}))
 
 
-def counted_sizes(problem: PredictiveProblem) -> CountedSizes:
-    """Return the sizes of a problem, counted in both ways."""
-    return CountedSizes(
-        dense_sizes(problem.size, len(problem.Gamma), problem.n_inputs),
-        sizes_without_zeros(problem.Phi, problem.Gamma, np.isfinite(problem.maps.high)),
-    )
-
-
-def _speed(size: int) -> str:
-    curve, times = reference_curve(), cholesky_times()
+def counted_sizes(problem: PredictiveProblem) -> tuple[QpSizes, QpSizes]:
+    """Return the sizes of a problem: dense, and with its zeros left out."""
     return (
-        f"Cholesky factorisation on the PLC: {curve.c1 * 1e6:.3g} n + {curve.c2 * 1e6:.3g} n^2 "
-        f"+ {curve.c3 * 1e6:.3g} n^3 us, within {100 * np.abs(residuals(curve, times)).max():.2f} % of 25 times\n"
-        f"speed in loops of length {size}: {curve.flops_per_s(size) / 1e6:.3f} Mflop/s; "
-        f"slow-down against the laptop: {slow_down(times, size):.0f}\n"
+        operations.dense_sizes(problem.size, len(problem.Gamma), problem.n_inputs),
+        operations.sizes_without_zeros(problem.Phi, problem.Gamma, np.isfinite(problem.maps.high)),
     )
 
 
@@ -341,7 +310,7 @@ def solver_table(
     columns = ("solver", "paper s", "dense s", "without zeros s", "tau_1_s", "default follows")
     rows: list[tuple[str, ...]] = [(*columns, "periods", *(f"in {period:g} s" for period in periods_s), "kB")]
     for name, solver in SOLVERS.items():
-        tau_1_s = _tau_1_s(program, name)
+        tau_1_s = program.iteration_of(name)
         plc = PlcBudget(program.budget, tau_1_s)
         rows.append((
             name, "" if solver.paper_s is None else f"{solver.paper_s:.2f}",
@@ -350,12 +319,6 @@ def solver_table(
             f"{memory[name] / 1e3:.1f}",
         ))  # fmt: skip
     return rows
-
-
-def _tau_1_s(program: ProgramSettings, name: SolverName) -> float:
-    if name is SolverName.HYBRID:
-        return max(program.ode.tau_1_s, program.interior_point.tau_1_s)
-    return float(getattr(program, name.replace("-", "_")).tau_1_s)
 
 
 def _iterations(program: ProgramSettings, problem: PredictiveProblem, period_s: float | None) -> str:

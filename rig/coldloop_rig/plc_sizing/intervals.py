@@ -17,6 +17,7 @@ scenarios are drawn from, and about problems that a converged loop meets, hot-st
 
 import random
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from itertools import product
 from typing import Final, NamedTuple
 
@@ -31,7 +32,7 @@ from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.qp.costs import augmented_cost
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
-from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
+from coldloop_optimizer_plc.settings import SolverName
 from coldloop_optimizer_plc.solvers import Solver, make_solver
 from coldloop_plant.load import HOURS, drawn, find_load
 from coldloop_rig.cosim.ideal_loop import run_ideal_loop
@@ -265,7 +266,10 @@ def certify(
         progress: Called with the number of scenarios done.
     """
     program = settings.optimizer_plc.program
-    solvers = {name: solver for name in SolverName if (solver := _solver(program, name)) is not None}
+    solvers = dict[SolverName, Solver]()
+    for name in SolverName:
+        with suppress(ConfigurationError):  # it is not installed
+            solvers[name] = make_solver(program.model_copy(update={"solver": name}))
     floor = program.adaptive.cost_floor
     needs: dict[SolverName, list[Needs]] = {name: [] for name in solvers}
     for number in range(scenarios):
@@ -285,14 +289,6 @@ def _certificate(name: SolverName, fitting: int, needs: list[Needs], beta: float
         name, fitting, failures, failure_bound(failures, len(needs), beta), max(one.worst for one in needs),
         run_failures, failure_bound(run_failures, len(needs), beta),
     )  # fmt: skip
-
-
-def _solver(program: ProgramSettings, name: SolverName) -> Solver | None:
-    """Return a solver; None if it is not installed."""
-    try:
-        return make_solver(program.model_copy(update={"solver": name}))
-    except ConfigurationError:
-        return None
 
 
 def certification_table(settings: Settings, scenarios: int, tolerance_pct: float, confidence_pct: float) -> str:

@@ -11,23 +11,14 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from coldloop.registers.control_plc import SEQUENCE_ROWS
+from coldloop_optimizer_plc import scheme
 from coldloop_optimizer_plc.estimator import Belief, begin_at_rest, correct, forget
 from coldloop_optimizer_plc.plausibility import USED, suspects_of
 from coldloop_optimizer_plc.qp.costs import augmented_cost
 from coldloop_optimizer_plc.qp.prediction import bounds_at, find_target, least_warm_load, loads_held
 from coldloop_optimizer_plc.qp.problem import hold, shift, shifted
 from coldloop_optimizer_plc.rules import Assessment, Observation, UpdatingRule, assessed, decide_by
-from coldloop_optimizer_plc.scheme import (
-    LARGEST,
-    Constants,
-    Delivery,
-    OptimizerState,
-    idle_valve,
-    predict_played,
-    problem_at,
-    stands,
-    with_floor,
-)
+from coldloop_optimizer_plc.scheme import Constants, OptimizerState
 
 Array = NDArray[np.float64]
 
@@ -69,20 +60,6 @@ class Starts(NamedTuple):
 
     first: int
     after_step: int
-
-
-@kernel
-def begin_sent(m: OptimizerState) -> None:
-    """Let the last answer be what is played: its sequence begins."""
-    copy_delivery(m.sent, m.playing)
-
-
-@kernel
-def copy_delivery(source: Delivery, target: Delivery) -> None:
-    """Make `target` the same as `source`."""
-    target.numbers[0] = source.numbers[0]
-    target.x[:], target.u_before[:], target.z[:] = source.x, source.u_before, source.z
-    target.rows[:] = source.rows
 
 
 @kernel
@@ -155,17 +132,9 @@ def limit_of_feed(c: Constants, m: OptimizerState, y: Array) -> float:
 
 @kernel
 def plan(
-    c: Constants,
-    rule: UpdatingRule,
-    m: OptimizerState,
-    wanted: int,
-    update: int,
-    tick: int,
-    u_before: Array,
-    load: float,
-    y: Array,
-    x: Array,
-) -> None:
+    c: Constants, rule: UpdatingRule, m: OptimizerState, wanted: int, update: int, tick: int, u_before: Array,
+    load: float, y: Array, x: Array,
+) -> None:  # fmt: skip
     """Take the update latched at `tick`, in physical units and the on-line type; decide the updating period.
 
     `wanted` is its q, or BY_THE_RULE where what is played is the answer to the update before, in time. The program does
@@ -198,17 +167,17 @@ def judge_played(c: Constants, m: OptimizerState, load: float, y: Array) -> floa
     now, played, real = m.numbers[0], m.playing.numbers[0], m.belief.x.dtype.type
     w = m.belief.numbers[0].w
     now.suspects = suspects_of(m.belief.readings)
-    if stands(c.turbine, y):
+    if scheme.stands(c.turbine, y):
         now.suspects += c.turbine.bit
-    idle = idle_valve(c.turbine, now.suspects)
+    idle = scheme.idle_valve(c.turbine, now.suspects)
     at = m.u[max(idle, 0)] / c.input_scale[max(idle, 0)]
     now.most_open = limit_of_feed(c, m, y)
     now.shortage = shortage(c, m.belief.x, w, load, now.most_open, idle, at, now.shortage, real(0.0))
-    if not abs(now.shortage) <= real(LARGEST):  # by an estimate that leads to no answer
+    if not abs(now.shortage) <= real(scheme.LARGEST):  # by an estimate that leads to no answer
         now.shortage = real(0.0)
     find_target(c.target, m.belief.x, w, m.belief.numbers[0].mismatch, now.most_open, idle, at, m.target)
-    qp = problem_at(c, m.belief.x, w, m.playing.u_before, played.share, m.target, now.most_open, idle)
-    return with_floor(augmented_cost(qp, m.playing.z, c.alpha), qp.constant, c.floor)
+    qp = scheme.problem_at(c, m.belief.x, w, m.playing.u_before, played.share, m.target, now.most_open, idle)
+    return scheme.with_floor(augmented_cost(qp, m.playing.z, c.alpha), qp.constant, c.floor)
 
 
 @kernel
@@ -274,7 +243,7 @@ def follow(c: Constants, m: OptimizerState, latched: Latched) -> int:
     if not (known and 0 <= elapsed <= LONGEST_GAP_TICKS and knows_what_is_played(m, latched.playing)):
         begin_again(c, m, latched, u, failed and m.playing.numbers[0].number == latched.playing)
     elif 0 < elapsed != now.ticks:
-        predict_played(c, m, elapsed)
+        scheme.predict_played(c, m, elapsed)
     interrupted = now.planned and 0 < elapsed < now.ticks and 0 < c.load_step < abs(latched.load - now.load)
     in_time = follow_sequence(c, m, latched, u)
     now.sequences = max(now.sequences, latched.playing)
@@ -329,8 +298,10 @@ def follow_sequence(c: Constants, m: OptimizerState, latched: Latched, u: Array)
     """Find out which profile is played from an update on; return whether it is the last answer, in time."""
     now, played, sent = m.numbers[0], m.playing.numbers[0], m.sent.numbers[0]
     begun, late = sent.length > 0 and sent.number == latched.playing, 0
-    if begun:
-        begin_sent(m)
+    if begun:  # the last answer is what is played
+        m.playing.numbers[0] = m.sent.numbers[0]
+        m.playing.x[:], m.playing.u_before[:], m.playing.z[:] = m.sent.x, m.sent.u_before, m.sent.z
+        m.playing.rows[:] = m.sent.rows
         late = latched.tick - sent.first_tick  # scans were missed: it began before this instant
     elif now.planned and played.length == 0:  # others may have moved the inputs again
         hold(u, c.input_scale, c.n_inputs, m.playing.z)

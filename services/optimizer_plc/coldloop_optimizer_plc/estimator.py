@@ -13,40 +13,18 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.compiled import kept, kernel
+from coldloop_optimizer_plc import computing_settings as computing
+from coldloop_optimizer_plc import plausibility as check
 from coldloop_optimizer_plc.computing_settings import (
     EstimatorKind,
     EstimatorSettings,
     NoiseReference,
-    Part,
     PlausibilitySettings,
-    in_its_name,
-    made,
     signals_of,
 )
-from coldloop_optimizer_plc.plausibility import (
-    NONE,
-    USED,
-    Apart,
-    Plausibility,
-    are_finite,
-    imputed,
-    judge,
-    new_readings,
-    none_apart,
-    note_surprise,
-    plausibility_of,
-    predict_apart,
-    watch,
-)
-from coldloop_optimizer_plc.qp.linear_algebra import (
-    DOUBLE,
-    Real,
-    add_transposed_product,
-    cholesky,
-    cholesky_solve,
-    multiply,
-    respond,
-)
+from coldloop_optimizer_plc.plausibility import Apart, Plausibility
+from coldloop_optimizer_plc.qp import linear_algebra as la
+from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, Transition
 
 Array = NDArray[np.float64]
@@ -109,11 +87,9 @@ class Belief(NamedTuple):
 
 
 def estimator_of(
-    prediction: PredictionModel,
-    settings: EstimatorSettings,
-    real: Real = DOUBLE,
+    prediction: PredictionModel, settings: EstimatorSettings, real: Real = DOUBLE,
     plausibility: PlausibilitySettings | None = None,
-) -> Estimator:
+) -> Estimator:  # fmt: skip
     """Return the estimator that the settings name; without `plausibility` whatever sensors show is plausible.
 
     Raises:
@@ -134,7 +110,9 @@ def estimator_of(
         m.outputs.transposed(), np.array(m.x0), np.array(m.u0), np.array(m.y0), m.w0, real(process.tick_s), kalman,
         settings.load_known,
         StationaryGains(*(array.astype(real, copy=False) for array in stationary)),
-        plausibility_of(plausible, prediction, settings.sensors, len(prediction.transitions) * process.tick_s, real),
+        check.plausibility_of(
+            plausible, prediction, settings.sensors, len(prediction.transitions) * process.tick_s, real
+        ),
     )  # fmt: skip
 
 
@@ -143,7 +121,7 @@ def no_belief(n_states: int, n_outputs: int, real: Real = DOUBLE) -> Belief:
     numbers = np.zeros(1, [("w", real), ("mismatch", real), ("since", "i8")])
     belief = Belief(
         numbers, np.zeros(n_states, real), np.zeros(n_states, real), np.zeros(n_outputs, real),
-        new_readings(n_outputs, real), none_apart(n_states, real),
+        check.new_readings(n_outputs, real), check.none_apart(n_states, real),
     )  # fmt: skip
     forget(belief)
     return belief
@@ -157,10 +135,10 @@ def forget(belief: Belief) -> None:
     belief.predicted[:] = zero
     belief.surprise[:] = zero
     b.w, b.mismatch, b.since = zero, zero, 1
-    belief.apart.watch[0].age_s = NONE
+    belief.apart.watch[0].age_s = check.NONE
     for i in range(belief.readings.shape[0]):
         r = belief.readings[i]
-        r.state, r.since_s, r.agreed_s, r.spikes_s = USED, zero, zero, zero
+        r.state, r.since_s, r.agreed_s, r.spikes_s = check.USED, zero, zero, zero
         r.jump, r.jumped_to, r.difference = zero, zero, zero
 
 
@@ -197,27 +175,27 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
         b.w, b.mismatch = known, belief.x.dtype.type(0.0)
         return
     real, period, maps = belief.x.dtype.type, min(b.since, c.stationary.gains.shape[0]) - 1, c.outputs
-    expected = respond(maps.A, maps.B, maps.F, belief.predicted, u_before - c.u0, known + b.mismatch)
+    expected = la.respond(maps.A, maps.B, maps.F, belief.predicted, u_before - c.u0, known + b.mismatch)
     innovation = y - c.y0 - expected
     J = c.stationary.inverse_covariances[period]
     if c.plausible.sigmas > 0.0:
-        innovation = judge(
+        innovation = check.judge(
             c.plausible, belief.readings, belief.surprise, belief.predicted, y, innovation, J,
             real(b.since) * c.tick_s,
         )  # fmt: skip
     believed = innovation.copy()
-    if not are_finite(innovation):
-        innovation = imputed(innovation, J)
+    if not check.are_finite(innovation):
+        innovation = check.imputed(innovation, J)
     if b.since <= c.stationary.gains.shape[0]:  # J is for no longer time
-        note_surprise(belief.surprise, innovation, J, real(b.since) * real(1.0 / MEMORY_TICKS))
+        check.note_surprise(belief.surprise, innovation, J, real(b.since) * real(1.0 / MEMORY_TICKS))
     correction = np.zeros(belief.x.size + 1, belief.x.dtype)
-    add_transposed_product(c.stationary.gains[period], innovation, correction)
+    la.add_transposed_product(c.stationary.gains[period], innovation, correction)
     belief.x[:] = belief.predicted + correction[:-1]
     belief.predicted[:] = belief.x
     b.mismatch += correction[belief.x.size]
     b.w = known + b.mismatch
     if c.plausible.watched >= 0:
-        watch(
+        check.watch(
             c.plausible, maps, c.stationary.gains[period], J, belief, known, u_before - c.u0, y - c.y0, believed,
             real(b.since) * c.tick_s,
         )  # fmt: skip
@@ -243,9 +221,9 @@ def predict(c: Estimator, belief: Belief, u: Array, ticks: int) -> None:
     while ticks > 0:
         step = min(ticks, longest)
         A, B, F = c.steps.A[step - 1], c.steps.B[step - 1], c.steps.F[step - 1]
-        belief.predicted[:] = respond(A, B, F, belief.predicted, u, b.w)
+        belief.predicted[:] = la.respond(A, B, F, belief.predicted, u, b.w)
         if belief.apart.watch[0].age_s >= 0.0:
-            predict_apart(A, B, F, belief, u)
+            check.predict_apart(A, B, F, belief, u)
         ticks -= step
 
 
@@ -306,17 +284,9 @@ def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -
     drift, sensors = walks_of(prediction, settings), np.array(settings.sensors)
     process = prediction.process
     found = kept(
-        "kalman",
-        gains_after,
-        steps,
-        C,
-        drift,
-        sensors,
-        of_time,
-        settings.longest_riccati,
-        process.tick_s,
+        "kalman", gains_after, steps, C, drift, sensors, of_time, settings.longest_riccati, process.tick_s,
         process.sampling_period_s,
-    )
+    )  # fmt: skip
     gains, inverses = np.split(found, [nx + 1], axis=2)
     gains = np.insert(gains, [nx] * len(prediction.ahead), 0.0, axis=2)
     return StationaryGains(np.ascontiguousarray(gains), np.ascontiguousarray(inverses))
@@ -413,11 +383,11 @@ def inverse_covariance(A: Array, C: Array, process: Array, sensors: Array, P: Ar
 
     `process` (n) and `sensors` (n_y) are variances.
     """
-    before = multiply(multiply(A, P), np.ascontiguousarray(A.T)) + np.diag(process)
-    S = multiply(multiply(C, before), np.ascontiguousarray(C.T)) + np.diag(sensors)
-    inverse, skyline = np.eye(len(C)), cholesky(S)
+    before = la.multiply(la.multiply(A, P), np.ascontiguousarray(A.T)) + np.diag(process)
+    S = la.multiply(la.multiply(C, before), np.ascontiguousarray(C.T)) + np.diag(sensors)
+    inverse, skyline = np.eye(len(C)), la.cholesky(S)
     for column in inverse:
-        cholesky_solve(S, skyline, column)
+        la.cholesky_solve(S, skyline, column)
     return inverse
 
 
@@ -451,7 +421,7 @@ def stationary_gain(A: Array, C: Array, process: Array, sensors: Array, P: Array
     previous = np.zeros((m, n))
     At = np.ascontiguousarray(A.T)
     for _ in range(periods):
-        P[:] = multiply(multiply(A, P), At)
+        P[:] = la.multiply(la.multiply(A, P), At)
         _keep_symmetric(P)
         for i in range(n):
             P[i, i] += process[i]
@@ -566,7 +536,9 @@ class OutsideEstimator:
     def __init__(self, name: str, prediction: PredictionModel, settings: EstimatorSettings) -> None:
         self.name = name
         self._n_states = prediction.n_estimated
-        self._estimator: OutsideCorrection = made(Part.ESTIMATOR, name, plant_model(prediction, settings))
+        self._estimator: OutsideCorrection = computing.made(
+            computing.Part.ESTIMATOR, name, plant_model(prediction, settings)
+        )
 
     def correct(self, c: Estimator, belief: Belief, u_before: Array, load: float, y: Array) -> None:
         """Take a measurement (u_before (m,), load, y (n_y,), in physical units), as `estimator.correct` does.
@@ -577,7 +549,7 @@ class OutsideEstimator:
         b, predicted = belief.numbers[0], belief.predicted[: self._n_states]
         known = load - c.w0 if c.load_known else 0.0
         measured = Measured(int(b["since"]), u_before - c.u0, known, y - c.y0)
-        with in_its_name(Part.ESTIMATOR, self.name):
+        with computing.in_its_name(computing.Part.ESTIMATOR, self.name):
             x, mismatch = self._estimator.correct(predicted.copy(), float(b["mismatch"]), measured)
             x, mismatch = np.asarray(x, np.float64), float(mismatch)
         if x.shape == predicted.shape and np.isfinite(x).all() and math.isfinite(mismatch):

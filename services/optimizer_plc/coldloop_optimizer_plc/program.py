@@ -205,14 +205,9 @@ class OptimizerProgram:
         length, held = int(sent["length"]), self.process.ticks_per_sample
         inputs = list(map(tuple, rows[:length:held].tolist()))
         header = SequenceHeader(
-            number=int(sent["number"]),
-            update=int(now["update"]),
-            first_tick=int(sent["first_tick"]),
-            length=length,
-            tau_u=int(now["ticks"]),
-            model_digest=self.model_digest,
-            crc=0,
-        )
+            number=int(sent["number"]), update=int(now["update"]), first_tick=int(sent["first_tick"]), length=length,
+            tau_u=int(now["ticks"]), model_digest=self.model_digest, crc=0,
+        )  # fmt: skip
         return with_checksum(header, [inputs[tick // held] for tick in range(length)])
 
     def answered(self, *, late: bool) -> None:

@@ -130,14 +130,10 @@ class OptimizerPublication:
 
     def _identity(self) -> Identity:
         return Identity(
-            map_digest=self.bank.map.digest,
-            map_version=self.bank.map.version,
-            state=ServiceState.RUNNING if self._session else ServiceState.READY,
-            model_digest=self._model_digest,
-            session=self._session,
-            tick=self._tick,
-            heartbeat=(self._last.update + 1 if self._last else 0) & 0xFFFF,
-        )
+            map_digest=self.bank.map.digest, map_version=self.bank.map.version,
+            state=ServiceState.RUNNING if self._session else ServiceState.READY, model_digest=self._model_digest,
+            session=self._session, tick=self._tick, heartbeat=(self._last.update + 1 if self._last else 0) & 0xFFFF,
+        )  # fmt: skip
 
     def snapshot(self) -> Mapping[str, object]:
         """Return what telemetry publishes."""

@@ -1,4 +1,4 @@
-"""Rules of the updating period: what they decide by, the three of ours, somebody else's, and which one is used.
+"""Rules of the updating period: what they decide by, the three of ours, and somebody else's.
 
 A rule decides q(t_{k+1}), the number of the next period in the ladder of periods; `PlcBudget` knows the ladder, and how
 many iterations of the solver fit into each. A rule is a NamedTuple of its parameters and a kernel that is registered
@@ -7,7 +7,7 @@ for it, which takes single and double precision alike.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Final, NamedTuple, Protocol, TypeVar
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from numba.extending import overload
@@ -18,7 +18,7 @@ from coldloop.kernels.intrinsics import Implementations
 from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
 from coldloop_optimizer_plc.computing_settings import Part, PlcBudget, in_its_name, made
 from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real
-from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.settings import ProgramSettings, RuleName
 
 Array = NDArray[np.float64]
 
@@ -108,19 +108,12 @@ class UpdatingRule(Protocol):
 
 
 Decision = Callable[[Any, Array, Observation, Assessment], int]
-D = TypeVar("D", bound=Decision)
 DECISIONS: Final[Implementations[Decision]] = Implementations("decide_by")
 """The kernel of each rule."""
 
 
-def decides_by(rule: type) -> Callable[[D], D]:
-    """Register a kernel as what decides by rules of this type."""
-
-    def register(decision: D) -> D:
-        DECISIONS[rule] = decision
-        return decision
-
-    return register
+decides_by = DECISIONS.register
+"""Decorator of the kernel that decides by rules of a class."""
 
 
 def decide_by(rule: Any, memory: Array, observation: Observation, assessment: Assessment) -> int:  # noqa: ANN401
@@ -137,113 +130,71 @@ def _decide_by(rule: Any, memory: Any, observation: Any, assessment: Any) -> Any
 # -- the rules ---------------------------------------------------------------------------------------------------------
 
 
-class FixedPeriod(NamedTuple):
-    """Always the same q: what adaptive periods are compared with."""
-
-    q: int
-
-    @property
-    def first(self) -> int:
-        """The fixed one."""
-        return self.q
-
-    @property
-    def status(self) -> UpdatingRuleStatus:
-        """The fixed one."""
-        return UpdatingRuleStatus(UpdatingRuleKind.FIXED, self.q, self.q, self.q)
-
-    def after_interruption(self) -> int:
-        """Return the fixed one."""
-        return self.q
+FIXED_PERIOD: Final = int(UpdatingRuleKind.FIXED)
+ALGORITHM_1: Final = int(UpdatingRuleKind.ALGORITHM_1)
+CONTRACTION: Final = int(UpdatingRuleKind.CONTRACTION)
 
 
-@decides_by(FixedPeriod)
-@kernel
-def decide_fixed_period(rule: FixedPeriod, memory: Array, o: Observation, a: Assessment) -> int:  # noqa: ARG001
-    """Return the fixed one."""
-    return rule.q
+class Rule(NamedTuple):
+    """Parameters of any rule of ours: of one type, so that what is compiled for one serves all.
 
-
-class Algorithm1(NamedTuple):
-    """The paper's rule as printed (section II): one step of `delta` down Gamma, projected on {q_min, ..., q_max}."""
-
-    q_first: int
-    q_min: int
-    q_max: int
-    delta: int
-
-    @property
-    def first(self) -> int:
-        """q(t_0)."""
-        return self.q_first
-
-    @property
-    def status(self) -> UpdatingRuleStatus:
-        """Its four parameters."""
-        return UpdatingRuleStatus(UpdatingRuleKind.ALGORITHM_1, self.q_first, self.q_min, self.q_max, self.delta)
-
-    def after_interruption(self) -> int:
-        """Return q(t_0): what was learnt of the problem before the step says nothing of the one after."""
-        return self.q_first
-
-
-@decides_by(Algorithm1)
-@kernel
-def decide_algorithm_1(rule: Algorithm1, memory: Array, o: Observation, a: Assessment) -> int:  # noqa: ARG001
-    """Return max(q_min, min(q_max, q - delta sign(Gamma)))."""
-    zero = type(a.gamma)(0.0)
-    sign = int(a.gamma > zero) - int(a.gamma < zero)
-    return max(rule.q_min, min(rule.q_max, o.q - rule.delta * sign))
-
-
-USUAL: Final = 0
-"""Place of the usual size of |ln K| in the memory."""
-
-
-class ContractionRule(NamedTuple):
-    """Algorithm 1 with a dead band, that rests at its shortest period; the default of the cold box.
+    - Fixed period: always the same q, what adaptive periods are compared with.
+    - Algorithm 1: the paper's rule as printed (section II), one step of `delta` down Gamma, projected on
+      {low, ..., high}.
+    - Contraction: Algorithm 1 with a dead band, that rests at its shortest period; the default of the cold box.
 
     The cost contracts from J_k to J_{k+1} by K. Where |ln K| is within `band` times its usual size, it says nothing,
-    and q goes down by one to `q_rest`. Beyond that, q goes up by one where the gradient Gamma of the response time asks
-    for a longer period, and down by one where it does not. The usual size is the median of |ln K|, followed by small
-    steps up and down: in quiet it is the noise of the measured contraction (`docs/updating-period.md`). The last three
-    parameters have the floating-point type of the costs.
+    and the contraction rule's q goes down by one to `low`. Beyond that, q goes up by one where the gradient Gamma of
+    the response time asks for a longer period, and down by one where it does not. The usual size is the median of
+    |ln K|, followed by small steps up and down: in quiet it is the noise of the measured contraction
+    (`docs/updating-period.md`). The last three parameters have the floating-point type of the costs.
     """
 
-    q_rest: int
-    q_max: int
-    band: float
+    kind: int
+    """An `UpdatingRuleKind`."""
+    first: int
+    """q(t_0), and that of a period which begins with a load step: what was learnt before says nothing of it."""
+    low: int
+    """Least q."""
+    high: int
+    """Largest q."""
+    delta: int = 0
+    """Step of Algorithm 1."""
+    band: float = 0.0
     """Usual sizes of |ln K| up to which it says nothing."""
-    least: float
+    least: float = 0.0
     """Least usual size, where it begins."""
-    change: float
+    change: float = 0.0
     """Share by which the usual size changes in a period."""
 
     @property
-    def first(self) -> int:
-        """The largest q."""
-        return self.q_max
-
-    @property
     def status(self) -> UpdatingRuleStatus:
-        """The two numbers that q moves between."""
-        return UpdatingRuleStatus(UpdatingRuleKind.CONTRACTION, self.q_max, self.q_rest, self.q_max)
+        """The rule and its whole numbers, as registers show them."""
+        return UpdatingRuleStatus(UpdatingRuleKind(self.kind), *self[1:5])
 
     def after_interruption(self) -> int:
-        """Return the largest q: a new load is answered by one longer solve."""
-        return self.q_max
+        """Return the q of the period that begins with a load step."""
+        return self.first
 
 
-@decides_by(ContractionRule)
+@decides_by(Rule)
 @kernel
-def decide_contraction(rule: ContractionRule, memory: Array, o: Observation, a: Assessment) -> int:
-    """Return q(t_{k+1}): about a dozen operations, one of them a logarithm."""
+def decide(rule: Rule, memory: Array, o: Observation, a: Assessment) -> int:
+    """Return q(t_{k+1}); by contraction it takes about a dozen operations, one of them a logarithm.
+
+    The usual size of |ln K| is in the memory.
+    """
     zero, one = memory.dtype.type(0.0), memory.dtype.type(1.0)
-    usual = max(memory[USUAL], rule.least)
+    if rule.kind == FIXED_PERIOD:
+        return rule.first
+    if rule.kind == ALGORITHM_1:
+        sign = int(a.gamma > zero) - int(a.gamma < zero)
+        return max(rule.low, min(rule.high, o.q - rule.delta * sign))
+    usual = max(memory[0], rule.least)
     size = abs(math.log(o.effective / o.effective_before))
-    memory[USUAL] = usual * (one + rule.change) if size > usual else usual * (one - rule.change)
+    memory[0] = usual * (one + rule.change) if size > usual else usual * (one - rule.change)
     longer = size > rule.band * usual and a.gamma < zero
-    return min(o.q + 1, rule.q_max) if longer else max(min(o.q - 1, rule.q_max), rule.q_rest)
+    return min(o.q + 1, rule.high) if longer else max(min(o.q - 1, rule.high), rule.low)
 
 
 class OutsideDecision(Protocol):
@@ -301,54 +252,6 @@ def decide_outside(rule: OutsideRule, memory: Array, o: Observation, a: Assessme
     return rule.decide(o, a)
 
 
-# -- which one is used -------------------------------------------------------------------------------------------------
-
-
-FIXED_PERIOD: Final = int(UpdatingRuleKind.FIXED)
-ALGORITHM_1: Final = int(UpdatingRuleKind.ALGORITHM_1)
-
-
-class Rule(NamedTuple):
-    """The rules in the order of `UpdatingRuleKind`, of which one decides: what is compiled for one serves all."""
-
-    kind: int
-    """An `UpdatingRuleKind`."""
-    fixed_period: FixedPeriod
-    algorithm_1: Algorithm1
-    contraction: ContractionRule
-
-    @property
-    def chosen(self) -> UpdatingRule:
-        """The rule that decides."""
-        rules: tuple[UpdatingRule, ...] = self[1:]
-        return rules[self.kind]
-
-    @property
-    def first(self) -> int:
-        """q(t_0)."""
-        return self.chosen.first
-
-    @property
-    def status(self) -> UpdatingRuleStatus:
-        """The rule and its parameters, as registers show them."""
-        return self.chosen.status
-
-    def after_interruption(self) -> int:
-        """Return the q of the period that begins with a load step."""
-        return self.chosen.after_interruption()
-
-
-@decides_by(Rule)
-@kernel
-def decide_chosen(rule: Rule, memory: Array, o: Observation, a: Assessment) -> int:
-    """Return q(t_{k+1})."""
-    if rule.kind == FIXED_PERIOD:
-        return rule.fixed_period.q
-    if rule.kind == ALGORITHM_1:
-        return decide_algorithm_1(rule.algorithm_1, memory, o, a)
-    return decide_contraction(rule.contraction, memory, o, a)
-
-
 def make_rule(settings: ProgramSettings, budget: PlcBudget, fixed_ticks: int, real: Real = DOUBLE) -> UpdatingRule:
     """Return the rule that the settings name.
 
@@ -364,9 +267,9 @@ def make_rule(settings: ProgramSettings, budget: PlcBudget, fixed_ticks: int, re
     if settings.outside.rule and not fixed_ticks:
         return OutsideRule(settings.outside.rule, budget)
     adaptive, own = settings.adaptive, settings.adaptive.contraction
-    return Rule(
-        FIXED_PERIOD if fixed_ticks else int(UpdatingRuleKind[adaptive.rule.name]),  # one type, compiled once
-        FixedPeriod(budget.q(fixed_ticks)),
-        Algorithm1(adaptive.q_first, adaptive.q_min, adaptive.q_max, adaptive.delta),
-        ContractionRule(own.q_rest, own.q_max, real(own.band), real(own.least), real(own.change)),
-    )
+    parts = 0, real(own.band), real(own.least), real(own.change)
+    if fixed_ticks:
+        return Rule(FIXED_PERIOD, *[budget.q(fixed_ticks)] * 3, *parts)
+    if adaptive.rule is RuleName.CONTRACTION:
+        return Rule(CONTRACTION, own.q_max, own.q_rest, own.q_max, *parts)
+    return Rule(ALGORITHM_1, adaptive.q_first, adaptive.q_min, adaptive.q_max, adaptive.delta, *parts[1:])

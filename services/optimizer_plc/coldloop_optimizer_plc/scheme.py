@@ -16,18 +16,11 @@ from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.estimator import Belief, Estimator, begin_prediction, no_belief, predict
 from coldloop_optimizer_plc.plausibility import are_finite
-from coldloop_optimizer_plc.qp.costs import OutputMaps, output_maps, predicted_indicators
+from coldloop_optimizer_plc.qp import problem as problems
+from coldloop_optimizer_plc.qp.costs import predicted_indicators
 from coldloop_optimizer_plc.qp.linear_algebra import Real
 from coldloop_optimizer_plc.qp.prediction import TargetSearch
-from coldloop_optimizer_plc.qp.problem import (
-    Maps,
-    PredictiveProblem,
-    QuadraticProblem,
-    instance,
-    keep_first_rate,
-    shifted,
-    write_inputs,
-)
+from coldloop_optimizer_plc.qp.problem import Maps, OutputMaps, PredictiveProblem, QuadraticProblem
 from coldloop_optimizer_plc.rules import MEMORY
 from coldloop_optimizer_plc.settings import ProgramSettings, RuleName
 from coldloop_optimizer_plc.solvers.interface import Answer, Costs, solve_by
@@ -248,7 +241,7 @@ def constants_of(
         estimator=estimator, target=target,
         Phi=problem.Phi, Gamma=problem.Gamma, maps=problem.maps, shifts=problem.shifts,
         knots=problem.knots, rest=rest,
-        predicted=output_maps(problem),
+        predicted=problem.predicted,
         weights=problem.knots_to_samples, input_scale=problem.input_scale, rate=problem.rate,
         scaled_rate=problem.scaled_rate,
         rate_shares=np.array([problem.limits.rate_share(ticks) for ticks in every], real),
@@ -301,7 +294,7 @@ def problem_at(
 
     With a limit of the feed; all are deviations. The input that is `idle`, unless it is -1, stays where it is.
     """
-    phi, gamma, low, high, constant = instance(c.maps, x, w, u_before, share, target)
+    phi, gamma, low, high, constant = problems.instance(c.maps, x, w, u_before, share, target)
     feed = c.target.feed
     for i in range(feed, c.n_inputs, u_before.shape[0]):
         high[i] = min(high[i], max(most_open, low[feed]))  # the first knot's low is as far as the rate lets it close
@@ -360,7 +353,7 @@ def pose(c: Constants, m: OptimizerState) -> tuple[QuadraticProblem, Array]:
     s.w, s.share, s.ticks = m.belief.numbers[0].w, c.rate_shares[ticks], ticks
     idle = idle_valve(c.turbine, m.numbers[0].suspects)
     qp = problem_at(c, sent.x, s.w, sent.u_before, s.share, m.target, m.numbers[0].most_open, idle)
-    return qp, shifted(c.shifts[ticks], m.playing.z, c.n_inputs)
+    return qp, problems.shifted(c.shifts[ticks], m.playing.z, c.n_inputs)
 
 
 @kernel
@@ -394,7 +387,7 @@ def deliver(c: Constants, m: OptimizerState, qp: QuadraticProblem, answer: Answe
     if idle >= 0:
         for i in range(idle, c.n_inputs, sent.u_before.shape[0]):
             sent.z[i] = sent.u_before[idle] / c.input_scale[idle]
-    keep_first_rate(c.maps, c.scaled_rate, sent.u_before, s.share, sent.z)
+    problems.keep_first_rate(c.maps, c.scaled_rate, sent.u_before, s.share, sent.z)
     s.j_dev, s.j_cst, s.violation = predicted_indicators(c.predicted, qp, sent.z, sent.x, s.w, c.n_inputs)
     s.number, s.first_tick = now.sequences + 1, now.tick + now.ticks
     s.length = write_rows(c, sent.z, now.ticks, sent.rows)
@@ -420,7 +413,7 @@ def write_rows(c: Constants, z: Array, ticks: int, rows: NDArray[np.float32]) ->
     per_sample = c.fitting.shape[0] - 1
     samples = (length + per_sample - 1) // per_sample
     inputs = np.empty(((rows.shape[0] + per_sample - 1) // per_sample, rows.shape[1]), z.dtype)
-    write_inputs(c.weights, z, c.input_scale, c.estimator.u0, c.rate, samples, inputs)
+    problems.write_inputs(c.weights, z, c.input_scale, c.estimator.u0, c.rate, samples, inputs)
     for sample in range(samples):
         for tick in range(sample * per_sample, min((sample + 1) * per_sample, length)):
             for i in range(inputs.shape[1]):

@@ -467,9 +467,13 @@ class ProgramSettings(ProcessSettings):
         """Time of an iteration of the solver in use, at P = 1."""
         if self.outside.solver:
             return self.outside.tau_1_s
-        if self.solver is SolverName.HYBRID:
+        return self.iteration_of(self.solver)
+
+    def iteration_of(self, solver: SolverName) -> float:
+        """Return the time of an iteration of a solver at P = 1, s."""
+        if solver is SolverName.HYBRID:
             return max(self.ode.tau_1_s, self.interior_point.tau_1_s)
-        return float(getattr(self, self.solver.replace("-", "_")).tau_1_s)
+        return float(getattr(self, solver.replace("-", "_")).tau_1_s)
 
     @pydantic.model_validator(mode="after")
     def _own_arithmetic(self) -> Self:

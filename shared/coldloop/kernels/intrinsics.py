@@ -6,6 +6,7 @@ given, for every call that passes it on, by atomic operations; with records of m
 run's compiled code were there. What the caller holds for the whole call need not be counted.
 """
 
+from collections.abc import Callable
 from typing import Any, Final, TypeVar, get_type_hints
 
 from numba.core import cgutils, types
@@ -117,3 +118,12 @@ class Implementations(dict[type, F]):
         super().__init__()
         self.name = name
         self.tables.append(self)
+
+    def register(self, kind: type) -> Callable[[F], F]:
+        """Return a decorator that enters an implementation for a class."""
+
+        def enter(implementation: F) -> F:
+            self[kind] = implementation
+            return implementation
+
+        return enter

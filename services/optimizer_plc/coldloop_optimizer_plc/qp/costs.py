@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from coldloop_optimizer_plc.qp.linear_algebra import Columns, add_product, add_transposed_product, by_columns
-from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
+from coldloop_optimizer_plc.qp.problem import OutputMaps, PredictiveProblem, QpParameters, QuadraticProblem
 
 Array = NDArray[np.float64]
 
@@ -92,17 +92,12 @@ def excess_by_columns(constant: Matrices, qp: QuadraticProblem, z: Array) -> Arr
 
 @kernel
 def gradient(
-    constant: Matrices, qp: QuadraticProblem, z: Array, alpha: float, result: Array, active: Array
-) -> None:  # fmt: skip
-    """Write dJ/dz into `result` (n,) and which rows push into `active` (m,) as 1.0 or 0.0."""
-    gradient_with_excess(constant, qp, z, excess_by_columns(constant, qp, z), alpha, result, active)
-
-
-@kernel
-def gradient_with_excess(
     constant: Matrices, qp: QuadraticProblem, z: Array, excess: Array, alpha: float, result: Array, active: Array
 ) -> None:  # fmt: skip
-    """Write the same where Gamma z - gamma (m,) is known."""
+    """Write dJ/dz into `result` (n,) and which rows push into `active` (m,) as 1.0 or 0.0.
+
+    `excess` (m,) is Gamma z - gamma.
+    """
     n = z.shape[0]
     zero, one, two = z.dtype.type(0.0), z.dtype.type(1.0), z.dtype.type(2.0)
     for i in range(n):
@@ -131,34 +126,9 @@ class ProfileCosts(NamedTuple):
     """Largest violated row, max(Gamma p - gamma, 0), in the units of the row (%, K, or input units)."""
 
 
-class OutputMaps(NamedTuple):
-    """Maps from a profile and the parameters to the constrained outputs over the horizon of N samples."""
-
-    resting: Array
-    """The b outputs with a band in turn at the operating point, shape (b N,)."""
-    of_z: Array
-    """Shape (n, b N)."""
-    of_x: Array
-    """Shape (n_x, b N)."""
-    of_w: Array
-    """Shape (b N,)."""
-    bands: Array
-    """Low, high and weight of each, shape (3, b)."""
-    row_gains: Array
-    """Factors that the rows of Gamma were multiplied by, shape (m,)."""
-
-
-def output_maps(problem: PredictiveProblem) -> OutputMaps:
-    """Return the maps of a problem."""
-    return OutputMaps(
-        problem.resting_outputs, problem.stacked_outputs_z, problem.stacked_outputs_x, problem.stacked_outputs_w,
-        problem.bands, problem.row_gains,
-    )  # fmt: skip
-
-
 def indicators(problem: PredictiveProblem, qp: QuadraticProblem, z: Array, parameters: QpParameters) -> ProfileCosts:
     """Return the indicators of profile z at the parameters (paper, section V); `qp` is the problem's instance there."""
-    maps, real = output_maps(problem), z.dtype.type
+    maps, real = problem.predicted, z.dtype.type
     return ProfileCosts(
         *map(float, predicted_indicators(maps, qp, z, parameters.x, real(parameters.w), problem.n_inputs))
     )
@@ -173,17 +143,14 @@ def predicted_indicators(
     add_transposed_product(maps.of_z, z, outputs)
     add_transposed_product(maps.of_x, x, outputs)
     j_cst = violation_cost(outputs, maps.of_w, w, maps.bands)
-    j_dev = deviation_cost(qp, z, n_inputs) + qp.constant
-    return ProfileCosts(j_dev, j_cst, largest_violation(qp, z, maps.row_gains))
-
-
-@kernel
-def deviation_cost(qp: QuadraticProblem, z: Array, n_inputs: int) -> float:
-    """Return J_0 of the inputs alone, without slacks and without the constant."""
     slackless = z.copy()
     for i in range(n_inputs, z.shape[0]):
         slackless[i] = z.dtype.type(0.0)
-    return quadratic_cost(qp.Phi, qp.phi, slackless)
+    j_dev = quadratic_cost(qp.Phi, qp.phi, slackless) + qp.constant
+    excess, violation = row_excess(qp, z), z.dtype.type(0.0)
+    for r in range(excess.shape[0]):
+        violation = max(violation, excess[r] / maps.row_gains[r])
+    return ProfileCosts(j_dev, j_cst, violation)
 
 
 @kernel
@@ -200,16 +167,6 @@ def violation_cost(outputs: Array, through_w: Array, w: float, bands: Array) -> 
             miss = max(y - bands[1, band], zero) + max(bands[0, band] - y, zero)
             total += bands[2, band] * miss * miss
     return total
-
-
-@kernel
-def largest_violation(qp: QuadraticProblem, z: Array, gains: Array) -> float:
-    """Return max(Gamma z - gamma, 0) over the rows, each divided by its gain."""
-    largest = z.dtype.type(0.0)
-    excess = row_excess(qp, z)
-    for r in range(excess.shape[0]):
-        largest = max(largest, excess[r] / gains[r])
-    return largest
 
 
 CONTACT = 1e-7
@@ -252,15 +209,11 @@ def judge(problem: QuadraticProblem, z: Array, alpha: float, multipliers: Array)
     stationarity = np.where(at_low, np.minimum(slope, 0.0), slope)
     stationarity = np.where(at_high, np.maximum(stationarity, 0.0), stationarity)
     return Solution(
-        z=z,
-        multipliers=multipliers,
-        base_cost=base_cost,
-        cost=base_cost + alpha * float(np.sum(np.maximum(excess, 0.0) ** 2)),
-        violation=violation,
-        primal_residual=max(violation, outside),
-        dual_residual=float(np.max(np.abs(stationarity), initial=0.0)),
+        z=z, multipliers=multipliers, base_cost=base_cost,
+        cost=base_cost + alpha * float(np.sum(np.maximum(excess, 0.0) ** 2)), violation=violation,
+        primal_residual=max(violation, outside), dual_residual=float(np.max(np.abs(stationarity), initial=0.0)),
         gap=abs(float(multipliers @ excess)),
-    )
+    )  # fmt: skip
 
 
 def penalty_multipliers(problem: QuadraticProblem, z: Array, alpha: float) -> Array:

@@ -346,15 +346,11 @@ def target_search(
         "scale": np.array([*scale, 1.0]),
     }
     return TargetSearch(
-        followed=design.target is not Target.OPERATING_POINT,
-        limited=True,
-        of_load=real(design.target is Target.LOAD),
-        margin=real(margin),
-        constants=np.array([places.get(signal, -1) for signal in signals]),
-        tolerance=real(TOLERANCES[np.dtype(real).itemsize]),
-        feed=feed,
+        followed=design.target is not Target.OPERATING_POINT, limited=True, of_load=real(design.target is Target.LOAD),
+        margin=real(margin), constants=np.array([places.get(signal, -1) for signal in signals]),
+        tolerance=real(TOLERANCES[np.dtype(real).itemsize]), feed=feed,
         **{name: np.ascontiguousarray(array).astype(real, copy=False) for name, array in arrays.items()},
-    )
+    )  # fmt: skip
 
 
 def no_target_search(n_inputs: int, real: Real) -> TargetSearch:

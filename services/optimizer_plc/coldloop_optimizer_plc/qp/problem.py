@@ -87,16 +87,8 @@ def hold(u: Array, scale: Array, n_inputs: int, z: Array) -> None:
 
 
 @kernel
-def inputs_of(weights: Array, z: Array, scale: Array, u0: Array, rate: Array) -> Array:
-    """Return the inputs (samples, 3) of a profile z (n,), for the knots' weights (samples, knots) in each sample."""
-    u = np.empty((weights.shape[0], scale.shape[0]), z.dtype)
-    write_inputs(weights, z, scale, u0, rate, weights.shape[0], u)
-    return u
-
-
-@kernel
 def write_inputs(weights: Array, z: Array, scale: Array, u0: Array, rate: Array, samples: int, u: Array) -> None:
-    """Write the inputs of the first samples into u (at least as many, 3).
+    """Write the inputs of the first samples into u (at least as many, 3), by `weights` (samples, knots) of the knots.
 
     They are in physical units, `u0` + `scale` z, and from one sample to the next within `rate`.
     """
@@ -142,9 +134,10 @@ def condense(prediction: PredictionModel, design: ControlDesign, weights: Array)
     weighted_resting = multiply(transposed(resting), np.diag(R))
     C, D, G = (matrix[list(prediction.constrained)] for matrix in (prediction.C, prediction.D, prediction.G))
     Phi, cross, constant = np.zeros((n, n)), np.zeros((nx + 1, n)), np.zeros((nx + 1, nx + 1))
+    rho, of_slacks = np.repeat(design.violation_weight, 2), np.zeros((n, n))
     outputs_z, outputs_s = [], []
     for sample, of_knots in enumerate(weights, 1):
-        u_of_z = input_map(of_knots, design)
+        u_of_z, slack_of_z = input_map(of_knots, design), slack_map(of_knots, design)
         ahead = [one for one in prediction.ahead if one.first <= sample <= one.last]
         to_z = multiply(A, to_z) + multiply(B, u_of_z)
         to_s = multiply(A, to_s)
@@ -153,6 +146,7 @@ def condense(prediction: PredictionModel, design: ControlDesign, weights: Array)
             to_s[:, one.place] += one.states
         weighted_z, weighted_s = multiply(Q, to_z), multiply(Q, to_s)
         Phi += multiply(transposed(to_z), weighted_z) + multiply(transposed(u_of_z), R[:, None] * u_of_z)
+        of_slacks += multiply(transposed(slack_of_z), rho[:, None] * slack_of_z)
         cross += 2.0 * (multiply(transposed(to_s), weighted_z) - multiply(weighted_resting, u_of_z))
         constant += multiply(transposed(to_s), weighted_s) + multiply(weighted_resting, resting)
         outputs_z.append(multiply(C, to_z) + multiply(D, u_of_z))
@@ -161,42 +155,41 @@ def condense(prediction: PredictionModel, design: ControlDesign, weights: Array)
         for one in ahead:
             through_w[:, one.place] += one.outputs[list(prediction.constrained)]
         outputs_s.append(through_w)
-    Phi = np.ascontiguousarray(Phi + _slack_weights(weights, design))
-    return Condensed(Phi, cross, constant, np.array(outputs_z), np.array(outputs_s))
+    return Condensed(np.ascontiguousarray(Phi + of_slacks), cross, constant, np.array(outputs_z), np.array(outputs_s))
 
 
 def input_map(of_knots: Array, design: ControlDesign) -> Array:
     """Return the matrix (inputs, n) from z to the input deviation at a sample with these knot weights (knots,)."""
-    u_of_z = np.zeros((design.n_inputs, (design.n_inputs + design.n_slacks) * len(of_knots)))
-    for knot, weight in enumerate(of_knots):
-        for i in range(design.n_inputs):
-            u_of_z[i, design.n_inputs * knot + i] = weight * design.input_scale[i]
-    return u_of_z
+    slacks = np.zeros((design.n_inputs, design.n_slacks * len(of_knots)))
+    return np.hstack([np.kron(of_knots, np.diag(design.input_scale)), slacks])
 
 
 def slack_map(of_knots: Array, design: ControlDesign) -> Array:
     """Return the matrix (slacks, n) from z to the slacks at a sample with these knot weights (knots,)."""
-    n_inputs = design.n_inputs * len(of_knots)
-    slack_of_z = np.zeros((design.n_slacks, n_inputs + design.n_slacks * len(of_knots)))
-    for knot, weight in enumerate(of_knots):
-        for i in range(design.n_slacks):
-            slack_of_z[i, n_inputs + design.n_slacks * knot + i] = weight
-    return slack_of_z
-
-
-def _slack_weights(weights: Array, design: ControlDesign) -> Array:
-    rho = np.repeat(design.violation_weight, 2)
-    n = (design.n_inputs + design.n_slacks) * weights.shape[1]
-    total = np.zeros((n, n))
-    for of_knots in weights:
-        slack_of_z = slack_map(of_knots, design)
-        total += multiply(transposed(slack_of_z), rho[:, None] * slack_of_z)
-    return total
+    inputs = np.zeros((design.n_slacks, design.n_inputs * len(of_knots)))
+    return np.hstack([inputs, np.kron(of_knots, np.eye(design.n_slacks))])
 
 
 def transposed(M: Array) -> Array:
     """Return M' with its rows contiguous."""
     return np.ascontiguousarray(M.T)
+
+
+class OutputMaps(NamedTuple):
+    """Maps from a profile and the parameters to the constrained outputs over the horizon of N samples."""
+
+    resting: Array
+    """The b outputs with a band in turn at the operating point, shape (b N,)."""
+    of_z: Array
+    """Shape (n, b N)."""
+    of_x: Array
+    """Shape (n_x, b N)."""
+    of_w: Array
+    """Shape (b N,)."""
+    bands: Array
+    """Low, high and weight of each, shape (3, b)."""
+    row_gains: Array
+    """Factors that the rows of Gamma were multiplied by, shape (m,)."""
 
 
 class OutputRows(NamedTuple):
@@ -247,11 +240,9 @@ def output_rows(condensed: Condensed, design: ControlDesign, weights: Array, y0:
             gains += 2 * [np.sqrt(rho[output] / rho.max())]
     gain = np.array(gains)
     return OutputRows(
-        Gamma=np.array(rows) * gain[:, None],
-        bounds=np.array(bounds) * gain,
-        states=np.ascontiguousarray((np.array(states) * gain[:, None]).T),
-        gains=gain,
-    )
+        Gamma=np.array(rows) * gain[:, None], bounds=np.array(bounds) * gain,
+        states=np.ascontiguousarray((np.array(states) * gain[:, None]).T), gains=gain,
+    )  # fmt: skip
 
 
 def rate_rows(design: ControlDesign, limits: InputLimits, penalties: PenaltySettings) -> RateRows:
@@ -279,12 +270,9 @@ def rate_rows(design: ControlDesign, limits: InputLimits, penalties: PenaltySett
                 gained.append(gains_of_inputs[i])
     gains = np.array(gained)
     return RateRows(
-        Gamma=np.reshape(rows, (-1, size)) * gains[:, None],
-        bounds=np.array(bounds) * gains,
-        first=np.array(first),
-        before=np.ascontiguousarray((np.reshape(before, (-1, n_inputs)) * gains[:, None]).T),
-        gains=gains,
-    )
+        Gamma=np.reshape(rows, (-1, size)) * gains[:, None], bounds=np.array(bounds) * gains, first=np.array(first),
+        before=np.ascontiguousarray((np.reshape(before, (-1, n_inputs)) * gains[:, None]).T), gains=gains,
+    )  # fmt: skip
 
 
 class Maps(NamedTuple):
@@ -412,13 +400,9 @@ class PredictiveProblem:
     """
 
     def __init__(
-        self,
-        prediction: PredictionModel,
-        design: ControlDesign,
-        limits: InputLimits,
-        real: Real = DOUBLE,
+        self, prediction: PredictionModel, design: ControlDesign, limits: InputLimits, real: Real = DOUBLE,
         penalties: PenaltySettings | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if penalties is None:
             with settings_of(prediction.process):
                 penalties = PenaltySettings()
@@ -438,7 +422,6 @@ class PredictiveProblem:
         n_states = prediction.n_states
         self.Phi = self._rounded(condensed.Phi)
         self.Gamma = self._rounded(np.ascontiguousarray(np.vstack([outputs.Gamma, rates.Gamma])))
-        self.row_gains = self._rounded(np.concatenate([outputs.gains, rates.gains]))
         scaled_rate = np.asarray(limits.rate) / np.asarray(design.input_scale)
         first_rate = scaled_rate if penalties.first_knot_in_box else np.full(design.n_inputs, np.inf)
         u0 = np.array(prediction.model.u0)
@@ -454,12 +437,14 @@ class PredictiveProblem:
         self.shifts = self._rounded(
             np.array([shift(instants, ticks / self.longest_ticks) for ticks in range(self.longest_ticks + 1)])
         )
-        self.bands = self._rounded(np.array([design.output_low, design.output_high, design.violation_weight]))
-        self.resting_outputs = self._rounded(np.tile(y0, design.horizon))
-        self.stacked_outputs_z = self._rounded(transposed(condensed.outputs_z.reshape(-1, self.size)))
         stacked = condensed.outputs_s.reshape(-1, n_states + 1)
-        self.stacked_outputs_x = self._rounded(transposed(stacked[:, :n_states]))
-        self.stacked_outputs_w = self._rounded(np.array(stacked[:, n_states]))
+        predicted = OutputMaps(
+            np.tile(y0, design.horizon), transposed(condensed.outputs_z.reshape(-1, self.size)),
+            transposed(stacked[:, :n_states]), np.array(stacked[:, n_states]),
+            np.array([design.output_low, design.output_high, design.violation_weight]),
+            np.concatenate([outputs.gains, rates.gains]),
+        )  # fmt: skip
+        self.predicted = OutputMaps(*map(self._rounded, predicted))
         self.input_scale = self._rounded(np.asarray(design.input_scale))
         self.rate = self._rounded(np.asarray(limits.rate))
         self._u0 = self._rounded(u0)
@@ -478,20 +463,12 @@ class PredictiveProblem:
             np.eye(len(rest), self.design.n_inputs), self.n_knots
         )  # profiles that hold an input of the target
         return Maps(
-            phi=condensed.phi_map,
-            constant=condensed.constant_map,
-            outputs=outputs.states,
-            output_bounds=outputs.bounds,
-            rate_bounds=rates.bounds,
-            rate_first=rates.first,
-            rate_before=rates.before,
+            phi=condensed.phi_map, constant=condensed.constant_map, outputs=outputs.states,
+            output_bounds=outputs.bounds, rate_bounds=rates.bounds, rate_first=rates.first, rate_before=rates.before,
             low=np.concatenate([np.tile(low_u, self.n_knots), np.zeros(slacks)]),
-            high=np.concatenate([np.tile(high_u, self.n_knots), np.full(slacks, np.inf)]),
-            first_rate=first_rate,
-            input_scale=scale,
-            rest=rest,
-            holding=np.ascontiguousarray(2.0 * held @ condensed.Phi[: self.n_inputs]),
-        )
+            high=np.concatenate([np.tile(high_u, self.n_knots), np.full(slacks, np.inf)]), first_rate=first_rate,
+            input_scale=scale, rest=rest, holding=np.ascontiguousarray(2.0 * held @ condensed.Phi[: self.n_inputs]),
+        )  # fmt: skip
 
     # -- instances ---------------------------------------------------------------------------------------------------
 
@@ -515,7 +492,7 @@ class PredictiveProblem:
         return share
 
     def _check(self, parameters: QpParameters) -> None:
-        n_states = self.stacked_outputs_x.shape[0]
+        n_states = self.predicted.of_x.shape[0]
         if parameters.x.shape != (n_states,):
             raise ValueError(f"a state of shape {parameters.x.shape} for a problem with {n_states} states")
 
@@ -543,15 +520,18 @@ class PredictiveProblem:
 
         The rates between knots are rows of the problem, which a truncated solution may break; what is sent keeps them.
         """
-        return inputs_of(self.knots_to_samples[:samples], z, self.input_scale, self._u0, self.rate)
+        u = np.empty((samples, self.design.n_inputs), z.dtype)
+        write_inputs(self.knots_to_samples, z, self.input_scale, self._u0, self.rate, samples, u)
+        return u
 
     def outputs(self, z: Array, parameters: QpParameters) -> Array:
         """Return the outputs with a band predicted at the end of each sampling period, shape (horizon, bands)."""
         self._check(parameters)
-        outputs = self.resting_outputs.copy()
-        add_transposed_product(self.stacked_outputs_z, z, outputs)
-        add_transposed_product(self.stacked_outputs_x, parameters.x, outputs)
-        outputs += self.stacked_outputs_w * parameters.w
+        maps = self.predicted
+        outputs = maps.resting.copy()
+        add_transposed_product(maps.of_z, z, outputs)
+        add_transposed_product(maps.of_x, parameters.x, outputs)
+        outputs += maps.of_w * parameters.w
         return outputs.reshape(-1, self._n_constrained)
 
     def hold(self, u: Array) -> Array:

@@ -56,12 +56,9 @@ class HybridMethod(NamedTuple):
 
 
 def hybrid_solver(
-    settings: HybridSettings,
-    far: InteriorPointSettings,
-    quiet: OdeSettings,
-    floor: float,
+    settings: HybridSettings, far: InteriorPointSettings, quiet: OdeSettings, floor: float,
     penalties: PenaltySettings | None = None,
-) -> KernelSolver:
+) -> KernelSolver:  # fmt: skip
     """Return the solver, which keeps the costs of guess and answer from one problem to the next.
 
     Args:

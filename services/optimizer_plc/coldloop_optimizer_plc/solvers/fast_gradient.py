@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from coldloop_optimizer_plc.computing_settings import FastGradientSettings
-from coldloop_optimizer_plc.qp.costs import Matrices, augmented_cost, gradient, matrices_of
+from coldloop_optimizer_plc.qp.costs import Matrices, augmented_cost, excess_by_columns, gradient, matrices_of
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.interface import Answer, Costs, KernelSolver, solves_by
 
@@ -115,7 +115,7 @@ def descend(
     point, t, slope, moved = momentum.extrapolated, momentum.t, np.empty_like(z), np.empty_like(z)
     active = np.empty_like(qp.gamma)
     for _ in range(count):
-        gradient(constant, qp, point, alpha, slope, active)
+        gradient(constant, qp, point, excess_by_columns(constant, qp, point), alpha, slope, active)
         uphill = z.dtype.type(0)
         for i in range(n):
             reached = min(max(point[i] - steps[i] * slope[i], qp.low[i]), qp.high[i])

@@ -9,7 +9,7 @@ kernels. Somebody else's is a class without arguments that follows `OutsideMetho
 import math
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from typing import Any, Final, NamedTuple, Protocol, TypeVar
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from numba.extending import overload
@@ -80,13 +80,9 @@ class Solver(Protocol):
 
 
 def collected(
-    problem: QuadraticProblem,
-    alpha: float,
-    guess: Array,
-    points: list[Array],
-    iterations: list[int],
+    problem: QuadraticProblem, alpha: float, guess: Array, points: list[Array], iterations: list[int],
     multipliers: Array,
-) -> Answer:
+) -> Answer:  # fmt: skip
     """Return the points of a solver that knows no augmented cost as an answer."""
     costs = [float(augmented_cost(problem, z, alpha)) for z in (guess, *points)]
     return Answer(costs[0], np.array(points), np.array(costs[1:]), np.array(iterations), multipliers)
@@ -99,19 +95,12 @@ def judged(problem: QuadraticProblem, answer: Answer, alpha: float) -> Solution:
 
 
 Kernel = Callable[[Any, QuadraticProblem, Array, NDArray[np.int64], Costs], Answer]
-K = TypeVar("K", bound=Callable[..., Answer])
 KERNELS: Final[Implementations[Kernel]] = Implementations("solve_by")
 """The kernel of each method."""
 
 
-def solves_by(method: type) -> Callable[[K], K]:
-    """Register a kernel as what solves problems by this method."""
-
-    def register(kernel: K) -> K:
-        KERNELS[method] = kernel
-        return kernel
-
-    return register
+solves_by = KERNELS.register
+"""Decorator of the kernel that solves problems by a method."""
 
 
 def solve_by(method: Any, qp: QuadraticProblem, guess: Array, counts: NDArray[np.int64], before: Costs) -> Answer:  # noqa: ANN401

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from coldloop.kernels.compiled import kernel
 from coldloop_optimizer_plc.computing_settings import InteriorPointSettings
 from coldloop_optimizer_plc.qp.costs import augmented_cost
-from coldloop_optimizer_plc.qp.linear_algebra import Real, cholesky, cholesky_solve
+from coldloop_optimizer_plc.qp.linear_algebra import cholesky, cholesky_solve
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.interface import Answer, Costs, KernelSolver, solves_by
 
@@ -78,19 +78,6 @@ class Path(NamedTuple):
     """mu below which there is nothing left to win."""
 
 
-def path_in(settings: InteriorPointSettings, size: int, real: Real) -> Path:
-    """Return the constants as scalars of a floating-point type, for a problem of so many variables and rows."""
-    return Path(
-        alpha=real(settings.alpha),
-        softness=real(0.5 / settings.alpha),
-        first_mu=real(settings.first_mu),
-        least_mu=real(settings.least_mu),
-        margin=real(settings.margin),
-        size=real(size),
-        finest=real(FINEST * np.finfo(real).eps),
-    )
-
-
 class InteriorPointMethod(NamedTuple):
     """Constants of the solver, the same for all problems."""
 
@@ -99,9 +86,14 @@ class InteriorPointMethod(NamedTuple):
 
 
 def method_of(settings: InteriorPointSettings, problem: QuadraticProblem) -> InteriorPointMethod:
-    """Return the method for problems with these matrices."""
-    size = len(problem.phi) + len(problem.gamma)
-    return InteriorPointMethod(structure_of(problem), path_in(settings, size, problem.phi.dtype.type))
+    """Return the method for problems with these matrices, in their floating-point type."""
+    real = problem.phi.dtype.type
+    path = Path(
+        alpha=real(settings.alpha), softness=real(0.5 / settings.alpha), first_mu=real(settings.first_mu),
+        least_mu=real(settings.least_mu), margin=real(settings.margin),
+        size=real(len(problem.phi) + len(problem.gamma)), finest=real(FINEST * np.finfo(real).eps),
+    )  # fmt: skip
+    return InteriorPointMethod(structure_of(problem), path)
 
 
 def interior_point_solver(settings: InteriorPointSettings) -> KernelSolver:
@@ -144,33 +136,10 @@ def add_columns(constant: Structure, weights: Array, result: Array) -> None:
 
 
 @kernel
-def begin(
-    constant: Structure, qp: QuadraticProblem, guess: Array, path: Path, best: Array, rows: Array
-) -> tuple[float, Point]:
-    """Write the guess inside the box into `best` (n,) and zeros into `rows` (m,); return its cost and a point near."""
-    for i in range(best.shape[0]):
-        best[i] = min(max(guess[i], qp.low[i]), qp.high[i])
-    for r in range(rows.shape[0]):
-        rows[r] = qp.gamma.dtype.type(0.0)
-    cost = augmented_cost(qp, best, path.alpha)
-    mu = qp.phi.dtype.type(max(path.least_mu, path.first_mu / path.size * (cost + qp.constant)))
-    order = constant.order
-    return cost, near(
-        constant, qp.gamma, qp.low[order], qp.high[order], best[order], path.softness, mu, path.margin
-    )  # fmt: skip
-
-
-@kernel
 def descend(
-    constant: Structure,
-    qp: QuadraticProblem,
-    path: Path,
-    point: Point,
-    best: Array,
-    rows: Array,
-    cost: float,
+    constant: Structure, qp: QuadraticProblem, path: Path, point: Point, best: Array, rows: Array, cost: float,
     count: int,
-) -> tuple[int, float, Point]:
+) -> tuple[int, float, Point]:  # fmt: skip
     """Take `count` steps from a point, or fewer once the products are as small as rounding.
 
     `best` (n,), its cost and its multipliers `rows` (m,) are those of the cheapest point so far. Returns how many
@@ -287,34 +256,19 @@ def mean_product(point: Point, away: Distances) -> float:
 
 
 @kernel
-def moved_by(place: Array, change: Array, share: float) -> Array:
-    """Return what `place` is after `share` of a change."""
-    result = place.copy()
-    for i in range(place.shape[0]):
-        result[i] += share * change[i]
-    return result
-
-
-@kernel
 def after(point: Point, change: Point, share: float) -> Point:
     """Return the point after `share` of a change."""
     return Point(
-        moved_by(point.z, change.z, share), moved_by(point.rows, change.rows, share),
-        moved_by(point.low, change.low, share), moved_by(point.high, change.high, share),
+        point.z + share * change.z, point.rows + share * change.rows, point.low + share * change.low,
+        point.high + share * change.high,
     )  # fmt: skip
 
 
 @kernel
 def newton_step(
-    constant: Structure,
-    U: Array,
-    skyline: NDArray[np.uint64],
-    slope: Array,
-    point: Point,
-    away: Distances,
-    products: Distances,
-    softness: float,
-) -> tuple[Point, Distances]:
+    constant: Structure, U: Array, skyline: NDArray[np.uint64], slope: Array, point: Point, away: Distances,
+    products: Distances, softness: float,
+) -> tuple[Point, Distances]:  # fmt: skip
     """Return the Newton step that changes the products by `products`, and how the distances change with it."""
     dz, of_rows, d_low, d_high = -slope, products.rows.copy(), products.low.copy(), products.high.copy()
     for r in range(of_rows.shape[0]):
@@ -413,8 +367,14 @@ def solve(
     c: InteriorPointMethod, qp: QuadraticProblem, guess: Array, counts: NDArray[np.int64], before: Costs  # noqa: ARG001
 ) -> Answer:  # fmt: skip
     """Return the best point after each count of steps, fewer once the products are as small as rounding."""
-    best, rows = np.empty_like(qp.phi), np.empty_like(qp.gamma)
-    guessed, point = begin(c.structure, qp, guess, c.path, best, rows)
+    best, rows, order = np.empty_like(qp.phi), np.zeros_like(qp.gamma), c.structure.order
+    for i in range(best.shape[0]):
+        best[i] = min(max(guess[i], qp.low[i]), qp.high[i])
+    guessed = augmented_cost(qp, best, c.path.alpha)
+    mu = best.dtype.type(max(c.path.least_mu, c.path.first_mu / c.path.size * (guessed + qp.constant)))
+    point = near(
+        c.structure, qp.gamma, qp.low[order], qp.high[order], best[order], c.path.softness, mu, c.path.margin
+    )  # fmt: skip
     points, costs = np.empty((counts.shape[0], best.shape[0]), best.dtype), np.empty(counts.shape[0], best.dtype)
     iterations = np.empty_like(counts)
     cost, done = guessed, 0

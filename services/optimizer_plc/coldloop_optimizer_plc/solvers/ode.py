@@ -13,13 +13,8 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from coldloop_optimizer_plc.computing_settings import OdeSettings
-from coldloop_optimizer_plc.qp.costs import (
-    Matrices,
-    cost_with_excess,
-    excess_by_columns,
-    gradient_with_excess,
-    matrices_of,
-)
+from coldloop_optimizer_plc.qp import costs
+from coldloop_optimizer_plc.qp.costs import Matrices, matrices_of
 from coldloop_optimizer_plc.qp.linear_algebra import Real, cholesky, cholesky_solve
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.settings import PenaltySettings
@@ -58,16 +53,11 @@ class Flow(NamedTuple):
 def flow_in(settings: OdeSettings, penalties: PenaltySettings | None, real: Real) -> Flow:
     """Return the constants as scalars of a floating-point type."""
     return Flow(
-        alpha=real(settings.alpha),
-        cost_scale=real(settings.cost_scale),
-        tolerance=real(settings.tolerance),
-        growth=real(settings.growth),
-        rejection=real(settings.rejection),
-        box=real((penalties or PenaltySettings()).box * settings.alpha),
-        look_ahead_rows=settings.look_ahead_rows,
-        hold_at_bounds=settings.hold_at_bounds,
-        longest=real(np.sqrt(np.finfo(real).max)),
-    )
+        alpha=real(settings.alpha), cost_scale=real(settings.cost_scale), tolerance=real(settings.tolerance),
+        growth=real(settings.growth), rejection=real(settings.rejection),
+        box=real((penalties or PenaltySettings()).box * settings.alpha), look_ahead_rows=settings.look_ahead_rows,
+        hold_at_bounds=settings.hold_at_bounds, longest=real(np.sqrt(np.finfo(real).max)),
+    )  # fmt: skip
 
 
 class OdeMethod(NamedTuple):
@@ -94,7 +84,7 @@ def velocity(
 
     `excess` (m,) is Gamma z - gamma.
     """
-    gradient_with_excess(constant, qp, z, excess, flow.alpha, result, active)
+    costs.gradient(constant, qp, z, excess, flow.alpha, result, active)
     if flow.box > z.dtype.type(0.0):
         add_box_gradient(qp, z, flow.box, result)
     for i in range(z.shape[0]):
@@ -139,13 +129,13 @@ def warm_start(constant: Matrices, qp: QuadraticProblem, guess: Array, flow: Flo
     for i in range(z.shape[0]):
         z[i] = min(max(guess[i], qp.low[i]), qp.high[i])
     v = np.empty_like(z)
-    excess = excess_by_columns(constant, qp, z)
+    excess = costs.excess_by_columns(constant, qp, z)
     velocity(constant, qp, z, excess, flow, v, np.empty_like(qp.gamma))
     total = z.dtype.type(0.0)
     for i in range(v.shape[0]):
         total += v[i] * v[i]
     speed = max(math.sqrt(total), z.dtype.type(1e-12))
-    return z, cost_with_excess(constant, qp, z, excess, flow.alpha), math.sqrt(z.dtype.type(1.0) / speed)
+    return z, costs.cost_with_excess(constant, qp, z, excess, flow.alpha), math.sqrt(z.dtype.type(1.0) / speed)
 
 
 @kernel
@@ -172,16 +162,9 @@ def stage_matrix(constant: Matrices, qp: QuadraticProblem, in_matrix: Array, dt:
 
 @kernel
 def descend(
-    constant: Matrices,
-    qp: QuadraticProblem,
-    z: Array,
-    look_ahead_rows: Array,
-    cost: float,
-    dt: float,
-    stalled: int,
-    count: int,
-    flow: Flow,
-) -> tuple[int, int, float, float]:
+    constant: Matrices, qp: QuadraticProblem, z: Array, look_ahead_rows: Array, cost: float, dt: float, stalled: int,
+    count: int, flow: Flow,
+) -> tuple[int, int, float, float]:  # fmt: skip
     """Move z by `count` steps, or fewer once it is stationary.
 
     `look_ahead_rows` (m,) are those that `step` has left for the next step, `stalled` is the number of stalled steps in
@@ -189,7 +172,7 @@ def descend(
     """
     stationarity = z.dtype.type(STATIONARITY)
     v, active = np.empty_like(z), np.empty_like(qp.gamma)
-    velocity(constant, qp, z, excess_by_columns(constant, qp, z), flow, v, active)
+    velocity(constant, qp, z, costs.excess_by_columns(constant, qp, z), flow, v, active)
     for done in range(count):
         if stalled == STALLED_STEPS:
             return done, stalled, cost, dt
@@ -201,16 +184,9 @@ def descend(
 
 @kernel
 def step(
-    constant: Matrices,
-    qp: QuadraticProblem,
-    z: Array,
-    v: Array,
-    active: Array,
-    look_ahead_rows: Array,
-    cost: float,
-    dt: float,
-    flow: Flow,
-) -> tuple[float, float]:
+    constant: Matrices, qp: QuadraticProblem, z: Array, v: Array, active: Array, look_ahead_rows: Array, cost: float,
+    dt: float, flow: Flow,
+) -> tuple[float, float]:  # fmt: skip
     """Move z by one TR-BDF2 step of size dt, or not at all; return the next step size and the cost at z.
 
     `v` (n,) and `active` (m,) are `velocity` at z, before and after. The matrix has the rows that are active at z or in
@@ -230,13 +206,13 @@ def step(
     change = real(G) * dt * v0
     cholesky_solve(M, skyline, change)
     zg = z + change
-    velocity(constant, qp, zg, excess_by_columns(constant, qp, zg), flow, vg, look_ahead_rows)
+    velocity(constant, qp, zg, costs.excess_by_columns(constant, qp, zg), flow, vg, look_ahead_rows)
     for i in range(n):
         vg[i] *= real(1.0) - held[i]
     change = real(C1) * zg - real(C0) * z - zg + real(D) * dt * vg
     cholesky_solve(M, skyline, change)
     candidate = zg + change
-    excess = excess_by_columns(constant, qp, candidate)
+    excess = costs.excess_by_columns(constant, qp, candidate)
     velocity(constant, qp, candidate, excess, flow, v1, active_ahead)
     error, inside = real(0.0), True
     for i in range(n):
@@ -247,9 +223,9 @@ def step(
         inside = inside and bounded == candidate[i]
         candidate[i] = bounded
     if not inside:
-        excess = excess_by_columns(constant, qp, candidate)
+        excess = costs.excess_by_columns(constant, qp, candidate)
         velocity(constant, qp, candidate, excess, flow, v1, active_ahead)
-    reached = cost_with_excess(constant, qp, candidate, excess, flow.alpha)
+    reached = costs.cost_with_excess(constant, qp, candidate, excess, flow.alpha)
     if not reached <= cost:
         return dt * flow.rejection, cost
     for i in range(n):

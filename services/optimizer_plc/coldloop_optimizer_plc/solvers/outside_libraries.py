@@ -124,6 +124,7 @@ class _Chain:
         for i, array in enumerate(self._outputs.values()):
             self._buffer.set_res(i, array.data)
         self._inputs["lba"][:] = -np.inf
+        self.z, self.multipliers = self._outputs["x"], self._outputs["lam_a"]
 
     def set_target(self, problem: QuadraticProblem) -> None:
         """Say where the homotopy leads to."""
@@ -137,14 +138,6 @@ class _Chain:
         with redirect_stdout(io.StringIO()):  # failures are printed whatever the print level
             self._evaluate()
         return str(self._buffer.stats()["unified_return_status"])
-
-    @property
-    def z(self) -> Array:
-        return self._outputs["x"]
-
-    @property
-    def multipliers(self) -> Array:
-        return self._outputs["lam_a"]
 
 
 @cache
