@@ -290,7 +290,7 @@ def _operations(problem: PredictiveProblem, prediction: PredictionModel, apart: 
         rows.append((name, *(f"{one.flops:,.0f}" for one in both), *(f"{one.bytes / 1e3:.1f}" for one in both)))
     sizes = operations.PreparationSizes(
         dense, m - 4 * len(problem.design.constraint_instants), problem.n_knots, prediction.n_states,
-        prediction.D.shape[1], prediction.D.shape[0], segments=1, samples=1,
+        prediction.D.shape[1], prediction.D.shape[0],
         targets=problem.design.target is not Target.OPERATING_POINT, limited=limited, apart=apart,
     )  # fmt: skip
     once = operations.preparation(sizes, mean)

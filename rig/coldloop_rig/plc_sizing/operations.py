@@ -250,10 +250,6 @@ class PreparationSizes(NamedTuple):
     states: int
     inputs: int
     outputs: int
-    segments: int
-    """Runs of equal inputs in the updating period."""
-    samples: int
-    """Sampling periods in a sequence."""
     targets: bool
     """Whether the cost is about a target that is sought."""
     limited: bool
@@ -263,15 +259,18 @@ class PreparationSizes(NamedTuple):
 
 
 def preparation(sizes: PreparationSizes, active: float) -> Operations:
-    """Return those of the Kalman correction, J_k, the prediction, the instance, the shift, the start, the sequence."""
+    """Return those of the Kalman correction, J_k, the prediction, the instance, the shift, the start, the sequence.
+
+    Inputs are equal in the updating period, and in the sequence, which is of one sampling period.
+    """
     n, states = sizes.problem.n, sizes.states
     correct = _response(sizes.outputs, sizes).plus(
         product((states + 1) * sizes.outputs), Operations(states + sizes.inputs + 2 * sizes.outputs + 4)
     )
-    predict = _response(states, sizes).times(sizes.segments)
+    predict = _response(states, sizes)
     apart = correct.plus(Operations(2 * sizes.outputs + 1), predict).times(sizes.apart)
     start = gradient(sizes.problem, active).plus(Operations(3 * n + 2))
-    sequence = product(sizes.samples * sizes.inputs * sizes.knots).plus(Operations(4 * sizes.samples * sizes.inputs))
+    sequence = product(sizes.inputs * sizes.knots).plus(Operations(4 * sizes.inputs))
     costs = augmented_cost(sizes.problem, active).times(2)
     sought = target(sizes.inputs) if sizes.targets else Operations(0)
     limit = _response(2, sizes).plus(Operations(13)) if sizes.limited else Operations(0)
@@ -356,7 +355,7 @@ def _operations(sizes: ProblemSizes) -> dict[str, float]:
     problem = dense_sizes(n_inputs + 2 * sizes.bands * sizes.knots, rows, n_inputs)
     once = PreparationSizes(
         problem=problem, rate_rows=rate_rows, knots=sizes.knots, states=sizes.states, inputs=sizes.inputs,
-        outputs=sizes.outputs, segments=1, samples=1, targets=False, limited=False,
+        outputs=sizes.outputs, targets=False, limited=False,
     )  # fmt: skip
     counts = {str(name): each.operations(problem).flops for name, each in SOLVERS.items()
               if name is not SolverName.HYBRID}  # fmt: skip

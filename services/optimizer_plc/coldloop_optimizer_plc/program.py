@@ -15,16 +15,8 @@ from coldloop.kernels.first_use import kernels_of
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.settings import InputLimits
+from coldloop.registers import optimizer_plc as registers
 from coldloop.registers.control_plc import Plan, SequenceHeader, Update, Verdict
-from coldloop.registers.optimizer_plc import (
-    INPUT_SAMPLES,
-    PREDICTED_SAMPLES,
-    ModelDeviation,
-    OperatingLimits,
-    Optimization,
-    Prediction,
-    UpdatingRuleStatus,
-)
 from coldloop.safety.sequence import InputSequence, with_checksum
 from coldloop_optimizer_plc import decisions, scheme
 from coldloop_optimizer_plc.computing_settings import Arithmetic, Part, PlcBudget, in_its_name
@@ -111,18 +103,6 @@ class OptimizerProgram:
             array[:] = 0
         decisions.begin_session(self.constants, self.state)
 
-    @property
-    def _now(self) -> np.void:
-        """Numbers of the period under way."""
-        record: np.void = self.state.numbers[0]
-        return record
-
-    @property
-    def _sent(self) -> np.void:
-        """Numbers of the last answer."""
-        record: np.void = self.state.sent.numbers[0]
-        return record
-
     # -- steps (4), (5) and (2): at an updating instant ---------------------------------------------------------------
 
     def plan(self, update: Update) -> Plan:
@@ -136,7 +116,7 @@ class OptimizerProgram:
         else:
             starts = Starts(self.rule.first, self.rule.after_interruption())
             load_step = decisions.take_update(c, self.rule, starts, m, latched)
-        now = self._now
+        now = self.state.numbers[0]
         return Plan(
             update.update, update.tick + int(now["ticks"]), float(load_step), float(now["shortage"]),
             int(now["suspects"]),
@@ -178,18 +158,18 @@ class OptimizerProgram:
 
     @property
     def _iterations(self) -> int:
-        if not self._now["planned"]:
+        if not self.state.numbers[0]["planned"]:
             raise RuntimeError("call plan before solve and answer_after_s")
-        return int(self._now["iterations"])
+        return int(self.state.numbers[0]["iterations"])
 
     def solve(self) -> InputSequence:
         """Predict the state at t_{i+1}, shift the profile, iterate; return the sequence to play from there.
 
         It has no rows where something was not finite.
         """
-        n = self._iterations
+        n, now = self._iterations, self.state.numbers[0]
         if ahead := len(self._forecasts):
-            self.state.belief.x[-ahead:] = self._ahead(int(self._now["tick"]) + int(self._now["ticks"]))
+            self.state.belief.x[-ahead:] = self._ahead(int(now["tick"]) + int(now["ticks"]))
         if isinstance(self.solver, KernelSolver):
             scheme.solve(self.constants, self.method, self.state)
         else:
@@ -197,11 +177,7 @@ class OptimizerProgram:
             with in_its_name(Part.SOLVER, self.settings.outside.solver or self.settings.solver):
                 answer = self.solver.solve(qp, guess, (n - 1, n))
             scheme.deliver(self.constants, self.state, qp, answer)
-        return self._sequence()
-
-    def _sequence(self) -> InputSequence:
-        """Return the last answer as the control PLC takes it."""
-        now, sent, rows = self._now, self._sent, self.state.sent.rows
+        sent, rows = self.state.sent.numbers[0], self.state.sent.rows
         length, held = int(sent["length"]), self.process.ticks_per_sample
         inputs = list(map(tuple, rows[:length:held].tolist()))
         header = SequenceHeader(
@@ -216,54 +192,54 @@ class OptimizerProgram:
 
     # -- diagnostics --------------------------------------------------------------------------------------------------
 
-    def prediction(self) -> Prediction:
+    def prediction(self) -> registers.Prediction:
         """Return what the last profile is expected to lead to."""
-        header, sent = self._sent, self.state.sent
+        header, sent = self.state.sent.numbers[0], self.state.sent
         if not header["length"]:
             raise RuntimeError("call solve before prediction")
         horizon = self.problem.design.horizon
         outputs = self.problem.outputs(sent.z, QpParameters(sent.x, header["w"], sent.u_before))
         inputs = self.problem.inputs(sent.z, horizon)
-        shown = outputs[[min(sample, horizon) - 1 for sample in PREDICTED_SAMPLES]]
-        planned = inputs[[min(sample, horizon) - 1 for sample in INPUT_SAMPLES]]
-        return Prediction(
-            int(self._now["update"]), int(header["first_tick"]), tuple(shown.T.ravel().tolist()),
+        shown = outputs[[min(sample, horizon) - 1 for sample in registers.PREDICTED_SAMPLES]]
+        planned = inputs[[min(sample, horizon) - 1 for sample in registers.INPUT_SAMPLES]]
+        return registers.Prediction(
+            int(self.state.numbers[0]["update"]), int(header["first_tick"]), tuple(shown.T.ravel().tolist()),
             tuple(planned.ravel().tolist()),
         )  # fmt: skip
 
-    def model_deviation(self) -> ModelDeviation:
+    def model_deviation(self) -> registers.ModelDeviation:
         """Return how the plant differs from the model, as the filter has estimated it at the last update."""
         belief, n_y = self.state.belief, len(self.process.outputs)
         constants = np.zeros(n_y + len(self.process.inputs))
         end = self._prediction.n_estimated
         constants[list(self.disturbances)] = belief.x[end - len(self.disturbances) : end]
-        return ModelDeviation(
+        return registers.ModelDeviation(
             _single([belief.numbers[0]["mismatch"]])[0], tuple(_single(constants[n_y:])),
             tuple(_single(constants[:n_y])), tuple(_single(np.sqrt(belief.surprise))),
         )  # fmt: skip
 
     @property
-    def operating_limits(self) -> OperatingLimits:
+    def operating_limits(self) -> registers.OperatingLimits:
         """Bands, bounds and rates that profiles keep."""
         design, limits = self.settings.design, self.problem.limits
-        return OperatingLimits(design.output_low, design.output_high, limits.low, limits.high, limits.rate)
+        return registers.OperatingLimits(design.output_low, design.output_high, limits.low, limits.high, limits.rate)
 
-    def rule_status(self) -> UpdatingRuleStatus:
+    def rule_status(self) -> registers.UpdatingRuleStatus:
         """Return what decides the updating period in this session."""
         times = self.budget.times
         return self.rule.status._replace(slots=times.slots, preparation=times.preparation, iteration=times.iteration)
 
-    def report(self, verdict: Verdict) -> Optimization:
+    def report(self, verdict: Verdict) -> registers.Optimization:
         """Return what was done with the last update, once the control PLC has answered."""
-        if not (self._sent["length"] or self._now["solved"]):
+        if not (self.state.sent.numbers[0]["length"] or self.state.numbers[0]["solved"]):
             raise RuntimeError("call solve before report")
-        now, sent = self._now, self._sent
+        now, sent = self.state.numbers[0], self.state.sent.numbers[0]
         of_sent, of_now = ("j_dev", "j_cst", "violation"), ("efficiency", "mismatch", "contraction", "gamma")
         numbers = [self.state.belief.numbers[0]["mismatch"], now["effective"], sent["hot_start"], sent["delivered"]]
         mismatch, effective, hot_start, delivered, *others = _single(
             [*numbers, *(sent[name] for name in of_sent), *(now[name] for name in of_now)]
         )
-        return Optimization(
+        return registers.Optimization(
             update=int(now["update"]), tick=int(now["tick"]), tau_u=int(now["ticks"]), q=int(now["q"]),
             iterations=int(sent["iterations"]), verdict=verdict,
             load_mismatch=mismatch, j_effective=effective, j_hot_start=hot_start, j_delivered=delivered,

@@ -214,9 +214,3 @@ def judge(problem: QuadraticProblem, z: Array, alpha: float, multipliers: Array)
         primal_residual=max(violation, outside), dual_residual=float(np.max(np.abs(stationarity), initial=0.0)),
         gap=abs(float(multipliers @ excess)),
     )  # fmt: skip
-
-
-def penalty_multipliers(problem: QuadraticProblem, z: Array, alpha: float) -> Array:
-    """Return what a penalty method has for multipliers: 2 alpha max(Gamma z - gamma, 0), shape (m,)."""
-    result: Array = 2.0 * alpha * np.maximum(problem.Gamma @ z - problem.gamma, 0.0)
-    return result

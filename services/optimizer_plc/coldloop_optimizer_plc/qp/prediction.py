@@ -110,21 +110,25 @@ class PredictionModel:
         """
         if not signals:
             return self
-        n, extra, n_outputs = self.n_states, len(signals), len(self.y0)
-        inputs = [(n + place, signal - n_outputs) for place, signal in enumerate(signals) if signal >= n_outputs]
-        twin = copy(self)
+        n, n_outputs, twin = self.n_states, len(self.y0), self._with_states(len(signals))
         twin.disturbances = tuple(signals)
+        twin.C[:, n:] = np.hstack([np.eye(n_outputs), self.D])[:, list(signals)]
+        for state, signal in enumerate(signals, n):
+            if signal >= n_outputs:
+                twin.resting_inputs[signal - n_outputs, state] = -1.0
+                for step in twin.transitions.values():
+                    step.A[:n, state] = step.B[:n, signal - n_outputs]
+        return twin
+
+    def _with_states(self, extra: int) -> "PredictionModel":
+        """Return a copy with so many further states, which nothing moves and no output shows."""
+        n, twin = self.n_states, copy(self)
         twin.x0 = np.concatenate([self.x0, np.zeros(extra)])
-        twin.C = np.hstack([self.C, np.hstack([np.eye(n_outputs), self.D])[:, list(signals)]])
-        twin.resting_inputs = np.zeros((self.D.shape[1], n + extra))
-        for state, i in inputs:
-            twin.resting_inputs[i, state] = -1.0
+        twin.C, twin.resting_inputs = (np.hstack([M, np.zeros((len(M), extra))]) for M in (self.C, self.resting_inputs))
         twin.transitions = {}
         for ticks, step in self.transitions.items():
             A = np.eye(n + extra)
             A[:n, :n] = step.A
-            for state, i in inputs:
-                A[:n, state] = step.B[:, i]
             B, F = (np.vstack([M, np.zeros((extra, M.shape[1]))]) for M in (step.B, step.F))
             twin.transitions[ticks] = Transition(A, B, F)
         return twin
@@ -140,22 +144,12 @@ class PredictionModel:
             return self
         n, extra = self.n_states, len(sources) * len(ends)
         A, _, F = self.sample
-        twin, starts, found = copy(self), (1, *(end + 1 for end in ends[:-1])), list[Ahead]()
+        twin, starts, found = self._with_states(extra), (1, *(end + 1 for end in ends[:-1])), list[Ahead]()
         for source in sources:
             column, seen = np.zeros(n + extra), self.G[:, 0] if source < 0 else self.C[:, source]
             column[:n] = F[:, 0] if source < 0 else A[:, source] - np.eye(n)[source]
             found += [Ahead(n + len(found) + k, starts[k], end, column, seen) for k, end in enumerate(ends)]
         twin.ahead = tuple(found)
-        twin.x0 = np.concatenate([self.x0, np.zeros(extra)])
-        twin.C = np.hstack([self.C, np.zeros((len(self.C), extra))])
-        twin.resting_inputs = np.hstack([self.resting_inputs, np.zeros((len(self.resting_inputs), extra))])
-        twin.transitions = {
-            ticks: Transition(
-                np.block([[step.A, np.zeros((n, extra))], [np.zeros((extra, n)), np.eye(extra)]]),
-                *(np.vstack([M, np.zeros((extra, M.shape[1]))]) for M in (step.B, step.F)),
-            )
-            for ticks, step in self.transitions.items()
-        }
         return twin
 
     @property

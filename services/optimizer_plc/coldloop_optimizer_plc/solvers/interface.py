@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.intrinsics import Implementations
 from coldloop_optimizer_plc.computing_settings import OutsideSettings, Part, in_its_name, made
-from coldloop_optimizer_plc.qp.costs import Solution, augmented_cost, judge, penalty_multipliers
+from coldloop_optimizer_plc.qp.costs import Solution, augmented_cost, judge
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 
 Array = NDArray[np.float64]
@@ -91,7 +91,9 @@ def collected(
 def judged(problem: QuadraticProblem, answer: Answer, alpha: float) -> Solution:
     """Return the last point of an answer with its residuals."""
     z, multipliers = answer.z, answer.multipliers
-    return judge(problem, z, alpha, multipliers if multipliers.size else penalty_multipliers(problem, z, alpha))
+    if not multipliers.size:  # those of a penalty method
+        multipliers = 2.0 * alpha * np.maximum(problem.Gamma @ z - problem.gamma, 0.0)
+    return judge(problem, z, alpha, multipliers)
 
 
 Kernel = Callable[[Any, QuadraticProblem, Array, NDArray[np.int64], Costs], Answer]
