@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel, discretise
 from coldloop.process.updating_periods import ROUNDING, SHORTEST_TICKS
-
-Array = NDArray[np.float64]
+from coldloop_optimizer_plc.qp.linear_algebra import Array
 
 RESERVE: Final = 2.0
 """Disturbance that the inputs can reject over the largest one, a gain margin of 6 dB: plants are not linear."""

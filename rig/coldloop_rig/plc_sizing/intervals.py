@@ -22,7 +22,7 @@ from itertools import product
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import betaincinv, stdtrit
 
 from coldloop.errors import ConfigurationError, StudyError
@@ -31,6 +31,7 @@ from coldloop.process.lti_model import load
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.qp.costs import augmented_cost
+from coldloop_optimizer_plc.qp.linear_algebra import Array
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.settings import SolverName
 from coldloop_optimizer_plc.solvers import Solver, make_solver
@@ -43,8 +44,6 @@ from coldloop_rig.results.indicators import evaluate
 from coldloop_rig.results.recording import Recorder
 from coldloop_rig.settings import Settings
 from coldloop_rig.text_tables import aligned
-
-Array = NDArray[np.float64]
 
 TAIL: Final = 0.025
 """Probability on each side of an interval."""

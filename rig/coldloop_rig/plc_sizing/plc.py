@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated, Final, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, field_validator, model_validator
 from scipy.optimize import nnls
 
@@ -20,10 +19,9 @@ from coldloop.errors import ConfigurationError, UsageError
 from coldloop.parsing import parsed_json
 from coldloop.table import read_table
 from coldloop.text_file import held_file, read_bytes
+from coldloop_optimizer_plc.qp.linear_algebra import Array
 from coldloop_rig.plc_sizing.operations import dense_cholesky
 from coldloop_rig.text_tables import markdown_table
-
-Array = NDArray[np.float64]
 
 MEMORY_BYTES = 2_000_000
 """The memory card, shared by code and variables: the paper's 2 Mb, which 4 * 700^2 bytes just fit."""

@@ -7,7 +7,6 @@ follows, and the period that begins. Its answer is `scheme.solve`; `note_answer`
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from coldloop.registers.control_plc import SEQUENCE_ROWS
@@ -15,12 +14,11 @@ from coldloop_optimizer_plc import scheme
 from coldloop_optimizer_plc.estimator import Belief, begin_at_rest, correct, forget
 from coldloop_optimizer_plc.plausibility import USED, suspects_of
 from coldloop_optimizer_plc.qp.costs import augmented_cost
+from coldloop_optimizer_plc.qp.linear_algebra import Array
 from coldloop_optimizer_plc.qp.prediction import bounds_at, find_target, least_warm_load, loads_held
 from coldloop_optimizer_plc.qp.problem import hold, shift, shifted
 from coldloop_optimizer_plc.rules import Assessment, Observation, UpdatingRule, assessed, decide_by
 from coldloop_optimizer_plc.scheme import Constants, OptimizerState
-
-Array = NDArray[np.float64]
 
 BY_THE_RULE: Final = 0
 """The q that `plan` is given when the rule is to decide it."""

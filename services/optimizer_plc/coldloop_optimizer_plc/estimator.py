@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.compiled import kept, kernel
@@ -24,10 +23,8 @@ from coldloop_optimizer_plc.computing_settings import (
 )
 from coldloop_optimizer_plc.plausibility import Apart, Plausibility
 from coldloop_optimizer_plc.qp import linear_algebra as la
-from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real
+from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Array, Real
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, Transition
-
-Array = NDArray[np.float64]
 
 MEMORY_TICKS: Final = 240
 """A minute of the cold box."""

@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from coldloop_optimizer_plc.computing_settings import PlausibilitySettings
-from coldloop_optimizer_plc.qp.linear_algebra import Real, add_transposed_product, cholesky, cholesky_solve, respond
+from coldloop_optimizer_plc.qp import linear_algebra as la
+from coldloop_optimizer_plc.qp.linear_algebra import Array, Real
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, Transition
-
-Array = NDArray[np.float64]
 
 USED: Final = 0
 """A reading is used by the filter."""
@@ -176,7 +175,7 @@ def imputed(innovation: Array, inverse_covariance: Array) -> Array:
                     mean[i] -= inverse_covariance[i, j] * innovation[j]
                 else:
                     M[i, j] = inverse_covariance[i, j]
-    cholesky_solve(M, cholesky(M), mean)
+    la.cholesky_solve(M, la.cholesky(M), mean)
     return mean
 
 
@@ -480,13 +479,13 @@ def correct_apart(
     for i in range(y.size):
         if p.constants[i] >= 0 and belief.readings[i].since_s == zero:
             a.predicted[which, p.constants[i]] = belief.x[p.constants[i]]
-    expected = respond(outputs.A, outputs.B, outputs.F, a.predicted[which], u, known + a.mismatch[which])
+    expected = la.respond(outputs.A, outputs.B, outputs.F, a.predicted[which], u, known + a.mismatch[which])
     innovation = y - expected
     for i in range(y.size):
         if i == p.watched or not np.isfinite(believed[i]):
             innovation[i] = np.nan
     correction = np.zeros(belief.x.size + 1, y.dtype)
-    add_transposed_product(K, imputed(innovation, J), correction)
+    la.add_transposed_product(K, imputed(innovation, J), correction)
     for i in range(belief.x.size):
         a.x[which, i] = a.predicted[which, i] + correction[i]
     a.mismatch[which] += correction[belief.x.size]
@@ -499,7 +498,7 @@ def predict_apart(A: Array, B: Array, F: Array, belief: Any, u: Array) -> None: 
     """Predict over a step (A, B, F, transposed) under the input deviation u (3,), with the load that is measured."""
     b, a = belief.numbers[0], belief.apart
     for which in range(a.x.shape[0]):
-        later = respond(A, B, F, a.predicted[which], u, b.w - b.mismatch + a.mismatch[which])
+        later = la.respond(A, B, F, a.predicted[which], u, b.w - b.mismatch + a.mismatch[which])
         for i in range(later.size):
             a.predicted[which, i] = later[i]
 

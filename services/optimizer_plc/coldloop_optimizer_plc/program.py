@@ -8,7 +8,6 @@ of the session. Pure: no sockets, no clock, no sleeping.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.first_use import kernels_of
@@ -22,15 +21,13 @@ from coldloop_optimizer_plc import decisions, scheme
 from coldloop_optimizer_plc.computing_settings import Arithmetic, Part, PlcBudget, in_its_name
 from coldloop_optimizer_plc.decisions import Latched, Starts
 from coldloop_optimizer_plc.estimator import OutsideEstimator, correct, estimator_of
-from coldloop_optimizer_plc.qp.linear_algebra import real_of
+from coldloop_optimizer_plc.qp.linear_algebra import Array, real_of
 from coldloop_optimizer_plc.qp.prediction import prediction_of, rest_map, target_search
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 from coldloop_optimizer_plc.rules import OutsideRule, UpdatingRule, decide_by, make_rule
 from coldloop_optimizer_plc.scheme import empty_state
 from coldloop_optimizer_plc.settings import ProgramSettings
 from coldloop_optimizer_plc.solvers import KernelSolver, make_solver
-
-Array = NDArray[np.float64]
 
 
 @np.errstate(over="ignore")

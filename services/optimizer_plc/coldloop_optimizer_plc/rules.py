@@ -9,18 +9,14 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple, Protocol
 
-import numpy as np
 from numba.extending import overload
-from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from coldloop.kernels.intrinsics import Implementations
 from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
 from coldloop_optimizer_plc.computing_settings import Part, PlcBudget, in_its_name, made
-from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real
+from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Array, Real
 from coldloop_optimizer_plc.settings import ProgramSettings, RuleName
-
-Array = NDArray[np.float64]
 
 MEMORY: Final = 1
 """Numbers that a rule may remember from one period to the next, in an array that begins with zeros."""

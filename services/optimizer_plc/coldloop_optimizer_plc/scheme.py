@@ -18,14 +18,12 @@ from coldloop_optimizer_plc.estimator import Belief, Estimator, begin_prediction
 from coldloop_optimizer_plc.plausibility import are_finite
 from coldloop_optimizer_plc.qp import problem as problems
 from coldloop_optimizer_plc.qp.costs import predicted_indicators
-from coldloop_optimizer_plc.qp.linear_algebra import Real
+from coldloop_optimizer_plc.qp.linear_algebra import Array, Real
 from coldloop_optimizer_plc.qp.prediction import TargetSearch
 from coldloop_optimizer_plc.qp.problem import Maps, OutputMaps, PredictiveProblem, QuadraticProblem
 from coldloop_optimizer_plc.rules import MEMORY
 from coldloop_optimizer_plc.settings import ProgramSettings, RuleName
 from coldloop_optimizer_plc.solvers.interface import Answer, Costs, solve_by
-
-Array = NDArray[np.float64]
 
 SLOW: Final = 0.05
 """Share of the turbine's speed at the operating point below which it may stand."""

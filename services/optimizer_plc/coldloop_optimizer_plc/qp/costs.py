@@ -7,13 +7,10 @@ variables in its own order.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop_optimizer_plc.qp.linear_algebra import Columns, add_product, add_transposed_product, by_columns
+from coldloop_optimizer_plc.qp.linear_algebra import Array, Columns, add_product, add_transposed_product, by_columns
 from coldloop_optimizer_plc.qp.problem import OutputMaps, PredictiveProblem, QpParameters, QuadraticProblem
-
-Array = NDArray[np.float64]
 
 
 @kernel

@@ -23,10 +23,8 @@ from coldloop.kernels.compiled import kernel
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.sections import Bath
 from coldloop.process.settings import InputLimits
-from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real, multiply
+from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Array, Real, multiply
 from coldloop_optimizer_plc.settings import ControlDesign, Target
-
-Array = NDArray[np.float64]
 
 
 class Transition(NamedTuple):

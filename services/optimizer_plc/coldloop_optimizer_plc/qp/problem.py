@@ -12,15 +12,12 @@ applied before the first knot; Phi and Gamma are constant. There is no factor 1/
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from coldloop.process.settings import InputLimits, settings_of
-from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Real, add_transposed_product, multiply
+from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Array, Real, add_transposed_product, multiply
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, rest_of, state_cost
 from coldloop_optimizer_plc.settings import ControlDesign, PenaltySettings, Target
-
-Array = NDArray[np.float64]
 
 
 def interpolation(knots: tuple[int, ...], at: Array) -> Array:

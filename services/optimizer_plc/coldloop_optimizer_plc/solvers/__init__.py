@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop_optimizer_plc.computing_settings import HybridSettings, InteriorPointSettings, OdeSettings
 from coldloop_optimizer_plc.qp.costs import matrices_of
+from coldloop_optimizer_plc.qp.linear_algebra import Array
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
-from coldloop_optimizer_plc.settings import PenaltySettings, ProgramSettings
+from coldloop_optimizer_plc.settings import ProgramSettings
 from coldloop_optimizer_plc.solvers import interface, interior_point, ode
 from coldloop_optimizer_plc.solvers.fast_gradient import fast_gradient_solver
 from coldloop_optimizer_plc.solvers.interface import Answer, KernelSolver, Solver, judged
@@ -32,7 +32,7 @@ from coldloop_optimizer_plc.solvers.outside_libraries import DaqpSolver, OsqpSol
 
 __all__ = ["Answer", "KernelSolver", "Solver", "judged", "make_solver"]
 
-Array = NDArray[np.float64]
+
 Counts = NDArray[np.int64]
 
 PICOSECONDS = 1_000_000_000_000
@@ -55,28 +55,17 @@ class HybridMethod(NamedTuple):
     """tau_1 of the interior-point solver."""
 
 
-def hybrid_solver(
-    settings: HybridSettings, far: InteriorPointSettings, quiet: OdeSettings, floor: float,
-    penalties: PenaltySettings | None = None,
-) -> KernelSolver:  # fmt: skip
-    """Return the solver, which keeps the costs of guess and answer from one problem to the next.
-
-    Args:
-        settings: When to switch.
-        far: Of the solver of problems that are far from their optimum.
-        quiet: Of the solver of the others; both have the same alpha.
-        floor: Constant that J has besides that of the problem.
-        penalties: Of the ODE-based solver.
-    """
+def hybrid_solver(settings: ProgramSettings) -> KernelSolver:
+    """Return the solver, which keeps the costs of guess and answer from one problem to the next."""
+    far, quiet, floor = settings.interior_point, settings.ode, settings.adaptive.cost_floor  # with the same alpha
     slot_s = max(far.tau_1_s, quiet.tau_1_s)
 
     def method(problem: QuadraticProblem) -> HybridMethod:
         real = problem.phi.dtype.type
         return HybridMethod(
-            ode.OdeMethod(matrices_of(problem), ode.flow_in(quiet, penalties, real)),
-            interior_point.method_of(far, problem),
-            real(settings.switch), real(floor), picoseconds(slot_s), picoseconds(quiet.tau_1_s),
-            picoseconds(far.tau_1_s),
+            ode.OdeMethod(matrices_of(problem), ode.flow_in(quiet, settings.penalties, real)),
+            interior_point.method_of(far, problem), real(settings.hybrid.switch), real(floor),
+            picoseconds(slot_s), picoseconds(quiet.tau_1_s), picoseconds(far.tau_1_s),
         )  # fmt: skip
 
     return KernelSolver(method, quiet.alpha, slot_s, floor)
@@ -147,9 +136,7 @@ _MAKERS: dict[str, Callable[[ProgramSettings], Solver]] = {
     "osqp": lambda settings: OsqpSolver(settings.osqp),
     "fast-gradient": lambda settings: fast_gradient_solver(settings.fast_gradient),
     "interior-point": lambda settings: interior_point.interior_point_solver(settings.interior_point),
-    "hybrid": lambda settings: hybrid_solver(
-        settings.hybrid, settings.interior_point, settings.ode, settings.adaptive.cost_floor, settings.penalties
-    ),
+    "hybrid": hybrid_solver,
     "daqp": lambda settings: DaqpSolver(settings.daqp),
 }
 

@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from coldloop.kernels.compiled import kernel
 from coldloop_optimizer_plc.computing_settings import FastGradientSettings
 from coldloop_optimizer_plc.qp.costs import Matrices, augmented_cost, excess_by_columns, gradient, matrices_of
+from coldloop_optimizer_plc.qp.linear_algebra import Array
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.interface import Answer, Costs, KernelSolver, solves_by
-
-Array = NDArray[np.float64]
 
 POWER_ITERATIONS = 200
 BOUND_MARGIN = 1.02

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from coldloop.kernels.intrinsics import Implementations
 from coldloop_optimizer_plc.computing_settings import OutsideSettings, Part, in_its_name, made
 from coldloop_optimizer_plc.qp.costs import Solution, augmented_cost, judge
+from coldloop_optimizer_plc.qp.linear_algebra import Array
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
-
-Array = NDArray[np.float64]
 
 
 class Costs(NamedTuple):

@@ -24,11 +24,10 @@ from numpy.typing import NDArray
 from coldloop.kernels.compiled import kernel
 from coldloop_optimizer_plc.computing_settings import InteriorPointSettings
 from coldloop_optimizer_plc.qp.costs import augmented_cost
-from coldloop_optimizer_plc.qp.linear_algebra import cholesky, cholesky_solve
+from coldloop_optimizer_plc.qp.linear_algebra import Array, cholesky, cholesky_solve
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.interface import Answer, Costs, KernelSolver, solves_by
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 SHORT_OF = 0.99

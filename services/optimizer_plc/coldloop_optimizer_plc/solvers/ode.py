@@ -15,12 +15,10 @@ from coldloop.kernels.compiled import kernel
 from coldloop_optimizer_plc.computing_settings import OdeSettings
 from coldloop_optimizer_plc.qp import costs
 from coldloop_optimizer_plc.qp.costs import Matrices, matrices_of
-from coldloop_optimizer_plc.qp.linear_algebra import Real, cholesky, cholesky_solve
+from coldloop_optimizer_plc.qp.linear_algebra import Array, Real, cholesky, cholesky_solve
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.settings import PenaltySettings
 from coldloop_optimizer_plc.solvers.interface import Answer, Costs, KernelSolver, solves_by
-
-Array = NDArray[np.float64]
 
 G = 2.0 - np.sqrt(2.0)
 """gamma of TR-BDF2: with this value both stages have the same matrix."""

@@ -26,14 +26,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 
 import daqp
 import numpy as np
-from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop_optimizer_plc.computing_settings import PENALTY_WEIGHT, DaqpSettings, OsqpSettings, QpoasesSettings
+from coldloop_optimizer_plc.qp.linear_algebra import Array
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.interface import Answer, collected
-
-Array = NDArray[np.float64]
 
 SOLVED, ON_THE_WAY = "SOLVER_RET_SUCCESS", "SOLVER_RET_LIMITED"
 FIRST_SOLVE_LIMIT = 10_000
