@@ -265,7 +265,8 @@ def make_rule(settings: ProgramSettings, budget: PlcBudget, fixed_ticks: int, re
     adaptive, own = settings.adaptive, settings.adaptive.contraction
     parts = 0, real(own.band), real(own.least), real(own.change)
     if fixed_ticks:
-        return Rule(FIXED_PERIOD, *[budget.q(fixed_ticks)] * 3, *parts)
+        q = budget.q(fixed_ticks)
+        return Rule(FIXED_PERIOD, q, q, q, *parts)
     if adaptive.rule is RuleName.CONTRACTION:
         return Rule(CONTRACTION, own.q_max, own.q_rest, own.q_max, *parts)
     return Rule(ALGORITHM_1, adaptive.q_first, adaptive.q_min, adaptive.q_max, adaptive.delta, *parts[1:])
