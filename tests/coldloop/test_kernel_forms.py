@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from coldloop.kernels import compiled
 from coldloop.kernels.cache_folder import CacheFolder
-from coldloop.kernels.compiled import LARGE, forms_of, is_compiled, kernel
+from coldloop.kernels.compiled import LARGE, is_compiled, kernel
 
 pytestmark = pytest.mark.usefixtures("compiles")
 
@@ -56,7 +56,7 @@ def _nothing_is_cached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_arguments_of_many_parts_have_no_wrapper_until_python_calls() -> None:
-    from_python, from_kernels = forms_of(weighted)
+    from_python, from_kernels = weighted, weighted.for_kernels
     twice = twice_weighted(MANY, X)
     assert not from_python.overloads
     assert len(from_kernels.overloads) == 1
@@ -65,7 +65,7 @@ def test_arguments_of_many_parts_have_no_wrapper_until_python_calls() -> None:
 
 
 def test_arguments_of_few_parts_have_one_form() -> None:
-    from_python, from_kernels = forms_of(product)
+    from_python, from_kernels = product, product.for_kernels
     assert twice_the_product(X) == 2.0 * product(X)
     assert len(from_python.overloads) == 1
     assert not from_kernels.overloads

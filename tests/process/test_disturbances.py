@@ -11,7 +11,7 @@ import pytest
 from coldloop.errors import ColdloopError, ModelFileError
 from coldloop.process.settings import process_of
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, rest_map
-from coldloop_plant.own.plants import Disturbances
+from coldloop_plant.own_plants import Disturbances
 from coldloop_rig.process_file.judgement import described
 from coldloop_rig.process_file.making import Made, made_from
 from tests.harness.processes import Processes

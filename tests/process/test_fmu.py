@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from coldloop.errors import ColdloopError
-from coldloop_plant.own.fmu import Fmu, FmuSimulation, Wiring
+from coldloop_plant.fmu import Fmu, FmuSimulation, Wiring
 from coldloop_rig.process_file.judgement import described
 from coldloop_rig.process_file.making import Made, made_from
 from tests.harness.process_files import EXAMPLES, fmu
@@ -268,9 +268,9 @@ def test_instances_do_not_know_of_one_another_and_return_to_their_states(compile
 
 def test_no_unpacked_folder_is_left_behind(compiled: Path, tmp_path: Path) -> None:
     fmu = Fmu(tanks(tmp_path, compiled))
-    instance = fmu.instance({})
+    simulation = FmuSimulation(fmu, Wiring(["u"], ["y"], "w", [], [], {}, 1), 0.25)
     assert len(left_behind()) == 1
-    del fmu, instance
+    del fmu, simulation
     assert not left_behind()
 
 
@@ -373,7 +373,7 @@ def test_a_damaged_member_gets_one_line(place: str, compiled: Path, tmp_path: Pa
 
 def test_no_archive_is_unpacked_without_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By its directory; where the directory lies, no more comes out, and the checksum is wrong."""
-    monkeypatch.setattr("coldloop_plant.own.fmu.MOST_UNPACKED", 2 << 20)
+    monkeypatch.setattr("coldloop_plant.fmu.MOST_UNPACKED", 2 << 20)
     file = tmp_path / "two_tanks.fmu"
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
         packed.writestr("zeros", bytes(3 << 20))

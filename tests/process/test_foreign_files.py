@@ -17,7 +17,7 @@ from coldloop.process.model_file import read_document
 from coldloop.service.telemetry_settings import TelemetrySettings
 from coldloop_chaos.plan import find_plan
 from coldloop_hmi.users import PageRole, Users, write_user
-from coldloop_plant.own.plants import _fmu_of, file_digest
+from coldloop_plant.own_plants import _fmu_of, file_digest
 from coldloop_rig.cli.commands.options import _tls_site
 from coldloop_rig.plc_sizing.plc import find_profile
 from coldloop_rig.process_file.judgement import described

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from numba.core.dispatcher import Dispatcher
 
-from coldloop.kernels.compiled import forms_of
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.results.recording import Recorder
 from coldloop_rig.runs.running import make_scenario
@@ -29,7 +28,7 @@ def compiled_kernels() -> int:
         for value in vars(module).values()
         if isinstance(value, Dispatcher)
     }
-    return sum(len(form.overloads) for kernel in found.values() for form in forms_of(kernel))
+    return sum(len(form.overloads) for kernel in found.values() for form in (kernel, kernel.for_kernels))
 
 
 class FirstTick(Recorder):

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from numba.core.dispatcher import Dispatcher
 
-from coldloop.kernels.compiled import _parts, cache_folder, forms_of
+from coldloop.kernels.compiled import _parts, cache_folder
 from coldloop.kernels.reach import label, reached
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.results.recording import Recorder
@@ -30,7 +30,7 @@ def kernels() -> Iterator[Dispatcher]:
         if name.partition(".")[0] in OURS
         for value in vars(module).values()
         if isinstance(value, Dispatcher)
-        for form in forms_of(value)
+        for form in (value, value.for_kernels)
         if form.overloads
     }
     yield from found.values()

@@ -7,7 +7,7 @@ from coldloop.errors import ConfigurationError
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
 from coldloop_plant.kinds import NO_MISMATCH, noise_of
-from coldloop_plant.own.plants import LinearPlant
+from coldloop_plant.own_plants import LinearPlant
 from coldloop_plant.program import PlantProgram
 from coldloop_plant.settings import PlantKind
 from coldloop_rig.cosim.one_process import OneProcessRig

@@ -17,7 +17,7 @@ from coldloop.process.declaration import Process
 from coldloop.process.sections import Lag, PlantSource
 from coldloop.text_file import MOST_BYTES, read_bytes
 from coldloop_plant.equilibrium import Linear, central_differences
-from coldloop_plant.own.plants import (
+from coldloop_plant.own_plants import (
     LINEAR,
     PYTHON,
     TRANSFER_FUNCTIONS,

@@ -16,8 +16,8 @@ from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel, discretise
 from coldloop.process.sections import Bath, Output, State
 from coldloop_plant.equilibrium import Linear, central_differences, model_of
-from coldloop_plant.own.fmu import DOUBLE, Fmu, FmuSimulation, Wiring
-from coldloop_plant.own.plants import FMU, PYTHON, file_digest
+from coldloop_plant.fmu import DOUBLE, Fmu, FmuSimulation, Wiring
+from coldloop_plant.own_plants import FMU, PYTHON, file_digest
 from coldloop_rig.plc_sizing.operations import ProblemSizes, iteration_shares
 from coldloop_rig.process_file.linear_model import (
     STEP,

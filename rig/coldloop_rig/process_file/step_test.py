@@ -20,7 +20,7 @@ from coldloop.process.declaration import Process
 from coldloop.process.lti_model import discretise
 from coldloop.process.sections import Disturbance, Load
 from coldloop.table import TIME, Table, read_table
-from coldloop_plant.own.plants import LINEAR
+from coldloop_plant.own_plants import LINEAR
 from coldloop_rig.process_file.linear_model import Linearised, operating_point
 
 Array = NDArray[np.float64]

@@ -49,7 +49,7 @@ def own_header(file: Path) -> ModelHeader:
     """
     header = read_header(file)
     if header.process:
-        from coldloop_plant.own.plants import check_files  # noqa: PLC0415 a cold box starts without it
+        from coldloop_plant.own_plants import check_files  # noqa: PLC0415 a cold box starts without it
 
         check_files(header)
         return header
@@ -118,7 +118,7 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
     if header.process:
         if section.mismatch != NO_MISMATCH:
             raise ConfigurationError("plant.mismatch: for a cold box alone; leave it out")
-        from coldloop_plant.own.plants import own_plant_maker  # noqa: PLC0415 a cold box starts without it
+        from coldloop_plant.own_plants import own_plant_maker  # noqa: PLC0415 a cold box starts without it
 
         return own_plant_maker(header, partial(noise_of, section.sensors))
     if section.kind is PlantKind.COLD_BOX:

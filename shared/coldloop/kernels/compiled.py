@@ -35,7 +35,6 @@ from coldloop.kernels.reach import digest, label
 
 P = ParamSpec("P")
 R = TypeVar("R")
-V = TypeVar("V", bound=tuple[Any, ...])
 VERSIONS: Final = (numba.__version__, llvmlite.__version__, np.__version__, sys.implementation.cache_tag)
 LONGEST_NAME: Final = 120
 """Characters of a kernel's name that the name of its file has."""
@@ -94,11 +93,6 @@ def _count(kinds: Iterable[Any]) -> int:
     for kind in kinds:
         count += _count(kind.types) if isinstance(kind, types.BaseTuple) else 1  # type: ignore[attr-defined]
     return count
-
-
-def forms_of(kernel: Any) -> tuple[Any, Any]:  # noqa: ANN401
-    """Return the two forms of a kernel, as dispatchers: for calls from Python, and for calls from kernels."""
-    return kernel, kernel.for_kernels
 
 
 def _in_turn(dispatcher: Any) -> Any:  # noqa: ANN401

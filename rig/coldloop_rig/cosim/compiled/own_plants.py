@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import kernel
-from coldloop_plant.own.plants import (
+from coldloop_plant.own_plants import (
     LagTable,
     LinearPlant,
     Matrices,

@@ -480,7 +480,7 @@ def own_plant_maker(header: ModelHeader, noise_of_seed: Callable[[int], Measurem
     given: dict[str, Any] = {"u0": header.u0, "disturbances": disturbances, "process": process}
     plant: Callable[..., PlantProgram]  # each session has an instance of its own, for a class may have a memory
     if header.plant == FMU:
-        from coldloop_plant.own.fmu import Fmu, FmuPlant, Wiring, fmu_maker  # noqa: PLC0415 few plants are FMUs
+        from coldloop_plant.fmu import Fmu, FmuPlant, Wiring, fmu_maker  # noqa: PLC0415 few plants are FMUs
 
         fmu = Fmu(_fmu_of(header))
         at_rest = fmu_maker(fmu, Wiring(**parameters["wiring"]), header.u0, w0, process.tick_s)

@@ -23,7 +23,9 @@ import numpy as np
 from coldloop.errors import ColdloopError, ModelFileError, foreign
 from coldloop.process.declaration import Process
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.own.plants import NO_DISTURBANCES, Disturbances, DisturbedPlant
+from coldloop_plant.own_plants import NO_DISTURBANCES, Disturbances, DisturbedPlant
+
+log = logging.getLogger("coldloop.plant")
 
 NUMBERS: Final = ("Real", "Float", "Integer", "Int", "UInt", "Boolean", "Enumeration")
 """Beginnings of the types of variables that are numbers here."""
@@ -72,16 +74,16 @@ class Fmu:
         self.path = path
         if not path.is_file():
             raise ModelFileError(f"{path}: no such file; plant.fmu names an FMU beside the process file")
-        self._folder = self._unpacked(MOST_UNPACKED)
+        self.folder = self._unpacked(MOST_UNPACKED)
         self.findings: tuple[str, ...] = ()
         """Violations of the standard in its description that do not keep it from being run."""
         with foreign(f"{path}: not a readable FMU", "get it anew from the tool that made it"):
             try:
-                self.description = fmpy.read_model_description(self._folder)
+                self.description = fmpy.read_model_description(self.folder)
             except Exception as error:  # noqa: BLE001 tools do not keep to the standard, and their FMUs run
                 self.findings = tuple(" ".join(str(one).split()) for one in getattr(error, "problems", [error]))
-                self.description = fmpy.read_model_description(self._folder, validate=False)
-            platforms = fmpy.supported_platforms(self._folder)
+                self.description = fmpy.read_model_description(self.folder, validate=False)
+            platforms = fmpy.supported_platforms(self.folder)
         self.variables = {each.name: each for each in self.description.modelVariables}
         slave = self.description.coSimulation
         self._check(slave, platforms, fmpy.platform)
@@ -90,7 +92,8 @@ class Fmu:
         self.has_derivatives = bool(slave.providesDirectionalDerivative)
         self.is_single = bool(slave.canBeInstantiatedOnlyOncePerProcess)
         """Whether a new instance ends the one before it."""
-        self._end_former: Any = None
+        self.end_former: Callable[[], object] | None = None
+        """Ends the instance that a new one takes the place of."""
 
     def _unpacked(self, most: int) -> str:
         """Return a folder with the members of the archive; zipfile gives no more of one than its directory says."""
@@ -119,18 +122,6 @@ class Fmu:
         if here not in platforms:
             others = ", ".join(platforms) or "none"
             raise ModelFileError(f"{where}: has no library for {here}, but for {others}; get it made for this platform")
-
-    def instance(self, start: Mapping[str, float]) -> "FmuInstance":
-        """Return an instance at time 0, initialised with start values by name of variable.
-
-        Raises:
-            ModelFileError: It cannot be.
-        """
-        if self._end_former is not None:
-            self._end_former()
-        made = FmuInstance(self, self._folder, start)
-        self._end_former = made.end if self.is_single else None
-        return made
 
     def port(self, name: str) -> Port:
         """Return the number of this name; elements of an array, as `x[1]` or `x[2,1]`, count from 1, row by row.
@@ -166,40 +157,72 @@ class Fmu:
         return str(self.description.fmiVersion) == "2.0"
 
 
-class FmuInstance:
-    """A running instance of an FMU; made by `Fmu.instance`. All of it raises `ColdloopError` where the FMU fails."""
+@dataclass(frozen=True)
+class Wiring:
+    """Variables of an FMU that are signals, and how it is run; what a model file says of it."""
 
-    def __init__(self, fmu: Fmu, folder: str, start: Mapping[str, float]) -> None:
+    inputs: Sequence[str]
+    outputs: Sequence[str]
+    load: str | None
+    disturbances: Sequence[str]
+    """Others than the load."""
+    states: Sequence[str]
+    """Variables that are its states, if it shows them."""
+    start: Mapping[str, float]
+    """Start values of variables."""
+    steps_per_tick: int
+    rest_ticks: int = 0
+    """Ticks from its start until it rests at the operating point."""
+
+
+class FmuSimulation:
+    """An instance at time 0, initialised with the wiring's start values, and with its signals connected.
+
+    All of it raises `ColdloopError` where the FMU fails; making it `ModelFileError`.
+    """
+
+    def __init__(self, fmu: Fmu, wiring: Wiring, tick_s: float) -> None:
         from fmpy.simulation import instantiate_fmu  # noqa: PLC0415
 
+        names = [*wiring.inputs, *([wiring.load] if wiring.load else []), *wiring.disturbances]
+        self.inputs = [fmu.port(name) for name in names]
+        self._outputs = [fmu.port(name) for name in wiring.outputs]
+        self._states = [fmu.port(name) for name in wiring.states]
         self._fmu = fmu
+        self._wiring = wiring
+        self._step_s = tick_s / wiring.steps_per_tick
+        self._steps = 0
         self._said = said = list[str]()
+        if fmu.end_former is not None:
+            fmu.end_former()
 
         def note(*arguments: Any) -> None:  # noqa: ANN401 of FMI 2: component, name, status, category, text; of 3: ...
             if arguments[-3] >= ERROR and arguments[-1]:
                 said[:] = [arguments[-1].decode(errors="replace")]
 
         with foreign(f"{fmu.path}: cannot be started", said=said):
-            self._slave = instantiate_fmu(folder, fmu.description, "CoSimulation", logger=note, debug_logging=True)
-            self.end = weakref.finalize(self, self._slave.freeInstance)
-            self._set([fmu.port(name) for name in start], list(start.values()))
+            self._slave = instantiate_fmu(fmu.folder, fmu.description, "CoSimulation", logger=note, debug_logging=True)
+            self._end = weakref.finalize(self, self._slave.freeInstance)
+            self._set([fmu.port(name) for name in wiring.start], list(wiring.start.values()))
             if fmu.is_fmi2:
                 self._slave.setupExperiment(startTime=0.0)
             self._slave.enterInitializationMode()
             self._slave.exitInitializationMode()
+        if fmu.is_single:
+            fmu.end_former = self._end
 
     @contextmanager
     def _calling(self, what: str) -> Iterator[None]:
-        if not self.end.alive:
+        if not self._end.alive:
             raise ColdloopError(f"{self._fmu.path}: allows one instance at a time, and another has taken its place")
         self._said.clear()
         with foreign(f"{self._fmu.path}: {what}", said=self._said):
             yield
 
-    def put(self, ports: Sequence[Port], values: Sequence[float]) -> None:
-        """Set variables; those that are no real numbers to the nearest value that they can have."""
+    def put(self, u: RealArray, w: RealArray) -> None:
+        """Set inputs, load (which may be none) and other disturbances, to the nearest value that each can have."""
         with self._calling("does not take its inputs"):
-            self._set(ports, values)
+            self._set(self.inputs, [*u.tolist(), *w[0 if self._wiring.load else 1 :].tolist()])
 
     def _set(self, ports: Sequence[Port], values: Sequence[float]) -> None:
         wholes: dict[str, dict[int, list[float]]] = {}
@@ -228,74 +251,6 @@ class FmuInstance:
         sizes = () if self._fmu.is_fmi2 else (sum(counts.values()),)
         return list(getattr(self._slave, f"get{kind}")(list(counts), *sizes))
 
-    def step(self, time_s: float, length_s: float) -> None:
-        """Do a step from a time."""
-        with self._calling(f"stopped at {time_s:g} s"):
-            answer = self._slave.doStep(time_s, length_s)
-        if answer and answer[1]:
-            raise ColdloopError(f"{self._fmu.path}: has ended its simulation at {time_s:g} s")
-
-    def derivatives(self, of: Sequence[Port], by: Sequence[Port]) -> RealArray:
-        """Return partial derivatives of real variables at the present state, shape (of, by)."""
-        unknown = [port.reference for port in of]
-        with self._calling("directional derivatives fail"):
-            columns = [self._slave.getDirectionalDerivative(unknown, [one.reference], [1.0]) for one in by]
-            return np.array(columns, dtype=np.float64).T
-
-    def state(self) -> bytes:
-        """Return the whole state."""
-        with self._calling("cannot save its state"):
-            held = self._slave.getFMUState()
-            content: bytes = self._slave.serializeFMUState(held)
-            self._slave.freeFMUState(held)
-        return content
-
-    def return_to(self, state: bytes) -> None:
-        """Return to a state."""
-        with self._calling("cannot return to a state"):
-            held = self._slave.deserializeFMUState(state)
-            self._slave.setFMUState(held)
-            self._slave.freeFMUState(held)
-
-
-log = logging.getLogger("coldloop.plant")
-
-
-@dataclass(frozen=True)
-class Wiring:
-    """Variables of an FMU that are signals, and how it is run; what a model file says of it."""
-
-    inputs: Sequence[str]
-    outputs: Sequence[str]
-    load: str | None
-    disturbances: Sequence[str]
-    """Others than the load."""
-    states: Sequence[str]
-    """Variables that are its states, if it shows them."""
-    start: Mapping[str, float]
-    """Start values of variables."""
-    steps_per_tick: int
-    rest_ticks: int = 0
-    """Ticks from its start until it rests at the operating point."""
-
-
-class FmuSimulation:
-    """An instance with its signals connected."""
-
-    def __init__(self, fmu: Fmu, wiring: Wiring, tick_s: float) -> None:
-        names = [*wiring.inputs, *([wiring.load] if wiring.load else []), *wiring.disturbances]
-        self.inputs = [fmu.port(name) for name in names]
-        self._outputs = [fmu.port(name) for name in wiring.outputs]
-        self._states = [fmu.port(name) for name in wiring.states]
-        self._instance = fmu.instance(wiring.start)
-        self._wiring = wiring
-        self._step_s = tick_s / wiring.steps_per_tick
-        self._steps = 0
-
-    def put(self, u: RealArray, w: RealArray) -> None:
-        """Set inputs, load (which may be none) and other disturbances."""
-        self._instance.put(self.inputs, [*u.tolist(), *w[0 if self._wiring.load else 1 :].tolist()])
-
     def outputs(self) -> RealArray:
         """Return the outputs."""
         return self.read(self._outputs)
@@ -304,10 +259,6 @@ class FmuSimulation:
         """Return the states that it shows."""
         return self.read(self._states)
 
-    def read(self, ports: Sequence[Port]) -> RealArray:
-        """Return other variables."""
-        return self._instance.read(ports)
-
     def tick(self) -> None:
         """Go one tick forward.
 
@@ -315,7 +266,11 @@ class FmuSimulation:
             ColdloopError: The FMU does not.
         """
         for _ in range(self._wiring.steps_per_tick):
-            self._instance.step(self._steps * self._step_s, self._step_s)
+            time_s = self._steps * self._step_s
+            with self._calling(f"stopped at {time_s:g} s"):
+                answer = self._slave.doStep(time_s, self._step_s)
+            if answer and answer[1]:
+                raise ColdloopError(f"{self._fmu.path}: has ended its simulation at {time_s:g} s")
             self._steps += 1
 
     def rest(self, u: RealArray, w: RealArray) -> None:
@@ -326,18 +281,28 @@ class FmuSimulation:
 
     def derivatives(self, of: Sequence[Port]) -> RealArray:
         """Return partial derivatives by states, inputs, load and k other disturbances, shape (of, n + m + 1 + k)."""
+        unknown = [port.reference for port in of]
         by = [*self._states, *self.inputs]
-        found = self._instance.derivatives(of, by)
+        with self._calling("directional derivatives fail"):
+            columns = [self._slave.getDirectionalDerivative(unknown, [one.reference], [1.0]) for one in by]
+            found = np.array(columns, dtype=np.float64).T
         no_load = len(self._states) + len(self._wiring.inputs)
         return found if self._wiring.load else np.insert(found, no_load, 0.0, axis=1)
 
     def saved(self) -> dict[str, Any]:
         """Return the state as plain data."""
-        return {"steps": self._steps, "state": base64.b64encode(self._instance.state()).decode()}
+        with self._calling("cannot save its state"):
+            held = self._slave.getFMUState()
+            content: bytes = self._slave.serializeFMUState(held)
+            self._slave.freeFMUState(held)
+        return {"steps": self._steps, "state": base64.b64encode(content).decode()}
 
     def return_to(self, saved: Mapping[str, Any]) -> None:
         """Return to a state that `saved` returned."""
-        self._instance.return_to(base64.b64decode(saved["state"]))
+        with self._calling("cannot return to a state"):
+            held = self._slave.deserializeFMUState(base64.b64decode(saved["state"]))
+            self._slave.setFMUState(held)
+            self._slave.freeFMUState(held)
         self._steps = int(saved["steps"])
 
 
