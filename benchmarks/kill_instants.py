@@ -7,12 +7,9 @@ from pathlib import Path
 
 from coldloop.config import Configuration, load_configuration
 from coldloop.process.cold_box import TICK_S
-from coldloop.session.settings import TimeMode
-from coldloop_chaos.evaluation import Evaluation
-from coldloop_chaos.experiment import perform
-from coldloop_chaos.faults import Kill, Pause
-from coldloop_chaos.plan import ChaosPlan
-from coldloop_chaos.report import ChaosProgress, summary_lines, write_report
+from coldloop.session import TimeMode
+from coldloop_chaos.faults import ChaosPlan, Kill, Pause
+from coldloop_chaos.report import ChaosProgress, Evaluation, perform, summary_lines, write_report
 from coldloop_rig.results.folders import claim_folder
 from coldloop_rig.settings import Settings
 

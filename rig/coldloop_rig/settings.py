@@ -10,8 +10,8 @@ from pydantic import Field
 from coldloop.config import Configuration, flattened, load_configuration
 from coldloop.errors import UsageError
 from coldloop.process.settings import InputLimits, RootSettings
-from coldloop.service.telemetry_settings import TelemetrySettings
-from coldloop.session.settings import SessionSettings
+from coldloop.service.settings import TelemetrySettings
+from coldloop.session import SessionSettings
 from coldloop_control_plc.settings import ControlSection
 from coldloop_hmi.settings import HmiSection
 from coldloop_optimizer_plc.settings import OptimizerSection

@@ -11,7 +11,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from coldloop_chaos.plan import shipped_plans
+from coldloop_chaos.faults import shipped_plans
 from tests.harness.processes import Processes
 
 if TYPE_CHECKING:

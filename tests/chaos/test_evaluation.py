@@ -8,9 +8,9 @@ from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.plant import PlantSample
 from coldloop.registers.safety import AlarmKind
-from coldloop_chaos.evaluation import ChaosTrace, Evaluation, Mark, RaisedAlarm, evaluate
 from coldloop_chaos.faults import Kill, Reset
-from coldloop_chaos.report import table
+from coldloop_chaos.report import Evaluation, RaisedAlarm, evaluate, table
+from coldloop_chaos.sequencer import ChaosTrace, Mark
 from coldloop_optimizer_plc.settings import ControlDesign
 
 TICKS = 400

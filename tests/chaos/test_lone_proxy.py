@@ -12,8 +12,7 @@ from pymodbus.client import ModbusTcpClient
 from pymodbus.exceptions import ModbusException
 from pymodbus.pdu import ModbusPDU
 
-from coldloop_chaos.faults import Direction
-from coldloop_chaos.plan import FaultTransition, LinkPlan, find_link_plan
+from coldloop_chaos.faults import Direction, FaultTransition, LinkPlan, find_link_plan
 from coldloop_chaos.proxy import Mangler
 from tests.harness.processes import Process, Processes
 

@@ -4,8 +4,7 @@ import pytest
 
 from coldloop.errors import LoadFileError, UsageError
 from coldloop.process.settings import settings_of
-from coldloop_chaos.faults import Drop, Kill, Reset
-from coldloop_chaos.plan import SHIPPED, SPREAD_S, ChaosPlan, find_plan, parse_plan, shipped_plans
+from coldloop_chaos.faults import SHIPPED, SPREAD_S, ChaosPlan, Drop, Kill, Reset, find_plan, parse_plan, shipped_plans
 from coldloop_rig.process_file.making import made_from
 from tests.harness.process_files import COLUMN
 

@@ -11,8 +11,7 @@ from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, LinkCause, Mode, OperatorMode, PlantLinkState, Verdict
 from coldloop.registers.plant import SensorFaultKind
 from coldloop.registers.safety import AlarmKind
-from coldloop.service.event_text import describe, log_event, utc_text
-from coldloop.service.journal import Journal
+from coldloop.service.journal import Journal, describe, log_event, utc_text
 
 
 def event(kind: int, subject: int = 0, cause: int = 0, value: float = 0.0, who: str = "") -> Event:

@@ -11,7 +11,7 @@ from coldloop.registers.bank import BusyError, Caller
 from coldloop.registers.declaration import Role
 from coldloop.registers.safety import LeaseState, LeaseStatus
 from coldloop.registers.text import to_words
-from coldloop.safety.lease import LINGER_S, SIMPLE_CLIENT, WriterLease
+from coldloop.safety.writers import LINGER_S, SIMPLE_CLIENT, WriterLease
 
 SILENCE_S = 5.0
 

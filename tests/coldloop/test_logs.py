@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from coldloop.service.logs import CAPACITY, JsonFormatter, QueueingHandler, dropped, end_logs, set_up_logs
+from coldloop.service.start import CAPACITY, JsonFormatter, QueueingHandler, dropped, end_logs, set_up_logs
 from tests.harness.processes import END_S, Processes
 
 
@@ -181,7 +181,7 @@ def test_the_last_line_is_written_after_all_others(stream: io.StringIO) -> None:
 
 PROGRAM = """
 import logging
-from coldloop.service.logs import dropped, end_logs, set_up_logs
+from coldloop.service.start import dropped, end_logs, set_up_logs
 set_up_logs("plant", "info")
 for number in range(3000):
     logging.getLogger(f"coldloop.{number}").info("x" * 100)

@@ -11,9 +11,8 @@ import pytest
 from coldloop.errors import PortInUseError
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.plant import Actuators, Measurement
-from coldloop.service.metrics import bank_families, exposition, gauge
-from coldloop.service.metrics_server import MOST_OPEN, MetricsServer
-from coldloop.service.metrics_settings import MetricsSettings
+from coldloop.service.metrics import MOST_OPEN, MetricsServer, bank_families, exposition, gauge
+from coldloop.service.settings import MetricsSettings
 from tests.harness.records import PLANT_MAP
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from coldloop.registers.codec import WordOrder, codec_of
 from coldloop.registers.control_plc import SequenceHeader, SequenceRow
-from coldloop.safety.sequence import InputSequence, checksum, with_checksum
+from coldloop.safety.writers import InputSequence, checksum, with_checksum
 from tests.harness.records import CONTROL_MAP, Row, as_transmitted
 
 ROWS = [Row(43.0 + 0.01 * tick, 75.0 - tick, 36.0) for tick in range(20)]

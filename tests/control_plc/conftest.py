@@ -10,7 +10,7 @@ from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.control_plc import Acknowledgement, Plan, SequenceHeader, Update, Verdict
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.registers.safety import AlarmKind, AlarmState
-from coldloop.safety.sequence import InputSequence, with_checksum
+from coldloop.safety.writers import InputSequence, with_checksum
 from coldloop_control_plc.program import ControlProgram, OperatingPoint
 from coldloop_control_plc.settings import ControlSection
 from tests.harness.records import Row, as_transmitted

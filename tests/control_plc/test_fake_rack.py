@@ -30,10 +30,9 @@ from coldloop.registers.control_plc import (
 from coldloop.registers.declaration import Role
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import LeaseState
-from coldloop.safety.lease import WriterLease
-from coldloop.safety.sequence import InputSequence, with_checksum
+from coldloop.safety.writers import InputSequence, WriterLease, with_checksum
 from coldloop.service.journal import Journal
-from coldloop.session.settings import TimeBase
+from coldloop.session import TimeBase
 from coldloop_control_plc.plant_link import PlantLink
 from coldloop_control_plc.program import make_program
 from coldloop_control_plc.rack_clock import PHASE, RackClock

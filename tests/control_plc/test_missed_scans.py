@@ -11,7 +11,7 @@ from coldloop.process.cold_box import COLD_BOX, L1, T5
 from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import LinkCause, Mode, Operator, OperatorMode, Verdict
 from coldloop.registers.safety import AlarmKind
-from coldloop.session.settings import TimeBase
+from coldloop.session import TimeBase
 from coldloop_control_plc.output_limits import OutputGuard
 from coldloop_control_plc.retained_state import ControlStateStore, RetainedControlState
 from tests.harness.records import Row, as_transmitted

@@ -22,7 +22,7 @@ from coldloop.registers.control_plc import LadderStatus, Operator, OperatorMode,
 from coldloop.registers.declaration import Block, Role
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import LeaseStatus
-from coldloop.safety.lease import SIMPLE_CLIENT
+from coldloop.safety.writers import SIMPLE_CLIENT
 from coldloop.service.journal import Journal
 from coldloop_control_plc.plant_link import PlantLink
 from coldloop_control_plc.program import make_program

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from coldloop.process.settings import InputLimits, RateReference
 from coldloop.registers.control_plc import Acknowledgement, Verdict
-from coldloop.safety.sequence import InputSequence
+from coldloop.safety.writers import InputSequence
 from tests.harness.records import Row, as_transmitted
 
 if TYPE_CHECKING:

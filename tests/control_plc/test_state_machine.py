@@ -24,8 +24,8 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmState
-from coldloop.safety.sequence import InputSequence, with_checksum
-from coldloop.session.settings import TimeBase
+from coldloop.safety.writers import InputSequence, with_checksum
+from coldloop.session import TimeBase
 from coldloop_control_plc.program import ControlProgram, make_program
 from coldloop_control_plc.retained_state import ControlStateStore, RetainedControlState
 from coldloop_control_plc.settings import ControlSection

@@ -8,7 +8,7 @@ from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers.common import MAGIC
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.safety import AlarmKind
-from coldloop.service.event_text import alarm_word
+from coldloop.service.journal import alarm_word
 from coldloop_control_plc.alarms import PASSING, AlarmSettings
 from tests.harness.records import CONTROL_MAP
 

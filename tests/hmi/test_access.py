@@ -19,7 +19,6 @@ from aiohttp.test_utils import make_mocked_request
 from coldloop.errors import ConfigurationError, UsageError
 from coldloop.modbus.settings import Endpoint, TlsSettings
 from coldloop.process.cold_box import COLD_BOX
-from coldloop_hmi.audit import Audit
 from coldloop_hmi.guard import Connections, Guard, host_of, is_own_origin, port_of, told_in_a_line
 from coldloop_hmi.page_server import PageServer, PageSite
 from coldloop_hmi.process_image import Model
@@ -30,6 +29,7 @@ from coldloop_hmi.users import (
     PASSWORD_BURST,
     REQUEST_BURST,
     REQUESTS_A_BROWSER,
+    Audit,
     ClientLimit,
     LoginLimit,
     LoginSessions,

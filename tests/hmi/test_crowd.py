@@ -13,10 +13,10 @@ import pytest
 
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers.control_plc import ProcessNow
-from coldloop_hmi.audit import KEPT, LARGEST_FILE, MOST_KINDS, OLDER_FILES, REPEATS_S, Audit
 from coldloop_hmi.page_server import PENS, ROWS_AT_ONCE, PageServer, PageSite
 from coldloop_hmi.process_image import Model
 from coldloop_hmi.settings import HmiSection
+from coldloop_hmi.users import KEPT, LARGEST_FILE, MOST_KINDS, OLDER_FILES, REPEATS_S, Audit
 from tests.harness.waiting import eventually
 from tests.hmi.conftest import OPERATOR, Clock, Site
 

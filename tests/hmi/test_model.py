@@ -18,7 +18,6 @@ from coldloop.registers.control_plc import LadderStatus, Mode, Plan, ProcessNow
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmPriority, AlarmState
 from coldloop.service.metrics import exposition
-from coldloop_hmi.answers import WAITING, Broadcast
 from coldloop_hmi.documents import (
     MOST_MARKS,
     alarms_document,
@@ -28,6 +27,7 @@ from coldloop_hmi.documents import (
     state_document,
     trend_document,
 )
+from coldloop_hmi.guard import WAITING, Broadcast
 from coldloop_hmi.page_server import safe_cell
 from coldloop_hmi.process_image import MOST_ROWS, STALE_S, JournalEntry, Model, TrendStore, thin
 from coldloop_hmi.runtime import Poller

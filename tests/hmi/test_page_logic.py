@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from coldloop.number_text import axis_labels, number_text
-from coldloop_hmi.answers import STATIC
+from coldloop_hmi.guard import STATIC
 from coldloop_hmi.signals import Quality
 
 if TYPE_CHECKING:

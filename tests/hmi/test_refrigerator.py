@@ -12,8 +12,8 @@ import pytest
 from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES
 from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
 from coldloop.registers.plant import StationAlarm, StationStatus
-from coldloop_hmi.answers import STATIC
 from coldloop_hmi.documents import plant_document
+from coldloop_hmi.guard import STATIC
 from coldloop_hmi.process_image import Model
 from coldloop_hmi.signals import signals_of
 from tests.harness.records import MAPS

@@ -16,7 +16,7 @@ from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind
 from coldloop_hmi.explanation import Branch
 from coldloop_hmi.process_image import JournalEntry, Model
-from coldloop_hmi.replay import Replay
+from coldloop_hmi.runtime import Replay
 from coldloop_hmi.signals import SOUND, doubted
 from coldloop_rig.live.recorded_page import RecordedPage
 from coldloop_rig.results.run_folder import RunFolder

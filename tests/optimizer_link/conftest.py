@@ -29,8 +29,7 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.declaration import Block, RegisterMap
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
-from coldloop.safety.lease import WriterLease
-from coldloop.safety.sequence import InputSequence, checksum
+from coldloop.safety.writers import InputSequence, WriterLease, checksum
 from coldloop_chaos.faults import Direction
 from coldloop_chaos.proxy import reset
 from coldloop_optimizer_plc.runtime import OptimizerPlc

@@ -15,7 +15,7 @@ from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.plant import Measurement
-from coldloop.safety.sequence import InputSequence
+from coldloop.safety.writers import InputSequence
 from coldloop_control_plc.program import make_program
 from coldloop_control_plc.settings import ControlSection
 from coldloop_optimizer_plc.program import OptimizerProgram

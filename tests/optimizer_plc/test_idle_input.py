@@ -7,7 +7,7 @@ from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, V1
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import Plan, Update
-from coldloop.safety.sequence import InputSequence
+from coldloop.safety.writers import InputSequence
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
 

@@ -19,7 +19,7 @@ from coldloop.process.lti_model import LtiModel
 from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import Plan, Update
 from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
-from coldloop.safety.sequence import InputSequence
+from coldloop.safety.writers import InputSequence
 from coldloop_optimizer_plc import solvers
 from coldloop_optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings
 from coldloop_optimizer_plc.program import OptimizerProgram

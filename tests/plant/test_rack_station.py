@@ -15,7 +15,7 @@ from coldloop.registers.plant import (
     StationStatus,
     Surroundings,
 )
-from coldloop.service.event_text import describe
+from coldloop.service.journal import describe
 
 if TYPE_CHECKING:
     from conftest import RackOnTheBus

@@ -14,8 +14,8 @@ import pytest
 from coldloop.errors import ColdloopError
 from coldloop.kernels.cache_folder import find_cache_folder
 from coldloop.process.model_file import read_document
-from coldloop.service.telemetry_settings import TelemetrySettings
-from coldloop_chaos.plan import find_plan
+from coldloop.service.settings import TelemetrySettings
+from coldloop_chaos.faults import find_plan
 from coldloop_hmi.users import PageRole, Users, write_user
 from coldloop_plant.own_plants import _fmu_of, file_digest
 from coldloop_rig.cli.commands.options import _tls_site

@@ -13,9 +13,9 @@ import pytest
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.sections import NO_LOAD
 from coldloop.process.settings import settings_of
-from coldloop.session.settings import TimeMode
+from coldloop.session import TimeMode
 from coldloop_chaos.commands import plans
-from coldloop_chaos.plan import shipped_plans
+from coldloop_chaos.faults import shipped_plans
 from coldloop_optimizer_plc.settings import Preset, SolverName
 from coldloop_plant.load import NAMED
 from coldloop_rig.cli import EXTRAS, command_names, make_parser

@@ -33,7 +33,7 @@ from coldloop.registers.text import to_words
 from coldloop_plant.kinds import own_header
 from coldloop_rig.cosim.wiring import SERVICES
 from coldloop_rig.settings import Settings
-from coldloop_rig.testing.live_rig import BackgroundLoop
+from coldloop_rig.testing import BackgroundLoop
 from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 
 if TYPE_CHECKING:

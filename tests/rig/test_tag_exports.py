@@ -18,7 +18,7 @@ from coldloop.registers.common import IDENTITY_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, f32
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import AlarmKind
-from coldloop.service.event_text import alarm_word
+from coldloop.service.journal import alarm_word
 from coldloop.service.metrics import metric_name
 from coldloop_rig.cli.registers import exported, runs
 from tests.conftest import Coldloop

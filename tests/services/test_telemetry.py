@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import aiomqtt
 import pytest
 
+from coldloop.service.settings import TelemetrySettings
 from coldloop.service.telemetry import Telemetry
-from coldloop.service.telemetry_settings import TelemetrySettings
 from tests.harness.waiting import until
 
 if TYPE_CHECKING:

@@ -10,20 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from coldloop.errors import LinkError, UsageError
 from coldloop.process.updating_periods import duration
 from coldloop.service.command_line import add_configuration_options
-from coldloop_rig.cli.commands.options import (
-    FIGURE_FORMATS,
-    MODES,
-    OWN_PORTS,
-    PLACES,
-    Command,
-    HostPort,
-    check_load,
-    configuration,
-    endpoint,
-    number_within,
-    refuse_ineffective,
-    say,
-)
+from coldloop_rig.cli.commands import options as common
 from coldloop_rig.interruption import run_until_interrupted
 
 if TYPE_CHECKING:
@@ -55,36 +42,35 @@ def _declare_chaos(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=duration, help="plant time, such as 2h or 90s, instead of the plan's")
     parser.add_argument("--load", type="name", dest="plan_load",
                         help="a named load or a CSV file, instead of the plan's")  # fmt: skip
-    parser.add_argument("--mode", choices=MODES, dest="plan_mode",
+    parser.add_argument("--mode", choices=common.MODES, dest="plan_mode",
                         help="instead of the plan's")  # fmt: skip
     parser.add_argument("--factor", type=float, dest="plan_factor", help="instead of the plan's")
-    parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png"], metavar="FORMAT",
+    parser.add_argument("--figures", nargs="+", choices=common.FIGURE_FORMATS, default=["png"], metavar="FORMAT",
                         help="of the run's picture: png, pdf, svg (default: png)")  # fmt: skip
 
 
 def _seed(text: str) -> int:
-    return number_within(text, 0, math.inf, "a whole number of at least 0")
+    return common.number_within(text, 0, math.inf, "a whole number of at least 0")
 
 
 def execute_chaos(options: argparse.Namespace) -> int:
     """A run with faults on purpose, and what the fail-safe side made of them."""
     if options.list:
-        from coldloop_chaos.plan import shipped_plans
+        from coldloop_chaos.faults import shipped_plans
 
         sys.stdout.write("".join(f"{plan.name:20} {plan.description}\n" for plan in shipped_plans()))
         return 0
-    check_load(options.plan_load)
+    common.check_load(options.plan_load)
     if options.plan is None:
         raise UsageError("name a plan; `coldloop chaos --list` lists the shipped ones")
     from coldloop.process.settings import settings_of
-    from coldloop_chaos.plan import find_plan
+    from coldloop_chaos.faults import find_plan
 
-    effective, changes = configuration(options), _changes(options)
+    effective, changes = common.configuration(options), _changes(options)
     with settings_of(effective.settings.process):
         plan = find_plan(options.plan, changes)
     _refuse_what_has_no_effect(effective)
-    from coldloop_chaos.experiment import perform
-    from coldloop_chaos.report import ChaosProgress, plot_chaos, summary_lines, table, write_report
+    from coldloop_chaos.report import ChaosProgress, perform, plot_chaos, summary_lines, table, write_report
     from coldloop_rig.results.folders import claim_folder, claim_folder_of_now, writing
     from coldloop_rig.runs.running import plain_arguments
 
@@ -107,13 +93,13 @@ def execute_chaos(options: argparse.Namespace) -> int:
 
 def _refuse_what_has_no_effect(effective: "Configuration[Settings]") -> None:
     """Refuse a value from the command line that the plan's own, or that of the command, would replace."""
-    from coldloop_chaos.plan import OF_PLAN
+    from coldloop_chaos.faults import OF_PLAN
 
-    refuse_ineffective(
+    common.refuse_ineffective(
         effective,
         {
             **{key: f"the plan has its own value; change it with {option}" for key, option in OF_PLAN.items()},
-            **dict.fromkeys(PLACES, OWN_PORTS),
+            **dict.fromkeys(common.PLACES, common.OWN_PORTS),
             "session.autostart": "it begins a session",
             "plant.retain.file": "the states are retained in the folder of the results",
             "control_plc.retain.file": "the states are retained in the folder of the results",
@@ -136,28 +122,28 @@ def _declare_proxy(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("plan", type="read", metavar="PLAN", help="TOML file with the faults (`coldloop docs chaos`)")
     parser.add_argument("--listen", type=_listener, required=True, metavar="[HOST:]PORT",
                         help="where clients connect; at 127.0.0.1 unless an address is named")  # fmt: skip
-    parser.add_argument("--to", type=endpoint, required=True, metavar="HOST:PORT", help="the server behind it")
+    parser.add_argument("--to", type=common.endpoint, required=True, metavar="HOST:PORT", help="the server behind it")
     parser.add_argument("--seed", type=int, help="decides which frames are hit, instead of the plan's")
 
 
-def _listener(text: str) -> HostPort:
-    return endpoint(text if ":" in text else f"127.0.0.1:{text}")
+def _listener(text: str) -> common.HostPort:
+    return common.endpoint(text if ":" in text else f"127.0.0.1:{text}")
 
 
 def execute_proxy(options: argparse.Namespace) -> int:
     """A link to any Modbus/TCP server, disturbed by plan: late, lost, doubled, damaged, cut, refused."""
     from coldloop.modbus.settings import Endpoint
-    from coldloop_chaos.plan import find_link_plan
+    from coldloop_chaos.faults import find_link_plan
     from coldloop_chaos.proxy import disturb
 
     plan = find_link_plan(options.plan, {} if options.seed is None else {"seed": options.seed})
     if options.listen == options.to:
         raise UsageError(f"--listen {options.to.host}:{options.to.port} is the server itself; listen at another port")
     target = Endpoint(host=options.to.host, port=options.to.port)
-    return 130 if run_until_interrupted(lambda: disturb(plan, options.listen, target, say)) else 0
+    return 130 if run_until_interrupted(lambda: disturb(plan, options.listen, target, common.say)) else 0
 
 
 COMMANDS: Final = {
-    "chaos": Command(_declare_chaos, execute_chaos),
-    "proxy": Command(_declare_proxy, execute_proxy),
+    "chaos": common.Command(_declare_chaos, execute_chaos),
+    "proxy": common.Command(_declare_proxy, execute_proxy),
 }

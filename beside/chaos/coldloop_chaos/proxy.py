@@ -12,7 +12,7 @@ from coldloop.errors import UsageError
 from coldloop.modbus.requests import MalformedFrameError, next_frame
 from coldloop.modbus.settings import Endpoint
 from coldloop_chaos import faults
-from coldloop_chaos.plan import LinkPlan
+from coldloop_chaos.faults import LinkPlan
 from coldloop_rig.cosim.wiring import Detours, ReservedPorts, RigEndpoints
 
 Replacing = faults.Drop | faults.Duplicate | faults.ExceptionAnswer | faults.Flip | faults.WrongUnit

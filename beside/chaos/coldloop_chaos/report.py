@@ -1,33 +1,225 @@
-"""Report of a run under chaos: its progress, table, files and picture."""
+"""A chaos plan from beginning to end: run, run again without faults, judged by fault, and reported."""
 
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from numpy.typing import NDArray
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
+from coldloop.config import Configuration
+from coldloop.errors import LinkError
 from coldloop.number_text import ends_text
 from coldloop.parsing import parsed_json
 from coldloop.process.declaration import Process
+from coldloop.process.lti_model import load as load_model
 from coldloop.process.sections import Input
+from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import LadderStatus, Mode
 from coldloop.registers.safety import AlarmState, alarm_key, alarms_of
-from coldloop.service.event_text import alarm_word
+from coldloop.service.journal import alarm_word
 from coldloop.text_file import whole_file, whole_text
-from coldloop_chaos.evaluation import ChaosTrace, Evaluation, RaisedAlarm, Row
-from coldloop_chaos.experiment import Experiment
-from coldloop_chaos.plan import ChaosPlan
+from coldloop_chaos.faults import ChaosPlan
+from coldloop_chaos.sequencer import ChaosTrace, conduct
+from coldloop_optimizer_plc.settings import ControlDesign
+from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.cosim.scenario import Job
 from coldloop_rig.figures import plot
+from coldloop_rig.figures.worker import FigureProcess
 from coldloop_rig.progress import PlantTimeBar, clock, make_console
 from coldloop_rig.results.folders import write_json
+from coldloop_rig.results.indicators import excess_of
+from coldloop_rig.results.recording import Recorder, Recording, Way
+from coldloop_rig.runs.running import run_into
+from coldloop_rig.settings import Settings
 from coldloop_rig.text_tables import aligned, markdown_table
+
+PerInput = tuple[float, ...]
+PerBand = tuple[float, ...]
+
+
+class RaisedAlarm(NamedTuple):
+    """An alarm, and how long after the beginning of the fault it was raised."""
+
+    name: str
+    after_s: float
+    after_done_s: float
+    """Delay from the tick at which the fault was certainly in effect, s; in lock-step ticks pass between the two."""
+
+
+class Row(NamedTuple):
+    """One fault. Its window lasts from its beginning to that of the next one, or to the end of the run."""
+
+    fault: str
+    at_s: float
+    lasted_s: float | None
+    """Plant time, until what was stopped answered again; None when it did not end within the run."""
+    modes: tuple[str, ...]
+    """The mode before, and those passed until the next fault."""
+    alarms: tuple[RaisedAlarm, ...]
+    """Alarms raised in the window."""
+    largest_steps: PerInput
+    """Largest change of each input from a tick to the next, as a share of its limit."""
+    outside_s: PerBand
+    """Time in the window that each output with a band was outside, beyond its dead band."""
+    undisturbed_s: PerBand
+    """Time outside in the same window of the run without faults, s."""
+    back_s: float | None
+    """Time from the end of the fault to mode MPC, s: 0 if MPC drove then, None if it did not return in the window."""
+
+    @property
+    def largest_step(self) -> float:
+        """The largest share among the inputs."""
+        return max(self.largest_steps)
+
+
+class Evaluation(NamedTuple):
+    """A run."""
+
+    rows: list[Row]
+    largest_steps: PerInput
+    outside_s: PerBand
+    undisturbed_s: PerBand
+    missing_ticks: int
+
+
+def evaluate(trace: ChaosTrace, undisturbed: Recording, rate: PerInput, design: ControlDesign) -> Evaluation:
+    """Compute the rows of all faults, and the same for the whole run; `rate` is the largest change of each input."""
+    recording, tick_s = trace.recording(), trace.process.tick_s
+    outside, outside_undisturbed = _outside(recording, design), _outside(undisturbed, design)
+    steps = _steps(recording, rate)
+    rows = [_row(trace, number, steps, (outside, outside_undisturbed)) for number in range(len(trace.marks))]
+    return Evaluation(
+        rows, _largest(steps), _seconds(outside, tick_s), _seconds(outside_undisturbed, tick_s), trace.missing
+    )
+
+
+def _row(
+    trace: ChaosTrace, number: int, steps: NDArray[np.float64], outside: tuple[NDArray[np.bool_], NDArray[np.bool_]]
+) -> Row:
+    mark, following = trace.marks[number], trace.marks[number + 1 : number + 2]
+    end, last_event, tick_s = trace.ticks, len(trace.events), trace.process.tick_s
+    for later in following:
+        end, last_event = later.begin, later.first_event
+    before = [Mode(event.subject) for event in trace.modes(0, mark.first_event)[-1:]]
+    changes = trace.modes(mark.first_event, last_event)
+    return Row(
+        fault=mark.fault.label,
+        at_s=mark.begin * tick_s,
+        lasted_s=None if mark.end is None else (mark.end - mark.begin) * tick_s,
+        modes=tuple(mode.name for mode in _different([*before, *(Mode(event.subject) for event in changes)])),
+        alarms=tuple(
+            RaisedAlarm(
+                alarm_key(event.subject, trace.process).upper(),
+                max(0, event.tick - mark.begin) * tick_s,
+                max(0, event.tick - (mark.begin if mark.done is None else mark.done)) * tick_s,
+            )
+            for event in trace.events[mark.first_event : last_event]
+            if event.kind == EventKind.ALARM_RAISED
+        ),
+        largest_steps=_largest(steps[mark.begin : end]),
+        outside_s=_seconds(outside[0][mark.begin : end], tick_s),
+        undisturbed_s=_seconds(outside[1][mark.begin : end], tick_s),
+        back_s=_back_s(mark.end, before, changes, tick_s),
+    )
+
+
+def _different(modes: Sequence[Mode]) -> list[Mode]:
+    """Return modes without repetitions."""
+    return [mode for mode, previous in zip(modes, [None, *modes], strict=False) if mode is not previous]
+
+
+def _back_s(end: int | None, before: Sequence[Mode], changes: Sequence[Event], tick_s: float) -> float | None:
+    """Return the time from the end of a fault until MPC drives; None when it does not."""
+    if end is None:
+        return None
+    at_end = [*before, *(Mode(event.subject) for event in changes if event.tick <= end)]
+    if at_end and at_end[-1] is Mode.MPC:
+        return 0.0
+    back = [event.tick for event in changes if event.tick > end and event.subject == Mode.MPC]
+    return (back[0] - end) * tick_s if back else None
+
+
+def _steps(recording: Recording, rate: PerInput) -> NDArray[np.float64]:
+    """Return the change of each input at each tick as a share of its limit, (N, 3); NaN where it is not known."""
+    u = recording.u.astype(float)
+    steps: NDArray[np.float64] = np.abs(np.diff(u, axis=0, prepend=u[:1])) / np.array(rate)
+    return steps
+
+
+def _largest(steps: NDArray[np.float64]) -> PerInput:
+    return tuple(np.max(np.nan_to_num(steps), axis=0, initial=0.0).tolist())
+
+
+def _outside(recording: Recording, design: ControlDesign) -> NDArray[np.bool_]:
+    """Return for each tick whether outputs are outside their bands, (N, bands); False for unknown ticks."""
+    outside: NDArray[np.bool_] = excess_of(recording.y, design) > design.process.dead_bands
+    return outside
+
+
+def _seconds(outside: NDArray[np.bool_], tick_s: float) -> PerBand:
+    return tuple((outside.sum(axis=0) * tick_s).tolist())
+
+
+class Experiment(NamedTuple):
+    """A plan, and what it has led to."""
+
+    plan: ChaosPlan
+    trace: ChaosTrace
+    undisturbed: Recording
+    evaluation: Evaluation
+    design: ControlDesign
+    """Has the bands that it was judged by."""
+    failure: str | None
+    """Reason why the run ended early; None if it did not."""
+
+
+def perform(
+    plan: ChaosPlan,
+    effective: Configuration[Settings],
+    folder: Path,
+    progress: Progress,
+    *,
+    arguments: Mapping[str, Any],
+    formats: Sequence[str],
+) -> Experiment:
+    """Run a plan into a folder that is claimed, and the same without faults; a run that fails is evaluated as it is.
+
+    The values of the plan are recorded in the place of those of the configuration.
+
+    Raises:
+        LoadFileError: The load of the plan cannot be had.
+        ColdloopError: The run was interrupted, or failed before its first tick.
+    """
+    settings = plan.with_plant(effective.settings)
+    scenario = plan.scenario(load_model(settings.model.file).w0)
+    trace = ChaosTrace(scenario.ticks, settings.process)
+    failure = None
+
+    async def conducted(recorder: Recorder, results: Path) -> None:
+        await conduct(plan, scenario, settings, results, recorder, trace, progress)
+
+    try:
+        job = Job(plan.configured(effective), scenario, Way.CHAOS, conduct=conducted)
+        with FigureProcess(formats) as figure:
+            run_into(folder, job, arguments, figure, [trace])
+    except LinkError as error:
+        if trace.missing == trace.ticks:
+            raise
+        failure = str(error)
+    alone = Recorder(scenario.ticks)
+    OneProcessRig(settings).run(scenario, alone)
+    undisturbed, design = alone.recording(), settings.optimizer_plc.program.design
+    evaluation = evaluate(trace, undisturbed, settings.limits.rate, design)
+    return Experiment(plan, trace, undisturbed, evaluation, design, failure)
+
 
 REFRESH_S: Final = 0.2
 

@@ -17,22 +17,25 @@ from coldloop.config import PREFIX
 from coldloop.errors import LinkError, PeerUnreachableError, RequestRefusedError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.cold_box import L1, TICK_S
+from coldloop.process.declaration import Process
 from coldloop.process.lti_model import discretise, load
 from coldloop.process.settings import settings_of
+from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import LadderStatus
-from coldloop.registers.plant import SensorFault, SensorFaultKind, Surroundings
+from coldloop.registers.plant import PlantSample, SensorFault, SensorFaultKind, Surroundings
 from coldloop.registers.safety import Alarm, alarms_of
 from coldloop_chaos import faults
-from coldloop_chaos.evaluation import ChaosTrace, Mark, Resources
-from coldloop_chaos.plan import ChaosPlan
 from coldloop_chaos.proxy import LinkProxies
 from coldloop_plant.cold_box.model import find_equilibrium, linearise
 from coldloop_plant.helium.properties import load_helium
 from coldloop_plant.kinds import box_of
 from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.cosim.scenario import Scenario, with_copied_load
 from coldloop_rig.cosim.session import CONTACT_S, SessionClient
-from coldloop_rig.cosim.wiring import SERVICES
+from coldloop_rig.cosim.wiring import SERVICES, START_PATIENCE_S, retaining
+from coldloop_rig.results.recording import CONTROL, LinkStatistics, Recorder, Recording, Sink
+from coldloop_rig.settings import Settings
 
 WRONG_MODEL: Final = "wrong_model.json"
 """File of the wrong model in the folder of a run."""
@@ -224,6 +227,79 @@ class Timeline:
         self.on.sort(key=lambda end: end.tick)
 
 
+@dataclass
+class Mark:
+    """A fault as it really was."""
+
+    fault: faults.AnyFault
+    begin: int
+    """Last tick that was seen before it began."""
+    end: int | None = None
+    """Tick at which it ended, and what it had stopped answered again."""
+    first_event: int = 0
+    """Index in `ChaosTrace.events` of the first one after its beginning. Ticks alone are ambiguous: a control PLC that
+    was restarted resumes one tick back."""
+    done: int | None = None
+    """First tick that was seen when it had been brought about: a process had ended by then."""
+
+
+class Resources(NamedTuple):
+    """Resources that the processes use at one tick."""
+
+    tick: int
+    seconds: float
+    """Real time from the start of the session."""
+    rss_mb: dict[str, float]
+    """Resident memory of those that run, by service."""
+
+
+@dataclass
+class ChaosTrace(Sink):
+    """Collects during a run; ticks that were not recorded stay NaN."""
+
+    ticks: int
+    process: Process
+    events: list[Event] = field(default_factory=list)
+    """Events of the control PLC, in the order of arrival."""
+    alarms: list[Alarm] = field(default_factory=list)
+    ladder: LadderStatus | None = None
+    marks: list[Mark] = field(default_factory=list)
+    resources: list[Resources] = field(default_factory=list)
+    log_lines: dict[str, int] = field(default_factory=dict)
+    lost_contacts: int = 0
+    """Requests of the rig's own that were not answered."""
+    seconds: float = 0.0
+    """Real time of the run."""
+
+    def __post_init__(self) -> None:
+        sizes = (1, len(self.process.inputs), len(self.process.outputs), len(self.process.states))
+        self._rows = [np.full((self.ticks, size), np.nan, dtype=np.float32) for size in sizes]
+
+    def sample(self, sample: PlantSample) -> None:
+        """Take a tick; a tick that is done again replaces what was there."""
+        for rows, values in zip(self._rows, ((sample.load,), sample.u, sample.y, sample.x), strict=True):
+            rows[sample.tick] = np.array(values)
+
+    def event(self, service: str, event: Event) -> None:
+        """Take an event of a journal."""
+        if service == CONTROL:
+            self.events.append(event)
+
+    def modes(self, first: int = 0, last: int | None = None) -> list[Event]:
+        """Return the changes of mode among the events from one index to before another."""
+        return [event for event in self.events[first:last] if event.kind == EventKind.MODE]
+
+    @property
+    def missing(self) -> int:
+        """Ticks of which there is no sample."""
+        return int(np.isnan(self._rows[0]).sum())
+
+    def recording(self) -> Recording:
+        """Return the physical trace in the form of an ordinary run's."""
+        load, u, y, x = self._rows
+        return Recording(load[:, 0], u, y, x, [], LinkStatistics())
+
+
 def resident_mb(services: LocalServices) -> dict[str, float]:
     """Return the resident memory of the services that run, where the system reports it (Linux)."""
     sizes = {}
@@ -260,7 +336,7 @@ LOOK_S: Final = 0.005
 class FaultSequencer:
     """Takes a session from fault to fault."""
 
-    plan: ChaosPlan
+    plan: faults.ChaosPlan
     services: LocalServices
     client: SessionClient
     injector: Injector
@@ -400,3 +476,54 @@ class FaultSequencer:
             if ladder is not None and ladder.optimizer:
                 return
             await asyncio.sleep(LOOK_S)
+
+
+SLOWEST: Final = 20.0
+"""Seconds of plant time in a second that lock-step should reach with proxies and all."""
+
+
+async def conduct(
+    plan: faults.ChaosPlan,
+    scenario: Scenario,
+    settings: Settings,
+    folder: Path,
+    recorder: Recorder,
+    trace: ChaosTrace,
+    progress: Progress,
+) -> None:
+    """Run a plan on three services started for it; `trace`, a sink of the recorder, has what there was.
+
+    Raises:
+        LinkError: A service ended by itself, plant time stopped, or the run took too long.
+    """
+    if any(isinstance(fault, faults.WrongModel) for fault in plan.schedule()):  # not while the clock is running
+        await asyncio.to_thread(save_wrong_model, settings.model.file, folder / WRONG_MODEL)
+    copied = with_copied_load(settings, scenario.load, folder)
+    async with contextlib.AsyncExitStack() as stack:
+        links = LinkProxies(str(plan.seed))
+        retained = retaining(copied, folder, always=True)
+        services = await stack.enter_async_context(LocalServices(retained, folder / "logs", links=links))
+        client = SessionClient(services.endpoints, settings, tolerant=True)
+        stack.callback(client.close)
+        await services.during(client.connect(START_PATIENCE_S))
+        await links.connect()
+        await services.during(client.begin(scenario, recorder))
+        injector = Injector(services, links, client.plant, folder)
+        driver = FaultSequencer(plan, services, client, injector, trace, progress)
+        try:
+            async with asyncio.timeout(_patience_s(plan)):
+                await services.during(driver.run())
+        except TimeoutError:
+            raise LinkError(
+                f"plan {plan.name} has taken {_patience_s(plan):.0f} s of real time and is at "
+                f"{driver.tick * plan.process.tick_s:g} s: see the logs in {folder / 'logs'}"
+            ) from None
+        finally:
+            driver.finish()
+            await client.last_look()
+
+
+def _patience_s(plan: faults.ChaosPlan) -> float:
+    schedule = plan.schedule()
+    speed = SLOWEST if not plan.realtime else plan.factor / 2
+    return 300.0 + plan.duration_s / speed + sum(60.0 + fault.duration_s / speed for fault in schedule)

@@ -30,7 +30,7 @@ from coldloop.registers.codec import blank
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, Update, Verdict
 from coldloop.registers.maps import maps_of
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, Prediction
-from coldloop.safety.sequence import InputSequence, with_checksum
+from coldloop.safety.writers import InputSequence, with_checksum
 from coldloop.service.start import in_one_line, main
 from coldloop.text_file import held_file, read_bytes
 from coldloop_optimizer_plc.program import OptimizerProgram

@@ -16,7 +16,7 @@ from coldloop.process.lti_model import load as load_model
 from coldloop.process.settings import InputLimits
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, Update, control_map
-from coldloop.safety.sequence import InputSequence
+from coldloop.safety.writers import InputSequence
 from coldloop_control_plc import output_limits
 from coldloop_control_plc.output_limits import Limits, admit, begin, beginning, copy_state, in_range, judge, plain
 from coldloop_export.kernels import PER_PROBLEM, Array

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from coldloop.errors import StudyError
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.settings import InputLimits
-from coldloop.safety.sequence import InputSequence
+from coldloop.safety.writers import InputSequence
 from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.qp.costs import indicators

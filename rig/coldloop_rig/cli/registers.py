@@ -20,7 +20,7 @@ from coldloop.process.declaration import Process
 from coldloop.registers.control_plc import Operator
 from coldloop.registers.declaration import Block, Kind, Register, RegisterMap
 from coldloop.registers.safety import Alarm, alarms_of
-from coldloop.service.event_text import alarm_word
+from coldloop.service.journal import alarm_word
 from coldloop_rig.cli.commands.options import HostPort
 from coldloop_rig.text_tables import aligned, markdown_table
 

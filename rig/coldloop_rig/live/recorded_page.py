@@ -18,10 +18,10 @@ from coldloop.registers.control_plc import Cause, Mode, ProcessNow
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization
 from coldloop.registers.plant import SensorFaultKind, StationSample
 from coldloop.registers.safety import Alarm, AlarmState, alarms_of
-from coldloop.service.event_text import EventText, alarm_cause, alarm_word
+from coldloop.service.journal import EventText, alarm_cause, alarm_word
 from coldloop_control_plc.alarms import TRANSITIONS, AlarmSettings
 from coldloop_hmi.process_image import JournalEntry
-from coldloop_hmi.replay import ReplayFrame
+from coldloop_hmi.runtime import ReplayFrame
 from coldloop_hmi.signals import Doubts
 from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.rules import make_rule

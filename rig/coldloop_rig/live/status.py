@@ -15,7 +15,7 @@ from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, 
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import AlarmState
-from coldloop.service.event_text import alarm_cause, alarm_word
+from coldloop.service.journal import alarm_cause, alarm_word
 from coldloop_rig.cosim.wiring import RigEndpoints, answered_in_time
 from coldloop_rig.text_tables import Colour, coloured
 

@@ -29,39 +29,10 @@ from coldloop.registers.plant import Measurement
 from coldloop_hmi.settings import HmiSection, HmiSettings
 from coldloop_hmi.users import PageRole, write_user
 from coldloop_rig import PYTHON
-from coldloop_rig.cosim.local_services import (
-    LocalServices,
-    end_of,
-    keep_up,
-    last_line,
-    say,
-    start_program,
-    terminate,
-    wait_for_end,
-)
+from coldloop_rig.cosim import local_services, wiring
 from coldloop_rig.cosim.scenario import with_copied_load
 from coldloop_rig.cosim.session import SessionClient
-from coldloop_rig.cosim.wiring import (
-    RETAINING,
-    SERVICES,
-    START_PATIENCE_S,
-    Links,
-    RigEndpoints,
-    fault_injection,
-    retaining,
-)
-from coldloop_rig.live.started_rigs import (
-    DEFAULT_PORTS,
-    STATE_FILE,
-    RunningRig,
-    make_own_folder,
-    make_private,
-    new_own,
-    read_own,
-    require_rig,
-    state_folder,
-    write_own,
-)
+from coldloop_rig.live import started_rigs
 from coldloop_rig.runs.running import make_scenario
 from coldloop_rig.settings import Settings
 
@@ -100,7 +71,7 @@ class Cut(NamedTuple):
 class CuttableLinks:
     """Cuts links on request, by files in the folder of their rig."""
 
-    def __init__(self, folder: Path, proxies: Links) -> None:
+    def __init__(self, folder: Path, proxies: wiring.Links) -> None:
         self._folder, self.proxies = folder, proxies
         for file in folder.glob(CUT_FILES):
             file.unlink(missing_ok=True)
@@ -124,16 +95,16 @@ class CuttableLinks:
         for file in self._folder.glob(CUT_FILES):
             with suppress(OSError):
                 try:
-                    yield Cut.parsed(read_own(file))
+                    yield Cut.parsed(started_rigs.read_own(file))
                 except ValueError as error:
-                    say(f"{file}: {error}")
+                    local_services.say(f"{file}: {error}")
                 file.unlink(missing_ok=True)
 
     async def _cut(self, cut: Cut) -> None:
         with self.proxies.cut(cut.link):
-            say(f"the {cut.link} link is cut for {cut.seconds:g} s")
+            local_services.say(f"the {cut.link} link is cut for {cut.seconds:g} s")
             await asyncio.sleep(cut.seconds)
-        say(f"the {cut.link} link is restored")
+        local_services.say(f"the {cut.link} link is restored")
 
 
 async def cut(first_port: int | None, link: str, seconds: float) -> None:
@@ -143,11 +114,11 @@ async def cut(first_port: int | None, link: str, seconds: float) -> None:
         UsageError: There is no such rig, or its links cannot be cut.
         ColdloopError: It does not take it.
     """
-    rig = require_rig(first_port)
+    rig = started_rigs.require_rig(first_port)
     if not rig.cuttable:
         raise UsageError("the links of this rig cannot be cut: start it with `coldloop up --cuttable`")
-    file = state_folder(rig.ports[0]) / CUT_FILES.replace("*", secrets.token_hex(8))
-    write_own(file, json.dumps([link, seconds]))
+    file = started_rigs.state_folder(rig.ports[0]) / CUT_FILES.replace("*", secrets.token_hex(8))
+    started_rigs.write_own(file, json.dumps([link, seconds]))
     deadline = time.monotonic() + TAKEN_S
     try:
         while file.exists():
@@ -178,7 +149,7 @@ def check_page(section: HmiSection) -> None:
             ) from None
 
 
-def pointed_at(section: HmiSection, endpoints: RigEndpoints) -> HmiSection:
+def pointed_at(section: HmiSection, endpoints: wiring.RigEndpoints) -> HmiSection:
     """Return the settings of a page of the services at these endpoints.
 
     Their certificate is an operator's, for commands; for reading the page uses the reader's next to it, if any.
@@ -244,7 +215,7 @@ class PageProcess:
         folder: Where it logs to, and keeps the first login and the audit.
     """
 
-    def __init__(self, settings: HmiSettings | Settings, endpoints: RigEndpoints, folder: Path) -> None:
+    def __init__(self, settings: HmiSettings | Settings, endpoints: wiring.RigEndpoints, folder: Path) -> None:
         self._log = folder / "logs" / "hmi.log"
         self._section, self._login = with_own_files(pointed_at(settings.hmi, endpoints), folder)
         self._environment = to_environment(HmiSettings(model=settings.model, hmi=self._section))
@@ -260,19 +231,19 @@ class PageProcess:
         if self._process is None:
             raise RuntimeError("the page was not started")
         code = await self._process.wait()
-        return f"{end_of(code, last_line(self._log))} (log: {self._log})"
+        return f"{local_services.end_of(code, local_services.last_line(self._log))} (log: {self._log})"
 
     async def restart(self) -> None:
         """Start it, or start it again."""
         self._log.parent.mkdir(parents=True, exist_ok=True)
-        with new_own(self._log) as log:
-            self._process = await start_program((*PYTHON, "-m", "coldloop_hmi"), self._environment, log)
+        with started_rigs.new_own(self._log) as log:
+            self._process = await local_services.start_program((*PYTHON, "-m", "coldloop_hmi"), self._environment, log)
 
     async def __aexit__(self, *_: object) -> None:
         """End it."""
         if self._process is not None:
-            terminate(self._process)
-            await wait_for_end(self._process)
+            local_services.terminate(self._process)
+            await local_services.wait_for_end(self._process)
 
     async def is_served(self) -> None:
         """Wait until the page answers.
@@ -317,18 +288,18 @@ class UpRig:
         *,
         page: bool = False,
         cuttable: bool = False,
-        services: Sequence[str] = SERVICES,
+        services: Sequence[str] = wiring.SERVICES,
         optimizer: Sequence[str] = (),
     ) -> None:
         self._optimizer = tuple(optimizer)
-        self.folder = make_own_folder(str(ports[0]))
-        self._settings = retaining(settings, self.folder, always=False)
+        self.folder = started_rigs.make_own_folder(str(ports[0]))
+        self._settings = wiring.retaining(settings, self.folder, always=False)
         self._scenario = make_scenario(settings)
         self._page = page
         self._services = tuple(services)
         self._ports = tuple(ports)
         self._tls = tls
-        self._links = CuttableLinks(self.folder, fault_injection("links")("up")) if cuttable else None
+        self._links = CuttableLinks(self.folder, wiring.fault_injection("links")("up")) if cuttable else None
         self._sessions = asyncio.Lock()
         """One session is begun at a time."""
 
@@ -339,9 +310,9 @@ class UpRig:
             ColdloopError: The session could not begin, or a service has ended again and again.
         """
         links = self._links
-        services = LocalServices(
+        services = local_services.LocalServices(
             with_copied_load(self._settings, self._scenario.load, self.folder),
-            make_private(self.folder / "logs"),
+            started_rigs.make_private(self.folder / "logs"),
             ports=self._ports,
             links=None if links is None else links.proxies,
             services=self._services,
@@ -358,12 +329,12 @@ class UpRig:
                     await self._keep(services, rig, page)
             finally:
                 rig.close()
-                (self.folder / STATE_FILE).unlink(missing_ok=True)
+                (self.folder / started_rigs.STATE_FILE).unlink(missing_ok=True)
 
     async def _begin(
-        self, services: LocalServices, rig: SessionClient, page: PageProcess | None, *, announce: bool
+        self, services: local_services.LocalServices, rig: SessionClient, page: PageProcess | None, *, announce: bool
     ) -> None:
-        await rig.connect(START_PATIENCE_S)
+        await rig.connect(wiring.START_PATIENCE_S)
         await rig.start(self._scenario)
         if page is not None:
             await page.is_served()
@@ -373,13 +344,13 @@ class UpRig:
             sys.stdout.flush()
         self._write_state(services)
 
-    def _write_state(self, services: LocalServices) -> None:
+    def _write_state(self, services: local_services.LocalServices) -> None:
         """Write which processes there are, for the commands that ask for them."""
         tls = "" if self._tls is None else str(self._tls.resolve())
         pids = {service: process.pid for service, process in services.processes.items()}
-        RunningRig.of_this_process(self._ports, tls, pids, cuttable=self._links is not None).write()
+        started_rigs.RunningRig.of_this_process(self._ports, tls, pids, cuttable=self._links is not None).write()
 
-    async def _keep(self, services: LocalServices, rig: SessionClient, page: PageProcess | None) -> None:
+    async def _keep(self, services: local_services.LocalServices, rig: SessionClient, page: PageProcess | None) -> None:
         work = [self._hold(rig), *(self._keep_service(services, service, rig) for service in self._services)]
         if page is not None:
             work.append(_keep_page(page))
@@ -400,23 +371,23 @@ class UpRig:
             except PeerUnreachableError:
                 pass  # the plant is being started again
             except LinkError as error:
-                say(f"the rest of the load is not written: {error}")
+                local_services.say(f"the rest of the load is not written: {error}")
             await asyncio.sleep(LOOK_S)
 
-    async def _keep_service(self, services: LocalServices, service: str, rig: SessionClient) -> None:
+    async def _keep_service(self, services: local_services.LocalServices, service: str, rig: SessionClient) -> None:
         async def restarted() -> None:
             try:
                 self._write_state(services)
             except OSError as error:  # commands cannot find this process; the rig keeps running
-                say(f"{error.filename}: {error.strerror}")
-            while service in RETAINING:  # the optimiser learns it from the control PLC
+                local_services.say(f"{error.filename}: {error.strerror}")
+            while service in wiring.RETAINING:  # the optimiser learns it from the control PLC
                 with suppress(LinkError):  # another one has ended, too
-                    await rig.clients[service].connect(START_PATIENCE_S)
+                    await rig.clients[service].connect(wiring.START_PATIENCE_S)
                     if await self._goes_on(service, rig):
                         return
                 await asyncio.sleep(LOOK_S)
 
-        await keep_up(
+        await local_services.keep_up(
             f"the {service} service",
             lambda: services.exit_of(service),
             lambda: services.start(service, may_end=True),
@@ -436,23 +407,23 @@ class UpRig:
             if plant and looking:
                 return False
             session = await rig.start(self._scenario)
-            say(f"session {session} has begun: the {service} service had no state to resume")
+            local_services.say(f"session {session} has begun: the {service} service had no state to resume")
             return True
 
 
 async def _keep_page(page: PageProcess) -> None:
     """Keep the page up; the rig keeps running without it once it is given up."""
     try:
-        await keep_up("the page", page.ended, page.restart)
+        await local_services.keep_up("the page", page.ended, page.restart)
     except LinkError as error:
-        say(str(error))
+        local_services.say(str(error))
 
 
 def addresses(settings: Settings, ports: Sequence[int], folder: Path, services: Sequence[str]) -> str:
     """Return where everything is, with a line to paste."""
     process = settings.process
     base = "" if process == COLD_BOX else f" --process {settings.model.file}"
-    base += "" if tuple(ports) == DEFAULT_PORTS else f" --port-base {ports[0]}"
+    base += "" if tuple(ports) == started_rigs.DEFAULT_PORTS else f" --port-base {ports[0]}"
     shown = process.banded[-1]
     measured = maps_of(process).plant.block_of(Measurement).registers()
     address = next(one.address for one in measured if one.name == f"y.{shown.name}")
@@ -463,7 +434,7 @@ def addresses(settings: Settings, ports: Sequence[int], folder: Path, services: 
     tls = any(getattr(settings, service).server.tls for service in services)
     places = {
         service: f"127.0.0.1:{port}" if service in services else "yours: a client of the control PLC"
-        for service, port in zip(SERVICES, ports, strict=True)
+        for service, port in zip(wiring.SERVICES, ports, strict=True)
     }
     lines = [
         f"the rig is up: {which}{settings.session.factor:g} x real time",

@@ -26,7 +26,7 @@ from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import SensorFaultKind
-from coldloop.service.event_text import describe, utc_text
+from coldloop.service.journal import describe, utc_text
 from coldloop_rig.results.columns import EVENTS, STATION, TRACE, UPDATES, RunFile, files_of, number_array, text_array
 from coldloop_rig.results.indicators import StageCost
 from coldloop_rig.results.recording import PLANT, SampleBlock, Sink, joined

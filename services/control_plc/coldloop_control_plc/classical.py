@@ -16,7 +16,7 @@ from coldloop.process.cold_box import LEVEL_LOOP, T5_LOOP
 from coldloop.process.sections import Band, Loop
 from coldloop.process.settings import InputLimits, ProcessSettings, declared, within
 from coldloop.process.updating_periods import whole_ticks
-from coldloop.safety.sequence import Inputs
+from coldloop.safety.writers import Inputs
 
 
 class PiSettings(BaseModel):

@@ -23,9 +23,8 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.declaration import Block, Role
 from coldloop.registers.safety import AlarmCommand, AlarmKind, LeaseEvent, WatchdogTime
-from coldloop.safety.lease import WriterLease
-from coldloop.safety.sequence import InputSequence
-from coldloop.session.settings import TimeBase
+from coldloop.safety.writers import InputSequence, WriterLease
+from coldloop.session import TimeBase
 from coldloop_control_plc.program import ControlProgram
 from coldloop_control_plc.publication import ControlPublication
 from coldloop_control_plc.sessions import Sessions

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import CoolDownStep
-from coldloop.safety.sequence import Inputs
+from coldloop.safety.writers import Inputs
 
 
 class CoolDownSettings(BaseModel):

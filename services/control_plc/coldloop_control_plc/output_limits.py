@@ -12,7 +12,7 @@ from typing import Final, NamedTuple, Protocol
 from coldloop.kernels.single_precision import neighbour, single
 from coldloop.process.settings import InputLimits, RateReference
 from coldloop.registers.control_plc import Verdict
-from coldloop.safety.sequence import Inputs
+from coldloop.safety.writers import Inputs
 
 
 class Numbers(Protocol):

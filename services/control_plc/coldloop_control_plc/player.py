@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from coldloop.process.declaration import LAST_NUMBER
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Acknowledgement, Plan, SequenceHeader, Update, Verdict
-from coldloop.safety.sequence import Inputs, InputSequence, checksum, with_checksum
+from coldloop.safety.writers import Inputs, InputSequence, checksum, with_checksum
 from coldloop_control_plc.output_limits import OutputGuard
 
 NONE: Final = 0

@@ -31,8 +31,8 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.registers.safety import Alarm, AlarmKind
-from coldloop.safety.sequence import Inputs, InputSequence
 from coldloop.safety.watchdog import Watchdog
+from coldloop.safety.writers import Inputs, InputSequence
 from coldloop.service.journal import Journal
 from coldloop_control_plc.alarms import (
     OPTIMIZER_DRIVES,

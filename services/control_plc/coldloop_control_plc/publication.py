@@ -8,9 +8,8 @@ from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.control_plc import LadderStatus, PlantLinkStatus, ProcessNow, Status
 from coldloop.registers.safety import AlarmState
-from coldloop.safety.lease import WriterLease
-from coldloop.service.event_text import alarm_word, log_event
-from coldloop.service.journal import JournalPublication
+from coldloop.safety.writers import WriterLease
+from coldloop.service.journal import JournalPublication, alarm_word, log_event
 from coldloop.session.clock import LatenessRecord
 from coldloop_control_plc.plant_link import PlantLink
 from coldloop_control_plc.program import ControlProgram

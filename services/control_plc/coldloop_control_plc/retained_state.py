@@ -17,8 +17,8 @@ from coldloop.registers.common import SessionPace
 from coldloop.registers.control_plc import SEQUENCE_ROWS, CoolDownStep, Operator, SequenceHeader, control_map
 from coldloop.registers.safety import Alarm, alarms_of
 from coldloop.safety.retained import RetainedFile, RetainedStateError, RetainedStateWriter
-from coldloop.safety.sequence import InputSequence, checksum
-from coldloop.session.settings import TimeBase
+from coldloop.safety.writers import InputSequence, checksum
+from coldloop.session import TimeBase
 from coldloop_control_plc.program import ControlProgram
 
 log = logging.getLogger("coldloop.control_plc")

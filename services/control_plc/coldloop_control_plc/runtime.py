@@ -29,11 +29,10 @@ from coldloop.registers.control_plc import ControlSession
 from coldloop.registers.maps import maps_of
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import AlarmKind, WatchdogTime
-from coldloop.service.logs import dropped
-from coldloop.service.metrics_server import MetricsServer
-from coldloop.service.start import SERVING
+from coldloop.service.metrics import MetricsServer
+from coldloop.service.start import SERVING, dropped
 from coldloop.service.telemetry import Telemetry
-from coldloop.session.settings import TimeBase
+from coldloop.session import TimeBase
 from coldloop_control_plc.client_requests import Clients
 from coldloop_control_plc.plant_link import FROZEN_S, FROZEN_TICKS, PlantLink
 from coldloop_control_plc.program import ControlProgram, make_program

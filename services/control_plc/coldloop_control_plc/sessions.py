@@ -9,7 +9,7 @@ from typing import Final
 
 from coldloop.registers.control_plc import ControlSession
 from coldloop.registers.plant import Measurement
-from coldloop.session.settings import SessionSettings, TimeBase, TimeMode
+from coldloop.session import SessionSettings, TimeBase, TimeMode
 from coldloop_control_plc.program import ControlProgram
 from coldloop_control_plc.retained_state import RetainedControlState
 

@@ -10,9 +10,8 @@ from coldloop.modbus.settings import CONTROL_PORT, PLANT_PORT, Endpoint, ServerS
 from coldloop.process.settings import InputLimits, ProcessSettings, RootSettings, declared, stretched, within
 from coldloop.registers.codec import WordOrder
 from coldloop.safety.retained import RetainSettings
-from coldloop.service.metrics_settings import MetricsSettings
-from coldloop.service.telemetry_settings import TelemetrySettings
-from coldloop.session.settings import SessionSettings
+from coldloop.service.settings import MetricsSettings, TelemetrySettings
+from coldloop.session import SessionSettings
 from coldloop_control_plc.alarms import AlarmSettings
 from coldloop_control_plc.classical import ClassicalSettings
 from coldloop_control_plc.cool_down import CoolDownSettings

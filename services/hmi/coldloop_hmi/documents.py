@@ -12,20 +12,14 @@ from prometheus_client.core import Metric
 
 from coldloop import __version__
 from coldloop.process.declaration import Process
+from coldloop.registers import optimizer_plc
 from coldloop.registers.audit import EventKind
 from coldloop.registers.codec import blank
 from coldloop.registers.control_plc import Mode
-from coldloop.registers.optimizer_plc import (
-    INPUT_SAMPLES,
-    PREDICTED_SAMPLES,
-    ModelDeviation,
-    Optimization,
-    Prediction,
-    outputs_of,
-)
+from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, Prediction
 from coldloop.registers.plant import StationAlarm, StationMode, StationStatus
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmPriority, AlarmState
-from coldloop.service.event_text import alarm_cause, alarm_word, flag_words
+from coldloop.service.journal import alarm_cause, alarm_word, flag_words
 from coldloop.service.metrics import block_families, build_family, gauge
 from coldloop_hmi.explanation import deviation, explain, sentence
 from coldloop_hmi.process_image import Gap, JournalEntry, ModeInterval, Model, rounded, thin
@@ -247,13 +241,13 @@ def explanation_document(model: Model, number: int | None, at_tick: int | None =
 def prediction_document(prediction: Prediction, process: Process) -> Document:
     """Return a prediction as curves over plant time."""
     start, sample_s = prediction.tick * process.tick_s, process.sampling_period_s
-    names, banded = process.input_names, zip(process.banded, outputs_of(prediction), strict=True)
+    names, banded = process.input_names, zip(process.banded, optimizer_plc.outputs_of(prediction), strict=True)
     inputs = [prediction.u[i :: len(names)] for i in range(len(names))]
     return {
         "update": prediction.update,
-        "time": [start + sample * sample_s for sample in PREDICTED_SAMPLES],
+        "time": [start + sample * sample_s for sample in optimizer_plc.PREDICTED_SAMPLES],
         **{one.name: list(map(rounded, ahead)) for one, ahead in banded},
-        "input_time": [start + sample * sample_s for sample in INPUT_SAMPLES],
+        "input_time": [start + sample * sample_s for sample in optimizer_plc.INPUT_SAMPLES],
         **{name: [rounded(value) for value in one] for name, one in zip(names, inputs, strict=True)},
     }
 

@@ -14,43 +14,17 @@ from aiohttp import web
 from coldloop.errors import LinkError, UsageError
 from coldloop.modbus.settings import Endpoint
 from coldloop.number_text import value_text
-from coldloop.operating.commands import (
-    Command,
-    FaultSensor,
-    PlayLoad,
-    SetFactor,
-    SetLoad,
-    SetMode,
-    SetPaused,
-    SetSetpoint,
-    TreatAlarm,
-    clock_text,
-    duration_text,
-    read_command,
-)
-from coldloop.operating.execution import (
-    WORK,
-    Clients,
-    CommandClient,
-    NotTakenError,
-    check_bounds,
-    check_manual,
-    clients_of,
-    connected,
-    reason_of,
-)
+from coldloop.operating import commands, execution
 from coldloop.parsing import parsed_json
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Mode, Operator, OperatorMode
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import AlarmAction
-from coldloop_hmi.answers import compressed_answer
-from coldloop_hmi.audit import Audit
 from coldloop_hmi.documents import encoded
-from coldloop_hmi.guard import Guard, cookie_name, refusal
+from coldloop_hmi.guard import Guard, compressed_answer, cookie_name, refusal
 from coldloop_hmi.process_image import Model
 from coldloop_hmi.settings import HmiSection
-from coldloop_hmi.users import LoginSession, Users
+from coldloop_hmi.users import Audit, LoginSession, Users
 
 Premises = dict[str, str]
 """Present values by what they are of, in words."""
@@ -61,7 +35,7 @@ LONGEST_REQUEST: Final = 2_000_000
 """Bytes of a request: a load file fits."""
 
 
-async def read_premises(clients: Clients, command: Command) -> Premises:
+async def read_premises(clients: execution.Clients, command: commands.Command) -> Premises:
     """Read the premises of a command: of all the session, of one about an alarm or a sensor no more than that.
 
     Raises:
@@ -70,18 +44,18 @@ async def read_premises(clients: Clients, command: Command) -> Premises:
     """
     found = {"session": str((await next(iter(clients.values())).read(Identity)).session)}
     match command:
-        case SetMode():
+        case commands.SetMode():
             mode = (await clients["control_plc"].read(LadderStatus)).mode
             found["operator's mode"] = OperatorMode.word_of((await clients["control_plc"].read(Operator)).mode)
             found["active"] = Mode.word_of(Mode.MPC if mode == Mode.REST else mode)  # between two sequences
-        case SetSetpoint():
-            operator = await check_manual(clients["control_plc"])
+        case commands.SetSetpoint():
+            operator = await execution.check_manual(clients["control_plc"])
             found[f"setpoint of {command.input}"] = value_text(operator.u[command.place], command.unit)
-        case SetLoad() | PlayLoad():
+        case commands.SetLoad() | commands.PlayLoad():
             load, process = await clients["plant"].read(LoadStatus), command.process
-            until = f"changing until {clock_text(load.last_tick * process.tick_s)}"  # by itself
+            until = f"changing until {commands.clock_text(load.last_tick * process.tick_s)}"  # by itself
             found[process.load.title] = until if load.upcoming else value_text(load.watts, process.load.unit)
-        case SetFactor() | SetPaused():
+        case commands.SetFactor() | commands.SetPaused():
             pace = await clients["plant"].read(SessionPace)
             running = f"{'paused, ' if pace.paused else ''}factor {value_text(pace.factor)}"
             found["plant time"] = running if pace.realtime else "lock-step"
@@ -105,7 +79,7 @@ class Preview(NamedTuple):
 class Prepared(NamedTuple):
     """A command that waits for its confirmation."""
 
-    command: Command
+    command: commands.Command
     text: str
     user: str
     until: float
@@ -154,20 +128,20 @@ class OperatorDesk:
         self._turn = asyncio.Lock()
         self._last = ""  # whose the last command was, and what
 
-    async def prepare(self, command: Command, user: str) -> Preview:
+    async def prepare(self, command: commands.Command, user: str) -> Preview:
         """Take a command, and return what it would do, with the token that confirms it.
 
         Raises:
             UsageError: It is not possible now.
             LinkError: The service does not answer.
         """
-        if isinstance(command, FaultSensor) and not self._training:
+        if isinstance(command, commands.FaultSensor) and not self._training:
             raise UsageError("sensor faults are offered only where hmi.training is switched on")
-        if isinstance(command, SetSetpoint):
+        if isinstance(command, commands.SetSetpoint):
             limits = self._model.limits
             low, high = limits.input_low[command.place], limits.input_high[command.place]
             if high > low:  # they are known
-                check_bounds(command, low, high)
+                execution.check_bounds(command, low, high)
         token = secrets.token_urlsafe(16)
         text = f"{command.text}{self._consequences(command)}"
         premises = await self._premises(command)
@@ -177,17 +151,17 @@ class OperatorDesk:
         now = "; ".join(f"{name} {value}" for name, value in premises.items() if name != "session")
         return Preview(token, text, now)
 
-    async def _premises(self, command: Command) -> Premises:
-        async with connected(self._clients(WORK[type(command)][0])) as clients:
+    async def _premises(self, command: commands.Command) -> Premises:
+        async with execution.connected(self._clients(execution.WORK[type(command)][0])) as clients:
             return await read_premises(clients, command)
 
-    def _consequences(self, command: Command) -> str:
+    def _consequences(self, command: commands.Command) -> str:
         """Return what a command means at present, beyond its own words."""
-        if isinstance(command, TreatAlarm) and command.action == AlarmAction.SHELVE and command.time_s:
+        if isinstance(command, commands.TreatAlarm) and command.action == AlarmAction.SHELVE and command.time_s:
             return self._by_the_clock(command.time_s)
         load = self._model.record("plant", LoadStatus)
-        if isinstance(command, SetLoad | PlayLoad) and load and load.upcoming:
-            until = clock_text(load.last_tick * self.process.tick_s)
+        if isinstance(command, commands.SetLoad | commands.PlayLoad) and load and load.upcoming:
+            until = commands.clock_text(load.last_tick * self.process.tick_s)
             steps = f"{load.upcoming} steps" if load.upcoming > 1 else "step"
             return f"; the {steps} of the load still to come, until {until}, will be dropped"
         return ""
@@ -203,7 +177,7 @@ class OperatorDesk:
             return " of plant time, which is paused"
         if pace.factor == 1.0 or pace.factor <= 0.0:
             return ""
-        return f" of plant time, {duration_text(seconds / pace.factor)} by the clock at factor {pace.factor:g}"
+        return f" of plant time, {commands.duration_text(seconds / pace.factor)} by the clock at factor {pace.factor:g}"
 
     async def confirm(self, token: str, user: str) -> CommandResult:
         """Carry out a command that was prepared, once.
@@ -222,7 +196,7 @@ class OperatorDesk:
             try:
                 changes = differences(prepared.premises, await self._premises(prepared.command))
             except LinkError as error:
-                return CommandResult(prepared.text, refused_because=reason_of(error))
+                return CommandResult(prepared.text, refused_because=execution.reason_of(error))
             if changes:
                 by = f"; the last command here was {self._last}" if self._last else ""
                 reason = f"not done, as it has changed since it was asked: {changes}{by}"
@@ -233,23 +207,23 @@ class OperatorDesk:
                 self._model.commands += 1
             return result
 
-    async def _carry_out(self, command: Command, asked: str) -> CommandResult:
-        services, work = WORK[type(command)]
+    async def _carry_out(self, command: commands.Command, asked: str) -> CommandResult:
+        services, work = execution.WORK[type(command)]
         clients = self._clients(services)
         try:
-            async with connected(clients):
+            async with execution.connected(clients):
                 return CommandResult(asked, applied=await work(clients, command))
-        except NotTakenError as error:
+        except execution.NotTakenError as error:
             return CommandResult(asked, refused_because=str(error))
         except (LinkError, UsageError) as error:
             if any(client.has_written for client in clients.values()):
-                reason = f"{reason_of(error)}; check its effect before repeating it"
+                reason = f"{execution.reason_of(error)}; check its effect before repeating it"
                 return CommandResult(asked, uncertain_because=reason)
-            return CommandResult(asked, refused_because=reason_of(error))
+            return CommandResult(asked, refused_because=execution.reason_of(error))
 
-    def _clients(self, services: Iterable[str]) -> dict[str, CommandClient]:
+    def _clients(self, services: Iterable[str]) -> dict[str, execution.CommandClient]:
         ends = {service: self._endpoints[service].model_copy(update={"timeout_s": TIMEOUT_S}) for service in services}
-        return clients_of(ends, self.process)
+        return execution.clients_of(ends, self.process)
 
 
 class Commanding:
@@ -329,7 +303,7 @@ class Commanding:
         if isinstance(operator, web.Response) or self._desk is None:
             return operator if isinstance(operator, web.Response) else refusal(409, "a recorded run takes no commands")
         try:
-            command = read_command(await _document(request), self._desk.process)
+            command = commands.read_command(await _document(request), self._desk.process)
             preview = await self._desk.prepare(command, operator.user.name)
         except (UsageError, LinkError) as error:
             self._refuse(request, str(error))

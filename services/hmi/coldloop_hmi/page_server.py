@@ -17,36 +17,15 @@ from aiohttp.log import server_logger
 from coldloop.errors import ConfigurationError, PortInUseError
 from coldloop.modbus.connection import RefusalLog
 from coldloop.modbus.tls_listener import TlsListener
-from coldloop.service.metrics import exposition
-from coldloop.service.metrics_server import CONTENT_TYPE
-from coldloop_hmi.answers import (
-    JSON,
-    Broadcast,
-    LongReads,
-    StreamCompression,
-    compressed_answer,
-    html_file,
-    kept_answer,
-    static_files,
-    takes_gzip,
-)
-from coldloop_hmi.audit import Audit
-from coldloop_hmi.documents import (
-    alarms_document,
-    catalog,
-    encoded,
-    event_document,
-    explanation_document,
-    page_families,
-    services_document,
-    state_document,
-    trend_document,
-)
-from coldloop_hmi.guard import Connections, Guard, add_headers, refusal, told_in_a_line
+from coldloop.service.metrics import CONTENT_TYPE, exposition
+from coldloop_hmi import documents
+from coldloop_hmi import guard as guards
+from coldloop_hmi.documents import encoded
+from coldloop_hmi.guard import Broadcast, Connections, Guard, LongReads, compressed_answer, refusal
 from coldloop_hmi.operator_desk import LONGEST_REQUEST, Commanding, OperatorDesk
 from coldloop_hmi.process_image import JournalEntry, Model
 from coldloop_hmi.settings import HmiSection
-from coldloop_hmi.users import Users
+from coldloop_hmi.users import Audit, Users
 
 POINTS: Final = 800
 MOST_POINTS: Final = 4000
@@ -83,14 +62,14 @@ class Reading:
         drawn = (process.measured_disturbances, process.inputs, process.banded, model.trends.station_names)
         self._most_names = PENS + 1 + sum(map(len, drawn))
         self._long_reads = LongReads(time.monotonic)
-        self._catalog = encoded(catalog(model, training=settings.training and not replay, replay=replay))
+        self._catalog = encoded(documents.catalog(model, training=settings.training and not replay, replay=replay))
         self._trends: dict[tuple[object, ...], bytes] = {}
 
     def routes(self) -> list[web.AbstractRouteDef]:
         """Return what is served."""
         return [
-            html_file("index.html"),
-            *static_files(),
+            guards.html_file("index.html"),
+            *guards.static_files(),
             web.get("/mimic.svg", self.mimic),
             web.get("/api/catalog", self.catalog),
             web.get("/api/state", self.state),
@@ -108,16 +87,16 @@ class Reading:
     async def mimic(self, _request: web.Request) -> web.Response:
         """Answer with the drawing that the process brings; those of the cold box are static files."""
         answer = web.Response(text=self._model.process.drawing, content_type="image/svg+xml")
-        add_headers(answer)
+        guards.add_headers(answer)
         return answer
 
     async def catalog(self, request: web.Request) -> web.Response:
         """Answer with what the page is made from."""
-        return kept_answer(request, self._catalog, JSON)
+        return guards.kept_answer(request, self._catalog, guards.JSON)
 
     async def state(self, request: web.Request) -> web.Response:
         """Answer with the whole state."""
-        return compressed_answer(request, encoded(state_document(self._model)))
+        return compressed_answer(request, encoded(documents.state_document(self._model)))
 
     async def stream(self, request: web.Request) -> web.StreamResponse:
         """Answer with the state and its changes, as server-sent events, until the browser goes or its session ends."""
@@ -125,10 +104,10 @@ class Reading:
         if stream is None:
             return refusal(503, f"{len(self._broadcast)} browsers are connected: close some, or raise hmi.browsers")
         answer = web.StreamResponse(headers={hdrs.CONTENT_TYPE: "text/event-stream"})
-        compression = StreamCompression() if takes_gzip(request) else None
+        compression = guards.StreamCompression() if guards.takes_gzip(request) else None
         if compression is not None:
             answer.headers[hdrs.CONTENT_ENCODING] = "gzip"
-        add_headers(answer)
+        guards.add_headers(answer)
         try:
             await answer.prepare(request)
             async for message in self._broadcast.messages(stream):
@@ -170,7 +149,7 @@ class Reading:
         key = (*names, start, end, points, is_brief, *state)
         if key not in self._trends:
             async with self._turn(request):
-                document = encoded(trend_document(model, names, start, end, points, is_brief=is_brief))
+                document = encoded(documents.trend_document(model, names, start, end, points, is_brief=is_brief))
                 answer = compressed_answer(request, document)  # takes time, too
             while len(self._trends) >= CACHED:
                 self._trends.pop(next(iter(self._trends)))
@@ -185,7 +164,7 @@ class Reading:
         """Answer with every sample of a window as CSV, some rows at a time."""
         names, start, end, _ = self._window(request.query)
         answer = web.StreamResponse(headers=csv_headers("coldloop-trend.csv"))
-        add_headers(answer)
+        guards.add_headers(answer)
         await answer.prepare(request)
         await answer.write(",".join(["time_s", *names, "quality"]).encode() + b"\n")
         with suppress(ConnectionError, TimeoutError):  # the client has gone
@@ -215,7 +194,7 @@ class Reading:
         number, at = request.query.get("update", ""), request.query.get("at", "")
         try:
             at_tick = round(float(at) / self._tick_s) if at else None
-            document = explanation_document(self._model, int(number) if number else None, at_tick)
+            document = documents.explanation_document(self._model, int(number) if number else None, at_tick)
         except (ValueError, OverflowError):
             raise web.HTTPBadRequest(reason="update and at must be numbers") from None
         if document is None:
@@ -225,7 +204,7 @@ class Reading:
 
     async def alarms(self, request: web.Request) -> web.Response:
         """Answer with all alarms."""
-        return compressed_answer(request, encoded({"alarms": alarms_document(self._model)}))
+        return compressed_answer(request, encoded({"alarms": documents.alarms_document(self._model)}))
 
     def _events(self, query: Mapping[str, str]) -> list[JournalEntry]:
         """Return the events that a search finds, the newest first.
@@ -254,7 +233,7 @@ class Reading:
             raise web.HTTPBadRequest(reason="page must be a whole number") from None
         async with self._turn(request):
             found = self._events(request.query)
-            shown = [*(event_document(one, self._tick_s) for one in found[start : start + EVENTS_SHOWN])]
+            shown = [*(documents.event_document(one, self._tick_s) for one in found[start : start + EVENTS_SHOWN])]
             pages = -(-len(found) // EVENTS_SHOWN)
             document = encoded({"found": len(found), "first": start + 1, "pages": pages, "events": shown})
             return compressed_answer(request, document)
@@ -269,13 +248,13 @@ class Reading:
         writer.writeheader()
         async with self._turn(request):
             for entry in self._events(request.query):
-                row = event_document(entry, self._tick_s)
+                row = documents.event_document(entry, self._tick_s)
                 writer.writerow({name: safe_cell(row[name]) for name in names})
         return web.Response(body=text.getvalue().encode(), headers=csv_headers("coldloop-events.csv"))
 
     async def health(self, _request: web.Request) -> web.Response:
         """Answer 200 while all services answer, 503 otherwise."""
-        services = services_document(self._model)
+        services = documents.services_document(self._model)
         well = all(one["live"] for one in services.values())
         return web.json_response({"page": "live", "services": services}, status=200 if well else 503)
 
@@ -291,7 +270,7 @@ class Reading:
             user = await self._guard.log_in(auth.login, auth.password, request.remote or "", self._guard.scrapes)
             if isinstance(user, web.Response):
                 return user
-        body = exposition(page_families(self._model, len(self._broadcast)))
+        body = exposition(documents.page_families(self._model, len(self._broadcast)))
         return compressed_answer(request, body, CONTENT_TYPE)
 
 
@@ -340,12 +319,12 @@ class PageServer:
         self._connections = Connections(settings.connections, time.monotonic)
         self._guard = Guard(settings, self._audit, self._users, self._connections)
         self._streams: list[tuple[Model, Broadcast, asyncio.Event]] = []
-        server_logger.addFilter(told_in_a_line)
+        server_logger.addFilter(guards.told_in_a_line)
         app = web.Application(middlewares=[self._guard.middleware], client_max_size=LONGEST_REQUEST)
         if len(sites) == 1:
             app.add_routes(self._routes(sites[0]))
         else:
-            app.add_routes([html_file("two-runs.html"), *static_files()])
+            app.add_routes([guards.html_file("two-runs.html"), *guards.static_files()])
             for number, site in enumerate(sites, 1):
                 part = web.Application()
                 part.add_routes(self._routes(site))
@@ -359,7 +338,7 @@ class PageServer:
 
     def _routes(self, site: PageSite) -> list[web.AbstractRouteDef]:
         model, desk, extra = site
-        broadcast = Broadcast(lambda: message(state_document(model)), self._settings.browsers)
+        broadcast = Broadcast(lambda: message(documents.state_document(model)), self._settings.browsers)
         news = asyncio.Event()
         model.on_change = news.set
         self._streams.append((model, broadcast, news))
@@ -431,7 +410,7 @@ async def _send_changes(model: Model, broadcast: Broadcast, news: asyncio.Event)
         sent = time.monotonic()
         changed, model.changed = model.changed, set()
         if len(broadcast):
-            broadcast.send(message(state_document(model, changed)))
+            broadcast.send(message(documents.state_document(model, changed)))
 
 
 def message(document: dict[str, object]) -> bytes:

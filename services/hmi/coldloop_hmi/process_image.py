@@ -22,7 +22,7 @@ from coldloop.registers.maps import maps_of
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Prediction, UpdatingRuleStatus
 from coldloop.registers.plant import StationStatus
 from coldloop.registers.safety import Alarm
-from coldloop.service.event_text import EventText, describe, utc_text
+from coldloop.service.journal import EventText, describe, utc_text
 from coldloop_hmi.signals import SOUND, Doubts, Quality, doubted, values_of
 
 STATION_NAMES: Final = ("P12", "P11")

@@ -21,8 +21,8 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.optimizer_plc import ControlLinkState
-from coldloop.safety.sequence import InputSequence
-from coldloop.session.settings import TimeBase
+from coldloop.safety.writers import InputSequence
+from coldloop.session import TimeBase
 from coldloop_optimizer_plc.control_link import ControlLink
 
 T = TypeVar("T")

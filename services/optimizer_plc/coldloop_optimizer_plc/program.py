@@ -16,7 +16,7 @@ from coldloop.process.lti_model import LtiModel
 from coldloop.process.settings import InputLimits
 from coldloop.registers import optimizer_plc as registers
 from coldloop.registers.control_plc import Plan, SequenceHeader, Update, Verdict
-from coldloop.safety.sequence import InputSequence, with_checksum
+from coldloop.safety.writers import InputSequence, with_checksum
 from coldloop_optimizer_plc import decisions, scheme
 from coldloop_optimizer_plc.computing_settings import Arithmetic, Part, PlcBudget, in_its_name
 from coldloop_optimizer_plc.decisions import Latched, Starts

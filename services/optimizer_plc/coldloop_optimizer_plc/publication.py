@@ -19,7 +19,7 @@ from coldloop.registers.optimizer_plc import (
     UpdatingRuleStatus,
 )
 from coldloop.service.journal import Journal, JournalPublication
-from coldloop.session.settings import TimeBase
+from coldloop.session import TimeBase
 from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.control_link import ControlLink
 

@@ -28,11 +28,11 @@ from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.control_plc import AwaitUpdate, Plan, Update, Verdict
 from coldloop.registers.maps import maps_of
 from coldloop.registers.optimizer_plc import ControlLinkState, ModelDeviation
-from coldloop.safety.sequence import InputSequence
-from coldloop.service.metrics_server import MetricsServer
+from coldloop.safety.writers import InputSequence
+from coldloop.service.metrics import MetricsServer
 from coldloop.service.start import SERVING
 from coldloop.service.telemetry import Telemetry
-from coldloop.session.settings import TimeBase, TimeMode
+from coldloop.session import TimeBase, TimeMode
 from coldloop_optimizer_plc.control_client import ControlClient
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.publication import OptimizerPublication

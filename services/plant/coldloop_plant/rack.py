@@ -21,10 +21,10 @@ from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import Caller
 from coldloop.registers.common import pace_subject
 from coldloop.registers.plant import Actuators, OutputVerdict, SensorFault, SensorFaultKind
-from coldloop.safety.lease import SIMPLE_CLIENT
 from coldloop.safety.watchdog import Watchdog
+from coldloop.safety.writers import SIMPLE_CLIENT
 from coldloop.service.journal import Journal
-from coldloop.session.settings import TimeBase
+from coldloop.session import TimeBase
 from coldloop_plant.load import LoadSchedule
 from coldloop_plant.program import MakePlant
 from coldloop_plant.settings import SafeAction, WatchdogSettings

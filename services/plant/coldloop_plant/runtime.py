@@ -30,15 +30,14 @@ from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import Actuators, LiveLoad, LoadAhead, LoadStep, PlantSession, Surroundings
 from coldloop.registers.safety import LeaseEvent, LeaseStatus, WatchdogStatus, WatchdogTime
-from coldloop.safety.lease import WriterLease
 from coldloop.safety.retained import RetainedFile, RetainedStateError
-from coldloop.service.event_text import log_event
-from coldloop.service.journal import Journal, JournalPublication
-from coldloop.service.metrics_server import MetricsServer
+from coldloop.safety.writers import WriterLease
+from coldloop.service.journal import Journal, JournalPublication, log_event
+from coldloop.service.metrics import MetricsServer
 from coldloop.service.start import SERVING
 from coldloop.service.telemetry import Telemetry
+from coldloop.session import TimeBase, TimeMode
 from coldloop.session.clock import Pacer, Schedule
-from coldloop.session.settings import TimeBase, TimeMode
 from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.load import find_load
 from coldloop_plant.program import MakePlant

@@ -21,9 +21,8 @@ from coldloop.process.settings import (
 )
 from coldloop.registers.codec import WordOrder
 from coldloop.safety.retained import RetainSettings
-from coldloop.service.metrics_settings import MetricsSettings
-from coldloop.service.telemetry_settings import TelemetrySettings
-from coldloop.session.settings import SessionSettings
+from coldloop.service.settings import MetricsSettings, TelemetrySettings
+from coldloop.session import SessionSettings
 from coldloop_plant.refrigerator.settings import RANGES, EventTarget, RefrigeratorEvent, StationSettings
 
 SHOWN: Final = (

@@ -46,7 +46,7 @@ PROJECT: Final = frozenset({
 """Packages that are ours wherever they are installed; what is not part of an installed distribution is ours, too."""
 NOT_DECISIVE: Final = frozenset({
     "coldloop.kernels.cache_folder", "coldloop.kernels.compiled", "coldloop.kernels.first_use",
-    "coldloop.kernels.reach", "coldloop.service.logs",
+    "coldloop.kernels.reach", "coldloop.service.start",
 })  # fmt: skip
 """Modules that decide where results are kept and what is logged, and not what results are."""
 

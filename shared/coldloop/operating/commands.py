@@ -11,7 +11,7 @@ from coldloop.process.load_profile import LoadProfile, load_profile_of
 from coldloop.process.settings import ProcessSettings, one_of, settings_of, settings_process, within
 from coldloop.registers.plant import SensorFaultKind
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, alarms_of
-from coldloop.service.event_text import alarm_word
+from coldloop.service.journal import alarm_word
 
 LONGEST_FILE: Final = 1_000_000
 """Characters of a load file."""

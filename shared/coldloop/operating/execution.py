@@ -11,18 +11,8 @@ from coldloop.errors import BUSY, LinkError, PeerUnreachableError, RequestRefuse
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.settings import Endpoint
 from coldloop.number_text import value_text
-from coldloop.operating.commands import (
-    Command,
-    FaultSensor,
-    PlayLoad,
-    SetFactor,
-    SetLoad,
-    SetMode,
-    SetPaused,
-    SetSetpoint,
-    TreatAlarm,
-    clock_text,
-)
+from coldloop.operating import commands
+from coldloop.operating.commands import Command, TreatAlarm, clock_text
 from coldloop.operating.observer import read_alarms
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
@@ -41,7 +31,7 @@ from coldloop.registers.plant import (
     SensorFaultKind,
 )
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmState, alarms_of
-from coldloop.service.event_text import alarm_word
+from coldloop.service.journal import alarm_word
 
 LAST_TICK: Final = 2**32 - 1
 KEPT_AHEAD: Final = LOAD_ROWS
@@ -222,7 +212,7 @@ def reason_of(error: Exception) -> str:
     return f"{error}: {hint}" if hint else str(error)
 
 
-async def set_mode(clients: Clients, command: SetMode) -> str:
+async def set_mode(clients: Clients, command: commands.SetMode) -> str:
     """Write the operating mode; wait until the control PLC follows."""
     client = clients["control_plc"]
     mode = OperatorMode[command.mode.upper()]
@@ -241,7 +231,7 @@ async def set_mode(clients: Clients, command: SetMode) -> str:
     return f"operator's mode {back.word}; the control PLC is in {Mode(ladder.mode).word} ({Cause(ladder.cause).word})"
 
 
-def check_bounds(command: SetSetpoint, low: float, high: float) -> None:
+def check_bounds(command: commands.SetSetpoint, low: float, high: float) -> None:
     """Check a setpoint against the bounds of its input.
 
     Raises:
@@ -265,7 +255,7 @@ async def check_manual(client: RegisterClient) -> Operator:
     return operator
 
 
-async def set_setpoint(clients: Clients, command: SetSetpoint) -> str:
+async def set_setpoint(clients: Clients, command: commands.SetSetpoint) -> str:
     """Write one setpoint; the others stay as they are."""
     client, place, unit = clients["control_plc"], command.place, command.unit
     operator = await check_manual(client)
@@ -277,7 +267,7 @@ async def set_setpoint(clients: Clients, command: SetSetpoint) -> str:
     return f"{now} ({was}); approached within the rate limit"
 
 
-async def set_load(clients: Clients, command: SetLoad) -> str:
+async def set_load(clients: Clients, command: commands.SetLoad) -> str:
     """Write the load; wait until the plant has it, where it is to have it at once.
 
     Raises:
@@ -297,7 +287,7 @@ async def set_load(clients: Clients, command: SetLoad) -> str:
     return f"{_load_text(command, status)} (was {value_text(before.watts, command.process.load.unit)})"
 
 
-def _load_text(command: SetLoad, status: LoadStatus) -> str:
+def _load_text(command: commands.SetLoad, status: LoadStatus) -> str:
     """Return what the plant knows of a load that was written.
 
     Raises:
@@ -314,7 +304,7 @@ def _load_text(command: SetLoad, status: LoadStatus) -> str:
     return f"{text}, before it {value_text(status.next_watts, unit)} from {status.next_tick * tick_s:g} s on"
 
 
-async def play_load(clients: Clients, command: PlayLoad) -> str:
+async def play_load(clients: Clients, command: commands.PlayLoad) -> str:
     """Write a load file at once.
 
     Raises:
@@ -459,7 +449,7 @@ def _names(kinds: Sequence[int], process: Process) -> str:
     return ", ".join(alarm_word(kind, process) for kind in kinds)
 
 
-async def fault_sensor(clients: Clients, command: FaultSensor) -> str:
+async def fault_sensor(clients: Clients, command: commands.FaultSensor) -> str:
     """Put a fault into a sensor."""
     client, row = clients["plant"], command.process.output_names.index(command.output)
     await client.write_rows([SensorFault(command.fault, command.value)], row)
@@ -467,11 +457,11 @@ async def fault_sensor(clients: Clients, command: FaultSensor) -> str:
     return f"sensor of {command.output}: {SensorFaultKind(back.kind).word}"
 
 
-async def set_pace(clients: Clients, command: SetFactor | SetPaused) -> str:
+async def set_pace(clients: Clients, command: commands.SetFactor | commands.SetPaused) -> str:
     """Write how fast plant time goes, pause or resume it."""
     plant = clients["plant"]
     pace = await plant.read(SessionPace)
-    if isinstance(command, SetFactor):
+    if isinstance(command, commands.SetFactor):
         pace = pace._replace(realtime=1, factor=command.factor)
     else:
         pace = pace._replace(paused=int(command.paused))
@@ -506,13 +496,13 @@ async def write_pace(clients: Mapping[str, RegisterClient], pace: SessionPace) -
 
 Work = Callable[[Clients, Any], Awaitable[str]]
 WORK: Final[Mapping[type[Command], tuple[tuple[str, ...], Work]]] = {
-    SetMode: (("control_plc",), set_mode),
-    SetSetpoint: (("control_plc",), set_setpoint),
-    SetLoad: (("plant",), set_load),
-    PlayLoad: (("plant",), play_load),
+    commands.SetMode: (("control_plc",), set_mode),
+    commands.SetSetpoint: (("control_plc",), set_setpoint),
+    commands.SetLoad: (("plant",), set_load),
+    commands.PlayLoad: (("plant",), play_load),
     TreatAlarm: (("control_plc",), treat_alarm),
-    FaultSensor: (("plant",), fault_sensor),
-    SetFactor: (ALL_SERVICES, set_pace),
-    SetPaused: (ALL_SERVICES, set_pace),
+    commands.FaultSensor: (("plant",), fault_sensor),
+    commands.SetFactor: (ALL_SERVICES, set_pace),
+    commands.SetPaused: (ALL_SERVICES, set_pace),
 }
 """Who is written to, and how; in the case of a time base the plant first."""

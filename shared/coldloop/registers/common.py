@@ -3,7 +3,7 @@
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.registers.declaration import Block, Worded, f32, in_ticks, u16, u32
-from coldloop.session.settings import TimeBase
+from coldloop.session import TimeBase
 
 MAGIC: Final = 123.456
 

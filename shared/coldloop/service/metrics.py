@@ -1,25 +1,34 @@
-"""Registers in Prometheus' text format: each number is a gauge, named by service, block and register.
+"""The registers of a service for Prometheus, over HTTP: `GET /metrics` and `/healthz`, and nothing else.
+
+Each number is a gauge, named by service, block and register; Prometheus' package is loaded where metrics are asked for.
 
 coldloop_plant_measurement_y{element="T5"} 12.5
 """
 
+import asyncio
+import logging
 import re
+import time
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, Final
-
-from prometheus_client import generate_latest
-from prometheus_client.core import GaugeMetricFamily, Metric
-from prometheus_client.registry import Collector
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, Final
 
 from coldloop import __version__
+from coldloop.errors import PortInUseError
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.declaration import Block
+from coldloop.service.settings import MetricsSettings
+
+if TYPE_CHECKING:
+    from prometheus_client.core import Metric
 
 _NOT_IN_NAMES: Final = re.compile(r"[^a-zA-Z0-9_]+")
 
 
-def gauge(name: str, description: str, values: float | Mapping[str, float], *, label: str = "") -> Metric:
+def gauge(name: str, description: str, values: float | Mapping[str, float], *, label: str = "") -> "Metric":
     """Return a gauge: one number, or one for each value of a label."""
+    from prometheus_client.core import GaugeMetricFamily  # noqa: PLC0415 without metrics it is not loaded
+
     if not isinstance(values, Mapping):
         return GaugeMetricFamily(name, description, value=values)
     family = GaugeMetricFamily(name, description, labels=[label])
@@ -28,12 +37,12 @@ def gauge(name: str, description: str, values: float | Mapping[str, float], *, l
     return family
 
 
-def build_family() -> Metric:
+def build_family() -> "Metric":
     """Return the version of the program as a label of the number 1."""
     return gauge("coldloop_build_info", "Version of Coldloop", {__version__: 1.0}, label="version")
 
 
-def block_families(service: str, block: Block, record: tuple[Any, ...]) -> Iterator[Metric]:
+def block_families(service: str, block: Block, record: tuple[Any, ...]) -> Iterator["Metric"]:
     """Yield the registers of a record; texts are left out."""
     for (name, field), value in zip(block.fields.items(), record, strict=True):
         if field.is_text or name == "crc":
@@ -44,7 +53,7 @@ def block_families(service: str, block: Block, record: tuple[Any, ...]) -> Itera
         yield gauge(metric_name(service, block.name, name), description, values, label="element")
 
 
-def bank_families(bank: RegisterBank) -> Iterator[Metric]:
+def bank_families(bank: RegisterBank) -> Iterator["Metric"]:
     """Yield all registers of a service that are not rows of a table and that no client writes."""
     yield build_family()
     for block in bank.map.shown:
@@ -57,17 +66,93 @@ def metric_name(*parts: str) -> str:
     return _NOT_IN_NAMES.sub("_", "_".join(("coldloop", *parts))).lower()
 
 
-class _Families(Collector):
-    """Metrics, made anew for each answer."""
-
-    def __init__(self, families: Iterable[Metric]) -> None:
-        self._families = families
-
-    def collect(self) -> Iterator[Metric]:
-        """Return it."""
-        yield from self._families
-
-
-def exposition(families: Iterable[Metric]) -> bytes:
+def exposition(families: Iterable["Metric"]) -> bytes:
     """Return families in Prometheus' text format."""
-    return generate_latest(_Families(families))
+    from prometheus_client import generate_latest  # noqa: PLC0415
+
+    return generate_latest(SimpleNamespace(collect=lambda: families))  # type: ignore[arg-type]  # it collects
+
+
+log = logging.getLogger("coldloop.service.metrics")
+
+CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
+LONGEST_REQUEST: Final = 4096
+PATIENCE_S: Final = 2.0
+"""Within this time a request is here, and its answer read."""
+MOST_OPEN: Final = 16
+"""Connections at a time; the oldest gives way. The service itself needs the others that the system allows."""
+KEPT_S: Final = 0.2
+"""An answer serves all who ask within this time: however many do, scans are not late because of them."""
+
+
+class MetricsServer:
+    """Answers one request a connection.
+
+    Args:
+        settings: Where it listens; port 0 is off.
+        bank: The registers that are shown.
+    """
+
+    def __init__(self, settings: MetricsSettings, bank: RegisterBank) -> None:
+        self._settings = settings
+        self._bank = bank
+        self._open: dict[asyncio.StreamWriter, None] = {}  # the oldest first
+        self._exposition = b""
+        self._kept_until = 0.0
+
+    async def run(self) -> None:
+        """Serve until cancelled; return at once where it is off.
+
+        Raises:
+            PortInUseError: Another program listens there.
+        """
+        host, port = self._settings.host, self._settings.port
+        if not port:
+            return
+        try:
+            server = await asyncio.start_server(self._answer, host, port, limit=LONGEST_REQUEST, backlog=MOST_OPEN)
+        except OSError as error:
+            raise PortInUseError(
+                f"{host}:{port}: {error.strerror}; give another one to `metrics.port` of the service"
+            ) from None
+        async with server:
+            await server.serve_forever()
+
+    async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if len(self._open) >= MOST_OPEN:
+            oldest = next(iter(self._open))
+            del self._open[oldest]
+            oldest.transport.abort()
+        self._open[writer] = None
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                head = await reader.readuntil(b"\r\n\r\n")
+                writer.write(self._response(head.partition(b"\r\n")[0].decode("latin-1").split(" ")))
+                writer.close()
+                await writer.wait_closed()
+        except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+            log.debug("malformed request for metrics")
+        finally:
+            self._open.pop(writer, None)
+            writer.transport.abort()
+
+    def _response(self, line: list[str]) -> bytes:
+        method, path = (line[0], line[1].partition("?")[0]) if len(line) > 1 else ("", "")
+        if method != "GET":
+            return _encoded("405 Method Not Allowed", b"only GET\n")
+        if path == "/metrics":
+            return _encoded("200 OK", self._registers())
+        if path == "/healthz":
+            return _encoded("200 OK", b"live\n")
+        return _encoded("404 Not Found", b"there are /metrics and /healthz\n")
+
+    def _registers(self) -> bytes:
+        now = time.monotonic()
+        if now >= self._kept_until:
+            self._exposition, self._kept_until = exposition(bank_families(self._bank)), now + KEPT_S
+        return self._exposition
+
+
+def _encoded(status: str, body: bytes) -> bytes:
+    lines = f"HTTP/1.1 {status}", f"Content-Type: {CONTENT_TYPE}", f"Content-Length: {len(body)}", "Connection: close"
+    return "\r\n".join((*lines, "", "")).encode() + body

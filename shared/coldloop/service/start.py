@@ -1,14 +1,25 @@
-"""Start of a service as a program: options, configuration, logs, event loop, signals, exit code."""
+"""Start of a service as a program: options, configuration, logs, event loop, signals, exit code.
+
+Logs are one JSON object a line on standard error, written by a thread that never holds up its callers. Lines that are
+not read are dropped and counted; the next line that is written says how many in `dropped`.
+"""
 
 import argparse
 import asyncio
 import contextlib
 import gc
+import io
+import json
 import logging
+import os
 import signal
 import sys
+import threading
+import time
+from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
-from typing import Any, Final, TypeVar
+from datetime import UTC, datetime
+from typing import Any, Final, TextIO, TypeVar
 
 from pydantic import BaseModel
 
@@ -17,11 +28,224 @@ from coldloop.config import load_configuration
 from coldloop.errors import ColdloopError
 from coldloop.kernels.first_use import Kernels, announce_with
 from coldloop.service.command_line import add_configuration_options
-from coldloop.service.logs import end_logs, set_up_logs
 
-S = TypeVar("S", bound=BaseModel)
+CAPACITY: Final = 1000
+"""Lines that wait to be written; a line has a few hundred bytes."""
+FLUSH_S: Final = 1.0
+"""How long the end of a program waits for the reader of its lines."""
+
+Write = Callable[[str], object]
+
+
+class LineWriter:
+    """A bounded queue of lines and the thread that writes them.
+
+    Args:
+        write: Writes one line; it may block, and is called by the thread alone.
+        capacity: Lines that may wait.
+
+    Attributes:
+        dropped: Lines that found the queue full, since the start.
+    """
+
+    def __init__(self, write: Write, capacity: int = CAPACITY) -> None:
+        self.dropped = 0
+        self._write = write
+        self._capacity = capacity
+        self._lines: deque[str] = deque()
+        self._changed = threading.Condition()
+        self._writing = self._closed = False
+        # A daemon: the interpreter does not wait for it at the end, when it may be blocked for good.
+        threading.Thread(target=self._run, name="log lines", daemon=True).start()
+
+    def put(self, line: str) -> bool:
+        """Let a line be written after those before it; return False when it was dropped instead."""
+        with self._changed:
+            if self._closed or len(self._lines) >= self._capacity:
+                self.dropped += 1
+                return False
+            self._lines.append(line)
+            self._changed.notify_all()
+            return True
+
+    def flush(self, within_s: float = FLUSH_S) -> bool:
+        """Wait until all lines are written; return whether they were, in time."""
+        end = time.monotonic() + within_s
+        with self._changed:
+            while self._lines or self._writing:
+                if not self._changed.wait(end - time.monotonic()):
+                    return False
+        return True
+
+    def close(self, within_s: float = FLUSH_S) -> bool:
+        """Take no more lines, and flush."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        return self.flush(within_s)
+
+    def _run(self) -> None:
+        while (line := self._next()) is not None:
+            try:
+                self._write(line)
+            except (OSError, ValueError):  # the reader has gone, or the stream is closed
+                with self._changed:
+                    self.dropped += 1
+            with self._changed:
+                self._writing = False
+                self._changed.notify_all()
+
+    def _next(self) -> str | None:
+        """Wait for a line and take it; None when there will be none."""
+        with self._changed:
+            while not self._lines and not self._closed:
+                self._changed.wait()
+            self._writing = bool(self._lines)
+            return self._lines.popleft() if self._lines else None
+
+
+def to_stream(stream: TextIO) -> Write:
+    """Return how to write a line to a stream.
+
+    A stream with a file descriptor is written to past its buffer: the interpreter takes the buffer's lock when it ends,
+    and aborts when a thread that is blocked in a write holds it.
+    """
+    try:
+        descriptor = stream.fileno()
+    except io.UnsupportedOperation:
+        return lambda line: stream.write(f"{line}\n")
+
+    def write(line: str) -> None:
+        data = memoryview(f"{line}\n".encode(errors="backslashreplace"))
+        while data:
+            data = data[os.write(descriptor, data) :]
+
+    return write
+
 
 log = logging.getLogger("coldloop.service.start")
+
+STANDARD_ATTRIBUTES = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName"}
+
+
+class JsonFormatter(logging.Formatter):
+    """Formats a record as JSON: time, level, service, logger, event, and whatever was passed as `extra`."""
+
+    def __init__(self, service: str) -> None:
+        super().__init__()
+        self._service = service
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        line: dict[str, Any] = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "service": self._service,
+            "logger": record.name,
+            "event": record.getMessage(),
+        }
+        line.update((key, value) for key, value in record.__dict__.items() if key not in STANDARD_ATTRIBUTES)
+        if record.exc_info:
+            line["error"] = self.formatException(record.exc_info)
+        return json.dumps(line, default=str, ensure_ascii=False)
+
+
+MOST_EVENTS = 1000
+"""Different events that are counted at a time."""
+LAST_LINE_S = 0.2
+"""How long the last line is waited for, when those before it have been written."""
+
+
+class FloodFilter(logging.Filter):
+    """Lets at most `lines` of one event through in an interval; the next one says how many were left out."""
+
+    def __init__(self, lines: int = 20, interval_s: float = 10.0, now: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._lines = lines
+        self._interval_s = interval_s
+        self._now = now
+        self._seen: dict[tuple[str, ...], tuple[float, int]] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether to write a record."""
+        about = tuple(str(getattr(record, name, "")) for name in ("alarm", "mode"))
+        event, now = (record.name, str(record.msg), *about), self._now()
+        if len(self._seen) > MOST_EVENTS:
+            self._seen.clear()
+        since, count = self._seen.get(event, (now, 0))
+        if now - since >= self._interval_s:
+            if count > self._lines:
+                record.left_out = count - self._lines
+            since, count = now, 0
+        self._seen[event] = since, count + 1
+        return count < self._lines
+
+
+class QueueingHandler(logging.Handler):
+    """Formats records into the queue of a writer."""
+
+    def __init__(self, writer: LineWriter) -> None:
+        super().__init__()
+        self.writer = writer
+        self._told = 0
+        """Number of dropped lines that a later line has reported."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Let a record be written; called with the handler's lock held."""
+        dropped = self.writer.dropped
+        if dropped > self._told:
+            record.dropped = dropped - self._told
+        if self.writer.put(self._formatted(record)):
+            self._told = dropped
+
+    def _formatted(self, record: logging.LogRecord) -> str:
+        try:
+            return self.format(record)
+        except Exception as error:  # noqa: BLE001 - a scan does not fail because of what it logs
+            about = {"name": record.name, "levelname": record.levelname, "created": record.created}
+            what = {"msg": "a record cannot be formatted", "reason": repr(error), "text": str(record.msg)}
+            return self.format(logging.makeLogRecord({**about, **what}))
+
+    def flush(self) -> None:
+        """Wait until all is written, for a bounded time."""
+        self.writer.flush()
+
+    def close(self) -> None:
+        """Write what waits, for a bounded time, and end the writer."""
+        if self.writer.flush() and self.writer.dropped > self._told:
+            last = {"name": log.name, "levelno": logging.WARNING, "levelname": "WARNING", "msg": "lines dropped"}
+            self.handle(logging.makeLogRecord(last))
+        self.writer.close(LAST_LINE_S)
+        super().close()
+
+
+_handlers: list[QueueingHandler] = []
+"""The handler of this process, when its logs are set up."""
+
+
+def set_up_logs(service: str, level: str, stream: TextIO = sys.stderr) -> None:
+    """Send the logs of this process, from `level` up, to `stream`."""
+    handler = QueueingHandler(LineWriter(to_stream(stream)))
+    handler.setFormatter(JsonFormatter(service))
+    handler.addFilter(FloodFilter())
+    logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
+    _handlers[:] = [handler]
+
+
+def dropped() -> int:
+    """Return how many lines of this process were dropped, because those before them were not read."""
+    return sum(handler.writer.dropped for handler in _handlers)
+
+
+def end_logs(last_line: str | None = None) -> None:
+    """Write a last line of plain text, if there is one, and what waits before it; for a bounded time."""
+    for handler in _handlers:
+        if last_line is not None:
+            handler.writer.put(last_line)
+        handler.close()
+
+
+S = TypeVar("S", bound=BaseModel)
 
 COMPILING: Final = "compiling kernels"
 """Logged when a service compiles kernels, with `kernels`, whose they are, and `about_s`, the seconds that it takes."""

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Final
 
-from coldloop.service.telemetry_settings import TelemetrySettings
+from coldloop.service.settings import TelemetrySettings
 
 if TYPE_CHECKING:
     import aiomqtt

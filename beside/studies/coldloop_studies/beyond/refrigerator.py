@@ -12,7 +12,7 @@ from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.plant import StationAlarm, StationMode
-from coldloop.service.event_text import alarm_word
+from coldloop.service.journal import alarm_word
 from coldloop_rig.results.recording import CONTROL
 from coldloop_rig.text_tables import Cell
 from coldloop_studies.drawing import cost_bars, over_time

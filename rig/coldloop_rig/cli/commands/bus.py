@@ -150,7 +150,7 @@ class _Lines:
         self._process = process
 
     def write(self, events: "Sequence[Event]") -> None:
-        from coldloop.service.event_text import describe, utc_text
+        from coldloop.service.journal import describe, utc_text
 
         for event in events:
             sys.stdout.write(
@@ -202,7 +202,7 @@ class _CsvFile:
 
 
 def _cells(event: "Event", process: "Process") -> list[str]:
-    from coldloop.service.event_text import describe, utc_text
+    from coldloop.service.journal import describe, utc_text
 
     text = describe(event, process)
     time = f"{event.tick * process.tick_s:.2f}"

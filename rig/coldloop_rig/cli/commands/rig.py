@@ -256,7 +256,7 @@ def _tick(options: argparse.Namespace) -> int:
 def _acknowledgement(options: argparse.Namespace) -> dict[str, object]:
     from coldloop.process.settings import settings_process
     from coldloop.registers.safety import ALL_ALARMS, AlarmAction, alarms_of
-    from coldloop.service.event_text import alarm_word
+    from coldloop.service.journal import alarm_word
 
     process = settings_process()
     kinds = {alarm_word(alarm, process).replace(" ", "-"): alarm for alarm in alarms_of(process)}
@@ -380,7 +380,7 @@ def execute_page(options: argparse.Namespace) -> int:
 
 
 async def _replay(folders: list[Path], settings: "Settings") -> None:
-    from coldloop_hmi.replay import serve_replays
+    from coldloop_hmi.runtime import serve_replays
     from coldloop_rig.live.recorded_page import RecordedPage
     from coldloop_rig.results.run_folder import RunFolder
 

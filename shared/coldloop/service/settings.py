@@ -1,4 +1,4 @@
-"""Configuration of telemetry, checked when it is made and immutable after."""
+"""Configuration of metrics and telemetry of a service, checked when it is made and immutable after."""
 
 from pathlib import Path
 from typing import Annotated, Self
@@ -7,6 +7,20 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, field_validato
 
 from coldloop.errors import ConfigurationError
 from coldloop.text_file import read_text
+
+
+class MetricsSettings(BaseModel):
+    """Address at which a service serves its registers as metrics.
+
+    Args:
+        host: Address to listen on.
+        port: TCP port; 0 is off.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=0xFFFF)] = 0
 
 
 class TelemetrySettings(BaseModel):

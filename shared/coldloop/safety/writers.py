@@ -1,4 +1,4 @@
-"""The one client that writes in a role: its lease, and the events of the lease.
+"""Writers of a service: the lease of the one that may write, and the seal of the sequences that it sends.
 
 A lease is granted to a connection with its first write, and refused to all others while it is held. It ends with
 silence, or by hand-over: when the connection of a simple client closes, at once; when that of a holder with a number
@@ -6,14 +6,23 @@ closes, after a moment in which it may come back over another connection, from t
 certificate: the number is no password, anyone can read it. A holder that reconnects leaves its former connection for
 good: another client that writes over it has the same number. A lease that is shared is held by all connections of its
 holder side by side, until the last of them closes.
+
+The checks of a sequence are the control PLC's; `docs/link.md` describes the whole exchange.
 """
 
+import struct
 import time
+import zlib
 from collections.abc import Callable
-from typing import Final
+from collections.abc import Sequence as Rows
+from itertools import chain
+from typing import Final, NamedTuple, TypeAlias
 
 from coldloop.registers.audit import WHO_WORDS
 from coldloop.registers.bank import BusyError, Caller
+from coldloop.registers.codec import codec_of
+from coldloop.registers.control_plc import SequenceHeader
+from coldloop.registers.declaration import Block
 from coldloop.registers.safety import LeaseEvent, LeaseState, LeaseStatus
 from coldloop.registers.text import to_words
 
@@ -148,3 +157,27 @@ class WriterLease:
         return LeaseStatus(
             state, SIMPLE_CLIENT if free else self._holder, self.refused & 0xFFFFFFFF, to_words(who, WHO_WORDS)
         )
+
+
+Inputs: TypeAlias = tuple[float, ...]
+"""Inputs of one tick, in their order."""
+_HEADER = codec_of(Block("sequence header", 0, SequenceHeader, ""))
+_CRC_BYTES = 4
+
+
+class InputSequence(NamedTuple):
+    """A header and its rows, one row a tick."""
+
+    header: SequenceHeader
+    rows: Rows[Inputs]
+
+
+def checksum(header: SequenceHeader, rows: Rows[Inputs]) -> int:
+    """Return the CRC-32 of header (without its CRC) and rows, whatever the word order of the link."""
+    crc = zlib.crc32(_HEADER.encode(header)[:-_CRC_BYTES])
+    return zlib.crc32(struct.pack(f">{len(rows[0]) * len(rows) if rows else 0}f", *chain.from_iterable(rows)), crc)
+
+
+def with_checksum(header: SequenceHeader, rows: Rows[Inputs]) -> InputSequence:
+    """Return the sequence with its CRC filled in."""
+    return InputSequence(header._replace(crc=checksum(header, rows)), rows)
