@@ -20,14 +20,13 @@ from coldloop.number_text import ends_text
 from coldloop.parsing import parsed_json
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.sections import Input
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import LadderStatus, Mode
 from coldloop.registers.safety import AlarmState, alarm_key, alarms_of
 from coldloop.service.journal import alarm_word
 from coldloop.text_file import whole_file, whole_text
 from coldloop_chaos.faults import ChaosPlan
-from coldloop_chaos.sequencer import ChaosTrace, conduct
+from coldloop_chaos.sequencer import ChaosTrace, ShowProgress, conduct
 from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Job
@@ -110,11 +109,12 @@ def _row(
         end, last_event = later.begin, later.first_event
     before = [Mode(event.subject) for event in trace.modes(0, mark.first_event)[-1:]]
     changes = trace.modes(mark.first_event, last_event)
+    modes = [*before, *(Mode(event.subject) for event in changes)]
     return Row(
         fault=mark.fault.label,
         at_s=mark.begin * tick_s,
         lasted_s=None if mark.end is None else (mark.end - mark.begin) * tick_s,
-        modes=tuple(mode.name for mode in _different([*before, *(Mode(event.subject) for event in changes)])),
+        modes=tuple(mode.name for mode, previous in zip(modes, [None, *modes], strict=False) if mode is not previous),
         alarms=tuple(
             RaisedAlarm(
                 alarm_key(event.subject, trace.process).upper(),
@@ -129,11 +129,6 @@ def _row(
         undisturbed_s=_seconds(outside[1][mark.begin : end], tick_s),
         back_s=_back_s(mark.end, before, changes, tick_s),
     )
-
-
-def _different(modes: Sequence[Mode]) -> list[Mode]:
-    """Return modes without repetitions."""
-    return [mode for mode, previous in zip(modes, [None, *modes], strict=False) if mode is not previous]
 
 
 def _back_s(end: int | None, before: Sequence[Mode], changes: Sequence[Event], tick_s: float) -> float | None:
@@ -185,7 +180,7 @@ def perform(
     plan: ChaosPlan,
     effective: Configuration[Settings],
     folder: Path,
-    progress: Progress,
+    progress: ShowProgress,
     *,
     arguments: Mapping[str, Any],
     formats: Sequence[str],
@@ -331,22 +326,19 @@ def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
 
 
 def _cells(row: Row, process: Process) -> list[str]:
+    modes: Sequence[str] = row.modes
+    if len(modes) > MANY_MODES:
+        modes = [*modes[: MANY_MODES - 2], f"({len(modes) - MANY_MODES} more)", *modes[-2:]]
     return [
         row.fault,
         f"{row.at_s:g}",
         "-" if row.lasted_s is None else f"{row.lasted_s:g}",
-        _modes(row.modes),
+        " > ".join(modes) or "-",
         _alarms(row.alarms, process),
         f"{row.largest_step:.3f}",
         *(f"{outside:g} ({was:g})" for outside, was in zip(row.outside_s, row.undisturbed_s, strict=True)),
         "not" if row.back_s is None else f"{row.back_s:g}",
     ]
-
-
-def _modes(modes: Sequence[str]) -> str:
-    if len(modes) > MANY_MODES:
-        modes = [*modes[: MANY_MODES - 2], f"({len(modes) - MANY_MODES} more)", *modes[-2:]]
-    return " > ".join(modes) or "-"
 
 
 def _alarms(alarms: Sequence[RaisedAlarm], process: Process) -> str:
@@ -386,25 +378,30 @@ def plot_chaos(path: Path, experiment: Experiment) -> None:
             place.set_ylabel(plot.with_unit(one.name, one.unit))
             plot.legend_above(place)
         for place, inputs in zip(axes[len(bands) :], units.values(), strict=True):
-            _inputs(place, [process.inputs[i] for i in inputs], minutes, recording.u[:, inputs])
+            for i, colour in zip(inputs, cycle(plot.COLOURS), strict=False):
+                place.plot(minutes, recording.u[:, i], color=colour, linewidth=1, label=process.inputs[i].name)
+            place.set_ylim(*plot.view(recording.u[:, inputs]))
+            first = process.inputs[inputs[0]]
+            place.set_ylabel(plot.with_unit(first.name if len(inputs) == 1 else "inputs", first.unit))
+            if len(inputs) > 1:
+                plot.legend_above(place)
         _draw_modes(ribbon, trace)
-        for place in axes:
-            _mark_faults(place, trace)
-        _name_faults(axes[0], trace)
+        for mark in trace.marks:
+            begin, end = (tick * process.tick_s / 60 for tick in (mark.begin, mark.end or mark.begin))
+            for place in axes:
+                place.axvline(begin, color=plot.ACCENT, linewidth=0.8, linestyle=":")
+                if end > begin:
+                    place.axvspan(begin, end, color=plot.ACCENT, alpha=0.08, linewidth=0)
+            if len(trace.marks) <= MANY:
+                axes[0].annotate(
+                    mark.fault.label, (begin, 1.14), xycoords=("data", "axes fraction"), rotation=35, ha="left",
+                    va="bottom", fontsize=7,
+                )  # fmt: skip
         ribbon.set_xlabel("time (min)")
         ribbon.set_xlim(0, trace.ticks * process.tick_s / 60)
         plot.label_marks(figure)
         figure.suptitle(f"{plan.name}: {plan.description}")
         whole_file(path, lambda draft: figure.savefig(draft, dpi=130, format="png"))
-
-
-def _inputs(axes: Axes, inputs: Sequence[Input], minutes: plot.Series, u: plot.Series) -> None:
-    for one, values, colour in zip(inputs, u.T, cycle(plot.COLOURS), strict=False):
-        axes.plot(minutes, values, color=colour, linewidth=1, label=one.name)
-    axes.set_ylim(*plot.view(u))
-    axes.set_ylabel(plot.with_unit(inputs[0].name if len(inputs) == 1 else "inputs", inputs[0].unit))
-    if len(inputs) > 1:
-        plot.legend_above(axes)
 
 
 def _draw_modes(axes: Axes, trace: ChaosTrace) -> None:
@@ -420,22 +417,3 @@ def _draw_modes(axes: Axes, trace: ChaosTrace) -> None:
     )  # fmt: skip
     axes.set_yticks([])
     axes.set_ylabel("mode")
-
-
-def _mark_faults(axes: Axes, trace: ChaosTrace) -> None:
-    tick_s = trace.process.tick_s
-    for mark in trace.marks:
-        begin, end = mark.begin * tick_s / 60, (mark.end or mark.begin) * tick_s / 60
-        axes.axvline(begin, color=plot.ACCENT, linewidth=0.8, linestyle=":")
-        if end > begin:
-            axes.axvspan(begin, end, color=plot.ACCENT, alpha=0.08, linewidth=0)
-
-
-def _name_faults(axes: Axes, trace: ChaosTrace) -> None:
-    if len(trace.marks) > MANY:
-        return
-    for mark in trace.marks:
-        axes.annotate(
-            mark.fault.label, (mark.begin * trace.process.tick_s / 60, 1.14), xycoords=("data", "axes fraction"),
-            rotation=35, ha="left", va="bottom", fontsize=7,
-        )  # fmt: skip

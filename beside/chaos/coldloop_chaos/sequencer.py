@@ -320,7 +320,7 @@ def log_lines(services: LocalServices) -> dict[str, int]:
     return counts
 
 
-Progress = Callable[[int, LadderStatus | None, list[str]], None]
+ShowProgress = Callable[[int, LadderStatus | None, list[str]], None]
 """Takes the plant's tick, the state of the control PLC (None while it does not answer), and the faults that are on."""
 
 STANDSTILL_PATIENCE_S: Final = 60.0
@@ -341,7 +341,7 @@ class FaultSequencer:
     client: SessionClient
     injector: Injector
     trace: ChaosTrace
-    progress: Progress
+    progress: ShowProgress
     tick: int = 0
     _marks: dict[int, Mark] = field(default_factory=dict)
 
@@ -435,7 +435,7 @@ class FaultSequencer:
         await self._look()
         mark.done = self.tick
         if isinstance(fault, faults.WrongModel) and not self.plan.realtime:
-            await self._until_refused()
+            await self._hold_time(lambda _: self.services.ended("optimizer_plc"))  # which it does, if it is refused
         self._timeline.begun(moment, self._seconds)
 
     async def _end(self, moment: Moment) -> None:
@@ -444,7 +444,7 @@ class FaultSequencer:
         if started is not None:
             await self._until_up(started, moment.fault)
         if not self.plan.realtime and not self._timeline.on:
-            await self._until_optimizer_is_known()
+            await self._hold_time(lambda ladder: ladder is not None and bool(ladder.optimizer))
         await self._look()
         mark.end = self.tick
 
@@ -458,22 +458,14 @@ class FaultSequencer:
                 await self._look()
             await asyncio.sleep(LOOK_S)
 
-    async def _until_refused(self) -> None:
-        """Hold plant time until an optimiser with a wrong model has ended, if it does."""
-        since = time.monotonic()
-        while not self.services.ended("optimizer_plc") and time.monotonic() - since < PRESENCE_S:
-            await self._look()
-            await asyncio.sleep(LOOK_S)
-
-    async def _until_optimizer_is_known(self) -> None:
-        """Hold plant time in lock-step until the control PLC detects its optimiser again.
+    async def _hold_time(self, until: Callable[[LadderStatus | None], bool]) -> None:
+        """Hold plant time in lock-step until something is so, such as that the control PLC detects its optimiser again.
 
         Without one it runs as fast as it can, and what the optimiser takes to come back says nothing in plant time.
         """
         since = time.monotonic()
         while time.monotonic() - since < PRESENCE_S:
-            ladder = await self._look()
-            if ladder is not None and ladder.optimizer:
+            if until(await self._look()):
                 return
             await asyncio.sleep(LOOK_S)
 
@@ -489,7 +481,7 @@ async def conduct(
     folder: Path,
     recorder: Recorder,
     trace: ChaosTrace,
-    progress: Progress,
+    progress: ShowProgress,
 ) -> None:
     """Run a plan on three services started for it; `trace`, a sink of the recorder, has what there was.
 
@@ -508,8 +500,9 @@ async def conduct(
         await services.during(client.connect(START_PATIENCE_S))
         await links.connect()
         await services.during(client.begin(scenario, recorder))
-        injector = Injector(services, links, client.plant, folder)
-        driver = FaultSequencer(plan, services, client, injector, trace, progress)
+        driver = FaultSequencer(
+            plan, services, client, Injector(services, links, client.plant, folder), trace, progress
+        )
         try:
             async with asyncio.timeout(_patience_s(plan)):
                 await services.during(driver.run())

@@ -118,7 +118,13 @@ class Poller:
                 try:
                     await self._look()
                 except LinkError as error:
-                    self._lose(error)
+                    self._client.close()
+                    self._checked = False
+                    self._journal.connection_lost()
+                    self._model.silent(self._service, str(error))
+                    if str(error) != self._told:
+                        self._told = str(error)
+                        log.warning("silent", extra={"peer": self._service, "reason": self._told})
                     await asyncio.sleep(RETRY_S)
                 else:
                     self._model.heard(self._service)
@@ -128,15 +134,6 @@ class Poller:
                     await asyncio.sleep(max(0.005, begun + self._poll_s - time.monotonic()))
         finally:
             self._client.close()
-
-    def _lose(self, error: LinkError) -> None:
-        self._client.close()
-        self._checked = False
-        self._journal.connection_lost()
-        self._model.silent(self._service, str(error))
-        if str(error) != self._told:
-            self._told = str(error)
-            log.warning("silent", extra={"peer": self._service, "reason": self._told})
 
     async def _look(self) -> None:
         model, service, client = self._model, self._service, self._client
@@ -167,21 +164,17 @@ class Poller:
         for record in self._slow:
             with suppress(DamagedAnswerError, RequestRefusedError):  # not sealed: not written yet
                 self._model.put(self._service, await self._client.read(record))
-        if self._service == "plant":
-            await self._read_configuration()
-            with suppress(RequestRefusedError):  # a plant without sensor faults
-                faults = await self._client.read_rows(SensorFault, 0, len(self._model.process.outputs))
-                self._model.faulty_sensors = sum(bool(fault.kind) << i for i, fault in enumerate(faults))
-
-    async def _read_configuration(self) -> None:
-        """Read what the service runs, when it is not what was read last."""
-        digest = self._model.record(self._service, ConfigurationDigest)
-        if digest is None or digest == self._configured:
+        if self._service != "plant":
             return
-        lines = await self._client.read_rows(ConfigurationLine, 0, lines_of(digest))
-        with suppress(ValueError):  # not one of ours, or it has changed meanwhile
-            self._model.configuration = configuration_of(digest, lines)
-            self._configured = digest
+        digest = self._model.record(self._service, ConfigurationDigest)
+        if digest is not None and digest != self._configured:
+            lines = await self._client.read_rows(ConfigurationLine, 0, lines_of(digest))
+            with suppress(ValueError):  # not one of ours, or it has changed meanwhile
+                self._model.configuration = configuration_of(digest, lines)
+                self._configured = digest
+        with suppress(RequestRefusedError):  # a plant without sensor faults
+            faults = await self._client.read_rows(SensorFault, 0, len(self._model.process.outputs))
+            self._model.faulty_sensors = sum(bool(fault.kind) << i for i, fault in enumerate(faults))
 
 
 STEP_S: Final = 0.1
@@ -306,9 +299,8 @@ class Replay:
         self._in_gap = False
         self._tick = max(0, tick - self._kept_ticks) - 1
         started = self._tick
-        updates, events = self._run.updates, self._run.events
-        model.put_updates(updates[: bisect_right(updates, started, key=lambda update: update.tick)])
-        model.put_events(events[: bisect_right(events, started, key=lambda entry: entry.tick)])
+        model.put_updates(self._run.updates[: _count(self._run.updates, started)])
+        model.put_events(self._run.events[: _count(self._run.events, started)])
         self._advance(tick, tick - started)
 
     def _advance(self, tick: int, points: int = MOST_AT_ONCE) -> None:
@@ -327,12 +319,10 @@ class Replay:
         self._tick = tick
         if newest is not None:  # after a step back it may be the one known
             self._put(newest)
-        updates, events = run.updates, run.events
-        first, last = (bisect_right(updates, one, key=lambda update: update.tick) for one in (before, tick))
-        model.put_updates(updates[first:last])
-        first, last = (bisect_right(events, one, key=lambda entry: entry.tick) for one in (before, tick))
-        model.put_events(events[first:last])
-        model.put_alarms(run.alarms(events[:last]))
+        model.put_updates(run.updates[_count(run.updates, before) : _count(run.updates, tick)])
+        events = run.events[: _count(run.events, tick)]
+        model.put_events(events[_count(events, before) :])
+        model.put_alarms(run.alarms(events))
 
     def _put(self, frame: ReplayFrame) -> None:
         model, process = self._model, frame.process
@@ -353,6 +343,11 @@ class Replay:
             "name": self._run.name, "playing": self._playing, "speed": self._speed, "tick": self._tick,
             "last_tick": self._run.ticks - 1,
         }  # fmt: skip
+
+
+def _count(rows: Sequence[Optimization] | Sequence[JournalEntry], tick: int) -> int:
+    """Return how many of these there are up to a tick."""
+    return bisect_right(rows, tick, key=lambda row: row.tick)
 
 
 async def serve_replays(runs: Sequence[RecordedRun], settings: HmiSection, announce: Callable[[str], None]) -> None:

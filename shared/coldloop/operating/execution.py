@@ -5,7 +5,7 @@ import math
 from bisect import bisect_right
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from coldloop.errors import BUSY, LinkError, PeerUnreachableError, RequestRefusedError, UsageError
 from coldloop.modbus.client import RegisterClient
@@ -33,6 +33,7 @@ from coldloop.registers.plant import (
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmState, alarms_of
 from coldloop.service.journal import alarm_word
 
+R = TypeVar("R")
 LAST_TICK: Final = 2**32 - 1
 KEPT_AHEAD: Final = LOAD_ROWS
 """Steps that the plant is to know in advance; it keeps twice as many."""
@@ -212,21 +213,26 @@ def reason_of(error: Exception) -> str:
     return f"{error}: {hint}" if hint else str(error)
 
 
+async def _read_until(read: Callable[[], Awaitable[R]], met: Callable[[R], bool]) -> R:
+    """Read again and again, for `EFFECT_S`, until what is read is as expected; return what was read last."""
+    found = await read()
+    for _ in range(round(EFFECT_S / LOOK_S)):
+        if met(found):
+            break
+        await asyncio.sleep(LOOK_S)
+        found = await read()
+    return found
+
+
 async def set_mode(clients: Clients, command: commands.SetMode) -> str:
     """Write the operating mode; wait until the control PLC follows."""
     client = clients["control_plc"]
     mode = OperatorMode[command.mode.upper()]
     operator = await client.read(Operator)
     await client.write(operator._replace(mode=mode))
-    expected = {OperatorMode.MANUAL: {Mode.MANUAL}, OperatorMode.CLASSICAL: {Mode.CLASSICAL}}.get(
-        mode, {Mode.MPC, Mode.REST}
-    )
-    ladder = await client.read(LadderStatus)
-    for _ in range(round(EFFECT_S / LOOK_S)):
-        if ladder.mode in expected:
-            break
-        await asyncio.sleep(LOOK_S)
-        ladder = await client.read(LadderStatus)
+    manual = {OperatorMode.MANUAL: {Mode.MANUAL}, OperatorMode.CLASSICAL: {Mode.CLASSICAL}}
+    expected = manual.get(mode, {Mode.MPC, Mode.REST})
+    ladder = await _read_until(lambda: client.read(LadderStatus), lambda ladder: ladder.mode in expected)
     back = OperatorMode((await client.read(Operator)).mode)
     return f"operator's mode {back.word}; the control PLC is in {Mode(ladder.mode).word} ({Cause(ladder.cause).word})"
 
@@ -278,12 +284,10 @@ async def set_load(clients: Clients, command: commands.SetLoad) -> str:
     if 0 < command.tick <= now:
         raise UsageError(f"plant time is {now * client.process.tick_s:g} s already: name a later one")
     await client.write(sealed(LiveLoad(command.tick, command.watts), client.map))
-    status = await client.read(LoadStatus)
-    for _ in range(0 if command.tick else round(EFFECT_S / LOOK_S)):
-        if math.isclose(status.watts, command.watts, rel_tol=1e-6):
-            break
-        await asyncio.sleep(LOOK_S)
-        status = await client.read(LoadStatus)
+    status = await _read_until(
+        lambda: client.read(LoadStatus),
+        lambda status: bool(command.tick) or math.isclose(status.watts, command.watts, rel_tol=1e-6),
+    )
     return f"{_load_text(command, status)} (was {value_text(before.watts, command.process.load.unit)})"
 
 
@@ -374,12 +378,9 @@ async def treat_alarm(clients: Clients, command: TreatAlarm) -> str:
         kinds, raised_again = _seen(before, kinds, command)
         for kind in kinds:
             await client.write(AlarmCommand(kind, action, command.time_s))
-    rows = await read_alarms(client)
-    for _ in range(round(EFFECT_S / LOOK_S)):
-        if all(_is_done(action, rows[kind].state) for kind in kinds):
-            break
-        await asyncio.sleep(LOOK_S)
-        rows = await read_alarms(client)
+    rows = await _read_until(
+        lambda: read_alarms(client), lambda rows: all(_is_done(action, rows[kind].state) for kind in kinds)
+    )
     return _treated(command, rows, kinds, raised_again)
 
 

@@ -202,20 +202,14 @@ class UpdateReader:
         for number, update in enumerate(
             await read_ring(self._client, Optimization, UPDATE_ROWS, known, newest - 1), known
         ):
-            if self._is_new(update, number):
+            later = self._last is None or update.tick > self._last.tick
+            # a row whose update was abandoned for a newer one is empty, or as it was 256 updates before
+            if (update.update - number) & 0xFFFF == 0 and update.tau_u > 0 and later:
                 self._take(update)
                 self._last = update
                 found += 1
         self._next = newest
         return found
-
-    def _is_new(self, update: Optimization, number: int) -> bool:
-        """Return whether a row is the update that is looked for, and not one that was recorded before.
-
-        An update that was abandoned for a newer one leaves its row empty, or as it was 256 updates before.
-        """
-        later = self._last is None or update.tick > self._last.tick
-        return (update.update - number) & 0xFFFF == 0 and update.tau_u > 0 and later
 
     async def read_until(self, ticks: int, last: int, patience_s: float) -> None:
         """Read on until update `last` is there, and one that reaches beyond the run.
@@ -282,7 +276,12 @@ class JournalReader:
         self._is_doubtful = False
         while True:
             page, found = await self._page()
-            self._check(page)
+            kept = page.newest - max(page.oldest, 1) + 1
+            if not (0 <= kept <= MOST_KEPT and (not page.next_first or page.next_first <= page.newest)):
+                raise LinkError(  # reading would not come to an end
+                    f"{self._client.peer}: its journal contradicts itself: events {page.oldest} to {page.newest}, next "
+                    f"{page.next_first}"
+                )
             if page.newest < self._newest:
                 restarts += 1
                 if restarts > 1:
@@ -303,16 +302,6 @@ class JournalReader:
     def _restart(self) -> None:
         self.restarted, self._next, self._newest, self._last = True, 1, 0, None
 
-    def _check(self, page: JournalPage) -> None:
-        """Refuse a page on which reading would not come to an end."""
-        kept = page.newest - max(page.oldest, 1) + 1
-        ahead = page.next_first <= page.newest if page.next_first else True
-        if not (0 <= kept <= MOST_KEPT and ahead):
-            raise LinkError(
-                f"{self._client.peer}: its journal contradicts itself: events {page.oldest} to {page.newest}, next "
-                f"{page.next_first}"
-            )
-
     async def _page(self) -> tuple[JournalPage, list[Event]]:
         if not self.limited:
             kind = next(iter(self._kinds)) if len(self._kinds) == 1 else 0
@@ -325,10 +314,6 @@ class JournalReader:
                 self.limited = True
             else:
                 return page, [Event(*row) for row in rows[: page.found]]
-        return await self._last_events()
-
-    async def _last_events(self) -> tuple[JournalPage, list[Event]]:
-        """Read what the block of the last events has from the next one on."""
         self.page = page = await self._client.read(JournalPage)
         first = max(self._next, page.newest - self._most + 1)
         rows = await read_ring(self._client, Event, EVENT_ROWS, first, page.newest)

@@ -64,7 +64,13 @@ def decoded(data: bytes, owner: str, digest: int) -> dict[str, Any]:
     """
     line, _, content = data.partition(b"\n")
     if line + b"\n" != _description(content, owner, digest):
-        raise RetainedStateError(f"{_complaint(line, owner, digest)}; it is not used")
+        words = line.decode(errors="replace").split()
+        complaint = "a torn retained state"
+        if words[:1] != [MAGIC]:
+            complaint = "not a retained state"
+        elif words[1:3] != [owner, f"{digest:08x}"]:
+            complaint = "the retained state of another program or model"
+        raise RetainedStateError(f"{complaint}; it is not used")
     try:
         state = parsed_json(content)
     except ValueError:
@@ -77,15 +83,6 @@ def decoded(data: bytes, owner: str, digest: int) -> dict[str, Any]:
 def _description(content: bytes, owner: str, digest: int) -> bytes:
     fields = f"{MAGIC} {owner} {digest:08x} {len(content)} {zlib.crc32(content):08x}"
     return f"{fields} {zlib.crc32(fields.encode()):08x}\n".encode()
-
-
-def _complaint(line: bytes, owner: str, digest: int) -> str:
-    words = line.decode(errors="replace").split()
-    if words[:1] != [MAGIC]:
-        return "not a retained state"
-    if words[1:3] != [owner, f"{digest:08x}"]:
-        return "the retained state of another program or model"
-    return "a torn retained state"
 
 
 class RetainedFile:
@@ -191,19 +188,12 @@ def _replace(path: Path, data: bytes, *, synced: bool) -> None:
         with contextlib.suppress(OSError):  # half a draft would only fill the disk further
             draft.unlink(missing_ok=True)
         raise
-    if synced:
-        _sync_folder(path.parent)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Let the disk have the names in a folder; only POSIX systems can."""
-    if os.name != "posix":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    if synced and os.name == "posix":  # let the disk have the names in the folder
+        descriptor = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 log = logging.getLogger("coldloop.safety.retained")

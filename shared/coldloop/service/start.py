@@ -26,7 +26,7 @@ from pydantic import BaseModel
 from coldloop import __version__
 from coldloop.config import load_configuration
 from coldloop.errors import ColdloopError
-from coldloop.kernels.first_use import Kernels, announce_with
+from coldloop.kernels.first_use import announce_with
 from coldloop.service.command_line import add_configuration_options
 
 CAPACITY: Final = 1000
@@ -195,16 +195,14 @@ class QueueingHandler(logging.Handler):
         dropped = self.writer.dropped
         if dropped > self._told:
             record.dropped = dropped - self._told
-        if self.writer.put(self._formatted(record)):
-            self._told = dropped
-
-    def _formatted(self, record: logging.LogRecord) -> str:
         try:
-            return self.format(record)
+            line = self.format(record)
         except Exception as error:  # noqa: BLE001 - a scan does not fail because of what it logs
             about = {"name": record.name, "levelname": record.levelname, "created": record.created}
             what = {"msg": "a record cannot be formatted", "reason": repr(error), "text": str(record.msg)}
-            return self.format(logging.makeLogRecord({**about, **what}))
+            line = self.format(logging.makeLogRecord({**about, **what}))
+        if self.writer.put(line):
+            self._told = dropped
 
     def flush(self) -> None:
         """Wait until all is written, for a bounded time."""
@@ -267,7 +265,7 @@ def main(name: str, settings: type[S], serve: Callable[[S], Awaitable[None]], ar
     parser.add_argument("--version", action="version", version=__version__)
     options = parser.parse_args(arguments)
     set_up_logs(name, options.log_level)
-    announce_with(_log_kernels)
+    announce_with(lambda one: log.info(COMPILING, extra={"kernels": one.owner, "about_s": one.about_s}))
     code, last_line = 1, None
     try:
         configuration = load_configuration(
@@ -291,10 +289,6 @@ def in_one_line(name: str, start: Callable[[], int]) -> int:
     except ColdloopError as error:
         sys.stderr.write(f"{name}: {error}\n")
         return error.exit_code
-
-
-def _log_kernels(kernels: Kernels) -> None:
-    log.info(COMPILING, extra={"kernels": kernels.owner, "about_s": kernels.about_s})
 
 
 def run_event_loop(start: Callable[[], Any]) -> int:
