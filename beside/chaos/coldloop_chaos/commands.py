@@ -5,17 +5,13 @@ import math
 import sys
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Final
 
 from coldloop.errors import LinkError, UsageError
 from coldloop.process.updating_periods import duration
 from coldloop.service.command_line import add_configuration_options
 from coldloop_rig.cli.commands import options as common
 from coldloop_rig.interruption import run_until_interrupted
-
-if TYPE_CHECKING:
-    from coldloop.config import Configuration
-    from coldloop_rig.settings import Settings
 
 SAID: Final = {
     "chaos": "a run with injected faults, and its evaluation",
@@ -64,12 +60,23 @@ def execute_chaos(options: argparse.Namespace) -> int:
     if options.plan is None:
         raise UsageError("name a plan; `coldloop chaos --list` lists the shipped ones")
     from coldloop.process.settings import settings_of
-    from coldloop_chaos.faults import find_plan
+    from coldloop_chaos.faults import OF_PLAN, find_plan
 
-    effective, changes = common.configuration(options), _changes(options)
+    effective = common.configuration(options)
+    given = {name: getattr(options, f"plan_{name}") for name in ("seed", "load", "mode", "factor")}
+    given["duration_s"] = options.duration and options.duration.seconds
     with settings_of(effective.settings.process):
-        plan = find_plan(options.plan, changes)
-    _refuse_what_has_no_effect(effective)
+        plan = find_plan(options.plan, {name: value for name, value in given.items() if value is not None})
+    retained = "the states are retained in the folder of the results"
+    common.refuse_ineffective(
+        effective,
+        {
+            **{key: f"the plan has its own value; change it with {option}" for key, option in OF_PLAN.items()},
+            **dict.fromkeys(common.PLACES, common.OWN_PORTS),
+            **dict.fromkeys(("plant.retain.file", "control_plc.retain.file"), retained),
+            "session.autostart": "it begins a session",
+        },
+    )
     from coldloop_chaos.report import ChaosProgress, perform, plot_chaos, summary_lines, table, write_report
     from coldloop_rig.results.folders import claim_folder, claim_folder_of_now, writing
     from coldloop_rig.runs.running import plain_arguments
@@ -89,33 +96,6 @@ def execute_chaos(options: argparse.Namespace) -> int:
     if experiment.failure is not None:
         raise LinkError(experiment.failure)
     return 0
-
-
-def _refuse_what_has_no_effect(effective: "Configuration[Settings]") -> None:
-    """Refuse a value from the command line that the plan's own, or that of the command, would replace."""
-    from coldloop_chaos.faults import OF_PLAN
-
-    common.refuse_ineffective(
-        effective,
-        {
-            **{key: f"the plan has its own value; change it with {option}" for key, option in OF_PLAN.items()},
-            **dict.fromkeys(common.PLACES, common.OWN_PORTS),
-            "session.autostart": "it begins a session",
-            "plant.retain.file": "the states are retained in the folder of the results",
-            "control_plc.retain.file": "the states are retained in the folder of the results",
-        },
-    )
-
-
-def _changes(options: argparse.Namespace) -> dict[str, Any]:
-    given = {
-        "seed": options.plan_seed,
-        "duration_s": options.duration and options.duration.seconds,
-        "load": options.plan_load,
-        "mode": options.plan_mode,
-        "factor": options.plan_factor,
-    }
-    return {name: value for name, value in given.items() if value is not None}
 
 
 def _declare_proxy(parser: argparse.ArgumentParser) -> None:

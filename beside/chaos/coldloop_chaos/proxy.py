@@ -75,29 +75,22 @@ class Mangler:
         """Return the frames that replace `piece`."""
         if not self._hit(fault.share):
             return [piece]
-        if isinstance(fault, faults.Drop):
-            return []
-        if isinstance(fault, faults.Duplicate):
-            return [piece, piece]
+        if isinstance(fault, faults.Drop | faults.Duplicate):
+            return [] if isinstance(fault, faults.Drop) else [piece, piece]
         if isinstance(fault, faults.Flip):
-            return [self._flipped(piece, fault.bits)]
-        return [_with_other_words(piece, fault) if len(piece) > UNIT + 1 else piece]
-
-    def _flipped(self, piece: bytes, bits: int) -> bytes:
-        damaged = bytearray(piece)
-        for bit in self._draw.sample(range(8 * len(piece)), min(bits, 8 * len(piece))):
-            damaged[bit // 8] ^= 1 << bit % 8
-        return bytes(damaged)
+            damaged, bits = bytearray(piece), 8 * len(piece)
+            for bit in self._draw.sample(range(bits), min(fault.bits, bits)):
+                damaged[bit // 8] ^= 1 << bit % 8
+            return [bytes(damaged)]
+        if len(piece) <= UNIT + 1:
+            return [piece]
+        unit, function = piece[UNIT], piece[UNIT + 1]
+        if isinstance(fault, faults.WrongUnit):
+            return [piece[:UNIT] + bytes([unit + 1 & 0xFF]) + piece[UNIT + 1 :]]
+        return [piece[:4] + b"\x00\x03" + bytes([unit, function | 0x80, fault.code])]
 
     def _hit(self, share: float) -> bool:
         return self._draw.random() < share
-
-
-def _with_other_words(frame: bytes, fault: faults.ExceptionAnswer | faults.WrongUnit) -> bytes:
-    unit, function = frame[UNIT], frame[UNIT + 1]
-    if isinstance(fault, faults.WrongUnit):
-        return frame[:UNIT] + bytes([unit + 1 & 0xFF]) + frame[UNIT + 1 :]
-    return frame[:4] + b"\x00\x03" + bytes([unit, function | 0x80, fault.code])
 
 
 def take_frames(buffer: bytearray) -> list[bytes]:

@@ -442,21 +442,17 @@ class FaultSequencer:
         mark = self._marks.pop(id(moment.fault))
         started = await self.injector.end(moment.fault)
         if started is not None:
-            await self._until_up(started, moment.fault)
+            since = time.monotonic()
+            while await self.client.contact(self.client.clients[started].read(Identity)) is None:
+                if time.monotonic() - since > RESTART_PATIENCE_S:
+                    raise LinkError(f"after '{moment.fault.label}' the {started} service does not answer: see its log")
+                if self.plan.realtime:
+                    await self._look()
+                await asyncio.sleep(LOOK_S)
         if not self.plan.realtime and not self._timeline.on:
             await self._hold_time(lambda ladder: ladder is not None and bool(ladder.optimizer))
         await self._look()
         mark.end = self.tick
-
-    async def _until_up(self, service: str, fault: faults.AnyFault) -> None:
-        """Wait until a service that was started again answers."""
-        since = time.monotonic()
-        while await self.client.contact(self.client.clients[service].read(Identity)) is None:
-            if time.monotonic() - since > RESTART_PATIENCE_S:
-                raise LinkError(f"after '{fault.label}' the {service} service does not answer: see its log")
-            if self.plan.realtime:
-                await self._look()
-            await asyncio.sleep(LOOK_S)
 
     async def _hold_time(self, until: Callable[[LadderStatus | None], bool]) -> None:
         """Hold plant time in lock-step until something is so, such as that the control PLC detects its optimiser again.

@@ -95,7 +95,13 @@ class NamedRegisters:
         self._client = client
         self._call = call
         self._blocks = {block.name: block for block in register_map.blocks}
-        self._places = {name: place for block in register_map.blocks for name, place in _places_of(block)}
+        self._places: dict[str, _Place] = {}
+        for block in register_map.blocks:
+            for name, field in block.fields.items():
+                self._places[f"{block.name}.{name}"] = _Place(block, name, None)
+                before = block.name if field.each else f"{block.name}.{name}"
+                for index, element in enumerate(field.elements):
+                    self._places[f"{before}.{element}"] = _Place(block, name, index)
         self.endpoint = endpoint
         """Endpoint of the service, for clients of your own."""
         self.latest: dict[str, Any] = {}
@@ -163,14 +169,6 @@ class NamedRegisters:
             hint = f"did you mean {', '.join(close)}" if close else "see `coldloop registers`: BLOCK.NAME"
             raise UsageError(f"no register '{name}'; {hint}")
         return self._places[name]
-
-
-def _places_of(block: Block) -> Iterator[tuple[str, _Place]]:
-    for name, field in block.fields.items():
-        yield f"{block.name}.{name}", _Place(block, name, None)
-        before = block.name if field.each else f"{block.name}.{name}"
-        for index, element in enumerate(field.elements):
-            yield f"{before}.{element}", _Place(block, name, index)
 
 
 class LiveRig:
@@ -323,35 +321,31 @@ class LiveRig:
                 self._loop.call(services.during(asyncio.sleep(END_S)))
             raise
 
-    def _start(self) -> None:
-        self._loop.call(self._started())
-
-    async def _started(self) -> None:
+    async def _start(self) -> None:
         await self._stack.enter_async_context(self._services)
         await self._services.during(self._driver.connect(wiring.START_PATIENCE_S))
         await self._links.connect()
         await self._services.during(self._driver.start(self._scenario))
         if self._scenario.realtime:
-            task = asyncio.create_task(self._fed(), name="load of the session")
-            self._stack.callback(task.cancel)
+            self._stack.callback(asyncio.create_task(self._feed(), name="load of the session").cancel)
 
-    async def _fed(self) -> None:
+    async def _feed(self) -> None:
         while True:
             with contextlib.suppress(LinkError):  # the plant is away on purpose: it is looked at again
                 await self._driver.hold(FEED_S)
             await asyncio.sleep(FEED_S)
 
     def _stop(self) -> None:
+        async def stop() -> None:
+            for client in self._clients.values():
+                client.close()
+            self._driver.close()
+            await self._stack.aclose()
+
         try:
-            self._loop.call(self._stopped())
+            self._loop.call(stop())
         finally:
             self._loop.close()
-
-    async def _stopped(self) -> None:
-        for client in self._clients.values():
-            client.close()
-        self._driver.close()
-        await self._stack.aclose()
 
 
 @contextmanager
@@ -402,7 +396,7 @@ def up(
         place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="coldloop-")) if folder is None else folder)
         rig = LiveRig(effective.settings, place)
         stack.callback(rig._stop)  # noqa: SLF001 the two are one
-        rig._start()  # noqa: SLF001
+        rig._loop.call(rig._start())  # noqa: SLF001
         yield rig
 
 

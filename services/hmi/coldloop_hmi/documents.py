@@ -302,21 +302,17 @@ def updates_document(
         if not inside:
             continue
         columns = {name: [QUANTITIES[name](one, tick_s) for one in inside] for name in quantities}
-        lost = [tick * tick_s for tick in _lost_updates(inside, gaps)]
+        lost = [  # updates before which some are missing because nothing could be read
+            after.tick * tick_s
+            for before, after in pairwise(inside)
+            if after.update != before.update + 1
+            and any(before.tick < gap.end and gap.start < after.tick for gap in gaps)
+        ]
         times, thinned = thin([one.tick * tick_s for one in inside], columns, points, tick_s, lost)
         found["time"] += [*times, last * tick_s, (last + 1) * tick_s]
         for name, values in thinned.items():
             found[name] += [*values, values[-1] if name in PERIODS else None, None]
     return found
-
-
-def _lost_updates(updates: Sequence[Optimization], gaps: Sequence[Gap]) -> list[int]:
-    """Return the ticks of the updates before which some are missing because nothing could be read."""
-    return [
-        after.tick
-        for before, after in pairwise(updates)
-        if after.update != before.update + 1 and any(before.tick < gap.end and gap.start < after.tick for gap in gaps)
-    ]
 
 
 def _ranges(names: Sequence[str], low: Sequence[float], high: Sequence[float]) -> Document:

@@ -193,7 +193,8 @@ def _branch(update: Optimization, before: Optimization | None, rule: UpdatingRul
     if update.update == 0:
         return Branch.FIRST
     undecided = update.efficiency == update.mismatch == update.contraction == 1.0 and update.gamma == 0.0
-    if undecided and (before is None or not _was_played(update, before)):
+    was_played = before and before.verdict == Verdict.ACCEPTED and update.tick - before.tick == before.tau_u
+    if undecided and not was_played:
         return _why_not_played(update, before, rule)
     if rule.rule == UpdatingRuleKind.ALGORITHM_1:
         return Branch.DOWN if update.gamma > 0 else Branch.UP if update.gamma < 0 else Branch.LEVEL
@@ -202,10 +203,6 @@ def _branch(update: Optimization, before: Optimization | None, rule: UpdatingRul
     if rule.rule == UpdatingRuleKind.OUTSIDE:
         return Branch.OUTSIDE
     raise NotImplementedError(f"no words for the rule {rule.rule} of the updating period: add a branch")
-
-
-def _was_played(update: Optimization, before: Optimization) -> bool:
-    return before.verdict == Verdict.ACCEPTED and update.tick - before.tick == before.tau_u
 
 
 def _why_not_played(update: Optimization, before: Optimization | None, rule: UpdatingRuleStatus) -> Branch:

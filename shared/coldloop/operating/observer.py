@@ -316,7 +316,7 @@ class JournalReader:
                 return page, [Event(*row) for row in rows[: page.found]]
         self.page = page = await self._client.read(JournalPage)
         first = max(self._next, page.newest - self._most + 1)
-        rows = await read_ring(self._client, Event, EVENT_ROWS, first, page.newest)
-        events = sorted(event for event in rows if event.number >= first)  # newer ones may have come meanwhile
+        kept = await read_ring(self._client, Event, EVENT_ROWS, first, page.newest)
+        events = sorted(event for event in kept if event.number >= first)  # newer ones may have come meanwhile
         newest = max([page.newest, *(event.number for event in events)])
         return JournalPage(max(page.oldest, newest - EVENT_ROWS + 1), newest, len(events)), events

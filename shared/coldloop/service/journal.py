@@ -181,10 +181,6 @@ def _nothing(number: int) -> str:
     return str(number) if number else ""
 
 
-def _row(number: int) -> str:
-    return f"row {number}"
-
-
 WARNINGS: Final = frozenset(
     {
         EventKind.MODE,
@@ -260,7 +256,7 @@ class _Words:
             EventKind.PLANT_LINK: _Wording(control_plc.PlantLinkState.word_of, _causes(control_plc.LinkCause)),
             EventKind.LEASE: _Wording(_texts(LeaseEvent)),
             EventKind.SENSOR_FAULT: _Wording(outputs, SensorFaultKind.word_of),
-            EventKind.LOAD: _Wording(_row, unit=unit),
+            EventKind.LOAD: _Wording("row {}".format, unit=unit),
             EventKind.CERTIFICATE: _Wording(_listed(("", "expires soon", "has expired")), unit="days left"),
             EventKind.LOST: _Wording(unit="events or lines"),
             EventKind.SENSOR: _Wording(outputs, _listed(("good again", "bad", "suspect"))),

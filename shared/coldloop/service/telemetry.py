@@ -79,20 +79,17 @@ class Telemetry:
         async with client:
             await broker.publish(f"{self._topic}/state", json.dumps({"state": "online"}))
             try:
-                await self._forward(broker)
+                while True:
+                    await self._arrived.wait()
+                    self._arrived.clear()
+                    while self._waiting:
+                        await broker.publish(f"{self._topic}/telemetry", self._waiting[0])
+                        self._waiting.popleft()
             except asyncio.CancelledError:  # a clean end calls for no last will
                 with contextlib.suppress(aiomqtt.MqttError, TimeoutError):
                     async with asyncio.timeout(FAREWELL_S):
                         await broker.publish(f"{self._topic}/state", str(offline.payload))
                 raise
-
-    async def _forward(self, broker: "_Publisher") -> None:
-        while True:
-            await self._arrived.wait()
-            self._arrived.clear()
-            while self._waiting:
-                await broker.publish(f"{self._topic}/telemetry", self._waiting[0])
-                self._waiting.popleft()
 
 
 class _Publisher:
