@@ -177,14 +177,9 @@ class Experiment(NamedTuple):
 
 
 def perform(
-    plan: ChaosPlan,
-    effective: Configuration[Settings],
-    folder: Path,
-    progress: ShowProgress,
-    *,
-    arguments: Mapping[str, Any],
-    formats: Sequence[str],
-) -> Experiment:
+    plan: ChaosPlan, effective: Configuration[Settings], folder: Path, progress: ShowProgress, *,
+    arguments: Mapping[str, Any], formats: Sequence[str],
+) -> Experiment:  # fmt: skip
     """Run a plan into a folder that is claimed, and the same without faults; a run that fails is evaluated as it is.
 
     The values of the plan are recorded in the place of those of the configuration.

@@ -471,14 +471,9 @@ SLOWEST: Final = 20.0
 
 
 async def conduct(
-    plan: faults.ChaosPlan,
-    scenario: Scenario,
-    settings: Settings,
-    folder: Path,
-    recorder: Recorder,
-    trace: ChaosTrace,
+    plan: faults.ChaosPlan, scenario: Scenario, settings: Settings, folder: Path, recorder: Recorder, trace: ChaosTrace,
     progress: ShowProgress,
-) -> None:
+) -> None:  # fmt: skip
     """Run a plan on three services started for it; `trace`, a sink of the recorder, has what there was.
 
     Raises:

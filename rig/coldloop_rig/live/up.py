@@ -281,16 +281,9 @@ class UpRig:
     """
 
     def __init__(
-        self,
-        settings: Settings,
-        ports: Sequence[int],
-        tls: Path | None,
-        *,
-        page: bool = False,
-        cuttable: bool = False,
-        services: Sequence[str] = wiring.SERVICES,
-        optimizer: Sequence[str] = (),
-    ) -> None:
+        self, settings: Settings, ports: Sequence[int], tls: Path | None, *, page: bool = False, cuttable: bool = False,
+        services: Sequence[str] = wiring.SERVICES, optimizer: Sequence[str] = (),
+    ) -> None:  # fmt: skip
         self._optimizer = tuple(optimizer)
         self.folder = started_rigs.make_own_folder(str(ports[0]))
         self._settings = wiring.retaining(settings, self.folder, always=False)

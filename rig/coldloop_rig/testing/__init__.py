@@ -350,18 +350,11 @@ class LiveRig:
 
 @contextmanager
 def up(
-    load: str | Path | None = None,
-    *,
-    mode: Literal["lockstep", "realtime"] | None = None,
-    factor: float | None = None,
-    solver: str | None = None,
-    updating_period: Period | None = None,
-    process: str | Path | None = None,
-    seed: int | None = None,
-    config: str | Path | None = None,
-    folder: str | Path | None = None,
+    load: str | Path | None = None, *, mode: Literal["lockstep", "realtime"] | None = None, factor: float | None = None,
+    solver: str | None = None, updating_period: Period | None = None, process: str | Path | None = None,
+    seed: int | None = None, config: str | Path | None = None, folder: str | Path | None = None,
     **settings: Mapping[str, object],
-) -> Iterator[LiveRig]:
+) -> Iterator[LiveRig]:  # fmt: skip
     """Start plant, control PLC and optimiser PLC on free ports of localhost, and begin a session; stop them at the end.
 
     Example:

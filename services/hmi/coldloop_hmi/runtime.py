@@ -1,4 +1,4 @@
-"""What feeds the page: pollers of a rig that is up, or a recorded run that is replayed.
+"""Sources of what the page shows: pollers of a rig that is up, or a recorded run that is replayed.
 
 A poller reads one service over Modbus, once for all browsers, and keeps polling a silent one. A replay plays a run into
 a model, at any speed: the page is the same.

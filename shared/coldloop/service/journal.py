@@ -182,24 +182,13 @@ def _nothing(number: int) -> str:
 
 
 WARNINGS: Final = frozenset(
-    {
-        EventKind.MODE,
-        EventKind.ALARM_RAISED,
-        EventKind.WATCHDOG_TIME,
-        EventKind.WATCHDOG_EXPIRED,
-        EventKind.LOST,
-    }
+    {EventKind.MODE, EventKind.ALARM_RAISED, EventKind.WATCHDOG_TIME, EventKind.WATCHDOG_EXPIRED, EventKind.LOST}
 )
 """Events that the log has as warnings."""
 OF_ALARMS: Final = frozenset({EventKind.ALARM_RAISED, EventKind.ALARM_RETURNED, EventKind.ALARM_ACKNOWLEDGED})
 """Events of an alarm with its cause."""
 SUPPRESSIONS: Final = frozenset(
-    {
-        EventKind.ALARM_SHELVED,
-        EventKind.ALARM_UNSHELVED,
-        EventKind.ALARM_OUT_OF_SERVICE,
-        EventKind.ALARM_IN_SERVICE,
-    }
+    {EventKind.ALARM_SHELVED, EventKind.ALARM_UNSHELVED, EventKind.ALARM_OUT_OF_SERVICE, EventKind.ALARM_IN_SERVICE}
 )
 
 
