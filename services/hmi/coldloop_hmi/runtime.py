@@ -118,13 +118,7 @@ class Poller:
                 try:
                     await self._look()
                 except LinkError as error:
-                    self._client.close()
-                    self._checked = False
-                    self._journal.connection_lost()
-                    self._model.silent(self._service, str(error))
-                    if str(error) != self._told:
-                        self._told = str(error)
-                        log.warning("silent", extra={"peer": self._service, "reason": self._told})
+                    self._lose(error)
                     await asyncio.sleep(RETRY_S)
                 else:
                     self._model.heard(self._service)
@@ -134,6 +128,15 @@ class Poller:
                     await asyncio.sleep(max(0.005, begun + self._poll_s - time.monotonic()))
         finally:
             self._client.close()
+
+    def _lose(self, error: LinkError) -> None:
+        self._client.close()
+        self._checked = False
+        self._journal.connection_lost()
+        self._model.silent(self._service, str(error))
+        if str(error) != self._told:
+            self._told = str(error)
+            log.warning("silent", extra={"peer": self._service, "reason": self._told})
 
     async def _look(self) -> None:
         model, service, client = self._model, self._service, self._client

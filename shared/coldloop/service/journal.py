@@ -190,6 +190,11 @@ OF_ALARMS: Final = frozenset({EventKind.ALARM_RAISED, EventKind.ALARM_RETURNED, 
 SUPPRESSIONS: Final = frozenset(
     {EventKind.ALARM_SHELVED, EventKind.ALARM_UNSHELVED, EventKind.ALARM_OUT_OF_SERVICE, EventKind.ALARM_IN_SERVICE}
 )
+LINK_ALARMS: Final[tuple[int, ...]] = (
+    AlarmKind.PLANT_LOST, AlarmKind.PLANT_OTHER_MASTER, AlarmKind.PLANT_FROZEN, AlarmKind.OUTPUTS_REJECTED,
+    AlarmKind.CLOCK_SKEW,
+)  # fmt: skip
+"""Alarms whose cause is one of the link to the plant."""
 
 
 class _Wording(NamedTuple):
@@ -210,19 +215,22 @@ class _Words:
             number: one.alarm_word or f"{one.name} outside its band"
             for number, one in zip(band_alarms(process), process.banded, strict=True)
         }
-        self.alarm_causes = self._alarm_causes()
-        alarm = _Wording(self.alarm_word)
-        suppression = alarm._replace(cause=lambda _: "")  # that of an alarm that may never have been raised
-        shelving = suppression._replace(unit="s")
-        self.wordings = self._wordings() | {
-            EventKind.ALARM_RAISED: alarm,
-            EventKind.ALARM_RETURNED: alarm,
-            EventKind.ALARM_ACKNOWLEDGED: alarm,
-            EventKind.ALARM_SHELVED: shelving,
-            EventKind.ALARM_UNSHELVED: suppression,
-            EventKind.ALARM_OUT_OF_SERVICE: suppression,
-            EventKind.ALARM_IN_SERVICE: suppression,
+        inputs, outputs = _listed(process.input_names), _listed(process.output_names)
+        self.alarm_causes: dict[int, Words] = dict.fromkeys(LINK_ALARMS, _causes(control_plc.LinkCause)) | {
+            AlarmKind.STATE_NOT_RETAINED: _listed(("", "the previous one was set aside")),
+            AlarmKind.MODE: _causes(control_plc.Cause),
+            AlarmKind.SENSOR_BAD: outputs,
+            AlarmKind.SENSOR_SUSPECT: outputs,
+            AlarmKind.INPUT_WITHOUT_EFFECT: inputs,
+            AlarmKind.CAPACITY: _texts(CapacityCause, CapacityCause.TOO_MUCH),
+            AlarmKind.SEQUENCE_REJECTED: _causes(control_plc.Verdict),
+            AlarmKind.CERTIFICATE: _listed(("", "expires soon", "has expired", "unreadable")),
         }
+        suppression = _Wording(self.alarm_word, cause=lambda _: "")  # of an alarm that may never have been raised
+        self.wordings: dict[int, _Wording] = {
+            **self._wordings(inputs, outputs), **dict.fromkeys(OF_ALARMS, _Wording(self.alarm_word)),
+            **dict.fromkeys(SUPPRESSIONS, suppression), EventKind.ALARM_SHELVED: suppression._replace(unit="s"),
+        }  # fmt: skip
 
     def alarm_word(self, number: int) -> str:
         return self.alarms.get(number, str(number))
@@ -230,8 +238,7 @@ class _Words:
     def _time_out(self, ticks: int) -> str:
         return f"{ticks * self.process.tick_s:g} s" if ticks else "off"
 
-    def _wordings(self) -> dict[int, _Wording]:
-        inputs, outputs = _listed(self.process.input_names), _listed(self.process.output_names)
+    def _wordings(self, inputs: Words, outputs: Words) -> dict[int, _Wording]:
         unit = self.process.load.unit
         return {
             EventKind.MODE: _Wording(control_plc.Mode.word_of, _causes(control_plc.Cause)),
@@ -256,24 +263,6 @@ class _Words:
             EventKind.MODEL_RANGE: _Wording(_listed(flag_words(ModelRange)), _listed(("returned", "left"))),
             EventKind.COOL_DOWN: _Wording(control_plc.CoolDownStep.word_of),
             EventKind.PACE: _Wording(_texts(TimeBaseKind), unit="x real time"),
-        }
-
-    def _alarm_causes(self) -> dict[int, Words]:
-        inputs, outputs = _listed(self.process.input_names), _listed(self.process.output_names)
-        return {
-            AlarmKind.STATE_NOT_RETAINED: _listed(("", "the previous one was set aside")),
-            AlarmKind.MODE: _causes(control_plc.Cause),
-            AlarmKind.SENSOR_BAD: outputs,
-            AlarmKind.SENSOR_SUSPECT: outputs,
-            AlarmKind.INPUT_WITHOUT_EFFECT: inputs,
-            AlarmKind.CAPACITY: _texts(CapacityCause, CapacityCause.TOO_MUCH),
-            AlarmKind.SEQUENCE_REJECTED: _causes(control_plc.Verdict),
-            AlarmKind.PLANT_LOST: _causes(control_plc.LinkCause),
-            AlarmKind.PLANT_OTHER_MASTER: _causes(control_plc.LinkCause),
-            AlarmKind.PLANT_FROZEN: _causes(control_plc.LinkCause),
-            AlarmKind.OUTPUTS_REJECTED: _causes(control_plc.LinkCause),
-            AlarmKind.CLOCK_SKEW: _causes(control_plc.LinkCause),
-            AlarmKind.CERTIFICATE: _listed(("", "expires soon", "has expired", "unreadable")),
         }
 
 
