@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from coldloop import __version__
 from coldloop_rig.plc_sizing.intervals import crossing
 from coldloop_studies import published as paper
 from coldloop_studies.catalogue import STUDIES
@@ -42,6 +43,7 @@ from coldloop_studies.reproduction import (
     findings,
     judge,
     lead,
+    paper_settings,
     paper_values,
     revisions,
     scorecard_table,
@@ -241,6 +243,19 @@ def test_the_line_below_the_title_is_the_programs() -> None:
     assert re.fullmatch(pattern, line)
     kept = (ROOT / "docs" / "report" / "report.md").read_text("utf-8").splitlines()[2]
     assert re.fullmatch(pattern, kept), "the report that is kept has it too"
+
+
+def test_the_report_that_is_kept_is_of_this_version_its_settings_and_its_tolerances() -> None:
+    kept = json.loads((ROOT / "docs" / "report" / "scorecard.json").read_text("utf-8"))
+    again = "make it anew: scripts/reproduce, then report.md, scorecard.json and the pictures into docs/report"
+    title = (ROOT / "docs" / "report" / "report.md").read_text("utf-8").splitlines()[2]
+    assert kept["coldloop"] == __version__, again
+    assert title.startswith(f"Coldloop {__version__}, "), again
+    assert kept["settings"] == json.loads(json.dumps(paper_settings())), again
+    assert (kept["quick"], kept["seeds"]) == (False, None), again
+    present = as_json(judge({}))
+    asked = [{name: one.get(name) for name in Claim.model_fields} for one in kept["claims"]]
+    assert asked == [{name: one.get(name) for name in Claim.model_fields} for one in present], again
 
 
 def test_the_report_that_is_kept_has_the_verdicts_that_its_values_have() -> None:

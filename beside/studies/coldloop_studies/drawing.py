@@ -230,9 +230,11 @@ def hour_panels(
             low, high = place.get_ylim()
             if sum(low <= mark <= high for mark in ticks) > 1:  # else costs that are nearly the same: a linear axis
                 place.set_yscale("log")
-                place.set_yticks(ticks, map(str, ticks))
+                place.autoscale(axis="y")  # the linear limits can lie below 0
+                low, high = place.get_ylim()
+                shown = [mark for mark in ticks if low <= mark <= high]
+                place.set_yticks(shown, map(str, shown))
                 place.minorticks_off()
-                place.set_ylim(max(low, 0.8 * ticks[0]), high)
         legend_outside(figure, axes[0], columns)
         for place in axes[max(0, len(names) - beside) : len(names)]:
             place.set_xlabel("updating period (s)")

@@ -32,6 +32,7 @@ from coldloop_studies.paper.reference_plc import SLOW_DOWN, SPEED
 from coldloop_studies.paper.solver_comparison import measures
 from coldloop_studies.paper.updating_period import is_inside
 from coldloop_studies.results import conduct, section
+from coldloop_studies.settings import settings_of
 from coldloop_studies.study import USUAL_DRAWS, StudyOptions, StudyResult
 
 TOLERANCES: Final = Path(__file__).with_name("tolerances.toml")
@@ -415,13 +416,22 @@ def reproduce(options: StudyOptions, workers: Workers, out: Path) -> tuple[str, 
     with writing(out):
         write_json(
             out / "scorecard.json",
-            {"coldloop": __version__, "seeds": options.seeds, "quick": options.quick, "counts": counts(judged),
-             "claims": as_json(judged)},
+            {"coldloop": __version__, "seeds": options.seeds, "quick": options.quick, "settings": paper_settings(),
+             "counts": counts(judged), "claims": as_json(judged)},
         )  # fmt: skip
         whole_text(out / "report.md", text)
         whole_text(out / "report.html", as_page(TITLE, text, out))
     text = f"{verdict_counts(judged)}; {minutes:.1f} min\nreport in {out / 'report.html'}\n"
     return text, sum(result.failed_runs for result in results.values())
+
+
+def paper_settings() -> dict[str, Any]:
+    """Return limits and program of the optimiser as the studies begin from them: the report holds for these."""
+    settings = settings_of(())
+    return {
+        "limits": settings.limits.model_dump(mode="json"),
+        "optimizer_plc.program": settings.optimizer_plc.program.model_dump(mode="json"),
+    }
 
 
 def _values(results: Mapping[str, StudyResult]) -> dict[str, list[float]]:

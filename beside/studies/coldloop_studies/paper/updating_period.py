@@ -250,7 +250,7 @@ def _figure(first: Mapping[str, _Hour], fresh: Mapping[str, _Hour]) -> Figure:
             place.plot(list(other.fixed), [run.indicators.J_open_mean / scale for run in other.fixed.values()],
                        color=INK, alpha=0.25, linewidth=0.8, label=label)  # fmt: skip
 
-    return hour_panels(list(first), draw, "cost (% of the worst)", (20, 30, 50, 70, 100), 3)
+    return hour_panels(list(first), draw, "cost (% of the worst)", (5, 10, 20, 30, 50, 75, 100), 3)
 
 
 def _table(title: str, hours: Mapping[str, _Hour]) -> str:
