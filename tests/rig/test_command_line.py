@@ -23,7 +23,7 @@ from coldloop_rig.cli.commands import options
 from coldloop_rig.cli.commands.rig import COMMANDS as RIG_COMMANDS
 from coldloop_rig.cli.registers import EXPORTS, FORMATS
 from coldloop_studies import commands
-from coldloop_studies.catalogue import APART, STUDIES
+from coldloop_studies.reproduction import APART, STUDIES
 from tests.harness.installed import installed
 from tests.harness.processes import Ended, Processes
 from tests.harness.records import MAPS

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop_studies.catalogue import APART, STUDIES
+from coldloop_studies.reproduction import APART, STUDIES
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop

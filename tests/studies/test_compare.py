@@ -10,7 +10,7 @@ import pytest
 
 from coldloop.errors import ColdloopError
 from coldloop_optimizer_plc.computing_settings import OutsideSettings
-from coldloop_studies.beyond.any_process import CompareStudy
+from coldloop_studies.any_process import CompareStudy
 from coldloop_studies.settings import _digest, outside_digests
 from coldloop_studies.study import StudyOptions, read_variants
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop_studies.beyond.contest import REFERENCE, SOLVERS, WAYS, ContestStudy
+from coldloop_studies.controllers import REFERENCE, SOLVERS, WAYS, ContestStudy
 from coldloop_studies.request import Outcome, RunRequest
 from coldloop_studies.settings import settings_of
 from coldloop_studies.study import StudyOptions

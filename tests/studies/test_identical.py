@@ -14,8 +14,8 @@ from coldloop_studies.execution import (
     perform_all,
     same_run,
 )
-from coldloop_studies.paper.solver_comparison import throttled
 from coldloop_studies.request import Outcome, RunRequest, perform
+from coldloop_studies.solver_comparison import throttled
 from coldloop_studies.study import Load, StudyOptions, draw_of
 
 if TYPE_CHECKING:

@@ -11,19 +11,19 @@ from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind
-from coldloop_studies.beyond.refrigerator import PLANTS
-from coldloop_studies.catalogue import STUDIES
-from coldloop_studies.paper.reference_plc import SLOW_DOWN, SPEED
-from coldloop_studies.paper.solver_comparison import measures
-from coldloop_studies.paper.trajectories import (
+from coldloop_studies.reference_plc import SLOW_DOWN, SPEED
+from coldloop_studies.refrigerator import PLANTS
+from coldloop_studies.reproduction import STUDIES
+from coldloop_studies.request import Happening
+from coldloop_studies.solver_comparison import measures
+from coldloop_studies.study import Load, Outcomes, StudyOptions, StudyResult
+from coldloop_studies.trajectories import (
     furthest_outside,
     iterations_by_event,
     load_steps,
     share_falling,
     won_and_lost,
 )
-from coldloop_studies.request import Happening
-from coldloop_studies.study import Load, Outcomes, StudyOptions, StudyResult
 
 if TYPE_CHECKING:
     from coldloop_studies.request import Outcome

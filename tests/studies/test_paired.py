@@ -18,7 +18,6 @@ from coldloop_optimizer_plc.settings import ControlDesign, Preset, ProgramSettin
 from coldloop_optimizer_plc.solvers import make_solver
 from coldloop_plant.load import find_load
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_studies.catalogue import STUDIES
 from coldloop_studies.paired_run import (
     PlayedProfiles,
     ProblemSequence,
@@ -28,8 +27,9 @@ from coldloop_studies.paired_run import (
     paired_run,
     problem_sequence,
 )
-from coldloop_studies.paired_sums import watch
-from coldloop_studies.paper.solver_comparison import (
+from coldloop_studies.reproduction import STUDIES
+from coldloop_studies.request import Outcome, perform
+from coldloop_studies.solver_comparison import (
     LABELS,
     harsh_request,
     harsh_table,
@@ -38,8 +38,8 @@ from coldloop_studies.paper.solver_comparison import (
     open_loop_table,
     paired_request,
     powers_of,
+    watch,
 )
-from coldloop_studies.request import Outcome, perform
 from coldloop_studies.study import StudyOptions, draw_of
 
 if TYPE_CHECKING:
@@ -258,11 +258,11 @@ def test_a_request_gives_the_problems_and_no_trace() -> None:
 
 def test_a_profile_below_the_optimum_ends_the_study(made_up: "MakeOutcome") -> None:
     run = made_up({"lowest": [1.0, 100.0]})
-    watch(run, "lowest", np.array([1.0 - 1e-10, 100.0 - 1e-8]), "rounding")
+    watch(run, np.array([1.0 - 1e-10, 100.0 - 1e-8]), "rounding")
     with pytest.raises(
         StudyError, match=r"^ode at P = 1: problem 1 costs 99.9, less than the optimum of 100; "
     ) as caught:
-        watch(run, "lowest", np.array([1.0, 99.9]), "ode at P = 1")
+        watch(run, np.array([1.0, 99.9]), "ode at P = 1")
     assert "\n" not in str(caught.value)
 
 

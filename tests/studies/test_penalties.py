@@ -9,7 +9,7 @@ import pytest
 
 from coldloop.errors import StudyError
 from coldloop.process.load_profile import LoadProfile
-from coldloop_studies.beyond.penalties import (
+from coldloop_studies.penalties import (
     FIRST,
     OWN,
     PRESETS,
@@ -24,11 +24,11 @@ from coldloop_studies.beyond.penalties import (
     powers_of,
     share_inside,
 )
-from coldloop_studies.paper.solver_comparison import paired_loads
-from coldloop_studies.paper.updating_period import is_inside
 from coldloop_studies.request import Outcome, RunRequest
 from coldloop_studies.settings import settings_of
+from coldloop_studies.solver_comparison import paired_loads
 from coldloop_studies.study import Load, StudyOptions, first_and_fresh
+from coldloop_studies.updating_period import is_inside
 from tests.studies.conftest import NOTHING
 
 if TYPE_CHECKING:

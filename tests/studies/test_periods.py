@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from coldloop.errors import StudyError
-from coldloop_studies.beyond.any_process import judged
+from coldloop_studies.any_process import judged
 
 COSTS = np.array(
     [

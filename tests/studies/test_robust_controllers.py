@@ -5,7 +5,7 @@ import pytest
 
 from coldloop.config import load_configuration
 from coldloop_rig.settings import Settings
-from coldloop_studies.beyond.robustness import (
+from coldloop_studies.controllers import (
     CONTROLLER_CONDITIONS,
     CONTROLLERS,
     DEFAULT,

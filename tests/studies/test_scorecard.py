@@ -18,14 +18,12 @@ from pydantic import ValidationError
 
 from coldloop import __version__
 from coldloop_rig.plc_sizing.intervals import crossing
-from coldloop_studies import published as paper
-from coldloop_studies.catalogue import STUDIES
-from coldloop_studies.paper.solver_comparison import measures
-from coldloop_studies.paper.trajectories import response
+from coldloop_studies.drawing import published_comparison, published_periods
 from coldloop_studies.reproduction import (
     EXPLANATIONS,
     FROM_POINTS,
     PLACEHOLDER,
+    STUDIES,
     TOLERANCES,
     Claim,
     ClaimKind,
@@ -51,7 +49,9 @@ from coldloop_studies.reproduction import (
     verdict_counts,
     withdrawn,
 )
+from coldloop_studies.solver_comparison import measures
 from coldloop_studies.study import StudyOptions
+from coldloop_studies.trajectories import response
 
 ROOT = Path(__file__).parents[2]
 FIRST = Path(__file__).with_name("tolerances-before-the-first-report.toml")
@@ -386,6 +386,6 @@ def test_the_page_holds_its_pictures_and_colours_its_verdicts(tmp_path: Path) ->
 
 
 def test_the_points_are_whole() -> None:
-    comparison = paper.solver_comparison()
+    comparison = published_comparison()
     assert {solver: len(points["J_BF"]) for solver, points in comparison.items()} == {"ode": 18, "qpoases": 18}
-    assert [len(points["tau_u_s"]) for points in paper.updating_period().values()] == [9] * 6
+    assert [len(points["tau_u_s"]) for points in published_periods().values()] == [9] * 6

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop_studies.catalogue import STUDIES
-from coldloop_studies.paper.trajectories import held_periods, response, response_table
-from coldloop_studies.paper.updating_period import FEW, POLICIES
+from coldloop_studies.reproduction import STUDIES
 from coldloop_studies.study import StudyOptions
+from coldloop_studies.trajectories import held_periods, response, response_table
+from coldloop_studies.updating_period import FEW, POLICIES
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -1,1 +1,1 @@
-"""Studies: questions that take many runs; `catalogue.py` has them by name, and `study.py` says what a study is."""
+"""Studies: questions that take many runs; `reproduction.py` has them by name, and `study.py` says what a study is."""

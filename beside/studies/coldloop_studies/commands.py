@@ -96,10 +96,9 @@ def execute_study(options: argparse.Namespace) -> int:
         raise UsageError("study compare: name the file of the variants with --variants (`coldloop docs compare`)")
     for name in options.load:
         check_load(name)
-    from coldloop_studies.catalogue import APART
-    from coldloop_studies.catalogue import STUDIES as REPORTED
+    from coldloop_studies import reproduction
 
-    everything = {**REPORTED, **APART}
+    everything = {**reproduction.STUDIES, **reproduction.APART}
     if options.list or options.name is None:
         for name, study in everything.items():
             sys.stdout.write(f"{name:18} {study.title}\n")

@@ -1,8 +1,13 @@
-"""Drawing of the figures of studies."""
+"""Figures of studies, and the points of the paper's figures, as far as its source holds them.
 
+Those of the PLC's speed are in `coldloop_rig.plc_sizing.plc`.
+"""
+
+import csv
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Final, Literal
 
@@ -10,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from coldloop.number_text import ends_text
 from coldloop.process.cold_box import SAMPLING_PERIOD_S, TICK_S
@@ -89,10 +94,6 @@ PANELS: Final = (
 )  # fmt: skip
 
 
-LIMITED: Final = ("L1", "T5", "CV155", "NCR22_A", "CV156")
-"""Series with a band, or with bounds."""
-
-
 def time_panels(outcomes: Sequence[tuple[str, Outcome]], bands: Sequence[tuple[float, float]]) -> Figure:
     """Draw load, cost, constrained outputs, inputs, iterations and updating period of runs under one load.
 
@@ -112,7 +113,8 @@ def time_panels(outcomes: Sequence[tuple[str, Outcome]], bands: Sequence[tuple[f
         place["load"].plot(first.series("time_s") / 3600, first.series("load"), color=INK, linewidth=0.9, label="load")
         limits = InputLimits()
         edges = [*bands, *zip(limits.low, limits.high, strict=True)]
-        for name, edge, what in zip(LIMITED, edges, ("band", "band", "bounds", "bounds", "bounds"), strict=True):
+        limited = ("L1", "band"), ("T5", "band"), ("CV155", "bounds"), ("NCR22_A", "bounds"), ("CV156", "bounds")
+        for (name, what), edge in zip(limited, edges, strict=True):
             together = np.concatenate([outcome.series(name) for _, outcome in outcomes])
             limit(place[name], together, edge, f"{what} {ends_text(*edge)}")
         place["cost"].set_yscale("log")
@@ -199,6 +201,31 @@ def ratio_rows(
         figure.supxlabel(textwrap.fill(label, 44), fontsize=8)
         legend_outside(figure, place, columns)
     return figure
+
+
+def _published(name: str, key: str) -> dict[str, dict[str, NDArray[np.float64]]]:
+    """Return the numeric columns of a file, by the value of the column `key`."""
+    with (Path(__file__).with_name("published") / name).open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))  # noqa: TID251 ours
+    groups: dict[str, list[dict[str, str]]] = {}
+    for row in rows:
+        groups.setdefault(row.pop(key), []).append(row)
+    return {
+        group: {column: np.array([float(row[column]) for row in members]) for column in members[0]}
+        for group, members in groups.items()
+    }
+
+
+@cache
+def published_comparison() -> Mapping[str, Mapping[str, NDArray[np.float64]]]:
+    """Return normalized_power, J_dev, J_cst, J_total, c1, c2 and J_BF of `ode` and `qpoases` (figure `solv_cmp`)."""
+    return _published("fig_solver_comparison.csv", "solver")
+
+
+@cache
+def published_periods() -> Mapping[str, Mapping[str, NDArray[np.float64]]]:
+    """Return tau_u_s, cost_fixed_pct and cost_adaptive_pct of the scenarios a to f (figure `tu_opt`)."""
+    return _published("fig_updating_period.csv", "scenario")
 
 
 LEAST_DRAWN: Final = 1e-5

@@ -77,28 +77,22 @@ def judged(settings: Settings, names: Sequence[str], done: Callable[[int, int], 
     Raises:
         StudyError: The loop costs nothing.
     """
-    sets, found = candidates(settings.optimizer_plc.program.design), list[Judged]()
+    sets, ticks = candidates(settings.optimizer_plc.program.design), settings.process.ticks_per_sample
+    found: list[Judged] = []
     for number, (label, design) in enumerate(sets.items()):
         done(number, len(sets))
-        found.append(_judged(settings.with_program(design=design), label, names, found[0].flops if found else None))
+        tried = settings.with_program(design=design)
+        program, (problem, prediction) = tried.optimizer_plc.program, problem_of(tried)
+        flops = SOLVERS[program.solver].operations(counted_sizes(problem)[1]).flops
+        plc = PlcBudget(program.budget, program.iteration_s * flops / (found[0].flops if found else flops))
+        costs = tuple(loop_cost(tried, name, ADAPTIVE, partial(run_ideal_loop, tried, ticks=ticks)) for name in names)
+        require_costs(costs)
+        condition = float(np.linalg.cond(problem.Phi.astype(float)))
+        memory = footprint(problem, estimator_memory(prediction, program.estimator), program.solver).total
+        iterations = plc.iterations(ticks) if plc.is_enough(ticks) else 0
+        rows = len(problem.Gamma)
+        found.append(Judged(label, design, problem.size, rows, condition, flops, memory, iterations, costs))
     return found
-
-
-def _judged(settings: Settings, label: str, names: Sequence[str], configured: float | None) -> Judged:
-    """Return a set with what it costs; `configured`: operations of an iteration with the configured one, if not it."""
-    program = settings.optimizer_plc.program
-    problem, prediction = problem_of(settings)
-    ticks = settings.process.ticks_per_sample
-    run = partial(run_ideal_loop, settings, ticks=ticks)
-    flops = SOLVERS[program.solver].operations(counted_sizes(problem)[1]).flops
-    plc = PlcBudget(program.budget, program.iteration_s * flops / (configured or flops))
-    costs = tuple(loop_cost(settings, name, ADAPTIVE, run) for name in names)
-    require_costs(costs)
-    return Judged(
-        label, program.design, problem.size, len(problem.Gamma), float(np.linalg.cond(problem.Phi.astype(float))),
-        flops, footprint(problem, estimator_memory(prediction, program.estimator), program.solver).total,
-        plc.iterations(ticks) if plc.is_enough(ticks) else 0, costs,
-    )  # fmt: skip
 
 
 def losses(found: Sequence[Judged]) -> list[float]:
@@ -146,14 +140,8 @@ def drawn(found: Sequence[Judged], names: Sequence[str]) -> Figure:
         for name, colour, cost, fullest in zip(
             names, COLOURS, zip(*(one.costs for one in sets), strict=True), found[-1].costs, strict=False
         ):
-            loss.plot(
-                sizes,
-                [each / fullest for each in cost],
-                color=colour,
-                linestyle=DASHES[colour],
-                marker=".",
-                label=f"load {name}",
-            )
+            loss.plot(sizes, np.divide(cost, fullest), color=colour, linestyle=DASHES[colour], marker=".",
+                      label=f"load {name}")  # fmt: skip
         loss.axhline(ENOUGH, color=INK, linewidth=0.8, linestyle=":", label=f"small enough, {ENOUGH:g}")
         iterations.plot(sizes, [one.iterations for one in sets], color=COLOURS[0], marker=".")
         lost = dict(zip([one.label for one in found], losses(found), strict=True))

@@ -1,4 +1,4 @@
-"""The reproduction of the paper: every study, each claim with its tolerance and verdict, and the report of it all."""
+"""All studies by name, and the reproduction of the paper: claims with tolerance and verdict, and the report."""
 
 import base64
 import html
@@ -25,15 +25,29 @@ from coldloop_rig.plc_sizing.operations import dense_cholesky
 from coldloop_rig.plc_sizing.plc import cholesky_times
 from coldloop_rig.results.folders import write_json, writing
 from coldloop_rig.text_tables import markdown_table
-from coldloop_studies import published as paper
-from coldloop_studies.catalogue import STUDIES
+from coldloop_studies.any_process import CompareStudy, PeriodsStudy
+from coldloop_studies.controllers import ClassicalStudy, ContestStudy, RobustnessStudy
+from coldloop_studies.drawing import published_comparison, published_periods
 from coldloop_studies.execution import Workers
-from coldloop_studies.paper.reference_plc import SLOW_DOWN, SPEED
-from coldloop_studies.paper.solver_comparison import measures
-from coldloop_studies.paper.updating_period import is_inside
+from coldloop_studies.penalties import PenaltiesStudy
+from coldloop_studies.reference_plc import SLOW_DOWN, SPEED, CholeskyStudy, SinglePrecision
+from coldloop_studies.refrigerator import CouplingStudy, DisturbancesStudy
 from coldloop_studies.results import conduct, section
 from coldloop_studies.settings import settings_of
-from coldloop_studies.study import USUAL_DRAWS, StudyOptions, StudyResult
+from coldloop_studies.solver_comparison import SolverComparison, measures
+from coldloop_studies.study import USUAL_DRAWS, Study, StudyOptions, StudyResult
+from coldloop_studies.trajectories import BUS, COURSES, TradeOff
+from coldloop_studies.updating_period import UpdatingPeriodStudy, is_inside
+
+_REPORTED: Final[tuple[Study, ...]] = (
+    CholeskyStudy(), *COURSES[:2], SolverComparison(), COURSES[2], UpdatingPeriodStudy(), *BUS, TradeOff(),
+    ClassicalStudy(), SinglePrecision(), CouplingStudy(), DisturbancesStudy(),
+)  # fmt: skip
+STUDIES: Final = {study.name: study for study in _REPORTED}
+"""Studies of the report, in the order of the paper."""
+_APART: Final[tuple[Study, ...]] = (RobustnessStudy(), ContestStudy(), PenaltiesStudy(), PeriodsStudy(), CompareStudy())
+APART: Final = {study.name: study for study in _APART}
+"""Studies that are too long for the report."""
 
 TOLERANCES: Final = Path(__file__).with_name("tolerances.toml")
 FROM_POINTS: Final = "points"
@@ -126,6 +140,11 @@ class Judged(NamedTuple):
 
 
 @cache
+def _document() -> dict[str, Any]:
+    return parsed_toml(TOLERANCES.read_text(encoding="utf-8"))
+
+
+@cache
 def claims() -> tuple[Claim, ...]:
     """Return all claims, in the order of the paper."""
     return tuple(Claim.model_validate(one) for one in _document()["claim"])
@@ -135,10 +154,6 @@ def claims() -> tuple[Claim, ...]:
 def withdrawn() -> tuple[Revision, ...]:
     """Return what was claimed in an earlier report."""
     return tuple(Revision.model_validate(one) for one in _document()["withdrawn"])
-
-
-def _document() -> dict[str, Any]:
-    return parsed_toml(TOLERANCES.read_text(encoding="utf-8"))
 
 
 def judge(values: Mapping[str, Sequence[float]]) -> list[Judged]:
@@ -178,7 +193,7 @@ def _within(limits: tuple[float, float], *values: float) -> bool:
 @cache
 def paper_values() -> Mapping[str, float]:
     """Return what the points of the paper's figures give, by the formulas that ours are computed with."""
-    comparison = paper.solver_comparison()
+    comparison = published_comparison()
     powers = comparison["ode"]["normalized_power"]
     values = measures(powers, comparison)
     closed = {solver: points["J_BF"] for solver, points in comparison.items()}
@@ -186,11 +201,15 @@ def paper_values() -> Mapping[str, float]:
     values["limited: J_BF"] = float(closed["qpoases"][one] / closed["qpoases"][-1])
     values["trajectories: J_BF"] = float(closed["ode"][one] / closed["qpoases"][-1])
     values["trajectories: J_BF of qpOASES over ODE"] = float(closed["qpoases"][one] / closed["ode"][one])
-    return {**values, **_updating_period(), **_cholesky()}
+    size, plc_s, laptop_s = cholesky_times()
+    speed = np.array([dense_cholesky(n).flops for n in size.tolist()]) / plc_s / 1e6
+    values[SPEED] = float(speed[size >= 50].mean())
+    values[SLOW_DOWN] = float((plc_s / laptop_s)[size >= 40].mean())
+    return {**values, **_updating_period()}
 
 
 def _updating_period() -> dict[str, float]:
-    hours = list(paper.updating_period().values())
+    hours = list(published_periods().values())
     fixed = np.array([hour["cost_fixed_pct"] for hour in hours])
     adaptive = np.array([hour["cost_adaptive_pct"][0] for hour in hours])
     best = fixed.min(axis=1)
@@ -206,12 +225,6 @@ def _updating_period() -> dict[str, float]:
         f"within 2 % of the best fixed period, share: {literal}": float((adaptive <= 1.02 * best).mean()),
         f"cost over that of the best fixed period, geometric mean: {literal}": geometric_mean(adaptive / best),
     }
-
-
-def _cholesky() -> dict[str, float]:
-    size, plc_s, laptop_s = cholesky_times()
-    speed = np.array([dense_cholesky(n).flops for n in size.tolist()]) / plc_s / 1e6
-    return {SPEED: float(speed[size >= 50].mean()), SLOW_DOWN: float((plc_s / laptop_s)[size >= 40].mean())}
 
 
 def counted(judged: Sequence[Judged]) -> list[Judged]:
@@ -241,18 +254,14 @@ def as_json(judged: Sequence[Judged]) -> list[dict[str, Any]]:
     return [
         {
             **j.claim.model_dump(mode="json", exclude={"reproduced", "partly"}),
-            "reproduced": _plain(j.claim.reproduced),
-            "partly": _plain(j.claim.partly),
+            **{name: limits and [limit if math.isfinite(limit) else None for limit in limits]
+               for name, limits in (("reproduced", j.claim.reproduced), ("partly", j.claim.partly))},
             "paper": j.of_paper,
             "values": [value if math.isfinite(value) else None for value in j.values],
             "verdict": j.verdict,
         }
         for j in judged
-    ]
-
-
-def _plain(limits: tuple[float, float] | None) -> list[float | None] | None:
-    return [limit if math.isfinite(limit) else None for limit in limits] if limits else None
+    ]  # fmt: skip
 
 
 STYLE: Final = """
@@ -277,11 +286,12 @@ def verdict_counts(judged: Sequence[Judged]) -> str:
 def scorecard_table(judged: Sequence[Judged], commands: Mapping[str, str]) -> str:
     """Return a row for each claim; `commands` says how each study is repeated."""
     header = ("figure", "claim", "paper's value", "ours", "tolerance and why", "verdict", "command")
-    rows = [
-        (j.claim.figure, f"{j.claim.says}<br>*{j.claim.value}*{_marks(j.claim)}", _of_paper(j), _ours(j),
-         _tolerance(j.claim), j.verdict, f"`{commands[j.claim.study]}`")
-        for j in judged
-    ]  # fmt: skip
+    rows = []
+    for j in judged:
+        mark = f"<br>**calibrated**: {j.claim.calibrated}" if j.claim.calibrated else ""
+        said = f"{j.claim.says}<br>*{j.claim.value}*{mark}"
+        command = f"`{commands[j.claim.study]}`"
+        rows.append((j.claim.figure, said, _of_paper(j), _ours(j), _tolerance(j.claim), j.verdict, command))
     return markdown_table(header, rows)
 
 
@@ -300,12 +310,12 @@ PLACEHOLDER: Final = re.compile(r"\{([^{}]+)\}")
 
 def explained(text: str, values: Mapping[str, Sequence[float]]) -> str:
     """Return an explanation with the means of the values that it names; what was not run is said to be so."""
-    return PLACEHOLDER.sub(lambda found: _mean(values.get(found[1], ())), text)
 
+    def mean(found: re.Match[str]) -> str:
+        there = [value for value in values.get(found[1], ()) if math.isfinite(value)]
+        return _number(sum(there) / len(there)) if there else "(not run)"
 
-def _mean(values: Sequence[float]) -> str:
-    there = [value for value in values if math.isfinite(value)]
-    return _number(sum(there) / len(there)) if there else "(not run)"
+    return PLACEHOLDER.sub(mean, text)
 
 
 def deviations(judged: Sequence[Judged], explanations: Mapping[str, str], values: Mapping[str, Sequence[float]]) -> str:
@@ -317,11 +327,6 @@ def deviations(judged: Sequence[Judged], explanations: Mapping[str, str], values
             lines.append(f"- **{j.verdict}: {j.claim.value}** ({j.claim.figure}): ours {_ours(j)}, "
                          f"paper {_of_paper(j)}. {why}")  # fmt: skip
     return "\n".join(lines) or "Everything that has data in the paper is reproduced."
-
-
-def _marks(claim: Claim) -> str:
-    """Return what a reader must know of a claim before its verdict."""
-    return f"<br>**calibrated**: {claim.calibrated}" if claim.calibrated else ""
 
 
 def revisions(some: Sequence[Revision]) -> str:
@@ -370,17 +375,18 @@ def _tolerance(claim: Claim) -> str:
 def as_page(title: str, markdown: str, folder: Path) -> str:
     """Return a report as one HTML page; its pictures are looked for in `folder`."""
     body = MarkdownIt("commonmark", {"html": True}).enable("table").render(markdown)
-    body = re.sub(r'<img src="([^"]+)"', lambda match: f'<img src="{_embedded(folder / match[1])}"', body)
+
+    def embedded(picture: re.Match[str]) -> str:
+        content = base64.b64encode((folder / picture[1]).read_bytes()).decode()
+        return f'<img src="data:image/png;base64,{content}"'
+
+    body = re.sub(r'<img src="([^"]+)"', embedded, body)
     for verdict in ClaimVerdict:
         body = body.replace(f"<td>{verdict}</td>", f'<td class="{verdict.replace(" ", "-")}">{verdict}</td>')
     head = (
         f'<meta charset="utf-8"><title>{html.escape(title)}</title><meta name="viewport" content="width=device-width">'
     )
     return f'<!doctype html>\n<html lang="en"><head>{head}<style>{STYLE}</style></head>\n<body>\n{body}</body></html>\n'
-
-
-def _embedded(picture: Path) -> str:
-    return f"data:image/png;base64,{base64.b64encode(picture.read_bytes()).decode()}"
 
 
 EXPLANATIONS = TOLERANCES.with_name("explanations.toml")
@@ -440,16 +446,13 @@ def _values(results: Mapping[str, StudyResult]) -> dict[str, list[float]]:
 
 def circumstances(options: StudyOptions, effort: str) -> str:
     """Return the generated line below the title."""
+    draws = f"{USUAL_DRAWS} draws of each load, where a study has no other number"
+    if options.quick or options.seeds:
+        draws = f"{len(options.draws)} draw(s) of each load"
     return (
         f"Coldloop {__version__}, Python {platform.python_version()}, {datetime.now(UTC):%Y-%m-%d}; "
-        f"{_draws(options)}; {effort}, what was kept from before included."
+        f"{draws}; {effort}, what was kept from before included."
     )
-
-
-def _draws(options: StudyOptions) -> str:
-    if options.quick or options.seeds:
-        return f"{len(options.draws)} draw(s) of each load"
-    return f"{USUAL_DRAWS} draws of each load, where a study has no other number"
 
 
 def lead(judged: Sequence[Judged]) -> str:

@@ -40,14 +40,6 @@ def conduct(study: Study, options: StudyOptions, workers: Workers, folder: Path)
     outcomes = perform_all(requests, Store(folder / RUNS), workers, study.name)
     result = study.evaluate(options, outcomes)
     result.failed_runs = sum(outcome.failed_updates > 0 for outcome in outcomes.values())
-    with writing(folder / study.name):
-        _write(study, result, folder / study.name)
-        write_json(folder / study.name / "manifest.json", _manifest(study, options, requests))
-    return result
-
-
-def _manifest(study: Study, options: StudyOptions, requests: Sequence[RunRequest]) -> dict[str, Any]:
-    """Return what the study was: versions, options, and its runs, each with the name of its file in `runs`."""
     outside: dict[str, str] = {}
     for assignments in {request.assignments for request in requests}:
         outside |= outside_digests(settings_of(assignments).optimizer_plc.program.outside)
@@ -59,11 +51,15 @@ def _manifest(study: Study, options: StudyOptions, requests: Sequence[RunRequest
         }
         for request in requests
     ]  # fmt: skip
-    return {
+    manifest = {
         "study": study.name, "coldloop": __version__, "python": platform.python_version(),
         "dependencies": {name: installed_version(name) for name in LIBRARIES}, "programs": programs_digest(),
         "outside": outside, "options": asdict(options), "runs": runs,
     }  # fmt: skip
+    with writing(folder / study.name):
+        _write(study, result, folder / study.name)
+        write_json(folder / study.name / "manifest.json", manifest)
+    return result
 
 
 def _write(study: Study, result: StudyResult, folder: Path) -> None:
@@ -158,10 +154,9 @@ def conduct_shard(study: Study, options: StudyOptions, workers: Workers, folder:
         ColdloopError: A run failed, or a file cannot be written.
     """
     requests = checked_requests(study, options, folder)
-    record = ShardRecord.of_study(study, options, shard)
     path = folder / study.name / f"shard-{shard.number}-of-{shard.of}.json"
     with writing(path):
-        write_json(path, record.model_dump())
+        write_json(path, ShardRecord.of_study(study, options, shard).model_dump())
     mine = shard.part(requests)
     perform_all(mine, Store(folder / RUNS), workers, f"{study.name} {shard}")
     return len(mine)

@@ -175,6 +175,11 @@ class StudyResult:
         """Add the value of one more draw."""
         self.values.setdefault(claim, []).append(float(value))
 
+    def note_all(self, values: Mapping[str, float]) -> None:
+        """Add the values of one more draw."""
+        for claim, value in values.items():
+            self.note(claim, value)
+
 
 class Study(Protocol):
     """A question, its runs, and its answer."""

@@ -16,13 +16,12 @@ from coldloop_plant.load import HOUR_TICKS
 from coldloop_rig.figures.plot import ACCENT, DASHES, INK, THIRD
 from coldloop_rig.plc_sizing.intervals import Interval, crossing, interval_of_share, jackknife, mean_ratio
 from coldloop_rig.text_tables import Cell, markdown_table
-from coldloop_studies import published
-from coldloop_studies.drawing import LEAST_DRAWN, above_lowest, hour_panels, legend_outside, panels, paper
-from coldloop_studies.paired_sums import PairedSums
-from coldloop_studies.paper.solver_comparison import paired_loads, paired_request, throttled
-from coldloop_studies.paper.updating_period import FEW, NINE, is_inside
-from coldloop_studies.request import Procedure, RunRequest, Series
+from coldloop_studies import drawing
+from coldloop_studies.drawing import above_lowest, hour_panels, legend_outside, panels, paper
+from coldloop_studies.request import RunRequest, Series
+from coldloop_studies.solver_comparison import PairedSums, paired_loads, paired_request, throttled
 from coldloop_studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, first_and_fresh, loads
+from coldloop_studies.updating_period import FEW, NINE, is_inside
 
 TUNED: Final = "tuned"
 AS_PRINTED: Final = Preset.AS_PRINTED.value
@@ -55,6 +54,7 @@ class PenaltyVariant(NamedTuple):
 Paired = PairedSums[PenaltyVariant | None]
 
 QPOASES: Final = "qpOASES"
+COLOURS: Final = {QPOASES: "#000000", TUNED: INK, AS_PRINTED: ACCENT}
 COST_SCALE: Final = "cost_scale"
 TIMED: Final = (f"{COST_SCALE} 0.0001", f"{COST_SCALE} 1e-08")
 """Starts whose best periods are looked for: that of the other preset."""
@@ -78,25 +78,18 @@ OWN: Final = {
 """Changes that each preset contains itself. A test compares them with the presets."""
 
 
-def _preset(preset: str) -> tuple[str, ...]:
-    """Return what asks for it; studies set out from the tuned one."""
-    return () if preset == TUNED else (f"{PROGRAM}preset={preset}",)
+def _variants_of(preset: str) -> Iterator[PenaltyVariant]:
+    """Yield a preset, then its changes; studies set out from the tuned one."""
+    asked = () if preset == TUNED else (f"{PROGRAM}preset={preset}",)
+    yield PenaltyVariant(preset, "", asked)
+    for change, assignment in CHANGES.items():
+        if change not in OWN[preset]:
+            yield PenaltyVariant(preset, change, (*asked, PROGRAM + assignment))
 
 
-PRESETS: Final = {preset: PenaltyVariant(preset, "", _preset(preset)) for preset in OWN}
-VARIANTS: Final = tuple(
-    variant
-    for preset in OWN
-    for variant in (
-        PRESETS[preset],
-        *(
-            PenaltyVariant(preset, change, (*_preset(preset), PROGRAM + assignment))
-            for change, assignment in CHANGES.items()
-            if change not in OWN[preset]
-        ),
-    )
-)
-
+PRESETS: Final = {preset: next(_variants_of(preset)) for preset in OWN}
+VARIANTS: Final = tuple(variant for preset in OWN for variant in _variants_of(preset))
+NOMINAL: Final = 1.0
 SETTLED: Final = 10.0
 """Computing power, over that of the reference PLC, at which a solver has converged."""
 START_POWERS: Final = (0.2, 0.4, 0.6, 1.0)
@@ -121,15 +114,12 @@ def powers_of(variant: PenaltyVariant | None, options: StudyOptions) -> tuple[fl
     return (1.0,)  # all else has an effect on few iterations, and none on the optimum
 
 
-def _with(request: RunRequest, variant: PenaltyVariant) -> RunRequest:
-    return replace(request, assignments=(*request.assignments, *variant.assignments))
-
-
 def paired(load: Load, variant: PenaltyVariant | None, power: float) -> RunRequest:
     """Return the request for a variant, or for qpOASES, on the problems of a load."""
     if variant is None:
         return paired_request(load, "qpoases", power)
-    return _with(throttled(load, "ode", power, procedure=Procedure.PAIRED_PROBLEMS), variant)
+    request = paired_request(load, "ode", power)
+    return replace(request, assignments=(*request.assignments, *variant.assignments))
 
 
 def paired_sums(options: StudyOptions, outcomes: Outcomes) -> Paired:
@@ -150,7 +140,8 @@ def _closed_loads(options: StudyOptions) -> list[Load]:
 
 def closed(load: Load, variant: PenaltyVariant) -> RunRequest:
     """Return the request for the closed loop of a variant at 5 s and P = 1."""
-    return _with(throttled(load, "ode", 1.0), variant)
+    request = throttled(load, "ode", NOMINAL)
+    return replace(request, assignments=(*request.assignments, *variant.assignments))
 
 
 def hours(options: StudyOptions) -> list[Load]:
@@ -167,15 +158,8 @@ def _timed_variants(load: Load, options: StudyOptions) -> list[PenaltyVariant]:
     return [one for one in variants(options) if one.is_timed and (not one.change or load.draw == 1)]
 
 
-def requests(options: StudyOptions) -> Iterator[RunRequest]:
-    """Yield all requests, load by load: a worker has the problems of a load at hand."""
-    for load in paired_loads(options):
-        for variant in (None, *variants(options)):
-            yield from (paired(load, variant, power) for power in powers_of(variant, options))
-    yield from (closed(load, variant) for variant in variants(options) for load in _closed_loads(options))
-    for load in hours(options):
-        for variant in _timed_variants(load, options):
-            yield from (load.request(period, *variant.assignments) for period in periods(options))
+def _period_runs(load: Load, variant: PenaltyVariant, options: StudyOptions) -> list[RunRequest]:
+    return [load.request(period, *variant.assignments) for period in periods(options)]
 
 
 FIRST: Final = "hours of the first draw"
@@ -184,9 +168,10 @@ PeriodCosts = dict[Load, Mapping[str, Series]]
 """Costs of the periods, by hour and kind of cost."""
 
 
-def table_of(costs: PeriodCosts, some: Sequence[Load], cost: str) -> Series:
-    """Return the costs of the periods in some hours, shape (hours, periods)."""
-    return np.array([costs[load][cost] for load in some])
+def _hours_by_title(costs: PeriodCosts, cost: str) -> dict[str, Series]:
+    """Return the costs of the periods in first and in fresh hours, shape (hours, periods) each."""
+    groups = first_and_fresh(costs, FIRST).items()
+    return {title: np.array([costs[load][cost] for load in some]) for title, some in groups}
 
 
 def share_inside(table: Series) -> Interval:
@@ -199,22 +184,14 @@ def end_over_best(table: Series, end: int) -> Interval:
     return mean_ratio(table[:, end], table.min(axis=1))
 
 
-def _period_values(preset: str, costs: PeriodCosts) -> dict[str, list[float]]:
-    return {
-        f"{preset}: interior optimum, share of {title}, {name}": [share_inside(table_of(costs, some, cost)).value]
-        for title, some in first_and_fresh(costs, FIRST).items()
-        for cost, name in COSTS.items()
-    }
-
-
 def _period_remarks(timed: Mapping[PenaltyVariant, PeriodCosts], periods: Sequence[float]) -> list[str]:
-    theirs = np.array([hour["cost_fixed_pct"] for hour in published.updating_period().values()])
+    theirs = np.array([hour["cost_fixed_pct"] for hour in drawing.published_periods().values()])
     remarks = []
     for cost, name in COSTS.items():
         rows: list[tuple[Cell, ...]] = []
         for setting, costs in timed.items():
-            for title, some in first_and_fresh(costs, FIRST).items():
-                rows.append((setting.label, title, *_period_row(table_of(costs, some, cost), periods)))
+            for title, table in _hours_by_title(costs, cost).items():
+                rows.append((setting.label, title, *_period_row(table, periods)))
         if cost == "J_open_mean" and theirs.shape[1] == len(periods):
             rows.insert(0, ("the paper's points", "hours a to f", *_period_row(theirs, periods)))
         caption = (
@@ -236,17 +213,16 @@ def _period_row(table: Series, periods: Sequence[float]) -> tuple[Cell, ...]:
 
 def _period_figure(timed: Mapping[PenaltyVariant, PeriodCosts], periods: Sequence[float]) -> Figure:
     """Draw the first draw of each hour over its best period, both presets and the paper's points."""
-    colours = {TUNED: INK, AS_PRINTED: ACCENT}
     presets = {setting: costs for setting, costs in timed.items() if not setting.change}
     names = [load.name for load in next(iter(presets.values())) if load.draw == 1]
 
     def draw(name: str, place: Axes) -> None:
         for setting, costs in presets.items():
             of_hour = next(of_load for load, of_load in costs.items() if load.name == name)["J_open_mean"]
-            colour = colours[setting.preset]
+            colour = COLOURS[setting.preset]
             place.plot(periods, of_hour / of_hour.min(), color=colour, linestyle=DASHES[colour], marker=".",
                        label=setting.label)  # fmt: skip
-        theirs = published.updating_period().get(name)
+        theirs = drawing.published_periods().get(name)
         if theirs:
             fixed = theirs["cost_fixed_pct"]
             paper(place, theirs["tau_u_s"], fixed / fixed.min(), THIRD, "paper")
@@ -254,8 +230,6 @@ def _period_figure(timed: Mapping[PenaltyVariant, PeriodCosts], periods: Sequenc
     return hour_panels(names, draw, "cost over that of the best (1)", (1, 2, 5, 10, 20, 50))
 
 
-COLOURS: Final = {QPOASES: "#000000", TUNED: INK, AS_PRINTED: ACCENT}
-NOMINAL: Final = 1.0
 COLUMNS: Final = (
     "part", "load", "preset", "change", "power or period", "J_dev", "J_cst", "c1", "c2", "lowest", "J per time", "J_BF",
 )  # fmt: skip
@@ -268,8 +242,18 @@ class PenaltiesStudy:
     title = "Penalties, start and devices of the ODE-based solver: two presets"
 
     def requests(self, options: StudyOptions) -> list[RunRequest]:
-        """Return all runs: paired problems, the closed loop at 5 s, fixed periods."""
-        return list(requests(options))
+        """Return all runs: paired problems, load by load, the closed loop at 5 s, fixed periods."""
+        found = [
+            paired(load, variant, power)
+            for load in paired_loads(options)  # a worker has the problems of a load at hand
+            for variant in (None, *variants(options))
+            for power in powers_of(variant, options)
+        ]
+        found += [closed(load, variant) for variant in variants(options) for load in _closed_loads(options)]
+        for load in hours(options):
+            for variant in _timed_variants(load, options):
+                found += _period_runs(load, variant, options)
+        return found
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Compare the variants with the lowest cost, with converged qpOASES and with the paper's points."""
@@ -288,8 +272,12 @@ class PenaltiesStudy:
                 f"{preset}: crossing in total cost": found.crossings(None, variant),
                 f"{preset}: c1 at P = 1": [one.c1 for one in found.sums[variant, NOMINAL]],
                 f"{preset}: c2 at P = 1": [one.c2 for one in found.sums[variant, NOMINAL]],
-                **_period_values(preset, timed[variant]),
             }
+            tables = {cost: _hours_by_title(timed[variant], cost) for cost in COSTS}
+            for title in tables["J_BF"]:
+                for cost, kind in COSTS.items():
+                    name = f"{preset}: interior optimum, share of {title}, {kind}"
+                    result.values[name] = [share_inside(tables[cost][title]).value]
         result.remarks += [
             _crossing_text(found),
             *(_table(preset, options, found, loops) for preset in PRESETS),
@@ -303,9 +291,9 @@ def _period_costs(options: StudyOptions, outcomes: Outcomes) -> dict[PenaltyVari
     costs: dict[PenaltyVariant, PeriodCosts] = {}
     for load in hours(options):
         for variant in _timed_variants(load, options):
-            runs = [outcomes[load.request(period, *variant.assignments)].indicators for period in periods(options)]
+            runs = [outcomes[request].indicators for request in _period_runs(load, variant, options)]
             costs.setdefault(variant, {})[load] = {
-                cost: np.array([getattr(run, cost) for run in runs]) for cost in ("J_open_mean", "J_BF")
+                cost: np.array([getattr(run, cost) for run in runs]) for cost in COSTS
             }
     return costs
 
@@ -356,7 +344,7 @@ def _crossing_text(found: Paired) -> str:
 
 def _of_paper(what: str) -> float:
     """Return a value of the paper's points at P = 1, relative to its converged qpOASES where that is meant."""
-    points = published.solver_comparison()
+    points = drawing.published_comparison()
     ode, qpoases = points["ode"], points["qpoases"]
     powers = ode["normalized_power"]
     if what == "crossing":
@@ -411,7 +399,7 @@ def _start_table(options: StudyOptions, found: Paired) -> list[str]:
     starts = [one for one in variants(options) if one.is_start or not one.change]
     if not any(one.is_start for one in starts):
         return []
-    points = published.solver_comparison()["ode"]
+    points = drawing.published_comparison()["ode"]
     theirs = points["J_total"] / points["J_total"][-1]
     some = list(START_POWERS)
     places = [int(np.argmin(np.abs(points["normalized_power"] - power))) for power in some]
@@ -438,7 +426,7 @@ def _misfit_of(curve: Callable[[Sequence[int]], Series], theirs: Series) -> Call
 
 def _figure(found: Paired) -> Figure:
     """Draw by which share total costs are above the lowest, against power, and the paper's above its converged one."""
-    points = published.solver_comparison()
+    points = drawing.published_comparison()
     converged = points["qpoases"]["J_total"][-1]
     with panels(1, 1, 3.2) as (figure, (place,)):
         for variant in (None, *PRESETS.values()):
@@ -446,7 +434,7 @@ def _figure(found: Paired) -> Figure:
             powers = found.powers[variant]
             above_lowest(place, powers, [found.interval(variant, power) for power in powers], COLOURS[label], label)
         for solver, label in (("qpoases", QPOASES), ("ode", AS_PRINTED)):
-            total = np.maximum(points[solver]["J_total"] / converged - 1.0, LEAST_DRAWN)
+            total = np.maximum(points[solver]["J_total"] / converged - 1.0, drawing.LEAST_DRAWN)
             name = "qpOASES" if solver == "qpoases" else "ODE"
             paper(place, points[solver]["normalized_power"], total, COLOURS[label], f"{name}, paper")
         legend_outside(figure, place, 5)

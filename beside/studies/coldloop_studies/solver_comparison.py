@@ -5,23 +5,22 @@ preparation (section V), so that slot is left out here. Paired, every solver at 
 judged by what would be played; harsh problems show what solvers make of the same bad guess in the same PLC time.
 """
 
-from collections.abc import Mapping, Sequence
-from itertools import product
-from typing import Final
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from functools import partial
+from typing import Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from coldloop.errors import StudyError
 from coldloop_plant.load import HOUR_TICKS
 from coldloop_rig.figures.plot import COLOURS
-from coldloop_rig.plc_sizing.intervals import crossing
-from coldloop_rig.text_tables import Cell, markdown_table
-from coldloop_studies import published
-from coldloop_studies.drawing import above_lowest, legend_outside, panels, paper, spans_decade, spread
+from coldloop_rig.plc_sizing.intervals import Interval, crossing, interval_of_mean, jackknife
+from coldloop_rig.text_tables import markdown_table
+from coldloop_studies import drawing
+from coldloop_studies.drawing import above_lowest, legend_outside, panels, paper, spread
 from coldloop_studies.paired_run import HARSH, INTERIOR_POINT_ITERATIONS
-from coldloop_studies.paired_sums import PairedSums, watch
-from coldloop_studies.request import Procedure, RunRequest, Series
+from coldloop_studies.request import Outcome, Procedure, RunRequest, Series
 from coldloop_studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
 
 PERIOD_S = 5.0
@@ -54,7 +53,7 @@ LABELS: Final = {
 
 
 def _paper_powers(options: StudyOptions) -> tuple[float, ...]:
-    return QUICK_POWERS if options.quick else tuple(published.solver_comparison()["ode"]["normalized_power"].tolist())
+    return QUICK_POWERS if options.quick else tuple(drawing.published_comparison()["ode"]["normalized_power"].tolist())
 
 
 def powers_of(solver: str, options: StudyOptions) -> tuple[float, ...]:
@@ -74,14 +73,106 @@ def paired_request(load: Load, solver: str, power: float) -> RunRequest:
     return throttled(load, solver, power, procedure=Procedure.PAIRED_PROBLEMS)
 
 
-def _paired_requests(options: StudyOptions) -> list[RunRequest]:
-    """Return all of them, load by load: a worker has the problems of a load at hand."""
-    return [
-        paired_request(load, solver, power)
-        for load in paired_loads(options)
-        for solver in LABELS
-        for power in powers_of(solver, options)
-    ]
+S = TypeVar("S", bound=Hashable)
+
+
+class Sums(NamedTuple):
+    """Summed costs and violations of one solver at one power on the problems of one draw."""
+
+    J_dev: float
+    J_cst: float
+    c1: float
+    c2: float
+    lowest: float
+
+    @property
+    def J_total(self) -> float:
+        """Cost that is compared with the lowest one: J_dev + J_cst."""
+        return self.J_dev + self.J_cst
+
+
+class PairedSums(Generic[S]):
+    """Sums of all draws, by solver, power (rising) and draw, of the outcomes of the requests that `request` makes.
+
+    Raises:
+        StudyError: A profile costs less than the optimum.
+    """
+
+    def __init__(
+        self, loads: Sequence[Load], powers: Mapping[S, Sequence[float]],
+        request: Callable[[Load, S, float], RunRequest], label: Callable[[S], str], outcomes: Outcomes,
+    ) -> None:  # fmt: skip
+        self.loads, self.powers = loads, powers
+        self.sums: dict[tuple[S, float], list[Sums]] = {}
+        for solver, power in ((solver, power) for solver, some in powers.items() for power in some):
+            sums = self.sums[solver, power] = []
+            for load in loads:
+                run = outcomes[request(load, solver, power)]
+                cost, what = run.column("j_dev") + run.column("j_cst"), f"{label(solver)} at P = {power:g}"
+                watch(run, cost, f"{what}, load {load.name}")
+                i = run.indicators
+                sums.append(Sums(i.J_dev, i.J_cst, i.c1, i.c2, float(run.column("lowest").sum())))
+
+    def table(self, draw: int) -> dict[S, dict[str, Series]]:
+        """Return J_dev, J_cst, J_total, c1, c2 and the lowest of a draw against power, by solver."""
+        names = (*Sums._fields, "J_total")
+        return {
+            solver: {name: np.array([getattr(self.sums[solver, p][draw], name) for p in some]) for name in names}
+            for solver, some in self.powers.items()
+        }
+
+    def over_lowest(self, solver: S, power: float, which: Sequence[int]) -> float:
+        """Return the total cost of some draws together over the lowest there is."""
+        some = [self.sums[solver, power][draw] for draw in which]
+        return sum(one.J_total for one in some) / sum(one.lowest for one in some)
+
+    def interval(self, solver: S, power: float) -> Interval:
+        """Return the interval of `over_lowest`."""
+        return jackknife(partial(self.over_lowest, solver, power), len(self.loads), above=1.0)
+
+    def over_converged(self, part: str, solver: S, power: float, reference: S) -> Interval:
+        """Return the interval of a part of the cost over that of a reference at its largest power."""
+        converged = self.sums[reference, self.powers[reference][-1]]
+
+        def ratio(which: Sequence[int]) -> float:
+            mine, theirs = (
+                sum(getattr(sums[draw], part) for draw in which) for sums in (self.sums[solver, power], converged)
+            )
+            return float(mine / theirs) if theirs else np.nan
+
+        return jackknife(ratio, len(self.loads), above=0.0)
+
+    def mean(self, what: str, solver: S, power: float) -> Interval:
+        """Return the interval of the mean over the draws of c1 or c2."""
+        return interval_of_mean([getattr(one, what) for one in self.sums[solver, power]], above=0.0)
+
+    def crossing(self, one: S, other: S) -> Interval:
+        """Return from which power on `one` costs no more than `other`, all draws together."""
+        return jackknife(partial(self._crossing, one, other), len(self.loads), above=0.0)
+
+    def crossings(self, one: S, other: S) -> list[float]:
+        """Return the same of each draw by itself."""
+        return [self._crossing(one, other, [draw]) for draw in range(len(self.loads))]
+
+    def _crossing(self, one: S, other: S, which: Sequence[int]) -> float:
+        common = [power for power in self.powers[one] if power in self.powers[other]]
+        curves = (np.array([self.over_lowest(solver, power, which) for power in common]) for solver in (one, other))
+        return crossing(np.array(common), *curves)
+
+
+def watch(run: Outcome, cost: Series, what: str) -> None:
+    """Make sure that no profile costs less than the best one that can be played.
+
+    Raises:
+        StudyError: One does: the study, or the optimum, is wrong. `what` is for the message.
+    """
+    bound = run.column("lowest")
+    below = np.flatnonzero(cost < bound - 1e-9 * (1.0 + np.abs(bound)))  # what rounding may do
+    if len(below):
+        raise StudyError(
+            f"{what}: problem {below[0]} costs {cost[below[0]]:.9g}, less than the optimum of {bound[below[0]]:.9g}; "
+            "its costs cannot be compared"
+        )
 
 
 OpenLoop = PairedSums[str]
@@ -126,25 +217,17 @@ def _open_loop_figure(found: OpenLoop) -> Figure:
     return figure
 
 
-HARSH_DRAWS: Final = 3
-"""Draws of each of six hours: together they have more than 300 harsh problems."""
-
-
 def _harsh_loads(options: StudyOptions) -> list[Load]:
-    return loads(options, *"abcdef", usual=HARSH_DRAWS)
+    return loads(options, *"abcdef", usual=3)  # together they have more than 300 harsh problems
 
 
-def _solvers() -> list[str]:
-    return [name for name in LABELS if name != "daqp"]  # one solve of DAQP is longer than all of these times
+HARSH_SOLVERS: Final = tuple(name for name in LABELS if name != "daqp")
+"""One solve of DAQP is longer than all of the times compared."""
 
 
 def harsh_request(load: Load, solver: str) -> RunRequest:
     """Return the request for one solver on the harsh problems of a load, at P = 1."""
     return throttled(load, solver, 1.0, procedure=Procedure.HARSH_PROBLEMS)
-
-
-def _harsh_requests(options: StudyOptions) -> list[RunRequest]:
-    return [harsh_request(load, solver) for load in _harsh_loads(options) for solver in _solvers()]
 
 
 def harsh_ratios(options: StudyOptions, outcomes: Outcomes) -> dict[str, dict[int, Series]]:
@@ -154,10 +237,11 @@ def harsh_ratios(options: StudyOptions, outcomes: Outcomes) -> dict[str, dict[in
         StudyError: A profile costs less than the optimum.
     """
     found = {}
-    for solver in _solvers():
+    for solver in HARSH_SOLVERS:
         runs = [outcomes[harsh_request(load, solver)] for load in _harsh_loads(options)]
-        for run, k in product(runs, INTERIOR_POINT_ITERATIONS):
-            watch(run, "lowest", run.column(f"after_{k}"), f"harsh problems, {solver}")
+        for run in runs:
+            for k in INTERIOR_POINT_ITERATIONS:
+                watch(run, run.column(f"after_{k}"), f"harsh problems, {solver}")
         found[solver] = {
             k: np.concatenate([run.column(f"after_{k}") / run.column("lowest") for run in runs])
             for k in INTERIOR_POINT_ITERATIONS
@@ -193,17 +277,12 @@ def harsh_table(options: StudyOptions, outcomes: Outcomes) -> str:
     )
     rows = []
     for solver, by_count in ratios.items():
-        counts = _counts(outcomes, first, solver)
-        cells = [
-            f"{np.median(found):.4g} ({found.max():.3g}) [{counts[k]:.0f}]" for k, found in by_count.items()
-        ]  # fmt: skip
+        runs = (outcomes[harsh_request(load, solver)] for load in first)
+        some = next(run for run in runs if len(run.column("lowest")))
+        counts = {k: some.column(f"count_{k}")[0] for k in by_count}
+        cells = [f"{np.median(found):.4g} ({found.max():.3g}) [{counts[k]:.0f}]" for k, found in by_count.items()]
         rows.append((LABELS[solver], *cells))
     return markdown_table(("solver", *(f"time of {k}" for k in INTERIOR_POINT_ITERATIONS)), rows, caption)
-
-
-def _counts(outcomes: Outcomes, drawn: list[Load], solver: str) -> dict[int, float]:
-    with_some = next(run for load in drawn if len((run := outcomes[harsh_request(load, solver)]).column("lowest")))
-    return {k: float(with_some.column(f"count_{k}")[0]) for k in INTERIOR_POINT_ITERATIONS}
 
 
 Table = Mapping[str, Mapping[str, Series]]
@@ -211,10 +290,6 @@ Table = Mapping[str, Mapping[str, Series]]
 
 SOLVERS: Final = {"ode": "ODE", "qpoases": "qpOASES"}
 INDICATORS: Final = ("J_dev", "J_cst", "J_total", "c1", "c2", "J_BF")
-CLOSED_DRAWS: Final = 6
-CLOSED_TICKS: Final = 2 * HOUR_TICKS
-"""Longest run of each of the eight hours in the closed loop: six draws of two hours say more than one and a half of
-eight."""
 COLUMNS: Final = ("part", "load", "solver", "power", *INDICATORS, "J_total over the lowest")
 
 
@@ -226,13 +301,20 @@ class SolverComparison:
 
     def requests(self, options: StudyOptions) -> list[RunRequest]:
         """Return the problems of all solvers, then every solver of the paper in the closed loop, long runs first."""
+        paired = [
+            paired_request(load, solver, power)
+            for load in paired_loads(options)  # a worker has the problems of a load at hand
+            for solver in LABELS
+            for power in powers_of(solver, options)
+        ]
+        harsh = [harsh_request(load, solver) for load in _harsh_loads(options) for solver in HARSH_SOLVERS]
         closed = [
             throttled(load, solver, power)
             for power in sorted(_paper_powers(options), reverse=True)
             for solver in SOLVERS
             for load in _closed_loads(options)
         ]
-        return [*_paired_requests(options), *_harsh_requests(options), *closed]
+        return [*paired, *harsh, *closed]
 
     @np.errstate(divide="ignore", invalid="ignore")  # under a load that never steps nothing costs anything
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
@@ -240,59 +322,37 @@ class SolverComparison:
         powers = np.array(_paper_powers(options))
         paired = open_loop(options, outcomes)
         tables: list[Table] = [paired.table(draw) for draw in range(len(paired.loads))]
-        closed = [_closed_table(load, powers, outcomes) for load in _closed_loads(options)]
+        closed: list[Table] = [
+            {solver: {"J_BF": np.array([outcomes[throttled(load, solver, power)].indicators.J_BF
+                                        for power in powers.tolist()])} for solver in SOLVERS}
+            for load in _closed_loads(options)
+        ]  # fmt: skip
         result = StudyResult(COLUMNS, [], {
             "indicators": _figure(powers, tables, closed),
             "paired open loop": _open_loop_figure(paired),
         })  # fmt: skip
         for load, table in zip(paired.loads, tables, strict=True):
-            result.rows += _open_rows(load, table, paired.powers)
-            _gather(result, _open_loop_measures(powers, table))
+            result.rows += [
+                ("paired", load.name, solver, power, *(columns[name][i] for name in INDICATORS[:-1]), np.nan,
+                 columns["J_total"][i] / columns["lowest"][i])
+                for solver, columns in table.items() for i, power in enumerate(paired.powers[solver])
+            ]  # fmt: skip
+            result.note_all(_open_loop_measures(powers, table))
+        nothing = (np.nan,) * (len(INDICATORS) - 1)
         for load, table in zip(_closed_loads(options), closed, strict=True):
             result.rows += [
-                (
-                    "closed",
-                    load.name,
-                    solver,
-                    power,
-                    *(np.nan,) * (len(INDICATORS) - 1),
-                    table[solver]["J_BF"][i],
-                    np.nan,
-                )
-                for solver in SOLVERS
-                for i, power in enumerate(powers.tolist())
-            ]
-            _gather(result, _closed_loop_measures(powers, table))
+                ("closed", load.name, solver, power, *nothing, table[solver]["J_BF"][i], np.nan)
+                for solver in SOLVERS for i, power in enumerate(powers.tolist())
+            ]  # fmt: skip
+            result.note_all(_closed_loop_measures(powers, table))
         result.values |= harsh_values(harsh_ratios(options, outcomes))
         result.remarks += [open_loop_table(paired), harsh_table(options, outcomes)]
         return result
 
 
-def _gather(result: StudyResult, values: Mapping[str, float]) -> None:
-    for claim, value in values.items():
-        result.note(claim, value)
-
-
-def _open_rows(
-    load: Load, table: Mapping[str, Mapping[str, Series]], powers: Mapping[str, Sequence[float]]
-) -> list[tuple[Cell, ...]]:
-    return [
-        ("paired", load.name, solver, power, *(columns[name][i] for name in INDICATORS[:-1]), np.nan,
-         columns["J_total"][i] / columns["lowest"][i])
-        for solver, columns in table.items()
-        for i, power in enumerate(powers[solver])
-    ]  # fmt: skip
-
-
 def _closed_loads(options: StudyOptions) -> list[Load]:
-    return loads(options, "8h", usual=CLOSED_DRAWS, longest_ticks=CLOSED_TICKS)
-
-
-def _closed_table(load: Load, powers: Series, outcomes: Outcomes) -> Table:
-    return {
-        solver: {"J_BF": np.array([outcomes[throttled(load, solver, p)].indicators.J_BF for p in powers.tolist()])}
-        for solver in SOLVERS
-    }
+    """Return six draws of two hours of each of the eight hours, which say more than one and a half of eight."""
+    return loads(options, "8h", usual=6, longest_ticks=2 * HOUR_TICKS)
 
 
 def measures(powers: Series, table: Table) -> dict[str, float]:
@@ -304,12 +364,12 @@ def _open_loop_measures(powers: Series, table: Table) -> dict[str, float]:
     ode, qpoases = table["ode"], table["qpoases"]
     converged = qpoases["J_total"][-1]
     relative = qpoases["J_total"] / converged
-    distance = np.abs(relative - 1)
+    far = np.abs(relative - 1)[:-1][powers[:-1] >= 10]
     one, fifth = _place(powers, 1.0), _place(powers, 0.2)
     return {
         "qpOASES over converged at P = 1": float(relative[one]),
         "qpOASES over converged at P = 0.2": float(relative[fifth]),
-        "qpOASES from P = 10 on, largest distance from converged": _largest(distance[:-1], powers[:-1] >= 10),
+        "qpOASES from P = 10 on, largest distance from converged": float(far.max()) if len(far) else np.nan,
         "qpOASES, largest rise of total cost with P": float((relative[1:] / relative[:-1] - 1).max()),
         "ODE over converged, largest from P = 0.6 on": float((ode["J_total"][powers >= 0.6] / converged).max()),
         "qpOASES over ODE in total cost at P = 1": float(qpoases["J_total"][one] / ode["J_total"][one]),
@@ -335,10 +395,6 @@ def _place(powers: Series, power: float) -> int:
     return int(np.argmin(np.abs(powers - power)))
 
 
-def _largest(values: Series, which: "NDArray[np.bool_]") -> float:
-    return float(values[which].max()) if which.any() else float("nan")
-
-
 def _figure(powers: Series, paired: Sequence[Table], closed: Sequence[Table]) -> Figure:
     """Draw ours and the paper's, each relative to its own qpOASES at the largest power where units differ."""
     labels = {
@@ -346,7 +402,7 @@ def _figure(powers: Series, paired: Sequence[Table], closed: Sequence[Table]) ->
         "J_cst": "(b) $J^{cst}$, relative (1)", "J_total": "(c) total, relative (1)",
         "c1": "(d) $c_1$ (%, K)", "c2": "(e) $c_2$ (%, K)", "J_BF": "(f) $J^{BF}$, relative (1)",
     }  # fmt: skip
-    theirs = published.solver_comparison()
+    theirs = drawing.published_comparison()
     with panels(3, 2, 7.5, sharex=True) as (figure, axes):
         for place, name in zip(axes, INDICATORS, strict=True):
             relative, tables = name.startswith("J"), closed if name == "J_BF" else paired
@@ -358,7 +414,7 @@ def _figure(powers: Series, paired: Sequence[Table], closed: Sequence[Table]) ->
                       f"{SOLVERS[solver]}, paper")  # fmt: skip
             place.set_xscale("log")
             place.set_ylabel(labels[name])
-            if spans_decade(np.concatenate([np.ravel(line.get_ydata()) for line in place.lines])):
+            if drawing.spans_decade(np.concatenate([np.ravel(line.get_ydata()) for line in place.lines])):
                 place.set_yscale("log")
         legend_outside(figure, axes[0])
         for place in axes[-2:]:

@@ -8,7 +8,7 @@ tick has the period that is in force then, and counts once.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,20 +18,12 @@ from coldloop.process.cold_box import COLD_BOX, SAMPLING_PERIOD_S, TICK_S
 from coldloop_rig.figures.plot import COLOURS, DASHES, legend_above
 from coldloop_rig.text_tables import markdown_table
 from coldloop_studies.drawing import legend_outside, panels, spread, time_panels
-from coldloop_studies.paper.solver_comparison import UNLIMITED, throttled
 from coldloop_studies.request import Outcome, RunRequest, Series
+from coldloop_studies.solver_comparison import UNLIMITED, throttled
 from coldloop_studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
 
 TRACE_TICKS = 4
-AFTER_STEP_S = 30.0
-"""A problem that follows a load step by less than this belongs to the load event."""
-QUIET_S = 120.0
-"""Without a load step for this long it is quiet."""
 BANDS = tuple((band.low, band.high) for band in COLD_BOX.bands)
-
-UNLIMITED_QPOASES = ("qpOASES, unlimited", "qpoases", UNLIMITED)
-THROTTLED_QPOASES = ("qpOASES, 10 iterations", "qpoases", 1.0)
-THROTTLED_ODE = ("ODE, 20 iterations", "ode", 1.0)
 
 
 @dataclass(frozen=True)
@@ -71,20 +63,16 @@ class TrajectoryStudy:
         return result
 
     def _judge(self, result: StudyResult, load: Load, runs: Sequence[Outcome]) -> None:
-        reference = runs[-1]
-        outside = tuple(reference.indicators.outside_band_pct.values())
-        after, quiet = iterations_by_event(reference, load)
-        values: dict[str, float] = {}
+        costs = [run.indicators.J_BF for run in runs]
         if len(runs) == 1:
-            values["furthest outside"] = furthest_outside(reference)
-            values["time outside"] = max(outside)
-            values["iterations"] = after / quiet if quiet else float("nan")
-        if len(runs) > 1:
-            values["J_BF"] = runs[0].indicators.J_BF / reference.indicators.J_BF
+            after, quiet = iterations_by_event(runs[0], load)
+            result.note(f"{self.name}: furthest outside", furthest_outside(runs[0]))
+            result.note(f"{self.name}: time outside", max(runs[0].indicators.outside_band_pct.values()))
+            result.note(f"{self.name}: iterations", after / quiet if quiet else np.nan)
+        else:
+            result.note(f"{self.name}: J_BF", costs[0] / costs[-1])
         if len(runs) > 2:
-            values["J_BF of qpOASES over ODE"] = runs[1].indicators.J_BF / runs[0].indicators.J_BF
-        for what, value in values.items():
-            result.note(f"{self.name}: {what}", value)
+            result.note(f"{self.name}: J_BF of qpOASES over ODE", costs[1] / costs[0])
 
 
 def furthest_outside(run: Outcome) -> float:
@@ -96,11 +84,14 @@ def furthest_outside(run: Outcome) -> float:
 
 
 def iterations_by_event(run: Outcome, load: Load) -> tuple[float, float]:
-    """Return the mean number of iterations just after load steps, and in quiet."""
+    """Return the mean number of iterations just after load steps, for 30 s, and in quiet, from 120 s on."""
     since = _seconds_since_step(run, load)
     iterations = run.column("iterations")
-    after, quiet = iterations[since < AFTER_STEP_S], iterations[since >= QUIET_S]
-    return (float(after.mean()) if len(after) else np.nan, float(quiet.mean()) if len(quiet) else np.nan)
+    return _mean(iterations[since < 30.0]), _mean(iterations[since >= 120.0])
+
+
+def _mean(some: NDArray[Any]) -> float:
+    return float(some.mean()) if len(some) else np.nan
 
 
 def load_steps(load: Load) -> Series:
@@ -120,31 +111,27 @@ def _steps_before(ticks: Series, load: Load) -> "NDArray[np.intp]":
 def _seconds_since_step(run: Outcome, load: Load) -> Series:
     """Return for each update the plant time since the last load step, which begins at the first one."""
     ticks = run.column("tick")
-    last = load_steps(load)[_steps_before(ticks, load)]
-    since: Series = (ticks - last) * TICK_S
+    since: Series = (ticks - load_steps(load)[_steps_before(ticks, load)]) * TICK_S
     return since
 
 
-UNLIMITED_STUDY = TrajectoryStudy(
-    "unlimited", "The scheme with qpOASES and no limit of iterations (figure working_mpc)", (UNLIMITED_QPOASES,)
-)
-LIMITED_STUDY = TrajectoryStudy(
-    "limited", "qpOASES limited to 10 iterations (figure not_working_mpc)", (THROTTLED_QPOASES, UNLIMITED_QPOASES)
-)
-TRAJECTORIES_STUDY = TrajectoryStudy(
-    "trajectories",
-    "The ODE-based solver, limited qpOASES and unlimited qpOASES (figure mult_solv)",
-    (THROTTLED_ODE, THROTTLED_QPOASES, UNLIMITED_QPOASES),
-)
+_UNLIMITED_QPOASES = ("qpOASES, unlimited", "qpoases", UNLIMITED)
+_THROTTLED_QPOASES = ("qpOASES, 10 iterations", "qpoases", 1.0)
+COURSES: Final = (
+    TrajectoryStudy("unlimited", "The scheme with qpOASES and no limit of iterations (figure working_mpc)",
+                    (_UNLIMITED_QPOASES,)),
+    TrajectoryStudy("limited", "qpOASES limited to 10 iterations (figure not_working_mpc)",
+                    (_THROTTLED_QPOASES, _UNLIMITED_QPOASES)),
+    TrajectoryStudy("trajectories", "The ODE-based solver, limited qpOASES and unlimited qpOASES (figure mult_solv)",
+                    (("ODE, 20 iterations", "ode", 1.0), _THROTTLED_QPOASES, _UNLIMITED_QPOASES)),
+)  # fmt: skip
+"""Studies of runs against time."""
 
 
 SOON_S: Final = (0.0, 30.0)
 """The window after a load step by which the response is judged."""
 QUIET_SPAN_S: Final = (60.0, np.inf)
 EDGES_S: Final = np.array([0.0, 2.5, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0, 300.0, np.inf])
-DRAWN_TO_S: Final = 400.0
-"""Where the last window, which has no end, ends in the figure."""
-
 Run = tuple[Outcome, Load]
 
 
@@ -156,15 +143,16 @@ class HeldPeriods(NamedTuple):
     tau_u_s: Series
     """The period in force."""
 
+    def _within(self, span: tuple[float, float]) -> Series:
+        return self.tau_u_s[(span[0] <= self.since_s) & (self.since_s < span[1])]
+
     def mean(self, span: tuple[float, float]) -> float:
         """Return the mean period (s) in a window of time since the step; NaN if no tick is in it."""
-        chosen = self.tau_u_s[(span[0] <= self.since_s) & (self.since_s < span[1])]
-        return float(chosen.mean()) if len(chosen) else np.nan
+        return _mean(self._within(span))
 
     def share_of_longest(self, span: tuple[float, float]) -> float:
         """Return the share of a window's time that has the longest period; NaN if no tick is in it."""
-        chosen = self.tau_u_s[(span[0] <= self.since_s) & (self.since_s < span[1])]
-        return float((chosen == SAMPLING_PERIOD_S).mean()) if len(chosen) else np.nan
+        return _mean(self._within(span) == SAMPLING_PERIOD_S)
 
 
 def held_periods(runs: Sequence[Run]) -> HeldPeriods:
@@ -175,28 +163,20 @@ def held_periods(runs: Sequence[Run]) -> HeldPeriods:
         if not len(start):
             continue
         ticks = np.arange(start[0], start[-1] + tau[-1])
-        steps = load_steps(load)
-        after = ticks - steps[np.searchsorted(steps, ticks, side="right") - 1]
+        after = ticks - load_steps(load)[_steps_before(ticks, load)]
         known = np.isfinite(after)
         since.append(after[known] * TICK_S)
         held.append(tau[np.searchsorted(start, ticks, side="right") - 1][known] * TICK_S)
     return HeldPeriods(np.concatenate(since), np.concatenate(held))
 
 
-def contractions(runs: Sequence[Run]) -> tuple[Series, Series]:
-    """Return for all updates but the first of each run K = J_{k+1} / J_k, and the time since the load step (s)."""
-    K, since = [np.empty(0)], [np.empty(0)]
-    for run, load in runs:
-        effective = run.column("j_effective")
-        K.append(effective[1:] / effective[:-1])
-        since.append(_seconds_since_step(run, load)[1:])
-    return np.concatenate(K), np.concatenate(since)
-
-
 def response(runs: Sequence[Run], policy: str) -> dict[str, float]:
     """Return what is claimed of the response of a policy, and the quantities that explain it."""
     held = held_periods(runs)
-    K, since = contractions(runs)
+    # K = J_{k+1} / J_k of all updates but the first of each run, and the time since the load step (s)
+    effective = [run.column("j_effective") for run, _ in runs]
+    K = np.concatenate([np.empty(0), *(cost[1:] / cost[:-1] for cost in effective)])
+    since = np.concatenate([np.empty(0), *(_seconds_since_step(run, load)[1:] for run, load in runs)])
     quiet = held.mean(QUIET_SPAN_S)
     return {
         f"tau_u 0 to 30 s after a load step over that in quiet, by time, {policy}": held.mean(SOON_S) / quiet,
@@ -226,7 +206,7 @@ def response_table(runs_of: Mapping[str, Sequence[Run]]) -> str:
 
 def response_figure(runs_of: Mapping[str, Sequence[Run]]) -> Figure:
     """Draw the mean period of each policy in each window."""
-    edges = np.where(np.isfinite(EDGES_S), EDGES_S, DRAWN_TO_S)
+    edges = np.where(np.isfinite(EDGES_S), EDGES_S, 400.0)  # the last window has no end
     with panels(1, 1, 2.8) as (figure, (place,)):
         for (policy, runs), colour in zip(runs_of.items(), COLOURS, strict=False):
             means = [held_periods(runs).mean(span) for span in pairwise(EDGES_S.tolist())]
@@ -249,10 +229,7 @@ class ExperimentStudy:
 
     def requests(self, options: StudyOptions) -> list[RunRequest]:
         """Return each case on the bus and in one process, under the first draw."""
-        return [request for load in self._loads(options) for _, period in self.cases for request in _both(load, period)]
-
-    def _loads(self, options: StudyOptions) -> list[Load]:
-        return [load for load in loads(options, "2h") if load.draw == 1]
+        return [run for load in _first(options) for _, period in self.cases for run in _both(load, period)]
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Compare traces, bands and updating periods."""
@@ -260,7 +237,7 @@ class ExperimentStudy:
             ("load", "case", "rig", "J_BF", "L1 outside (%)", "T5 outside (%)", "tau_u mean (s)",
              "tau_u mean per update (s)", "trace"), [], {},
         )  # fmt: skip
-        for load in self._loads(options):
+        for load in _first(options):
             labelled = []
             for label, period in self.cases:
                 networked, alone = (outcomes[request] for request in _both(load, period))
@@ -283,17 +260,20 @@ class ExperimentStudy:
         return result
 
 
+def _first(options: StudyOptions) -> list[Load]:
+    return [load for load in loads(options, "2h") if load.draw == 1]
+
+
 def _both(load: Load, period_s: float) -> Sequence[RunRequest]:
     return [load.request(period_s, networked=networked, trace_ticks=TRACE_TICKS) for networked in (True, False)]
 
 
-PLC_2H = ExperimentStudy("plc-2h", "Two hours on the bus at tau_u = 5 s (figure scenario_exp)", (("5 s", 5.0),))
-ADAPTIVE_2H = ExperimentStudy(
-    "adaptive-2h", "Two hours on the bus, 2.5 s against adaptive (figure diff_upt)", (("2.5 s", 2.5), ("adaptive", 0.0))
-)
-
-
-PERIODS_S: Final = (1.0, 2.0, 3.0, 4.0, 5.0)
+BUS: Final = (
+    ExperimentStudy("plc-2h", "Two hours on the bus at tau_u = 5 s (figure scenario_exp)", (("5 s", 5.0),)),
+    ExperimentStudy("adaptive-2h", "Two hours on the bus, 2.5 s against adaptive (figure diff_upt)",
+                    (("2.5 s", 2.5), ("adaptive", 0.0))),
+)  # fmt: skip
+"""Studies of runs on the bus."""
 SOLVERS: Final = {"ode": "ODE", "qpoases": "qpOASES", "fast-gradient": "fast gradient", "osqp": "OSQP"}
 
 
@@ -322,11 +302,12 @@ class TradeOff:
         curves: dict[str, list[list[tuple[float, float]]]] = {solver: [] for solver in SOLVERS}
         for load in loads(options, "c"):
             for solver, label in SOLVERS.items():
-                points = [won_and_lost(outcomes[_request(load, solver, period)], load) for period in periods]
+                runs = [outcomes[_request(load, solver, period)] for period in periods]
+                points = [won_and_lost(run, load) for run in runs]
                 curves[solver].append(points)
                 result.rows += [
-                    (load.name, label, period, won, lost, share_falling(outcomes[_request(load, solver, period)], load))
-                    for period, (won, lost) in zip(periods, points, strict=True)
+                    (load.name, label, period, *point, share_falling(run, load))
+                    for period, point, run in zip(periods, points, runs, strict=True)
                 ]
             for what, value in _discriminating(load, periods, outcomes).items():
                 result.note(what, value)
@@ -335,7 +316,7 @@ class TradeOff:
 
 
 def _periods(options: StudyOptions) -> tuple[float, ...]:
-    return (1.0, 2.5, 5.0) if options.quick else PERIODS_S
+    return (1.0, 2.5, 5.0) if options.quick else (1.0, 2.0, 3.0, 4.0, 5.0)
 
 
 def _request(load: Load, solver: str, period_s: float) -> RunRequest:
@@ -351,13 +332,13 @@ def _after_steps(run: Outcome, load: Load) -> tuple[Series, Series]:
 def won_and_lost(run: Outcome, load: Load) -> tuple[float, float]:
     """Return the mean of E_k and of D_k over the first updates after load steps."""
     won, lost = _after_steps(run, load)
-    return (float(won.mean()), float(lost.mean())) if len(won) else (float("nan"), float("nan"))
+    return _mean(won), _mean(lost)
 
 
 def share_falling(run: Outcome, load: Load) -> float:
     """Return after which share of the load steps E_k > D_k: the cost falls in the first period."""
     won, lost = _after_steps(run, load)
-    return float((won > lost).mean()) if len(won) else float("nan")
+    return _mean(won > lost)
 
 
 def _discriminating(load: Load, periods: tuple[float, ...], outcomes: Outcomes) -> dict[str, float]:

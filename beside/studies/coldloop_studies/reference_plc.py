@@ -23,7 +23,7 @@ from coldloop_plant.load import HOUR_TICKS
 from coldloop_rig.figures.plot import COLOURS, legend_above
 from coldloop_rig.plc_sizing import operations
 from coldloop_rig.plc_sizing import plc as reference
-from coldloop_rig.plc_sizing.budget import Footprint, estimator_memory, footprint
+from coldloop_rig.plc_sizing.budget import estimator_memory, footprint
 from coldloop_rig.plc_sizing.operations import dense_sizes
 from coldloop_rig.text_tables import Cell, markdown_table
 from coldloop_studies.drawing import panels, paper
@@ -37,7 +37,6 @@ N: Final = 49
 """Variables of the paper's problem."""
 SIZES: Final = dense_sizes(N, 94, 21)
 """Sizes of the paper's problem, zeros counted."""
-REPEATS = 20
 
 
 class CholeskyStudy:
@@ -64,7 +63,12 @@ class CholeskyStudy:
         columns = ("n", "PLC (ms), paper", "PLC (ms), fitted", "laptop (us), paper", "here (us)")
         large = times.size[times.size >= 50]
         modelled = np.array([curve.time_s(n) for n in times.size.tolist()])
-        reduced, trivial = _footprints()
+        prediction, estimator = PredictionModel(load_model(SHIPPED_MODELS["cold-box"])), EstimatorSettings()
+        design, limits, real = ControlDesign(), InputLimits(), real_of(Arithmetic.FLOAT32)
+        reduced, trivial = (
+            footprint(PredictiveProblem(prediction, one, limits, real), estimator_memory(prediction, estimator),
+                      SolverName.ODE) for one in (design, trivial_design(design))
+        )  # fmt: skip
         values = {
             SPEED: float(np.mean([operations.dense_cholesky(n).flops / curve.time_s(n) / 1e6 for n in large.tolist()])),
             SLOW_DOWN: float((modelled / times.laptop_s)[times.size >= 40].mean()),
@@ -86,7 +90,7 @@ def _seconds_here(n: int) -> float:
     """Return the shortest time of one factorisation of size n on this machine, s."""
     A = np.eye(n) * n + 1.0
     best = np.inf
-    for _ in range(REPEATS):
+    for _ in range(20):
         M_ = A.copy()
         began = time.perf_counter()
         linear_algebra.cholesky(M_)
@@ -96,17 +100,6 @@ def _seconds_here(n: int) -> float:
 
 def _counted_s(curve: reference.SpeedCurve, count: operations.Operations) -> float:
     return count.flops / curve.flops_per_s(N)
-
-
-def _footprints() -> tuple[Footprint, Footprint]:
-    prediction = PredictionModel(load_model(SHIPPED_MODELS["cold-box"]))
-    design, limits, real = ControlDesign(), InputLimits(), real_of(Arithmetic.FLOAT32)
-    estimator = estimator_memory(prediction, EstimatorSettings())
-    reduced, trivial = (
-        footprint(PredictiveProblem(prediction, one, limits, real), estimator, SolverName.ODE)
-        for one in (design, trivial_design(design))
-    )
-    return reduced, trivial
 
 
 def _remark(curve: reference.SpeedCurve, error: float) -> str:
@@ -157,9 +150,6 @@ def _speed_figure(rows: list[tuple[Cell, ...]]) -> Figure:
     return figure
 
 
-PERIOD_S: Final = 2.5
-LONGEST_TICKS: Final = 2 * HOUR_TICKS
-"""Longest run of each of the eight hours: rounding changes single steps, so more draws say more than longer runs."""
 INPUTS: Final = {"CV155": "%", "NCR22_A": "W", "CV156": "%"}
 
 
@@ -191,13 +181,13 @@ class SinglePrecision:
 
 
 def _loads(options: StudyOptions) -> list[Load]:
-    return loads(options, "8h", longest_ticks=LONGEST_TICKS)
+    """Return two hours of each draw: rounding changes single steps, so more draws say more than longer runs."""
+    return loads(options, "8h", longest_ticks=2 * HOUR_TICKS)
 
 
 def _both(load: Load) -> list[RunRequest]:
     return [
-        load.request(PERIOD_S, f"{PROGRAM}arithmetic={arithmetic}", trace_ticks=1)
-        for arithmetic in ("float64", "float32")
+        load.request(2.5, f"{PROGRAM}arithmetic={arithmetic}", trace_ticks=1) for arithmetic in ("float64", "float32")
     ]
 
 

@@ -1,4 +1,8 @@
-"""Comparison of controllers and rules of the updating period on plants and sensors that differ from the model."""
+"""Controllers in the closed loop: the classical loops as the baseline, solvers and rules, plants that are off.
+
+The classical loops stand beside MPC; solvers under fixed periods and under rules are compared with each other, and
+controllers and rules on plants and sensors that differ from the model.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -10,10 +14,121 @@ from coldloop.process.cold_box import TICK_S
 from coldloop_rig.plc_sizing.intervals import Interval, interval_of_mean, mean_ratio
 from coldloop_rig.results.indicators import Indicators
 from coldloop_rig.text_tables import markdown_table
-from coldloop_studies.drawing import ratio_rows
-from coldloop_studies.paper.updating_period import ADAPTIVE, INTERRUPT, RULE
+from coldloop_studies import study
+from coldloop_studies.drawing import cost_bars, ratio_rows
 from coldloop_studies.request import Procedure, RunRequest, Series
-from coldloop_studies.study import NOISE, PROGRAM, TUNED, Load, Outcomes, StudyOptions, StudyResult, loads, noise
+from coldloop_studies.study import NOISE, PROGRAM, TUNED, Load, Outcomes, StudyOptions, StudyResult, loads
+from coldloop_studies.updating_period import ADAPTIVE, INTERRUPT, RULE, Policy
+
+CASES: Final = {
+    "classical loops": (2.5, ("control_plc.driver=classical",)),
+    "MPC, 2.5 s": (2.5, ()),
+    "MPC, adaptive": (0.0, ()),
+}
+
+
+class ClassicalStudy:
+    """Two PI loops against MPC."""
+
+    name = "classical"
+    title = "The classical loops as a baseline (section IV-A)"
+
+    def requests(self, options: StudyOptions) -> list[RunRequest]:
+        """Return every case under every draw."""
+        return [request for load in loads(options, *"abcdef") for request in _classical_runs(load)]
+
+    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+        """Compare closed-loop costs and bands."""
+        result = StudyResult(("load", "case", "J_BF", "L1 outside (%)", "T5 outside (%)"), [], {})
+        table = []
+        for load in loads(options, *"abcdef"):
+            runs = [outcomes[request].indicators for request in _classical_runs(load)]
+            rows = [(run.J_BF, *run.outside_band_pct.values()) for run in runs]
+            result.rows += [(load.name, label, *row) for label, row in zip(CASES, rows, strict=True)]
+            table.append((load.name, *(f"{cost:,.0f} ({L1:.1f} / {T5:.1f})" for cost, L1, T5 in rows)))
+            result.note("J_BF of the classical loops over MPC at 2.5 s", runs[0].J_BF / runs[1].J_BF)
+        result.figures["closed-loop cost"] = cost_bars(result, CASES, 0.25, logarithmic=True)
+        caption = "**J_BF (time outside the bands, %: L1 / T5)**"
+        result.remarks.append(markdown_table(("hour", *CASES), table, caption))
+        return result
+
+
+def _classical_runs(load: Load) -> list[RunRequest]:
+    return [load.request(period, *assignments) for period, assignments in CASES.values()]
+
+
+SOLVERS: Final = {
+    "ODE": (),
+    "ODE as printed": (f"{PROGRAM}preset=as-printed",),
+    "interior point": (f"{PROGRAM}solver=interior-point",),
+    "hybrid": (f"{PROGRAM}solver=hybrid",),
+    "hybrid as printed": (f"{PROGRAM}solver=hybrid", f"{PROGRAM}preset=as-printed"),
+}
+WAYS: Final = (
+    Policy("Algorithm 1", ADAPTIVE),
+    Policy("Algorithm 1, interrupt", ADAPTIVE, (INTERRUPT,)),
+    Policy("contraction rule, interrupt", ADAPTIVE, (f"{RULE}contraction", INTERRUPT)),
+    *(Policy(f"fixed {period:g} s", period) for period in (1.0, 1.5, 2.5, 5.0)),
+    Policy("fixed 1.5 s, interrupt", 1.5, (INTERRUPT,)),
+)
+REFERENCE: Final = ("ODE", "Algorithm 1")
+"""Solver and way that the others are compared with."""
+
+
+class ContestStudy:
+    """Every solver under every way to choose the updating period."""
+
+    name = "contest"
+    title = "Beyond the paper: solvers and rules in the closed loop"
+
+    def requests(self, options: StudyOptions) -> list[RunRequest]:
+        """Return all runs."""
+        return [
+            request for solver in SOLVERS for way in WAYS
+            for hours in _groups(options).values() for request in _under(hours, solver, way)
+        ]  # fmt: skip
+
+    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+        """Compare both costs with those of the ODE-based solver under Algorithm 1, hour by hour."""
+        result = StudyResult(("load", "solver", "way", "tau_u mean (s)", "J per time", "J_BF"), [], {})
+        over = f"over that of {' under '.join(REFERENCE)}"
+        for title, hours in _groups(options).items():
+            found = {
+                (solver, way.label): [outcomes[request].indicators for request in _under(hours, solver, way)]
+                for solver in SOLVERS for way in WAYS
+            }  # fmt: skip
+            result.rows += [
+                (load.name, *key, runs[place].tau_u_mean, runs[place].J_open_mean, runs[place].J_BF)
+                for place, load in enumerate(hours) for key, runs in found.items()
+            ]  # fmt: skip
+            for indicator, cost in (("J_BF", "J_BF"), ("J_open_mean", "mean open-loop cost")):
+                costs = {key: np.array([getattr(run, indicator) for run in runs]) for key, runs in found.items()}
+                means = {key: mean_ratio(values, costs[REFERENCE]) for key, values in costs.items()}
+                worst = {key: float((values / costs[REFERENCE]).max()) for key, values in costs.items()}
+                keys = {way.label: [(solver, way.label) for solver in SOLVERS] for way in WAYS}
+                rows = [
+                    (label, *(f"{means[key].text()} ({worst[key]:.2f})" for key in row)) for label, row in keys.items()
+                ]
+                caption = (
+                    f"**{title}, {cost}** {over}, geometric mean of {len(hours)} hours with its 95 % interval; in "
+                    "brackets the worst hour."
+                )
+                result.remarks.append(markdown_table(("way", *SOLVERS), rows, caption))
+                drawn = {solver: {way.label: means[solver, way.label] for way in WAYS} for solver in SOLVERS}
+                result.figures[f"{title}, {cost}"] = ratio_rows(drawn, f"{cost} {over} (1)", 4.0, 0.16, len(SOLVERS))
+                for key, mean in means.items():
+                    result.values[f"{cost} over ODE, Algorithm 1, {title}: {', '.join(key)}"] = [mean.value]
+        return result
+
+
+def _groups(options: StudyOptions) -> dict[str, list[Load]]:
+    """Return the first draws, and those that no constant was chosen on."""
+    return study.first_and_fresh(loads(options, *options.hours, usual=6))
+
+
+def _under(hours: Sequence[Load], solver: str, way: Policy) -> list[RunRequest]:
+    return [load.request(way.period_s, *SOLVERS[solver], *way.assignments) for load in hours]
+
 
 MISMATCH: Final = "plant.mismatch."
 OFF: Final = (0.8, 0.9, 1.1, 1.2)
@@ -31,7 +146,7 @@ CONDITIONS: Final = {
         for name, keys in PARAMETERS.items() for factor in OFF
     },
     "sensor noise": NOISE,
-    "sensor noise doubled": noise(2.0),
+    "sensor noise doubled": study.noise(2.0),
     "sensor bias": (
         "plant.sensors.level_bias=0.2", "plant.sensors.temperature_bias=0.2", "plant.sensors.pressure_bias=0.005",
     ),
@@ -115,7 +230,25 @@ Found = Mapping[tuple[str, str], HoursUnder]
 def controllers_remarks(options: StudyOptions, found: Found) -> list[str]:
     """Return what the controllers hold and at which cost, and the tables of it."""
     names = [load.name for load in loads(options, *options.hours, usual=1)]
-    return [holding(found), comparison(found), LEFT_OUT, _costs(found), _own_ratios(found, names)]
+    costs, ratios = [], []
+    for condition in CONTROLLER_CONDITIONS:
+        under = [found[condition, controller] for controller in CONTROLLERS]
+        means = (interval_of_mean(one.costs.tolist(), 0.0).brief() for one in under)
+        costs.append((condition, *(f"{mean}; {one.outside}" for mean, one in zip(means, under, strict=True))))
+        own = (over_own(found, condition, controller) for controller in CONTROLLERS)
+        worst = ((mean.brief(), by_hour.max(), names[int(by_hour.argmax())]) for mean, by_hour in own)
+        ratios.append((condition, *(f"{mean} ({most:.3g}: {name})" for mean, most, name in worst)))
+    header = ("condition", *CONTROLLERS)
+    what_costs = (
+        f"**J_BF; share of the time outside the bands (%: L1 / T5)**, means of {len(found[NOMINAL, DEFAULT].costs)} "
+        "runs, J_BF with its 95 % interval."
+    )
+    what_ratios = (
+        f"**J_BF over that of the same controller on the plant {NOMINAL}**, geometric mean of the hours with its 95 % "
+        "interval; in brackets the worst hour."
+    )
+    tables = markdown_table(header, costs, what_costs), markdown_table(header, ratios, what_ratios)
+    return [holding(found), comparison(found), LEFT_OUT, *tables]
 
 
 def holding(found: Found) -> str:
@@ -154,45 +287,18 @@ def comparison(found: Found) -> str:
     )
 
 
-def _costs(found: Found) -> str:
-    rows = []
-    for condition in CONTROLLER_CONDITIONS:
-        under = [found[condition, controller] for controller in CONTROLLERS]
-        means = [interval_of_mean(one.costs.tolist(), 0.0).brief() for one in under]
-        rows.append((condition, *(f"{mean}; {one.outside}" for mean, one in zip(means, under, strict=True))))
-    caption = (
-        f"**J_BF; share of the time outside the bands (%: L1 / T5)**, means of {len(found[NOMINAL, DEFAULT].costs)} "
-        "runs, J_BF with its 95 % interval."
-    )
-    return markdown_table(("condition", *CONTROLLERS), rows, caption)
-
-
 def over_own(found: Found, condition: str, controller: str) -> tuple[Interval, Series]:
     """Return the J_BF of a controller over its own on the plant as its model: geometric mean, and hour by hour."""
     costs, own = found[condition, controller].costs, found[NOMINAL, controller].costs
     return mean_ratio(costs, own), costs / own
 
 
-def _own_ratios(found: Found, names: list[str]) -> str:
-    rows = []
-    for condition in CONTROLLER_CONDITIONS:
-        cells = []
-        for controller in CONTROLLERS:
-            mean, by_hour = over_own(found, condition, controller)
-            cells.append(f"{mean.brief()} ({by_hour.max():.3g}: {names[int(by_hour.argmax())]})")
-        rows.append((condition, *cells))
-    caption = (
-        f"**J_BF over that of the same controller on the plant {NOMINAL}**, geometric mean of the hours with its 95 % "
-        "interval; in brackets the worst hour."
-    )
-    return markdown_table(("condition", *CONTROLLERS), rows, caption)
-
-
 RULE_CONDITIONS: Final = {**CONDITIONS, "rate limit by elapsed time": ("limits.rate_reference=elapsed",)}
-REFERENCE: Final = "fixed 2.5 s"
+USUAL: Final = "fixed 2.5 s"
+"""Policy that the others are compared with."""
 POLICIES: Final = {
     "fixed 1 s": (1.0, ()),
-    REFERENCE: (2.5, ()),
+    USUAL: (2.5, ()),
     "fixed 5 s": (5.0, ()),
     "fixed 1.5 s, interrupt": (1.5, (INTERRUPT,)),
     "Algorithm 1": (ADAPTIVE, ()),
@@ -230,14 +336,15 @@ class RobustnessStudy:
         what = f"J_BF over that of the same controller on the plant {NOMINAL} (1)"
         result.figures["controllers on plants that are off"] = ratio_rows(over, what, 8.0, 0.27, 3)
         result.remarks += controllers_remarks(options, found)
-        tables = {key: np.array([(run.J_BF, run.J_open_mean) for run in some]) for key, some in runs.items()}
-        for column, cost in enumerate(("J_BF", "open loop")):
-            costs = {key: values[:, column] for key, values in tables.items()}
-            ratios = _over_reference(costs)
-            by_policy = {policy: {condition: row[policy] for condition, row in ratios.items()} for policy in POLICIES}
-            what = f"{cost} over that of {REFERENCE} (1)"
-            result.figures[f"policies under {cost}"] = ratio_rows(by_policy, what, 6.5, 0.13, 3)
-            result.remarks.append(_table(ratios, cost, costs))
+        for indicator, cost in (("J_BF", "J_BF"), ("J_open_mean", "open loop")):
+            costs = {key: np.array([getattr(run, indicator) for run in some]) for key, some in runs.items()}
+            ratios = {
+                policy: {each: mean_ratio(costs[each, policy], costs[each, USUAL]) for each in RULE_CONDITIONS}
+                for policy in POLICIES
+            }
+            what = f"{cost} over that of {USUAL} (1)"
+            result.figures[f"policies under {cost}"] = ratio_rows(ratios, what, 6.5, 0.13, 3)
+            result.remarks.append(_policy_table(ratios, cost, costs))
         return result
 
 
@@ -258,25 +365,17 @@ def _cases(options: StudyOptions) -> Iterator[Case]:
                 yield condition, policy, load, load.request(period_s, *changes, *own)
 
 
-Ratios = dict[str, dict[str, Interval]]
-
-
-def _over_reference(costs: dict[tuple[str, str], Series]) -> Ratios:
-    return {
-        condition: {policy: mean_ratio(costs[condition, policy], costs[condition, REFERENCE]) for policy in POLICIES}
-        for condition in RULE_CONDITIONS
-    }
-
-
-def _table(ratios: Ratios, cost: str, costs: dict[tuple[str, str], Series]) -> str:
-    others = [policy for policy in POLICIES if policy != REFERENCE]
-    hours = len(costs[NOMINAL, REFERENCE])
+def _policy_table(
+    ratios: Mapping[str, Mapping[str, Interval]], cost: str, costs: Mapping[tuple[str, str], Series]
+) -> str:  # fmt: skip
+    others = [policy for policy in POLICIES if policy != USUAL]
     caption = (
-        f"**Preset `paper`: {cost}** over that of {REFERENCE} under the same condition, geometric mean of "
-        f"{hours} runs with its 95 % interval; before it, that of {REFERENCE} over its own without mismatch."
+        f"**Preset `paper`: {cost}** over that of {USUAL} under the same condition, geometric mean of "
+        f"{len(costs[NOMINAL, USUAL])} runs with its 95 % interval; before it, that of {USUAL} over its own without "
+        "mismatch."
     )
     rows = []
-    for condition, row in ratios.items():
-        own = mean_ratio(costs[condition, REFERENCE], costs[NOMINAL, REFERENCE])
-        rows.append((condition, own.text(2), *(row[policy].text() for policy in others)))
-    return markdown_table(("condition", REFERENCE, *others), rows, caption)
+    for condition in RULE_CONDITIONS:
+        own = mean_ratio(costs[condition, USUAL], costs[NOMINAL, USUAL])
+        rows.append((condition, own.text(2), *(ratios[policy][condition].text() for policy in others)))
+    return markdown_table(("condition", USUAL, *others), rows, caption)

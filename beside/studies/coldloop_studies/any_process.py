@@ -25,7 +25,7 @@ from coldloop_rig.plc_sizing.intervals import (
 )
 from coldloop_rig.text_tables import markdown_table
 from coldloop_studies.drawing import legend_outside, panels, ratio_rows, ratio_scale, spans_decade
-from coldloop_studies.request import Outcome, RunRequest
+from coldloop_studies.request import RunRequest
 from coldloop_studies.settings import settings_of
 from coldloop_studies.study import NOISE, PROGRAM, TUNED, Load, Outcomes, StudyOptions, StudyResult, Variant, loads
 
@@ -52,7 +52,8 @@ class CompareStudy:
         result = StudyResult((*VARIANT_COLUMNS, *shares), [], {})
         found = [[outcomes[_variant_run(load, variant)].indicators for load in drawn] for variant in variants]
         costs = np.array([[run.J_BF for run in runs] for runs in found])
-        ratios = over_reference(costs)
+        require_costs(costs)
+        ratios = [mean_ratio(row, costs[0]) for row in costs]  # paired by draw
         reference, summary = variants[0].name, []
         for variant, runs, over, ratio in zip(variants, found, costs / costs[0], ratios, strict=True):
             outside = np.array([[*run.outside_band_pct.values()] for run in runs])
@@ -62,44 +63,28 @@ class CompareStudy:
             ]
             means = (f"{share:.3g}" for share in outside.mean(axis=0))
             is_reference = variant is variants[0]
-            said = ("1", "the reference") if is_reference else (ratio.text(), in_words(ratio))
+            words = ratio.in_words("costs less", "costs more", "one draw has no interval")
+            said = ("1", "the reference") if is_reference else (ratio.text(), words)
             summary.append((variant.name, *said, *means))
             if not is_reference:
-                what = f"J_BF of {variant.name} over that of {reference} {ratio.text()}, {in_words(ratio)}; by draw"
+                what = f"J_BF of {variant.name} over that of {reference} {ratio.text()}, {words}; by draw"
                 result.values[what] = over.tolist()
         header = ("variant", f"J_BF over that of {reference}", "in words", *shares)
         caption = (
             f"Geometric mean of {len(drawn)} paired runs with its 95 % interval; shares of the time outside, their mean"
         )
-        result.remarks += [markdown_table(header, summary, caption), _settings_table(variants)]
+        changes = [(one.name, ", ".join(f"`{each}`" for each in one.assignments[1:]) or "defaults") for one in variants]
+        result.remarks += [
+            markdown_table(header, summary, caption),
+            markdown_table(("variant", "settings"), changes, "What each variant changes of the defaults"),
+        ]
         result.figures["variants over the reference"] = _variants_figure(variants, ratios, costs / costs[0])
         return result
-
-
-def over_reference(costs: Array) -> list[Interval]:
-    """Return the geometric mean of each row of J_BF over the first, paired by column (a draw), with its interval.
-
-    Raises:
-        StudyError: A loop costs nothing.
-    """
-    require_costs(costs)
-    return [mean_ratio(row, costs[0]) for row in costs]
-
-
-def in_words(ratio: Interval) -> str:
-    """Return what an interval of a ratio of costs shows."""
-    return ratio.in_words("costs less", "costs more", "one draw has no interval")
 
 
 def _variant_run(load: Load, variant: Variant) -> RunRequest:
     period_s = settings_of((*load.settings, *variant.assignments)).optimizer_plc.program.updating_period_s
     return load.request(period_s, *variant.assignments)
-
-
-def _settings_table(variants: tuple[Variant, ...]) -> str:
-    rows = [(variant.name, ", ".join(f"`{one}`" for one in variant.assignments[1:]) or "defaults")
-            for variant in variants]  # fmt: skip
-    return markdown_table(("variant", "settings"), rows, "What each variant changes of the defaults")
 
 
 def _variants_figure(variants: tuple[Variant, ...], ratios: list[Interval], by_draw: Array) -> Figure:
@@ -155,7 +140,7 @@ class PeriodsStudy:
             run
             for regime in _regimes(options.process).values()
             for load in loads(options, *"abcdef")
-            for run in (*_runs(load, options.process, regime), _other(load, options.process, regime))
+            for run in _runs(load, options.process, regime)
         ]
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
@@ -165,15 +150,18 @@ class PeriodsStudy:
         tried, named = periods(process), _other_rule(process)[1]
         costs, means, training = {}, {}, np.array([load.draw == 1 for load in drawn])
         for regime, settings in _regimes(process).items():
-            found = [[outcomes[run] for run in _runs(load, process, settings)] for load in drawn]
-            for load, some in zip(drawn, found, strict=True):
-                result.rows += [_row(regime, load.name, *one) for one in zip(tried, some, strict=True)]
-            other = [outcomes[_other(load, process, settings)] for load in drawn]
-            result.rows += [_row(regime, load.name, named, run) for load, run in zip(drawn, other, strict=True)]
-            costs[regime] = np.array([[one.indicators.J_BF for one in some] for some in found]).T
-            means[regime] = float(np.mean([some[0].indicators.tau_u_mean for some in found]))
+            found = [[outcomes[run].indicators for run in _runs(load, process, settings)] for load in drawn]
+            rows = [
+                [(regime, load.name, label, run.tau_u_mean, run.J_BF, *run.outside_band_pct.values())
+                 for label, run in zip(("adaptive", *tried[1:], named), runs, strict=True)]
+                for load, runs in zip(drawn, found, strict=True)
+            ]  # fmt: skip
+            result.rows += [row for of_load in rows for row in of_load[:-1]] + [of_load[-1] for of_load in rows]
+            every = np.array([[run.J_BF for run in runs] for runs in found]).T
+            costs[regime] = every[:-1]
+            means[regime] = float(np.mean([runs[0].tau_u_mean for runs in found]))
             best, ratio = judged(costs[regime], training)
-            of_other = judged(np.vstack(([run.indicators.J_BF for run in other], costs[regime][1:])), training)[1]
+            _, of_other = judged(np.vstack((every[-1], every[1:-1])), training)
             result.note(f"{regime}: J_BF of the adaptive period over fixed {tried[best]:g} s", ratio.value)
             cells = f"{means[regime]:.2f}", f"{tried[best]:g}", ratio.text(), pays(ratio), of_other.text()
             summary.append((regime, *cells))
@@ -181,9 +169,8 @@ class PeriodsStudy:
         chosen = "on the first draws, judged on the others" if fresh else "on the same, which favours it"
         title = f"J_BF of the adaptive period over the best fixed one, chosen {chosen}"
         result.remarks.append(markdown_table((*SUMMARY, f"{named} over it"), summary, title))
-        result.remarks.append(
-            markdown_table(result.columns, [tuple(map(_text, row)) for row in result.rows], "All runs")
-        )
+        texts = [tuple(cell if isinstance(cell, str) else f"{cell:.4g}" for cell in row) for row in result.rows]
+        result.remarks.append(markdown_table(result.columns, texts, "All runs"))
         result.figures["cost against period"] = _periods_figure(costs, means, tried[1:])
         return result
 
@@ -210,21 +197,9 @@ def _has_others(training: NDArray[np.bool_]) -> bool:
 
 
 def _runs(load: Load, process: Process, settings: tuple[str, ...]) -> list[RunRequest]:
-    return [load.request(period, TUNED, *settings) for period in periods(process)]
-
-
-def _other(load: Load, process: Process, settings: tuple[str, ...]) -> RunRequest:
-    return load.request(ADAPTIVE, TUNED, f"{PROGRAM}adaptive.rule={_other_rule(process)[0]}", *settings)
-
-
-def _row(regime: str, name: str, period_s: float | str, outcome: Outcome) -> tuple[str | float, ...]:
-    run = outcome.indicators
-    period = "adaptive" if period_s == ADAPTIVE else period_s
-    return (regime, name, period, run.tau_u_mean, run.J_BF, *run.outside_band_pct.values())
-
-
-def _text(cell: str | float) -> str:
-    return cell if isinstance(cell, str) else f"{cell:.4g}"
+    """Return the run of each of `periods`, and that of the rule that is not the default."""
+    other = load.request(ADAPTIVE, TUNED, f"{PROGRAM}adaptive.rule={_other_rule(process)[0]}", *settings)
+    return [*(load.request(period, TUNED, *settings) for period in periods(process)), other]
 
 
 def _periods_figure(costs: dict[str, Array], means: dict[str, float], fixed_s: tuple[float, ...]) -> Figure:

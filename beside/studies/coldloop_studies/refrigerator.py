@@ -42,22 +42,23 @@ class CouplingStudy:
 
     def requests(self, options: StudyOptions) -> list[RunRequest]:
         """Return every plant under every draw."""
-        return [request for load in loads(options, *"abcdef") for request in _coupled_runs(load)]
+        return [request for load in loads(options, *"abcdef") for request in _coupled_runs(load).values()]
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Compare closed-loop costs, bands, updating periods and what the pressures do."""
         result = StudyResult(COUPLING_COLUMNS, [], {}, always_shown=True)
         for load in loads(options, *"abcdef"):
-            runs = [outcomes[request] for request in _coupled_runs(load)]
-            for label, run in zip(PLANTS, runs, strict=True):
+            runs = {plant: outcomes[request] for plant, request in _coupled_runs(load).items()}
+            alone, *_ = runs.values()
+            for plant, run in runs.items():
                 i = run.indicators
-                result.rows.append((load.name, label, i.J_BF, *i.outside_band_pct.values(), i.tau_u_mean, *warm(run)))
-            for label, run in list(zip(PLANTS, runs, strict=True))[1:]:
-                ratio = run.indicators.J_BF / runs[0].indicators.J_BF
-                result.note(f"J_BF on the {label}, over the cold box alone", ratio)
+                result.rows.append((load.name, plant, i.J_BF, *i.outside_band_pct.values(), i.tau_u_mean, *warm(run)))
+                if run is not alone:
+                    ratio = run.indicators.J_BF / alone.indicators.J_BF
+                    result.note(f"J_BF on the {plant}, over the cold box alone", ratio)
             if "pressures" not in result.figures:
-                labelled = list(zip(PLANTS, runs, strict=True))
-                result.figures["pressures"] = over_time(f"hour {Path(load.name).name}", labelled, COUPLING_SHOWN, 6.0)
+                title = f"hour {Path(load.name).name}"
+                result.figures["pressures"] = over_time(title, list(runs.items()), COUPLING_SHOWN, 6.0)
         result.figures["closed-loop cost"] = cost_bars(result, PLANTS, 0.19)
         return result
 
@@ -75,8 +76,8 @@ def _range(run: Outcome, name: str, digits: int) -> str:
     return f"{series.min():.{digits}f}..{series.max():.{digits}f}"
 
 
-def _coupled_runs(load: Load) -> list[RunRequest]:
-    return [load.request(0.0, *assignments, trace_ticks=TRACE_TICKS) for assignments in PLANTS.values()]
+def _coupled_runs(load: Load) -> dict[str, RunRequest]:
+    return {plant: load.request(0.0, *settings, trace_ticks=TRACE_TICKS) for plant, settings in PLANTS.items()}
 
 
 def _events(*events: tuple[int, str, float]) -> tuple[str, ...]:
@@ -128,35 +129,31 @@ class DisturbancesStudy:
 
     def requests(self, options: StudyOptions) -> list[RunRequest]:
         """Return every event with every pair of controllers."""
-        return [run for event in CASES.values() for load in _loads(event, options) for run in _runs(event, load)]
+        return [run for event in CASES.values() for load in _loads(event, options) for run in _runs(event, load).values()]
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Tabulate bands, pressures, modes and alarms of each run."""
         result = StudyResult(COLUMNS, [], {}, always_shown=True)
         for name, event in CASES.items():
             for load in _loads(event, options):
-                runs = [outcomes[request] for request in _runs(event, load)]
-                for (driver, station), run in zip(_pairs(), runs, strict=True):
-                    result.rows.append((f"{name} ({load.name})", driver, station, *_measures(run)))
+                runs = {pair: outcomes[request] for pair, request in _runs(event, load).items()}
+                result.rows += [(f"{name} ({load.name})", *pair, *_measures(run)) for pair, run in runs.items()]
                 if load.draw == 1:
-                    labelled = list(zip(map(", ".join, _pairs()), runs, strict=True))
+                    labelled = [(", ".join(pair), run) for pair, run in runs.items()]
                     result.figures[name] = over_time("", labelled, SHOWN, 8.0)
         return result
-
-
-def _pairs() -> list[tuple[str, str]]:
-    return [(driver, station) for driver in DRIVERS for station in STATION]
 
 
 def _loads(event: Case, options: StudyOptions) -> list[Load]:
     return loads(replace(options, loads=options.loads[:1]), event[0])
 
 
-def _runs(event: Case, load: Load) -> list[RunRequest]:
-    return [
-        load.request(0.0, REFRIGERATOR, *event[1], *DRIVERS[driver], *STATION[station], trace_ticks=TRACE_TICKS)
-        for driver, station in _pairs()
-    ]
+def _runs(event: Case, load: Load) -> dict[tuple[str, str], RunRequest]:
+    """Return the run of each driver with each control of the station."""
+    return {
+        (driver, station): load.request(0.0, REFRIGERATOR, *event[1], *driving, *control, trace_ticks=TRACE_TICKS)
+        for driver, driving in DRIVERS.items() for station, control in STATION.items()
+    }  # fmt: skip
 
 
 def _measures(run: Outcome) -> tuple[str | float, ...]:

@@ -1,6 +1,6 @@
 """Cost against updating period, fixed and adapted (paper, figure `tu_opt`), and what the literal rule needs to work."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -11,13 +11,12 @@ from matplotlib.figure import Figure
 from coldloop_rig.figures.plot import ACCENT, INK, THIRD
 from coldloop_rig.plc_sizing.intervals import geometric_mean
 from coldloop_rig.text_tables import Cell, markdown_table
-from coldloop_studies import published
-from coldloop_studies.drawing import hour_panels
-from coldloop_studies.paper.trajectories import response, response_figure, response_table
+from coldloop_studies import drawing
 from coldloop_studies.request import Outcome, RunRequest, Series
 from coldloop_studies.study import NOISE, PROGRAM, Load, Outcomes, StudyOptions, StudyResult, first_and_fresh, loads
+from coldloop_studies.trajectories import response, response_figure, response_table
 
-NINE: Final = tuple(published.updating_period()["a"]["tau_u_s"].tolist())
+NINE: Final = tuple(drawing.published_periods()["a"]["tau_u_s"].tolist())
 """Periods of the paper, s."""
 SHORTER: Final = (0.5, 0.75)
 """Periods below the paper's, s, where the optimum of a fast solver may lie."""
@@ -83,25 +82,19 @@ class UpdatingPeriodStudy:
 
     def requests(self, options: StudyOptions) -> list[RunRequest]:
         """Return all runs; variants under the first draw only."""
-        hours = _hours(options)
+        hours = loads(options, *options.hours)
         main = [request for load in hours for request in _main(load, options)]
-        return main + [
-            request for load in hours if load.draw == 1 for variant in _variants(options)
-            for request in _variant_runs(load, variant)
-        ]  # fmt: skip
+        return main + [request for *_, runs in _variants(options) for request in runs.values()]
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Rank fixed periods and rules in each hour."""
         result = StudyResult(COLUMNS, [], {})
-        hours = {load.name: _Hour.of(load, options, outcomes) for load in _hours(options)}
+        hours = {load.name: _Hour.of(load, options, outcomes) for load in loads(options, *options.hours)}
         for name, hour in hours.items():
             for label, run in hour.runs():
                 result.rows.append(_row("", name, label, run))
-        for load in _hours(options):
-            for variant in _variants(options) if load.draw == 1 else ():
-                labels = [f"fixed {period:g} s" for period in variant.periods] + [p.label for p in variant.policies]
-                for label, request in zip(labels, _variant_runs(load, variant), strict=True):
-                    result.rows.append(_row(variant.label, load.name, label, outcomes[request]))
+        for variant, load, runs in _variants(options):
+            result.rows += [_row(variant.label, load.name, label, outcomes[run]) for label, run in runs.items()]
         groups = first_and_fresh(hour.load for hour in hours.values())
         first, fresh = (
             {load.name: hours[load.name] for load in groups.get(title, ())} for title in ("hours", "fresh hours")
@@ -112,11 +105,10 @@ class UpdatingPeriodStudy:
         _judge(result, "hours", first)
         if fresh:
             _judge(result, "fresh hours", fresh)
-        if AS_PRINTED in _variants(options):
-            printed = [_variant_runs(load, AS_PRINTED)[: len(NINE)] for load in _hours(options) if load.draw == 1]
-            result.values["interior optimum from 1 to 5 s, share of hours, as printed"] = [
-                _share(is_inside([outcomes[one].indicators.J_open_mean for one in runs]) for runs in printed)
-            ]
+        if printed := [list(runs.values()) for variant, _, runs in _variants(options) if variant is AS_PRINTED]:
+            costs = ([outcomes[one].indicators.J_open_mean for one in runs[: len(NINE)]] for runs in printed)
+            share = _share(map(is_inside, costs))
+            result.values["interior optimum from 1 to 5 s, share of hours, as printed"] = [share]
         for policy in (LITERAL, OWN_INTERRUPT):
             found = response(responses[policy.label], policy.label)
             result.values |= {name: [value] for name, value in found.items()}
@@ -130,18 +122,10 @@ def _row(variant: str, load: str, policy: str, run: Outcome) -> tuple[Cell, ...]
     return variant, load, policy, i.tau_u_mean, i.J_open_mean, i.J_BF, i.tau_u_mean_per_update
 
 
-def _hours(options: StudyOptions) -> list[Load]:
-    return loads(options, *options.hours)
-
-
 def _periods(load: Load, options: StudyOptions) -> tuple[float, ...]:
     if options.quick:
         return FEW
     return (*SHORTER, *NINE) if load.draw == 1 else NINE
-
-
-def _variants(options: StudyOptions) -> tuple[PolicyVariant, ...]:
-    return () if options.quick else VARIANTS
 
 
 def _main(load: Load, options: StudyOptions) -> list[RunRequest]:
@@ -149,9 +133,16 @@ def _main(load: Load, options: StudyOptions) -> list[RunRequest]:
     return fixed + [load.request(policy.period_s, *policy.assignments) for policy in POLICIES]
 
 
-def _variant_runs(load: Load, variant: PolicyVariant) -> list[RunRequest]:
-    fixed = [load.request(period, *variant.assignments) for period in variant.periods]
-    return fixed + [load.request(p.period_s, *variant.assignments, *p.assignments) for p in variant.policies]
+def _variants(options: StudyOptions) -> Iterator[tuple[PolicyVariant, Load, dict[str, RunRequest]]]:
+    """Yield the runs of each variant under the first draw of each hour, by policy; a quick study has none."""
+    for load in () if options.quick else loads(options, *options.hours):
+        for variant in VARIANTS if load.draw == 1 else ():
+            policies = (*(Policy(f"fixed {period:g} s", period) for period in variant.periods), *variant.policies)
+            yield (
+                variant,
+                load,
+                {one.label: load.request(one.period_s, *variant.assignments, *one.assignments) for one in policies},
+            )
 
 
 @dataclass(frozen=True)
@@ -176,34 +167,29 @@ class _Hour:
     def runs(self) -> list[tuple[str, Outcome]]:
         return [(f"fixed {period:g} s", run) for period, run in self.fixed.items()] + list(self.policies.items())
 
-    def nine(self, indicator: str) -> Series:
+    def nine(self, indicator: str = "J_open_mean") -> Series:
         """Costs of the paper's periods."""
         return np.array([getattr(run.indicators, indicator) for p, run in self.fixed.items() if p in NINE])
 
-    def cost(self, label: str, indicator: str = "J_open_mean") -> float:
-        return float(getattr(self.policies[label].indicators, indicator))
-
-    def every(self, indicator: str) -> Series:
-        """Costs of all fixed periods."""
-        return np.array([getattr(run.indicators, indicator) for run in self.fixed.values()])
+    def cost(self, label: str) -> float:
+        return self.policies[label].indicators.J_open_mean
 
 
 def _judge(result: StudyResult, which: str, hours: Mapping[str, _Hour]) -> None:
     """Compute what the claims are judged by, over these hours."""
     some = list(hours.values())
     values = result.values
-    grids = {"1 to 5 s": [h.nine("J_open_mean") for h in some]}
+    grids = {"1 to 5 s": [h.nine() for h in some]}
     if all(period in h.fixed for h in some for period in SHORTER):
-        grids["0.5 to 5 s"] = [h.every("J_open_mean") for h in some]
+        grids["0.5 to 5 s"] = [np.array([run.indicators.J_open_mean for run in h.fixed.values()]) for h in some]
     for grid, costs_by_hour in grids.items():
         values[f"interior optimum from {grid}, share of {which}"] = [_share(map(is_inside, costs_by_hour))]
         ends = [max(costs[0], costs[-1]) / costs.min() for costs in costs_by_hour]
         values[f"worst end over best from {grid}, smallest of {which}"] = [float(min(ends))]
     for policy in POLICIES:
         costs = np.array([h.cost(policy.label) for h in some])
-        best = np.array([h.nine("J_open_mean").min() for h in some])
-        mean = np.array([h.nine("J_open_mean").mean() for h in some])
-        closed = np.array([h.cost(policy.label, "J_BF") for h in some])
+        best, mean = np.array([(h.nine().min(), h.nine().mean()) for h in some]).T
+        closed = np.array([h.policies[policy.label].indicators.J_BF for h in some])
         usual = np.array([h.fixed[2.5].indicators.J_BF for h in some])
         of = f"{policy.label}, {which}"
         values[f"better than the mean fixed period, share: {of}"] = [_share(costs < mean)]
@@ -231,14 +217,14 @@ def _figure(first: Mapping[str, _Hour], fresh: Mapping[str, _Hour]) -> Figure:
 
     def draw(name: str, place: Axes) -> None:
         hour = first[name]
-        base = hour.nine("J_open_mean").max() / 100.0
+        base = hour.nine().max() / 100.0
         periods = list(hour.fixed)
         costs = [run.indicators.J_open_mean / base for run in hour.fixed.values()]
         place.plot(periods, costs, color=INK, marker=".", label="fixed, here")
         place.axhline(hour.cost(LITERAL.label) / base, color=ACCENT, linestyle="--", label="Algorithm 1, here")
         place.axhline(hour.cost(OWN_INTERRUPT.label) / base, color=THIRD, linestyle="-.",
                       label="contraction rule, interrupt")  # fmt: skip
-        theirs = published.updating_period().get(name)
+        theirs = drawing.published_periods().get(name)
         if theirs:
             place.plot(theirs["tau_u_s"], theirs["cost_fixed_pct"], ":o", color=INK, markerfacecolor="white",
                        markersize=4, linewidth=0.8, label="fixed, paper")  # fmt: skip
@@ -246,11 +232,11 @@ def _figure(first: Mapping[str, _Hour], fresh: Mapping[str, _Hour]) -> Figure:
         others = [other for other in fresh.values() if other.load.name.startswith((f"{name}@", f"{name}#"))]
         for number, other in enumerate(others):
             label = "" if number else "fixed, other draws"
-            scale = other.nine("J_open_mean").max() / 100.0
+            scale = other.nine().max() / 100.0
             place.plot(list(other.fixed), [run.indicators.J_open_mean / scale for run in other.fixed.values()],
                        color=INK, alpha=0.25, linewidth=0.8, label=label)  # fmt: skip
 
-    return hour_panels(list(first), draw, "cost (% of the worst)", (5, 10, 20, 30, 50, 75, 100), 3)
+    return drawing.hour_panels(list(first), draw, "cost (% of the worst)", (5, 10, 20, 30, 50, 75, 100), 3)
 
 
 def _table(title: str, hours: Mapping[str, _Hour]) -> str:
@@ -262,7 +248,7 @@ def _table(title: str, hours: Mapping[str, _Hour]) -> str:
     )
     rows: list[tuple[Cell, ...]] = []
     for name, hour in hours.items():
-        nine, closed = hour.nine("J_open_mean"), hour.nine("J_BF")
+        nine, closed = hour.nine(), hour.nine("J_BF")
         runs = {"fixed 2.5 s": hour.fixed[2.5], **hour.policies}
         cells = [
             f"{runs[label].indicators.J_open_mean / nine.min():.3f} "
