@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop_export.c_files import OdeExport
-from coldloop_export.golden import ITERATIONS, GoldenVector, paper_settings, record
-from coldloop_export.kernels import PER_PROBLEM
+from coldloop_export.golden import ITERATIONS, PER_PROBLEM, GoldenVector, paper_settings, record
 
 GIVEN = (*PER_PROBLEM, "guess")
 

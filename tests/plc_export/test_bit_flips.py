@@ -8,10 +8,9 @@ import pytest
 
 from coldloop.errors import UsageError
 from coldloop.process.settings import InputLimits
-from coldloop_export.bit_flips import flipped
 from coldloop_export.c_files import GuardExport, OdeExport, OptimizerExport
-from coldloop_export.golden import ITERATIONS, GoldenVectors, golden_calls
-from coldloop_export.kernels import GuardKernels
+from coldloop_export.folder import flipped
+from coldloop_export.golden import ITERATIONS, GoldenVectors, GuardKernels, golden_calls
 from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, write
 from tests.plc_export.recorded_optimizers import OPTIMISERS, recorded_updates, recorder
 

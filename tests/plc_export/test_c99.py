@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from coldloop_export.c_files import OdeExport
-from coldloop_export.golden import ITERATIONS, GoldenVector, GoldenVectors
-from coldloop_export.kernels import PER_PROBLEM
+from coldloop_export.golden import ITERATIONS, PER_PROBLEM, GoldenVector, GoldenVectors
 from coldloop_optimizer_plc.qp.costs import matrices_of
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.interface import Costs

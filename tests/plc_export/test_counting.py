@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from coldloop.config import load_configuration
 from coldloop_export.counting import CountedProgram, Counter, counted_iterations, counted_updates, counter_of
-from coldloop_export.golden import ITERATIONS, SINGLE, GoldenVectors
-from coldloop_export.kernels import OdeProgram
+from coldloop_export.golden import ITERATIONS, SINGLE, GoldenVectors, OdeProgram
 from coldloop_optimizer_plc.computing_settings import OdeSettings
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.ode import ode_solver

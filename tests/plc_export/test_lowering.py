@@ -12,7 +12,7 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop_export.kernels import leaves
+from coldloop_export.golden import leaves
 from coldloop_export.st_lowering import Lowering, Record
 from coldloop_export.st_pausing import one_iteration_a_call
 from coldloop_export.st_printer import StructuredTextPrinter, block_name, memory

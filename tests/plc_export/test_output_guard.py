@@ -19,8 +19,7 @@ from coldloop.registers.control_plc import Verdict
 from coldloop_control_plc.output_limits import OutputGuard, begin
 from coldloop_export.c_files import GuardExport
 from coldloop_export.counting import counted_guard, counted_longest
-from coldloop_export.golden import Call, GoldenCall, Judgement, golden_calls
-from coldloop_export.kernels import GuardKernels
+from coldloop_export.golden import Call, GoldenCall, GuardKernels, Judgement, golden_calls
 from coldloop_export.st_files import GuardText
 from tests.harness.records import Row
 from tests.plc_export import matiec

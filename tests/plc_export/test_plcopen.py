@@ -8,10 +8,8 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from coldloop.process.settings import InputLimits
-from coldloop_export.golden import GoldenVectors, golden_calls
-from coldloop_export.kernels import GuardKernels
-from coldloop_export.plcopen import NAMESPACE, POUS, SECTIONS, XHTML, plcopen_xml
-from coldloop_export.st_files import GuardText, StructuredTextExport
+from coldloop_export.golden import GoldenVectors, GuardKernels, golden_calls
+from coldloop_export.st_files import NAMESPACE, POUS, SECTIONS, XHTML, GuardText, StructuredTextExport, plcopen_xml
 from tests.plc_export.st_parser import parsed
 
 pytestmark = pytest.mark.usefixtures("compiles")

@@ -10,8 +10,7 @@ import pytest
 from coldloop.process.cold_box import TICK_S
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop_export.c_files import GuardExport
-from coldloop_export.golden import golden_calls
-from coldloop_export.kernels import GuardKernels
+from coldloop_export.golden import GuardKernels, golden_calls
 from coldloop_rig.process_file.making import made_from
 from tests.plc_export import problems_file
 from tests.plc_export.c_programs import STRICT, write

@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop_export import st_printer
-from coldloop_export.golden import ITERATIONS, GoldenVector, GoldenVectors
-from coldloop_export.kernels import PER_PROBLEM
+from coldloop_export.golden import ITERATIONS, PER_PROBLEM, GoldenVector, GoldenVectors
 from coldloop_export.st_files import WORK, StructuredTextExport, sum_of
 from coldloop_export.st_printer import LONGEST, Names, StructuredTextPrinter, identifier
 from coldloop_export.tree import UnfitKernelError

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from coldloop.process.settings import InputLimits
-from coldloop_export.golden import golden_calls, integers_of
-from coldloop_export.kernels import GuardKernels
-from coldloop_export.plcopen import plcopen_xml
-from coldloop_export.st_files import GuardText, OptimizerText, register_table
+from coldloop_export.golden import GuardKernels, golden_calls, integers_of
+from coldloop_export.st_files import GuardText, OptimizerText, plcopen_xml, register_table
 from coldloop_export.st_printer import LARGEST_LIST, StructuredTextPrinter
 from coldloop_optimizer_plc.program import OptimizerProgram
 from tests.harness.records import CONTROL_MAP

@@ -1,6 +1,7 @@
 """Solver, whole optimiser and output guard as folders of C99: sources, constants, golden vectors, self-tests."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Any, Final
 
@@ -8,10 +9,9 @@ import numpy as np
 
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS
-from coldloop_export import tree
+from coldloop_export import golden, tree
 from coldloop_export.c_printer import GENERATED, Array, ConstantRecords, KernelFiles, Printer, golden_files, identifier
-from coldloop_export.golden import GoldenCall, GoldenUpdate, GoldenVector, arrays_in, tables_of, update_tables
-from coldloop_export.kernels import PER_PROBLEM, GuardKernels, OdeProgram, OptimizerKernels, crc, leaves
+from coldloop_export.golden import PER_PROBLEM, GoldenCall, GoldenUpdate, GoldenVector, GuardKernels, OdeProgram, crc
 from coldloop_export.tree import ArrayType, Function, Invoke, Kind, RecordType, StructType, Type, filled, template, walk
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
@@ -47,12 +47,13 @@ class OdeExport:
         constants = self._constants().items()
         declared = "".join(f"extern const {self.printer.scalar(values)} {name}[{values.size}];\n"
                            for name, values in constants)  # fmt: skip
-        sum_ = crc(np.array([float(each.rstrip("f")) for each in self.printer.literals], self.problem.phi.dtype))
-        for _, values in constants:
-            sum_ = crc(values, sum_)
+        literals = np.array([float(each.rstrip("f")) for each in self.printer.literals], self.problem.phi.dtype)
+        sum_ = reduce(lambda before, values: crc(values, before), (values for _, values in constants), crc(literals))
+        arrays = "\n".join(self.printer.array(name, values, "") for name, values in constants)
+        tables = f'{GENERATED}#include <math.h>\n\n#include "tables.h"\n\n{self.kernels.literals()}\n{arrays}'
         return {
             **self.kernels.texts(), "problem.h": self._filled("problem.h", header), "problem.c": self._problem(),
-            "tables.h": self._filled("tables.h", {"DECLARED": declared, "SUM": sum_}), "tables.c": self._tables(),
+            "tables.h": self._filled("tables.h", {"DECLARED": declared, "SUM": sum_}), "tables.c": tables,
             **self._golden(list(vectors)), "self_test.c": self._filled("self_test.c", {}),
         }  # fmt: skip
 
@@ -62,15 +63,16 @@ class OdeExport:
         constants = word * len(self.printer.literals) + sum(
             values.size * (word if values.dtype.kind == "f" else 4) for values in self._constants().values()
         )
-        golden = sum(word * sum(values.size for values in arrays_in(each).values()) for each in vectors)
+        arrays = (values for each in vectors for values in golden.arrays_in(each).values())
         return {"constants": constants, "stack of `solve_problem`, arrays and numbers": stack(self.entry, word),
-                "self-test and golden vectors": golden}  # fmt: skip
+                "self-test and golden vectors": word * sum(values.size for values in arrays)}  # fmt: skip
 
     def _constants(self) -> dict[str, Array]:
         """Return the constant arrays by name."""
-        real = self.problem.phi.dtype
-        flow = np.array([float(each) for each in self.method.flow], real)
-        matrices = {"_".join(path): values for path, values in leaves(("matrices",), self.method.matrices).items()}
+        flow = np.array([float(each) for each in self.method.flow], self.problem.phi.dtype)
+        matrices = {
+            "_".join(path): values for path, values in golden.leaves(("matrices",), self.method.matrices).items()
+        }
         return {"Phi": self.problem.Phi, "Gamma": self.problem.Gamma, "counts": self.counts, **matrices, "flow": flow}
 
     def _problem(self) -> str:
@@ -94,10 +96,6 @@ class OdeExport:
                 "BEFORE": none, "VECTORS": vectors}  # fmt: skip
         return self._filled("problem.c", body)
 
-    def _tables(self) -> str:
-        arrays = "\n".join(self.printer.array(name, values, "") for name, values in self._constants().items())
-        return f'{GENERATED}#include <math.h>\n\n#include "tables.h"\n\n{self.kernels.literals()}\n{arrays}'
-
     def _golden(self, vectors: list[GoldenVector]) -> dict[str, str]:
         """Return the files of the golden vectors: inputs and results of all in a row."""
         stacked = {
@@ -108,9 +106,7 @@ class OdeExport:
             "costs": np.array([each.answer.costs for each in vectors]),
             "iterations": np.array([each.answer.iterations for each in vectors]),
         }  # fmt: skip
-        sum_ = 0
-        for values in stacked.values():
-            sum_ = crc(values, sum_)
+        sum_ = reduce(lambda before, values: crc(values, before), stacked.values(), 0)
         declared = {f"golden_{name}[{values.size}]": values.ravel() for name, values in stacked.items()}
         return golden_files(self.printer, sum_, declared, N_GOLDEN=len(vectors))
 
@@ -123,6 +119,15 @@ class OdeExport:
 
 def _filled(name: str, parts: Mapping[str, str]) -> str:
     return filled(template(f"c/{name}"), {**parts, "GENERATED": GENERATED.rstrip()})
+
+
+def _in_order(
+    folder: str, kernels: KernelFiles, parts: Mapping[str, str], own: tuple[Sequence[str], Sequence[str]],
+    vectors: Mapping[str, str],
+) -> dict[str, str]:  # fmt: skip
+    """Return the files of a part of the export: kernels, constants, golden vectors, interface and self-test."""
+    constants, interface = ({name: _filled(f"{folder}/{name}", parts) for name in names} for names in own)
+    return {**kernels.texts(), **constants, **vectors, **interface}
 
 
 def stack(function: Function, word: int) -> int:
@@ -140,21 +145,18 @@ TABLES: Final = ("constants", "method", "rules", "starts")
 class OptimizerExport:
     """The optimiser of some settings as C99, with golden updates."""
 
-    def __init__(self, optimizer: OptimizerProgram, golden: Sequence[GoldenUpdate]) -> None:
-        self.kernels, self._golden, self._state = OptimizerKernels(optimizer), golden, optimizer.state
+    def __init__(self, optimizer: OptimizerProgram, updates: Sequence[GoldenUpdate]) -> None:
+        self.kernels, self._golden = golden.OptimizerKernels(optimizer), updates
         self._process, self.printer = optimizer.process, Printer(np.float32)
         functions = self.kernels.functions
-        made = (kind for each in functions for kind in self.printer.made_in(each))
+        made = [node.variable.type for each in functions for node in walk(each.body) if isinstance(node, tree.Make)]
         self._kernels = KernelFiles(self.printer, functions, self.kernels.entries, "optimizer", TABLES, made)
         self.state_type = next(each for each in self._kernels.records if each.name == "OptimizerState")
         self.constants = ConstantRecords(self.printer)
-        self._initial = {name: self.constants.printed(name, record) for name, record in self._leading()}
-
-    def _leading(self) -> Iterator[tuple[str, Any]]:
-        yield from self.kernels.constants.items()
+        records: dict[str, Any] = {**self.kernels.constants}
         for ticks, (rule, starts) in enumerate(zip(self.kernels.rules, self.kernels.starts, strict=True)):
-            yield f"rules[{ticks}]", rule
-            yield f"starts[{ticks}]", starts
+            records |= {f"rules[{ticks}]": rule, f"starts[{ticks}]": starts}
+        self._initial = {name: self.constants.printed(name, record) for name, record in records.items()}
 
     # -- files ---------------------------------------------------------------------------------------------------------
 
@@ -165,12 +167,8 @@ class OptimizerExport:
                  "ROWS": SEQUENCE_ROWS, "LONGEST": process.ticks_per_sample, "SHORTEST": SHORTEST_TICKS,
                  "TICK_S": process.tick_s}  # fmt: skip
         parts = {**self._constants(), **{name: str(size) for name, size in sizes.items()}}
-        names = ("optimizer.h", "optimizer.c", "self_test.c")
-        constants, own = (
-            {name: _filled(f"optimizer/{name}", parts) for name in each}
-            for each in (("constants.h", "constants.c"), names)
-        )
-        return {**self._kernels.texts(), **constants, **self._golden_files(), **own}
+        own = ("constants.h", "constants.c"), ("optimizer.h", "optimizer.c", "self_test.c")
+        return _in_order("optimizer", self._kernels, parts, own, self._golden_files())
 
     def sizes(self) -> dict[str, int]:
         """Return the bytes of what a PLC needs; the stack is that of the deepest calls, without what compilers add."""
@@ -196,7 +194,7 @@ class OptimizerExport:
     # -- golden updates ------------------------------------------------------------------------------------------------
 
     def _golden_files(self) -> dict[str, str]:
-        integers, reals = update_tables(self._golden).values()
+        integers, reals = golden.update_tables(self._golden).values()
         rows = np.array([row for each in self._golden if each.sequence for row in each.sequence.rows], np.float32)
         sum_ = crc(rows, crc(reals, crc(integers)))
         declared = {
@@ -221,9 +219,9 @@ def size_of(kind: Type, real: int = 4) -> int:
 class GuardExport:
     """The output guard for some limits as C99, with golden calls."""
 
-    def __init__(self, kernels: GuardKernels, golden: Sequence[GoldenCall], tick_s: float) -> None:
+    def __init__(self, kernels: GuardKernels, calls: Sequence[GoldenCall], tick_s: float) -> None:
         self._inputs, self._tick_s = len(kernels.limits.low), tick_s
-        self._printer, self._tables = Printer(np.float64), tables_of(golden)
+        self._printer, self._tables = Printer(np.float64), golden.tables_of(calls)
         self._kernels = KernelFiles(self._printer, kernels.functions, kernels.entries, "guard", ["limits"])
         self.constants = ConstantRecords(self._printer)
         self._limits = self.constants.printed("limits", kernels.limits)
@@ -233,26 +231,20 @@ class GuardExport:
         sizes = {"INPUTS": self._inputs, "ROWS": SEQUENCE_ROWS, "TICK_S": self._tick_s}
         parts = {**{name: str(size) for name, size in sizes.items()}, "LIMITS": self._limits,
                  **self.constants.parts(self._kernels)}  # fmt: skip
-        names = ("output_guard.h", "output_guard.c", "self_test.c")
-        limits, own = (
-            {name: _filled(f"output_guard/{name}", parts) for name in each}
-            for each in (("limits.h", "limits.c"), names)
-        )
-        return {**self._kernels.texts(), **limits, **self._golden_files(), **own}
+        own = ("limits.h", "limits.c"), ("output_guard.h", "output_guard.c", "self_test.c")
+        return _in_order("output_guard", self._kernels, parts, own, self._golden_files())
 
     def sizes(self) -> dict[str, int]:
         """Return the bytes of what a PLC needs."""
         state = next(each for each in self._kernels.records if each.name == "GuardState")
         rows = 2 * 8 * self._inputs * SEQUENCE_ROWS
-        golden = sum(values.nbytes for values in self._tables.values())
+        tables = sum(values.nbytes for values in self._tables.values())
         judged = 2 * size_of(state, 8) + rows
         return {"constants": self.constants.bytes(), "state and rows that are judged, about": judged,
-                "self-test and golden calls": golden}  # fmt: skip
+                "self-test and golden calls": tables}  # fmt: skip
 
     def _golden_files(self) -> dict[str, str]:
-        sum_ = 0
-        for values in self._tables.values():
-            sum_ = crc(values.view(np.int32), sum_)
+        sum_ = reduce(lambda before, values: crc(values.view(np.int32), before), self._tables.values(), 0)
         declared = {f"golden_{name}[{len(values)}][{values.shape[1]}]": values
                     for name, values in self._tables.items()}  # fmt: skip
         integers, _, rows = self._tables.values()

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop_export import tree
-from coldloop_export.kernels import crc
+from coldloop_export.golden import crc
 from coldloop_export.tree import Expression, Function, Kind, Literal, Name, RecordType, RowsType, StructType, Type, View
 
 Array = NDArray[Any]
@@ -82,10 +82,6 @@ class Printer(tree.TreePrinter):
             return f"{self._element(kind)} {name}[{length}]"
         return self.declaration(kind, name)
 
-    def made_in(self, function: Function) -> Iterator[Type]:
-        """Yield the types of records that a function makes."""
-        yield from (node.variable.type for node in tree.walk(function.body) if isinstance(node, tree.Make))
-
     # -- constant arrays -----------------------------------------------------------------------------------------------
 
     def scalar(self, values: Array) -> str:
@@ -128,23 +124,33 @@ class Printer(tree.TreePrinter):
         unused = [f"    (void){identifier(each.name)};" for each in function.parameters
                   if each.name not in function.used]  # fmt: skip
         lines = [*unused, *self._block(function.body, 1)]
-        where = "/".join(function.source.split("/")[-3:])
         body = "".join(f"{line}\n" for line in lines)
-        return f"/* {where} */\n{storage}{self.signature(function)} {{\n{body}}}\n"
+        return f"/* {tree.place_of(function.source)} */\n{storage}{self.signature(function)} {{\n{body}}}\n"
 
     def _block(self, statements: Iterable[tree.Statement], depth: int) -> Iterator[str]:
         for statement in statements:
             yield from self._statement(statement, depth)
 
-    def _statement(self, statement: tree.Statement, depth: int) -> Iterator[str]:  # noqa: C901 one case a statement
+    def _statement(self, statement: tree.Statement, depth: int) -> Iterator[str]:  # noqa: C901, PLR0912 one case a statement
         pad = "    " * depth
         match statement:
             case tree.Declare(variable, value):
-                yield pad + self._declared(variable, value)
+                name, kind = identifier(variable.name), variable.type
+                if isinstance(kind, tree.ArrayType):
+                    yield f"{pad}{self.scalars[kind.kind]} {name}[{max(kind.size, 1)}] = {{0}};"
+                else:
+                    initial = self._bare(value or Literal(kind, 0)) if isinstance(kind, Kind) else ""
+                    yield f"{pad}{self.declaration(kind, name)} = {initial};"
             case tree.Assign(target, value):
                 yield f"{pad}{self._target(target)} = {self._bare(value)};"
-            case tree.Point():
-                yield pad + self._pointed(statement)
+            case tree.Point(variable, part, constant):
+                root: Expression = part.array if isinstance(part, View) else part.rows
+                while isinstance(root, tree.Field):
+                    root = root.record
+                fixed = constant or (isinstance(root, Name) and root.name in self._constant)
+                self._constant |= {variable.name} if fixed else set()
+                declared = self.declaration(variable.type, identifier(variable.name), constant=fixed)
+                yield f"{pad}{declared} = {self._argument(part)};"
             case tree.Make(variable, parts):
                 self._made.add(variable)
                 listed = ", ".join(f".{identifier(name)} = {self._argument(part)}" for name, part in parts)
@@ -175,24 +181,6 @@ class Printer(tree.TreePrinter):
             yield f"{pad}}} else {{"
             yield from self._block(other, depth + 1)
         yield f"{pad}}}"
-
-    def _declared(self, variable: Name, value: Expression | None) -> str:
-        name, kind = identifier(variable.name), variable.type
-        if isinstance(kind, tree.ArrayType):
-            return f"{self.scalars[kind.kind]} {name}[{max(kind.size, 1)}] = {{0}};"
-        initial = self._bare(value or Literal(kind, 0)) if isinstance(kind, Kind) else ""
-        return f"{self.declaration(kind, name)} = {initial};"
-
-    def _pointed(self, point: tree.Point) -> str:
-        root: Expression = point.part.array if isinstance(point.part, View) else point.part.rows
-        while isinstance(root, tree.Field):
-            root = root.record
-        name = point.variable.name
-        constant = point.constant or (isinstance(root, Name) and root.name in self._constant)
-        if constant:
-            self._constant.add(name)
-        declared = self.declaration(point.variable.type, identifier(name), constant=constant)
-        return f"{declared} = {self._argument(point.part)};"
 
     def _target(self, target: tree.Target) -> str:
         if isinstance(target, Name) and target in self._results:
@@ -253,19 +241,18 @@ class Printer(tree.TreePrinter):
     def _operation(self, operation: tree.Operation) -> str:  # noqa: PLR0911 one case an operator
         parts = [self.expression(each) for each in operation.operands]
         kind = "real" if operation.operands[0].type is Kind.REAL else "int"
+        listed = ", ".join(parts)
         match operation.operator:
             case name if name in OF_MATH:
-                return f"{OF_MATH[name]}{'f' * self.single}({', '.join(parts)})"
+                return f"{OF_MATH[name]}{'f' * self.single}({listed})"
             case "single":
-                return f"(({self.scalars[Kind.REAL]})(float){parts[0]})"
+                return f"(({self.scalars[Kind.REAL]})(float){listed})"
             case "isfinite" | "isinf" | "isnan" as name:
-                return f"({name}({parts[0]}) != 0)"
+                return f"({name}({listed}) != 0)"
             case "min" | "max" as name:
-                return f"{name}_{kind}({', '.join(parts)})"
-            case "%":
-                return f"floor_mod({', '.join(parts)})"
-            case "//":
-                return f"floor_div({', '.join(parts)})"
+                return f"{name}_{kind}({listed})"
+            case "%" | "//" as sign:
+                return f"{'floor_mod' if sign == '%' else 'floor_div'}({listed})"
             case "negative":
                 return f"(-{parts[0]})"
             case "not":
@@ -427,24 +414,19 @@ class ConstantRecords:
     def parts(self, kernels: KernelFiles) -> dict[str, str]:
         """Return the parts of the files that have the constants, and the literals of some kernels."""
         arrays = "\n".join(self.printer.array(name, values) for name, values in self.arrays.items())
-        return {"DECLARED": self._declared(), "LITERALS": kernels.literals(), "ARRAYS": arrays,
-                "SUMMING": self._summing()}  # fmt: skip
-
-    def _declared(self) -> str:
-        return f"""/* Sum over literals and constants; SUM_OF_CONSTANTS is what it was when they were written. */
+        bits = {"REAL": self.type, "BITS": f"uint{8 * self.real.itemsize}_t", "BYTES": str(self.real.itemsize)}
+        body = "".join(f"    {each}\n" for each in self._sums)
+        declared = f"""/* Sum over literals and constants; SUM_OF_CONSTANTS is what it was when they were written. */
 uint32_t sum_of_constants(void);
 uint32_t sum_of_reals(uint32_t sum, const volatile {self.type} *values, int32_t count);
 uint32_t sum_of_integers(uint32_t sum, const volatile int32_t *values, int32_t count);
 #define SUM_OF_CONSTANTS UINT32_C({self._sum})
 """
-
-    def _summing(self) -> str:
-        bits = {"REAL": self.type, "BITS": f"uint{8 * self.real.itemsize}_t", "BYTES": str(self.real.itemsize)}
-        body = "".join(f"    {each}\n" for each in self._sums)
-        return f"""{tree.filled(tree.template("c/sums.c"), bits)}
+        summing = f"""{tree.filled(tree.template("c/sums.c"), bits)}
 uint32_t sum_of_constants(void) {{
     bool changed = false; /* where an array is */
     uint32_t sum = sum_of_reals(0, literals, N_LITERALS);
 {body}    return changed ? ~SUM_OF_CONSTANTS : sum;
 }}
 """
+        return {"DECLARED": declared, "LITERALS": kernels.literals(), "ARRAYS": arrays, "SUMMING": summing}

@@ -2,10 +2,10 @@
 
 import ast
 from collections.abc import Callable, Mapping
+from functools import reduce
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
-from numba.core.dispatcher import Dispatcher
-
+from coldloop.kernels.compiled import python_of
 from coldloop_export import expressions, tree
 from coldloop_export.expressions import FUNCTIONS, NEW_ARRAYS, DType, Elementwise, Kernel, Known, Python, Record, Value
 from coldloop_export.tree import ArrayType, Expression, Field, Function, Item, Kind, Literal, Name, RecordType, Storage
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from coldloop_export.statements import Program
 
 Returned: TypeAlias = Name | Field | tree.Group
-Generic: TypeAlias = Mapping[Callable[..., Any], Mapping[str, Dispatcher]]
+Generic: TypeAlias = Mapping[Callable[..., Any], Mapping[str, Kernel]]
 """Functions that stand for several kernels: the kernel for each type of the first argument."""
 
 
@@ -36,7 +36,7 @@ class CallReader(expressions.ExpressionReader):
         """Names of parts of arrays, and of records in them."""
         self.intermediate = 0
 
-    def _call(self, node: ast.Call) -> Value:  # noqa: C901, PLR0911 one case for what can be called
+    def _call(self, node: ast.Call) -> Value:  # noqa: C901, PLR0911, PLR0912 one case for what can be called
         if node.keywords or any(isinstance(argument, ast.Starred) for argument in node.args):
             raise self.refusal(node, "arguments are given by their places")
         if isinstance(node.func, ast.Attribute) and node.func.attr == "copy" and not node.args:
@@ -51,11 +51,19 @@ class CallReader(expressions.ExpressionReader):
         if called.value is type and len(node.args) == 1:
             return DType(cast("Kind", self.scalar(node.args[0]).type))
         if called.value is len and len(node.args) == 1:
-            return self._length(node.args[0])
+            return Known(self.array(node.args[0], "only arrays have a length").shape[0])
         if called.value is int and len(node.args) == 1:
-            return self._integer(node)
+            operand = self.scalar(node.args[0])
+            rounded = isinstance(operand, tree.Operation) and operand.operator == "round"
+            if operand.type is not Kind.BOOL and not rounded:
+                raise self.refusal(node, f"int of type {expressions.named(operand.type)} is not in the subset")
+            return tree.Convert(Kind.INT, operand)
         if hasattr(called.value, "_fields"):
-            return self._record(node, called.value)
+            made: Any = called.value
+            if len(node.args) != len(made._fields):
+                raise self.refusal(node, f"{made.__name__} has {len(made._fields)} fields")
+            parts = (self.typed(each, self.read(each)) for each in node.args)
+            return Record(made.__name__, tuple(zip(made._fields, parts, strict=True)))
         if called.value in FUNCTIONS:
             return self._function(node, FUNCTIONS[called.value])
         if called.value in NEW_ARRAYS:
@@ -66,39 +74,23 @@ class CallReader(expressions.ExpressionReader):
     def kernel(self, node: ast.Call) -> Kernel | None:
         """Return the kernel that is called; of several with one name that for the type of its first argument."""
         of = node.func.value if isinstance(node.func, ast.Attribute) else node.func
-        if not isinstance(self.read(of), Python):
+        called = self.read(node.func) if isinstance(self.read(of), Python) else None
+        if not isinstance(called, Python) or not callable(called.value):
             return None
-        called = self.read(node.func)
-        if not isinstance(called, Python):
-            return None
-        if isinstance(called.value, Dispatcher) or (
-            callable(called.value) and called.value in self.specialised.portable
-        ):
+        if python_of(called.value) or called.value in self.specialised.portable:
             return called.value
-        chosen = self.specialised.generic.get(called.value) if callable(called.value) else None
+        chosen = self.specialised.generic.get(called.value)
         return None if chosen is None else chosen[expressions.named(self.storage(node.args[0]).type)]
-
-    def _record(self, node: ast.Call, made: Any) -> Record:  # noqa: ANN401 a NamedTuple
-        if len(node.args) != len(made._fields):
-            raise self.refusal(node, f"{made.__name__} has {len(made._fields)} fields")
-        parts = [self.typed(each, self.read(each)) for each in node.args]
-        return Record(made.__name__, tuple(zip(made._fields, parts, strict=True)))
 
     def _tuple(self, node: ast.Tuple) -> Record:
         return Record("", tuple(("", self.typed(each, self.read(each))) for each in node.elts))
 
-    def _length(self, node: ast.expr) -> Known:
-        array = self.storage(node)
-        if not isinstance(array.type, ArrayType):
-            raise self.refusal(node, "only arrays have a length")
-        return Known(array.type.shape[0])
-
-    def _integer(self, node: ast.Call) -> Value:
-        operand = self.scalar(node.args[0])
-        rounded = isinstance(operand, tree.Operation) and operand.operator == "round"
-        if operand.type is not Kind.BOOL and not rounded:
-            raise self.refusal(node, f"int of type {expressions.named(operand.type)} is not in the subset")
-        return tree.Convert(Kind.INT, operand)
+    def array(self, node: ast.expr, else_: str) -> ArrayType:
+        """Return the type of an array that has a name; anything else is refused with `else_`."""
+        kind = self.storage(node).type
+        if not isinstance(kind, ArrayType):
+            raise self.refusal(node, else_)
+        return kind
 
     def copied(self, node: ast.AST, array: Storage) -> Elementwise:
         """Return the elements of an array."""
@@ -132,24 +124,16 @@ class CallReader(expressions.ExpressionReader):
         kind = cast("Kind", operands[0].type)
         if name not in {"min", "max"} and (kind is not Kind.REAL or len(operands) != least):
             raise self.refusal(node, f"{name} of type {kind.value} is not in the subset")
-        result = (
-            operands[0] if least > 1 else tree.Operation(Kind.BOOL if name.startswith("is") else kind, name, operands)
-        )
-        for operand in operands[1:]:
-            result = tree.Operation(kind, name, (result, operand))
-        return result
+        if least == 1:
+            return tree.Operation(Kind.BOOL if name.startswith("is") else kind, name, operands)
+        return reduce(lambda one, other: tree.Operation(kind, name, (one, other)), operands)
 
     def _new_array(self, node: ast.Call) -> Value:
         name = cast("ast.Attribute", node.func).attr
         if name.endswith("_like"):
-            like = self.storage(node.args[0])
-            if not isinstance(like.type, ArrayType):
-                raise self.refusal(node, "an array is expected")
-            made = like.type
+            made = self.array(node.args[0], "an array is expected")
         else:
-            if len(node.args) != 2:
-                raise self.refusal(node, "a new array needs its type")
-            dtype = self.read(node.args[1])
+            dtype = self.read(node.args[1]) if len(node.args) == 2 else None
             if not isinstance(dtype, DType):
                 raise self.refusal(node, "a new array needs its type")
             lengths = node.args[0].elts if isinstance(node.args[0], ast.Tuple) else [node.args[0]]

@@ -6,6 +6,7 @@ each; comparisons, minima, maxima, signs, conversions and what is done with inte
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from types import SimpleNamespace
 from typing import Any, Final, NamedTuple
 
@@ -14,16 +15,15 @@ from numpy.typing import NDArray
 
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop_control_plc.output_limits import GuardState, Limits, beginning
-from coldloop_export import tree
-from coldloop_export.golden import ITERATIONS, Call, GoldenCall, GoldenUpdate, GoldenVector
-from coldloop_export.kernels import Array, GuardKernels, OdeProgram, OptimizerKernels
+from coldloop_export import golden, tree
+from coldloop_export.golden import ITERATIONS, Array, Call, GoldenCall, GoldenUpdate, GoldenVector, GuardKernels
 from coldloop_export.tree import ArrayType, Declare, Expression, For, Function, Kind, Operation, Return, Statement
 from coldloop_optimizer_plc.computing_settings import Arithmetic
 from coldloop_optimizer_plc.decisions import Latched
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.qp.linear_algebra import real_of
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
-from coldloop_optimizer_plc.scheme import OptimizerState, empty_state
+from coldloop_optimizer_plc.scheme import empty_state
 from coldloop_optimizer_plc.settings import ProgramSettings
 from coldloop_optimizer_plc.solvers.interface import Costs
 from coldloop_optimizer_plc.solvers.ode import OdeMethod, ode_solver
@@ -273,7 +273,7 @@ class Counter:
 
     def __init__(self, method: OdeMethod, problem: QuadraticProblem) -> None:
         self.method, self.problem = method, problem
-        ode = OdeProgram(method, problem, COUNTS)
+        ode = golden.OdeProgram(method, problem, COUNTS)
         self._entry, self._program = ode.entry.name, CountedProgram(ode.functions)
         self._noted = self._program.noting(ITERATION)
 
@@ -321,23 +321,20 @@ def cost_of(found: Sequence[int], worst: int | None = None) -> CallCost:
     return CallCost(least=min(found), mean=sum(found) / len(found), most=max(found), worst=worst)
 
 
-def _empty(optimizer: OptimizerProgram) -> OptimizerState:
-    state, process = optimizer.state, optimizer.process
-    return empty_state(len(state.belief.x), len(process.inputs), len(process.outputs), len(state.sent.z), REAL)
-
-
 def counted_updates(optimizer: OptimizerProgram, golden: Iterable[GoldenUpdate]) -> dict[str, CallCost]:
     """Return the operations of the calls that golden updates take beside the iterations: plan, start, finish."""
-    kernels = OptimizerKernels(optimizer)
+    kernels = golden.OptimizerKernels(optimizer)
     begin, take, solve, _ = (each.name for each in kernels.entries)
     program = CountedProgram(kernels.functions)
     c, method = kernels.constants["constants"], kernels.constants["method"]
-    state = _empty(optimizer)
+    x, z, process = len(optimizer.state.belief.x), len(optimizer.state.sent.z), optimizer.process
+    empty = partial(empty_state, x, len(process.inputs), len(process.outputs), z, REAL)
+    state = empty()
     noted = {name: program.noting(name) for name in (take, "pose", "warm_start", "deliver")}
     for each in golden:
         if each.fixed_ticks >= 0:
             c = c._replace(fixed_ticks=each.fixed_ticks)
-            state = _empty(optimizer)
+            state = empty()
             program[begin](c, state)
         program[take](c, kernels.rules[c.fixed_ticks], kernels.starts[c.fixed_ticks], state, latched(each))
         if each.sequence:

@@ -12,22 +12,21 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Final, TypeAlias, cast
 
 import numpy as np
-from numba.core.dispatcher import Dispatcher
 
+from coldloop.kernels.compiled import python_of
 from coldloop.kernels.single_precision import single
 from coldloop_export import tree
 from coldloop_export.tree import ArrayType, Expression, Field, Kind, Literal, Name, Operation, RowsType, View
 
-Kernel: TypeAlias = Dispatcher | Callable[..., Any]
+Kernel: TypeAlias = Callable[..., Any]
 """A kernel, or a function of plain Python that is one for the exporter."""
-RESERVED = re.compile(r"(new|result|at|stop)_\d")
 
 
 class Source:
     """Syntax tree of a kernel, with what its names mean where it was written."""
 
     def __init__(self, function: Kernel) -> None:
-        python: Callable[..., Any] = function.py_func if isinstance(function, Dispatcher) else function
+        python = python_of(function) or function
         self.name = python.__name__
         self.file = inspect.getsourcefile(python) or python.__module__
         lines, first = inspect.getsourcelines(python)
@@ -53,7 +52,7 @@ class Source:
                  and isinstance(node.ctx, ast.Store)]  # fmt: skip
         parameters = {argument.arg for argument in self.definition.args.args}
         for name in {*names, *parameters}:
-            if RESERVED.match(name):
+            if re.match(r"(new|result|at|stop)_\d", name):
                 raise self.refusal(self.definition, f"the name {name} is kept for intermediate values")
         return set(names), {name for name in names if names.count(name) == 1} - parameters
 
@@ -66,7 +65,6 @@ BINARY: Final[dict[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]]] =
 COMPARISONS: Final[dict[type[ast.cmpop], str]] = {
     ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=",
 }  # fmt: skip
-OF_INTEGERS, OF_REALS = ("+", "-", "*", "%", "//"), ("+", "-", "*", "/", "power")
 FUNCTIONS: Final[dict[object, str]] = {
     abs: "abs", min: "min", max: "max", np.sqrt: "sqrt", math.sqrt: "sqrt", np.isfinite: "isfinite",
     math.isfinite: "isfinite", np.isinf: "isinf", math.isnan: "isnan", math.log: "log", math.copysign: "copysign",
@@ -74,9 +72,6 @@ FUNCTIONS: Final[dict[object, str]] = {
 }  # fmt: skip
 OPERANDS: Final = {"min": 2, "max": 2, "copysign": 2}
 """Least number of operands of functions that take more than one."""
-OF_PLATFORM: Final = ("power", "log")
-"""Operators whose bits are those of the platform's library."""
-LARGEST_INTEGER: Final = 2**31 - 1
 DTYPES: Final[dict[object, Kind]] = {np.int64: Kind.INT, np.uint64: Kind.UNSIGNED, np.bool_: Kind.BOOL}
 NEW_ARRAYS: Final = (np.empty, np.zeros, np.empty_like, np.zeros_like)
 
@@ -189,7 +184,7 @@ class ExpressionReader:
             raise self.refusal(
                 node, "a literal without a type would be computed in double: z.dtype.type(...) gives it one"
             )
-        if abs(int(known.value)) > LARGEST_INTEGER:
+        if abs(int(known.value)) > 2**31 - 1:
             raise self.refusal(node, "an integer beyond 32 bits")
         return Literal(Kind.INT, int(known.value))
 
@@ -257,26 +252,21 @@ class ExpressionReader:
             if (part := dict(base.parts).get(node.attr)) is None:
                 raise self.refusal(node, f"{base.name or 'a tuple'} has no {node.attr}")
             return part
-        base_type = base.type
-        if isinstance(base_type, tree.RecordType | tree.StructType):
-            for name, kind in base_type.fields:
-                if name == node.attr:
-                    return self._field(kind, base, name)
-        if isinstance(base_type, RowsType) and node.attr == "shape":
-            return Shape((base_type.length,))
-        if isinstance(base_type, ArrayType) and node.attr == "shape":
-            return Shape(base_type.shape)
-        if isinstance(base_type, ArrayType) and node.attr == "size":
-            return Known(base_type.size)
-        if isinstance(base_type, ArrayType) and node.attr == "dtype":
-            return DType(base_type.kind)
+        match base.type, node.attr:
+            case tree.RecordType(_, fields) | tree.StructType(_, fields), name if name in dict(fields):
+                kind = dict(fields)[name]
+                if isinstance(kind, Kind) and isinstance(base.type, tree.StructType):
+                    return tree.Member(kind, cast("Name", base), name)
+                return Field(kind, cast("Name", base), name)
+            case RowsType(_, length), "shape":
+                return Shape((length,))
+            case ArrayType(_, shape), "shape":
+                return Shape(shape)
+            case ArrayType() as array, "size":
+                return Known(array.size)
+            case ArrayType(number, _), "dtype":
+                return DType(number)
         raise self.refusal(node, f"the attribute {node.attr} is not in the subset")
-
-    @staticmethod
-    def _field(kind: object, base: Value, name: str) -> Value:
-        if isinstance(kind, Kind) and isinstance(base, Name | tree.Item) and isinstance(base.type, tree.StructType):
-            return tree.Member(kind, base, name)
-        return Field(cast("Kind", kind), cast("Name", base), name)
 
     def _subscript(self, node: ast.Subscript) -> Value:
         base = self.read(node.value)
@@ -338,12 +328,13 @@ class ExpressionReader:
         value = self.read(node.operand)
         if isinstance(value, Known):
             return Known(-value.value)
-        return self.each(node, lambda parts: self._negative(node, parts[0]), (value,))
 
-    def _negative(self, node: ast.expr, operand: Expression) -> Expression:
-        if operand.type not in {Kind.REAL, Kind.INT}:
-            raise self.refusal(node, f"minus of type {named(operand.type)}")
-        return Operation(cast("Kind", operand.type), "negative", (operand,))
+        def negative(operands: tuple[Expression, ...]) -> Expression:
+            if (kind := operands[0].type) not in {Kind.REAL, Kind.INT}:
+                raise self.refusal(node, f"minus of type {named(kind)}")
+            return Operation(cast("Kind", kind), "negative", operands)
+
+        return self.each(node, negative, (value,))
 
     def _binop(self, node: ast.BinOp) -> Value:
         if type(node.op) not in BINARY:
@@ -365,9 +356,8 @@ class ExpressionReader:
             one, other = (tree.Convert(Kind.REAL, each) for each in (one, other))
         if one.type is not other.type:
             raise self.refusal(node, f"{named(one.type)} {sign} {named(other.type)} would be computed in double")
-        if one.type is Kind.BOOL or (one.type is Kind.UNSIGNED and sign == "-"):
-            raise self.refusal(node, f"{sign} of type {named(one.type)} is not in the subset")
-        if sign not in (OF_REALS if one.type is Kind.REAL else OF_INTEGERS):
+        signs = ("+", "-", "*", "/", "power") if one.type is Kind.REAL else ("+", "-", "*", "%", "//")
+        if one.type is Kind.BOOL or (one.type is Kind.UNSIGNED and sign == "-") or sign not in signs:
             raise self.refusal(node, f"{sign} of type {named(one.type)} is not in the subset")
         self.refuse_platform(node, sign)
         if sign in {"%", "//"} and not (isinstance(other, Literal) and other.value > 0):
@@ -376,26 +366,26 @@ class ExpressionReader:
 
     def refuse_platform(self, node: ast.AST, name: str) -> None:
         """Refuse an operator whose bits are the platform's, unless it is accepted."""
-        if name in OF_PLATFORM and name not in self.platform:
+        if name in {"power", "log"} - self.platform:
             raise self.refusal(node, f"the bits of {name} are those of the platform's library")
 
     def each(
         self, node: ast.expr, combine: Callable[[tuple[Expression, ...]], Expression], parts: tuple[Value, ...]
     ) -> Value:  # fmt: skip
         """Return an operation on numbers, or the array of it where there are arrays of one shape."""
-        arrays = [part.type for part in parts if isinstance(part.type, ArrayType)]
+        shapes = {part.type.shape for part in parts if isinstance(part.type, ArrayType)}
         if any(isinstance(part, Untyped) for part in parts):
             raise self.refusal(node, "this is not a number")
-        if not arrays:
+        if not shapes:
             return combine(cast("tuple[Expression, ...]", parts))
-        if any(array.shape != arrays[0].shape for array in arrays):
+        if len(shapes) > 1:
             raise self.refusal(node, "arrays of different shapes")
 
         def at(indices: tuple[Expression, ...]) -> Expression:
             return combine(tuple(element_of(part, indices) for part in parts))
 
-        zero = tuple(ZERO for _ in arrays[0].shape)
-        return Elementwise(ArrayType(cast("Kind", at(zero).type), arrays[0].shape), at)
+        (shape,) = shapes
+        return Elementwise(ArrayType(cast("Kind", at((ZERO,) * len(shape)).type), shape), at)
 
     def _compare(self, node: ast.Compare) -> Value:
         operands = [node.left, *node.comparators]

@@ -1,22 +1,28 @@
-"""Solver, whole optimiser and output guard as Structured Text: blocks, constants, golden vectors, self-tests."""
+"""Solver, whole optimiser and output guard as Structured Text: blocks, constants, golden vectors, self-tests.
+
+Tools import it as text, or as one PLCopen XML file (TC6, version 2.01) that is made from the text that is printed. That
+takes the text of this package alone: a declaration a line, sections and units that begin and end at a line's start.
+"""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
 from functools import reduce
 from itertools import groupby
 from typing import Any, ClassVar, Final
+from xml.etree import ElementTree as ET
 
 import numpy as np
 
+from coldloop import __version__
 from coldloop.process.declaration import Process
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Acknowledgement, Plan, SequenceHeader, SequenceRow, Update
 from coldloop.registers.declaration import Block as RegisterBlock
 from coldloop.registers.declaration import Register, RegisterMap
 from coldloop_control_plc.output_limits import beginning
-from coldloop_export import st_printer, tree
-from coldloop_export.golden import GoldenCall, GoldenUpdate, GoldenVector, answered, arrays_in, tables_of, update_tables
-from coldloop_export.kernels import PER_PROBLEM, Array, GuardKernels, OdeProgram, OptimizerKernels, leaves
+from coldloop_export import golden, st_printer, tree
+from coldloop_export.golden import PER_PROBLEM, Array, GoldenCall, GoldenVector, OptimizerKernels, arrays_in, leaves
 from coldloop_export.st_lowering import VALUE, Entry, Lowering, Place, Record, Rows, dotted, zeroed
 from coldloop_export.st_pausing import ANEW, PIECE, Pausing, an_answer_in_calls, one_iteration_a_call
 from coldloop_export.st_printer import Constants, interface_names, memory, portable, scalar_of, section, sum_of
@@ -52,7 +58,7 @@ class StructuredTextExport:
 
     def __init__(self, method: OdeMethod, problem: QuadraticProblem, vectors: Iterable[GoldenVector]) -> None:
         self.vectors = [bounded(method, each) for each in vectors]
-        program = OdeProgram(method, problem, np.arange(1, len(self.vectors[0].answer.costs) + 1))
+        program = golden.OdeProgram(method, problem, np.arange(1, len(self.vectors[0].answer.costs) + 1))
         constants = {path: np.asarray(values) for path, values in program.constants().items()}
         self.printer = st_printer.StructuredTextPrinter(st_printer.types_in(constants))
         function, lowering = one_iteration_a_call(program.entry), Lowering(constants)
@@ -71,11 +77,11 @@ class StructuredTextExport:
 
     def files(self) -> dict[str, str]:
         """Return the texts of the files by their names, in the order in which they are loaded."""
-        golden = "\n".join(self._golden(number, each) for number, each in enumerate(self.vectors))
+        vectors = "\n".join(self._golden(number, each) for number, each in enumerate(self.vectors))
         test = self._self_test()
         functions, lists = template("structured_text/functions.st"), self.constants.configuration()
         texts = {"types.st": self.printer.types(), "functions.st": functions, "kernels.st": self.kernels,
-                 "golden.st": golden, "self_test.st": test, "configuration.st": lists}  # fmt: skip
+                 "golden.st": vectors, "self_test.st": test, "configuration.st": lists}  # fmt: skip
         return {name: GENERATED + portable(text) for name, text in texts.items()}
 
     def sizes(self) -> dict[str, int]:
@@ -132,10 +138,9 @@ class StructuredTextExport:
 
 def bounded(method: OdeMethod, vector: GoldenVector) -> GoldenVector:
     """Return a golden vector with the largest number for an infinite bound, which has no literal, and its answer."""
-    most = np.finfo(np.float32).max
-    problem = vector.problem
-    return answered(method, problem._replace(low=np.maximum(problem.low, -most), high=np.minimum(problem.high, most)),
-                    vector.guess)  # fmt: skip
+    most, problem = np.finfo(np.float32).max, vector.problem
+    finite = problem._replace(low=np.maximum(problem.low, -most), high=np.minimum(problem.high, most))
+    return golden.answered(method, finite, vector.guess)
 
 
 STATE: Final[Path] = ("m", "state")
@@ -154,8 +159,12 @@ class OptimizerText:
     outputs: ClassVar[tuple[str, ...]] = ("element",)
     """Outputs of the self-test besides those that every self-test has."""
 
-    def __init__(self, optimizer: OptimizerProgram, golden: Sequence[GoldenUpdate]) -> None:
-        kernels, self.golden, self._process = OptimizerKernels(optimizer), golden, optimizer.process
+    def __init__(self, optimizer: OptimizerProgram, updates: Sequence[golden.GoldenUpdate]) -> None:
+        kernels, self.golden, self._process = OptimizerKernels(optimizer), updates, optimizer.process
+        self._arrays = self._golden_arrays()
+        updates = sum(int(values[0].nbytes) for values in self._arrays.values())
+        self._page_length = st_printer.LARGEST_LIST // updates
+        """Golden updates that a block has within a list of constants."""
         begin, take, solve, note = kernels.entries
         constants, split = st_printer.in_pieces(constants_of(kernels))
         self.state = {**dict(state_types(STATE, type_of(optimizer.state))), FIXED_TICKS: Kind.INT, BEGUN: Kind.BOOL,
@@ -202,10 +211,10 @@ class OptimizerText:
 
     def sizes(self) -> dict[str, int]:
         """Return the bytes of what a PLC needs; blocks are an instance of each of the interface."""
-        golden = sum(4 * values.size for values in self._golden_arrays().values())
+        tables = sum(4 * values.size for values in self._arrays.values())
         return {
             "constants": self.constants.bytes(), "state": sum(map(st_printer.size_of, self.state.values())),
-            "instances of the four blocks": sum(map(memory, self.entries)), "self-test and golden updates": golden,
+            "instances of the four blocks": sum(map(memory, self.entries)), "self-test and golden updates": tables,
         }  # fmt: skip
 
     def _interface(self) -> str:
@@ -230,17 +239,13 @@ class OptimizerText:
             sampled = sent[::held]
             assert (np.repeat(sampled, held, axis=0)[: len(sent)] == sent).all()  # noqa: S101 as it is sent
             rows[place, : len(sampled)] = sampled
-        arrays = {**update_tables(self.golden), "rows": rows.reshape(len(rows), -1)}
+        arrays = {**golden.update_tables(self.golden), "rows": rows.reshape(len(rows), -1)}
         sums = [sum_of(three[2], sum_of(three[1], sum_of(three[0]))) for three in zip(*arrays.values(), strict=True)]
         return {**arrays, "sums": np.array(sums, np.int32)[:, None]}
 
-    def _page_length(self) -> int:
-        """Return how many golden updates a block has within a list of constants."""
-        return st_printer.LARGEST_LIST // sum(int(values[0].nbytes) for values in self._golden_arrays().values())
-
     def _pages(self) -> Iterator[str]:
         """Yield the blocks that copy a golden update to where the self-test has it."""
-        arrays, length = self._golden_arrays(), self._page_length()
+        arrays, length = self._arrays, self._page_length
         for number, first in enumerate(range(0, len(self.golden), length)):
             part = {name: values[first : first + length] for name, values in arrays.items()}
             shared = {name: self.printer.array_type(scalar_of(values), values.shape[1])
@@ -262,7 +267,7 @@ class OptimizerText:
             ])  # fmt: skip
 
     def _self_test(self, pages: int) -> str:
-        arrays, page = self._golden_arrays(), self._page_length()
+        arrays, page = self._arrays, self._page_length
         lengths = {name: values.shape[1] for name, values in arrays.items() if name != "sums"}
         process, inputs = self._process, len(self._process.inputs)
         places = np.cumsum([1, inputs, inputs, len(process.outputs), len(process.states)])
@@ -345,8 +350,8 @@ class GuardText:
     outputs: ClassVar[tuple[str, ...]] = ()
     """Outputs of the self-test besides those that every self-test has."""
 
-    def __init__(self, kernels: GuardKernels, golden: Sequence[GoldenCall]) -> None:
-        self._tables = tables_of(golden)
+    def __init__(self, kernels: golden.GuardKernels, calls: Sequence[GoldenCall]) -> None:
+        self._tables = golden.tables_of(calls)
         constants = {path: np.asarray(value) for path, value in leaves(("c", "limits"), kernels.limits).items()}
         constants |= {("c", f"golden_{name}"): values for name, values in self._tables.items()}
         state = type_of(beginning(kernels.limits, kernels.limits.low))
@@ -360,8 +365,8 @@ class GuardText:
         self._kernels = "\n".join(map(self.printer.block, lowering.blocks))
         self.constants = Constants(constants, self.printer)
         n = len(kernels.limits.low)
-        self._counts = {"INPUTS": n, "LAST": n - 1, "NUMBERS": n * SEQUENCE_ROWS,
-                        "ROWS": SEQUENCE_ROWS}  # fmt: skip
+        self._sizes = {"INPUTS": n, "LAST": n - 1, "NUMBERS": n * SEQUENCE_ROWS, "ROWS": SEQUENCE_ROWS}
+        self._counts = {name: str(count) for name, count in self._sizes.items()}
 
     def files(self) -> dict[str, str]:
         """Return the texts of the files by their names, in the order in which they are loaded."""
@@ -376,21 +381,21 @@ class GuardText:
 
     def sizes(self) -> dict[str, int]:
         """Return the bytes of what a PLC needs."""
-        golden = sum((8 if values.dtype.kind == "f" else 4) * values.size for values in self._tables.values())
-        rows = 2 * 8 * self._counts["NUMBERS"]
+        tables = sum((8 if values.dtype.kind == "f" else 4) * values.size for values in self._tables.values())
+        rows = 2 * 8 * self._sizes["NUMBERS"]
         return {
-            "constants": self.constants.bytes() - golden,
+            "constants": self.constants.bytes() - tables,
             "state": sum(st_printer.size_of(kind, st_printer.DOUBLE) for kind in self.state.values()),
             "instances of the four blocks": rows + sum(memory(each, st_printer.DOUBLE) for each in self.entries),
-            "self-test and golden calls": golden,
+            "self-test and golden calls": tables,
         }
 
     def _interface(self) -> str:
         for size in ("INPUTS", "NUMBERS"):
-            self.printer.array_type("REAL", self._counts[size])
+            self.printer.array_type("REAL", self._sizes[size])
         begin, resume, admit, judge, in_range = self.entries
         return filled(template("structured_text/output_guard/output_guard.st"), {
-            **self._printed_counts(), "BEGIN": self._passed(begin, ROW), "RESUME": self._passed(resume, ROW),
+            **self._counts, "BEGIN": self._passed(begin, ROW), "RESUME": self._passed(resume, ROW),
             "ADMIT": self._passed(admit, ROW), "JUDGE": self._passed(judge, ROWS),
             "IN_RANGE": self._passed(in_range, ROW), "INSIDE": self._value(in_range), "PASSES": self._value(judge),
         })  # fmt: skip
@@ -405,16 +410,13 @@ class GuardText:
         """Return the name of the output that is a function's value."""
         return interface_names(block, self.printer.type)[Name(Kind.BOOL, VALUE)]
 
-    def _printed_counts(self) -> dict[str, str]:
-        return {name: str(count) for name, count in self._counts.items()}
-
     def _self_test(self) -> str:
         checks = template("structured_text/checks.st")
         checks = checks[checks.index("(* Sums up") :] + "\n"  # the other ones are of single precision
         integers, reals, rows = self._tables.values()
         main = st_printer.main_program(self.outputs)
         return filled(checks + template("structured_text/output_guard/self_test.st") + main, {
-            **self._printed_counts(), **self.constants.summed(), "AT_ONCE": str(AT_ONCE),
+            **self._counts, **self.constants.summed(), "AT_ONCE": str(AT_ONCE),
             "OF_REALS": str(reals.shape[1]), "N_INTEGERS": str(integers.size), "N_REALS": str(reals.size),
             "N_ROWS": str(rows.size), "VECTOR_COUNT": str(len(integers)),
         })  # fmt: skip
@@ -464,3 +466,119 @@ def units(registers: list[Register]) -> str:
     """Return the unit of all of them, if they have one."""
     found = {each.unit for each in registers}
     return found.pop() if len(found) == 1 else ""
+
+
+# -- PLCopen XML -------------------------------------------------------------------------------------------------------
+
+NAMESPACE: Final = "http://www.plcopen.org/xml/tc6_0201"
+XHTML: Final = "http://www.w3.org/1999/xhtml"
+SECTIONS: Final = {
+    "VAR_INPUT": "inputVars", "VAR_OUTPUT": "outputVars", "VAR_IN_OUT": "inOutVars", "VAR_EXTERNAL": "externalVars",
+    "VAR": "localVars",
+}  # fmt: skip
+POUS: Final = {"FUNCTION": "function", "FUNCTION_BLOCK": "functionBlock", "PROGRAM": "program"}
+ELEMENTARY: Final = ("BOOL", "DINT", "REAL", "LREAL")
+
+_COMMENT = r"\(\*((?:(?!\*\)).)*)\*\)"
+_UNIT = re.compile(
+    rf"(?:^{_COMMENT}\n)?^(FUNCTION_BLOCK|FUNCTION|PROGRAM) (\w+)(?: : (\w+))?\n(.*?)^END_\2$", re.MULTILINE | re.DOTALL
+)
+_SECTION = re.compile(r"^(VAR\w*)( CONSTANT)?\n(.*?)^END_VAR\n", re.MULTILINE | re.DOTALL)
+_DECLARATION = re.compile(rf"^    (\w+) : (\w+)(?: := ([^;]+?))?(?: {_COMMENT})?;\n", re.MULTILINE)
+_ARRAY = re.compile(r"^    (\w+) : ARRAY \[(\d+)\.\.(\d+)\] OF (\w+);\n", re.MULTILINE)
+_CONFIGURATION = re.compile(
+    r"^CONFIGURATION (\w+)\n(.*?)^RESOURCE (\w+) ON PLC\n(.*?)^END_RESOURCE", re.MULTILINE | re.DOTALL
+)
+_TASK = re.compile(r"TASK (\w+)\(INTERVAL := T#(\w+), PRIORITY := (\d+)\);\n    PROGRAM (\w+) WITH \1 : (\w+);")
+
+
+def plcopen_xml(texts: Iterable[str], content: str) -> str:
+    """Return a project with all types, functions, function blocks, programs, constants and the configuration.
+
+    Args:
+        texts: Structured Text as this package prints it.
+        content: What is in it.
+    """
+    text = "\n".join(texts)
+    project = ET.Element("project", xmlns=NAMESPACE)
+    made = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"
+    ET.SubElement(project, "fileHeader", companyName="Coldloop", productName="Coldloop", productVersion=__version__,
+                  creationDateTime=made, contentDescription=content)  # fmt: skip
+    header = ET.SubElement(project, "contentHeader", name="coldloop", modificationDateTime=made)
+    coordinates = ET.SubElement(header, "coordinateInfo")
+    for language in ("fbd", "ld", "sfc"):
+        ET.SubElement(ET.SubElement(coordinates, language), "scaling", x="1", y="1")
+    types = ET.SubElement(project, "types")
+    data_types = ET.SubElement(types, "dataTypes")
+    for name, first, last, kind in _ARRAY.findall(text):
+        array = ET.SubElement(ET.SubElement(ET.SubElement(data_types, "dataType", name=name), "baseType"), "array")
+        ET.SubElement(array, "dimension", lower=first, upper=last)
+        ET.SubElement(array, "baseType").append(_type(kind))
+    ET.SubElement(types, "pous").extend(map(_pou, _UNIT.finditer(text)))
+    ET.SubElement(ET.SubElement(project, "instances"), "configurations").append(_configuration(text))
+    ET.indent(project, " ")
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{ET.tostring(project, encoding="unicode")}\n'
+
+
+def _pou(found: re.Match[str]) -> ET.Element:
+    note, kind, name, result, text = found.groups()
+    pou = ET.Element("pou", name=name, pouType=POUS[kind])
+    interface = ET.SubElement(pou, "interface")
+    if result:
+        ET.SubElement(interface, "returnType").append(_type(result))
+    for keyword, constant, declared in _SECTION.findall(text):
+        interface.append(_variables(SECTIONS[keyword], declared, constant=bool(constant)))
+    body = re.sub(r"^ {4}", "", _SECTION.sub("", text), flags=re.MULTILINE)
+    _write(ET.SubElement(ET.SubElement(pou, "body"), "ST"), body)
+    if note:
+        _write(ET.SubElement(pou, "documentation"), note.strip())
+    return pou
+
+
+def _variables(tag: str, declared: str, *, constant: bool, **attributes: str) -> ET.Element:
+    """Return declarations as a list of variables."""
+    listed = ET.Element(tag, attributes | ({"constant": "true"} if constant else {}))
+    for name, kind, value, note in _DECLARATION.findall(declared):
+        variable = ET.SubElement(listed, "variable", name=name)
+        ET.SubElement(variable, "type").append(_type(kind))
+        if value:
+            ET.SubElement(variable, "initialValue").append(_value(value))
+        if note:
+            _write(ET.SubElement(variable, "documentation"), note.strip())
+    return listed
+
+
+def _type(name: str) -> ET.Element:
+    return ET.Element(name) if name in ELEMENTARY else ET.Element("derived", name=name)
+
+
+def _value(text: str) -> ET.Element:
+    """Return a number, or an array of numbers."""
+    if not text.startswith("["):
+        return ET.Element("simpleValue", value=text)
+    array = ET.Element("arrayValue")
+    for each in text.strip("[]").split(","):
+        ET.SubElement(array, "value").append(_value(each.strip()))
+    return array
+
+
+def _configuration(text: str) -> ET.Element:
+    """Return the configuration: its task with what runs in it, and the lists of constants."""
+    found = _CONFIGURATION.search(text)
+    assert found  # noqa: S101 the text is of this package
+    name, declared, resource, tasks = found.groups()
+    configuration = ET.Element("configuration", name=name)
+    within = ET.SubElement(configuration, "resource", name=resource)
+    for task, interval, priority, instance, program in _TASK.findall(tasks):
+        running = ET.SubElement(within, "task", name=task, interval=f"T#{interval}", priority=priority)
+        ET.SubElement(running, "pouInstance", name=instance, typeName=program)
+    for number, (_, constant, listed) in enumerate(_SECTION.findall(declared), 1):
+        configuration.append(
+            _variables("globalVars", listed, constant=bool(constant), name=f"{name[:3]}constants_{number}")
+        )
+    return configuration
+
+
+def _write(element: ET.Element, text: str) -> None:
+    """Write text into an element as a paragraph."""
+    ET.SubElement(element, "p", xmlns=XHTML).text = text

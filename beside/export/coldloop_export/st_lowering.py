@@ -189,10 +189,13 @@ class FunctionLowering:
             self.before = outer
         return tuple(result)
 
-    def _statement(self, statement: tree.Statement) -> Iterator[tree.Statement]:  # noqa: C901 one case a statement
+    def _statement(self, statement: tree.Statement) -> Iterator[tree.Statement]:  # noqa: C901, PLR0912 one case a statement
         match statement:
             case tree.Declare(variable, value):
-                yield from self._declared(variable, value)
+                if isinstance(variable.type, ArrayType):
+                    yield zeroed(variable)
+                else:
+                    yield from self._assigned(variable, value or Literal(cast("Kind", variable.type), 0))
             case Assign(target, value):
                 yield from self._assigned(cast("tree.Target", self._expression(target)), value)
             case tree.Point(variable, part):
@@ -218,12 +221,6 @@ class FunctionLowering:
             case tree.Return(value) if value:
                 yield from self._assigned(Name(cast("Kind", value.type), VALUE), value)
                 yield tree.Return()
-
-    def _declared(self, variable: Name, value: Expression | None) -> Iterator[tree.Statement]:
-        if isinstance(variable.type, ArrayType):
-            yield zeroed(variable)
-        else:
-            yield from self._assigned(variable, value or Literal(cast("Kind", variable.type), 0))
 
     def _assigned(self, target: tree.Target, value: Expression) -> Iterator[tree.Statement]:
         """Yield an assignment; of a choice, a decision between two."""
@@ -266,9 +263,12 @@ class FunctionLowering:
                 kept.append((variable, output))
             else:
                 passed[output.name] = variable
-        listed = tuple((each, self._noted(passed.get(each.name.removesuffix(GIVEN)) or self._own_name(each)))
-                       for each in (*block.inputs, *block.shared))  # fmt: skip
-        return tree.Call(block, listed, tuple(kept))
+        listed = []
+        for each in (*block.inputs, *block.shared):
+            if (given_ := passed.get(each.name.removesuffix(GIVEN))) is None:
+                self._given.add(each)
+            listed.append((each, self._noted(given_ or each)))
+        return tree.Call(block, tuple(listed), tuple(kept))
 
     def _handed(self, name: str, place: Place, passed: dict[str, Expression]) -> Place:
         """Return where a parameter is in what is called; what that needs goes into `passed`."""
@@ -322,26 +322,22 @@ class FunctionLowering:
         outer, self.before = self.before, []
         other = self._expression(operation.operands[1])
         own, self.before = self.before, outer
-        if not own and self._may_be_computed(other):
+        if not own and all(map(self._is_within, tree.walk(other))):
             return Operation(Kind.BOOL, operation.operator, (one, other))
         part = self._temporary(Kind.BOOL, "part")
         undecided: Expression = part if operation.operator == "and" else Operation(Kind.BOOL, "not", (part,))
         self.before += [Assign(part, one), If(undecided, (*own, Assign(part, other)), ())]
         return part
 
-    def _may_be_computed(self, expression: Expression) -> bool:
-        """Return whether the indices of an expression are within their arrays whatever has been decided before."""
-        return all(
-            self._is_within(index, length)
-            for node in tree.walk(expression) if isinstance(node, Element) and isinstance(node.array.type, ArrayType)
-            for index, length in zip(node.indices, node.array.type.shape, strict=True)
-        )  # fmt: skip
-
-    def _is_within(self, index: Expression, length: int) -> bool:
-        if isinstance(index, Literal):
+    def _is_within(self, node: object) -> bool:
+        """Return whether a part of an expression is no element, or one whose indices are within their array always."""
+        if not (isinstance(node, Element) and isinstance(node.array.type, ArrayType)):
             return True
-        reached = self._ranges.get(index.name) if isinstance(index, Name) else None
-        return reached is not None and reached.start >= 0 and reached.stop <= length
+        for index, length in zip(node.indices, node.array.type.shape, strict=True):
+            reached = self._ranges.get(index.name, range(-1, 0)) if isinstance(index, Name) else range(-1, 0)
+            if not isinstance(index, Literal) and not 0 <= reached.start <= reached.stop <= length:
+                return False
+        return True
 
     # -- places --------------------------------------------------------------------------------------------------------
 
@@ -366,12 +362,8 @@ class FunctionLowering:
         """Return a place; fields of records that are not global are parameters."""
         name = place.array if isinstance(place, Part) else place
         if isinstance(name, Name):
-            self._own_name(name)
+            self._given.add(name)
         return place
-
-    def _own_name(self, name: Name) -> Name:
-        self._given.add(name)
-        return name
 
     def _kept(self, part: Expression) -> Place:
         """Return where a part of a record is that is made: a number as it is now."""

@@ -39,12 +39,17 @@ def one_iteration_a_call(solve: Function, *, keep: bool = False) -> Function:
         UnfitKernelError: The solver is built otherwise.
     """
     follow = _only(solve, [each for each in solve.body if isinstance(each, Invoke)][-1:])
-    _refuse_other_names(solve, follow)
+    if follow.arguments[: len(follow.function.parameters)] != follow.function.parameters:
+        raise _unfit(solve)
     within = follow.function.body
     loop = _only(solve, [each for each in within if isinstance(each, tree.For) and _calls(each)])
     behind = _only(solve, [each for each in loop.body if isinstance(each, If)])
     iteration = tuple(map(_one_at_a_time, behind.body))
-    kept = _kept(loop, behind) if keep else ()
+    kept: tuple[Statement, ...] = ()
+    if keep:  # the answer, at the counts that are reached in a call
+        reached = Operation(Kind.BOOL, "==", (behind.condition.operands[0], CALLS))  # type: ignore[union-attr]
+        stores = tuple(each for each in loop.body if each is not behind)
+        kept = (replace(loop, body=(If(reached, stores, ()),)),)
     needed = {node.name for node in tree.walk((iteration, kept)) if isinstance(node, Name)}
     state = tuple(each for each in within if isinstance(each, tree.Declare) and each.variable.name in needed)
     start = (*solve.body[: solve.body.index(follow)], *state)
@@ -83,14 +88,6 @@ def an_answer_in_calls(solve: Function, method: str) -> Function:
     return Function("answer", solve.source, summary, (START, FINISH, *solve.parameters), body=body)
 
 
-def _kept(loop: tree.For, behind: If) -> tuple[Statement, ...]:
-    """Return what keeps the answer at the counts that are reached in a call."""
-    count = behind.condition.operands[0]  # type: ignore[union-attr]
-    reached = Operation(Kind.BOOL, "==", (count, CALLS))
-    stores = tuple(each for each in loop.body if each is not behind)
-    return (tree.For(loop.variable, loop.start, loop.stop, loop.step, (If(reached, stores, ()),)),)
-
-
 def _calls(loop: tree.For) -> bool:
     return any(isinstance(node, Invoke) for node in tree.walk(loop.body))
 
@@ -99,17 +96,9 @@ def _one_at_a_time(statement: Statement) -> Statement:
     """Return a call with the number of iterations made one; any other statement as it is."""
     if not isinstance(statement, Invoke):
         return statement
-    parameters = statement.function.parameters
-    arguments: tuple[tree.Expression, ...] = tuple(
-        Literal(Kind.INT, 1) if parameter.name == COUNT else argument
-        for parameter, argument in zip(parameters, statement.arguments, strict=True)
-    )
-    return Invoke(statement.function, arguments, statement.results)
-
-
-def _refuse_other_names(solve: Function, follow: Invoke) -> None:
-    if follow.arguments[: len(follow.function.parameters)] != follow.function.parameters:
-        raise _unfit(solve)
+    given = zip(statement.function.parameters, statement.arguments, strict=True)
+    arguments = tuple(ONE if parameter.name == COUNT else argument for parameter, argument in given)
+    return replace(statement, arguments=arguments)
 
 
 def _only(solve: Function, found: list[Node]) -> Node:
@@ -136,7 +125,7 @@ BUSY: Final = Name(Kind.BOOL, "busy.")
 STEP: Final = Name(Kind.INT, "next.step")
 CALL_ANEW: Final = Name(Kind.BOOL, "call.anew")
 """Whether the next call of a block that pauses is the first."""
-ONE, TRUE, FALSE = Literal(Kind.INT, 1), Literal(Kind.BOOL, 1), Literal(Kind.BOOL, 0)
+ONE, TRUE = Literal(Kind.INT, 1), Literal(Kind.BOOL, 1)
 END: Final = 0
 """The number that no step has."""
 

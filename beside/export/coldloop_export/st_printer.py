@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from coldloop_export import tree
-from coldloop_export.kernels import Array
+from coldloop_export.golden import Array
 from coldloop_export.st_lowering import Split
 from coldloop_export.tree import ArrayType, Block, Call, Convert, Kind, Literal, Name, Path, Statement, Type, type_of
 from coldloop_rig.text_tables import markdown_table
@@ -105,15 +105,9 @@ DOUBLE: Final = {**SCALARS, Kind.REAL: "LREAL"}
 BYTES: Final = {"REAL": 4, "LREAL": 8, "DINT": 4, "BOOL": 1}
 INFIX: Final = {"and": "AND", "or": "OR", "==": "=", "!=": "<>"}
 FUNCTIONS: Final = {
-    "sqrt": "SQRT",
-    "abs": "ABS",
-    "power": "EXPT",
-    "log": "LN",
-    "round": f"{PREFIX}round",
-    "copysign": f"{PREFIX}copysign",
-    "%": f"{PREFIX}floor_mod",
-    "//": f"{PREFIX}floor_div",
-}
+    "sqrt": "SQRT", "abs": "ABS", "power": "EXPT", "log": "LN", "round": f"{PREFIX}round",
+    "copysign": f"{PREFIX}copysign", "%": f"{PREFIX}floor_mod", "//": f"{PREFIX}floor_div",
+}  # fmt: skip
 NO_NOTES: Final[Mapping[str, str]] = {}
 TABLE: Final = f"{PREFIX}literals"
 LARGEST: Final = np.finfo(np.float32).max
@@ -187,9 +181,9 @@ class StructuredTextPrinter(tree.TreePrinter):
         variables |= {self._instance(each): block_name(each) for each in block.called}
         if self._uses_literals:
             outside[TABLE] = f"{TABLE}_table"
-        where = "/".join(block.source.split("/")[-3:])
+        head = comment(f"{tree.place_of(block.source)}: {block.summary}")
         return "".join([
-            comment(f"{where}: {block.summary}"), f"FUNCTION_BLOCK {block_name(block)}\n", section("VAR_INPUT", inputs),
+            head, f"FUNCTION_BLOCK {block_name(block)}\n", section("VAR_INPUT", inputs),
             section("VAR_IN_OUT", shared), section("VAR_OUTPUT", outputs), section("VAR_EXTERNAL", outside),
             section("VAR", variables), *(f"{line}\n" for line in body), "END_FUNCTION_BLOCK\n",
         ])  # fmt: skip
@@ -433,10 +427,11 @@ class Constants:
         yield section("VAR_GLOBAL", listed)
 
     def configuration(self, state: Mapping[Path, Type] = MappingProxyType({})) -> str:
-        """Return the configuration with these lists, a state, and room for the verdict of the self-test."""
+        """Return the configuration: these lists, a state, room for the self-test's verdict, one task for `cl_main`."""
         listed = section("VAR_GLOBAL", {global_name(path): self.printer.type(kind) for path, kind in state.items()})
         verdict = section("VAR_GLOBAL", {VERDICT: self.printer.array_type("DINT", LENGTH)})
-        return configuration([*self.lists(), listed, verdict])
+        lists = "".join([*self.lists(), listed, verdict])
+        return tree.filled(tree.template("structured_text/configuration.st"), {"LISTS": lists})
 
     def sum(self) -> int:
         """Return the sum over all of them that the self-test computes."""
@@ -471,11 +466,6 @@ class Constants:
             bits = f"cl_lreal_bits({element}, (offset MOD {PARTS}))" if double else f"cl_bits({element})"
             read = f"item := {bits if real else element};"
         return f"{pad}{part}:\n{pad}    {read.replace(chr(10), chr(10) + '    ')}\n"
-
-
-def configuration(lists: Iterable[str]) -> str:
-    """Return a configuration with these lists of variables, and one task that runs `cl_main`."""
-    return tree.filled(tree.template("structured_text/configuration.st"), {"LISTS": "".join(lists)})
 
 
 def in_pieces(constants: Mapping[Path, Array]) -> tuple[dict[Path, Array], Split]:

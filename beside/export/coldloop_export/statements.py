@@ -2,7 +2,7 @@
 
 import ast
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from types import MappingProxyType
 from typing import Any, Final, cast
 
@@ -72,13 +72,6 @@ class KernelReader(CallReader):
         self.write_to(target, place)
         return [Assign(place, self.of_type(target, kind, value, node))]
 
-    def into_all(self, targets: Sequence[ast.expr], node: ast.expr) -> list[Statement]:
-        """Return the assignments of one value to several places, none of which it reads."""
-        if set(map(root_of, targets)) & names_in(node):
-            raise self.refusal(node, "a value is read behind its assignment: two statements say the order")
-        value = self.read(node)
-        return [each for one in targets for each in self.into(one, value, node)]
-
     def of_type(self, target: ast.expr, kind: Kind, value: Value, node: ast.expr) -> Expression:
         """Return a number for a place of this type; a number with a point that is known takes it."""
         if isinstance(value, Known) and kind is Kind.REAL and isinstance(value.value, float):
@@ -120,7 +113,13 @@ class KernelReader(CallReader):
             if isinstance(target, ast.Tuple):
                 raise self.refusal(target, f"{function.name} has one result")
             return self.into(target, tree.Invocation(function.value, function, arguments), value)
-        targets, returned = self._paired(target, value, function.name, function.returned)
+        if function.returned is None:
+            raise self.refusal(value, f"{function.name} has no result")
+        targets, returned = [target], [function.returned]
+        if isinstance(target, ast.Tuple):
+            targets, returned = target.elts, [part for _, part in getattr(function.returned, "parts", ())]
+        if len(targets) != len(returned):
+            raise self.refusal(value, f"{function.name} has {max(len(returned), 1)} results")
         taken: dict[Name, Name] = {}
         declared: list[Statement] = []
         behind: list[tuple[ast.expr, Value]] = []
@@ -138,19 +137,6 @@ class KernelReader(CallReader):
             self.before += self.into(one, got, value)
         return []
 
-    def _paired(
-        self, target: ast.expr, value: ast.Call, name: str, returned: Returned | None
-    ) -> tuple[list[ast.expr], list[Returned]]:  # fmt: skip
-        """Return targets, and what is returned for each of them."""
-        if returned is None:
-            raise self.refusal(value, f"{name} has no result")
-        if not isinstance(target, ast.Tuple):
-            return [target], [returned]
-        parts = [part for _, part in getattr(returned, "parts", ())]
-        if len(parts) != len(target.elts):
-            raise self.refusal(value, f"{name} has {max(len(parts), 1)} results")
-        return target.elts, parts
-
     # -- variables -----------------------------------------------------------------------------------------------------
 
     def _choice(self, target: ast.Name, value: ast.IfExp) -> list[Statement]:
@@ -165,16 +151,15 @@ class KernelReader(CallReader):
 
     def variable(self, node: ast.Name, kind: Type) -> tuple[Name, list[Statement]]:
         """Return the variable of a name and its declaration, where it is new."""
-        for scope in reversed(self.scopes):
-            if node.id in scope:
-                found = scope[node.id]
-                if not isinstance(found, Name) or found.type != kind:
-                    raise self.refusal(node, f"{node.id} has another type already")
-                if node.id in self.loop_variables:
-                    raise self.refusal(node, f"{node.id} counts a loop")
-                if found in self.parameters and not isinstance(kind, Kind):
-                    raise self.refusal(node, SAME)
-                return found, []
+        found = next((scope[node.id] for scope in reversed(self.scopes) if node.id in scope), None)
+        if found is not None:
+            if not isinstance(found, Name) or found.type != kind:
+                raise self.refusal(node, f"{node.id} has another type already")
+            if node.id in self.loop_variables:
+                raise self.refusal(node, f"{node.id} counts a loop")
+            if found in self.parameters and not isinstance(kind, Kind):
+                raise self.refusal(node, SAME)
+            return found, []
         variable = Name(kind, node.id)
         self.scopes[-1][node.id] = variable
         return variable, [tree.Declare(variable)]
@@ -216,9 +201,8 @@ class KernelReader(CallReader):
         if isinstance(value, Name | Field | View) and isinstance(value.type, ArrayType):
             value = self.copied(ast.Pass(), value)
         if isinstance(value, Elementwise):
-            return self._elementwise(
-                value, lambda indices: tree.Element(value.type.kind, cast("Name", target), indices)
-            )
+            kind, array = value.type.kind, cast("Name", target)
+            return self._elementwise(value, lambda indices: tree.Element(kind, array, indices))
         return [Assign(target, cast("Expression", value))]
 
     def _elementwise(self, value: Elementwise, target: Any) -> list[Statement]:  # noqa: ANN401 element of indices
@@ -291,7 +275,7 @@ class KernelReader(CallReader):
             self.scopes.pop()
         return tuple(result)
 
-    def statement(self, node: ast.stmt) -> list[Statement]:  # noqa: PLR0911 one case a statement
+    def statement(self, node: ast.stmt) -> list[Statement]:  # noqa: C901, PLR0911 one case a statement
         """Return what a statement is."""
         match node:
             case ast.Expr(value=ast.Constant()):
@@ -302,9 +286,14 @@ class KernelReader(CallReader):
                 return self.assigned(target, value)
             case ast.Assign(targets=targets, value=value) if all(isinstance(one, ast.Subscript | ast.Attribute)
                                                                  for one in targets):  # fmt: skip
-                return self.into_all(targets, value)
+                if set(map(root_of, targets)) & names_in(value):
+                    raise self.refusal(value, "a value is read behind its assignment: two statements say the order")
+                read = self.read(value)
+                return [each for one in targets for each in self.into(one, read, value)]
             case ast.AugAssign(target=ast.Name() | ast.Subscript() | ast.Attribute() as target, op=sign, value=value):
-                return self._augmented(target, sign, value)
+                if isinstance(target, ast.Name) and not isinstance(self.read(target).type, Kind):
+                    raise self.refusal(target, "this is not a number that changes")
+                return self.assigned(target, ast.copy_location(ast.BinOp(target, sign, value), target))
             case ast.For(target=ast.Name(id=name), iter=ast.Call() as counted, orelse=[]):
                 return self._for(node, name, counted)
             case ast.While(test=test, orelse=[]):
@@ -358,7 +347,8 @@ class KernelReader(CallReader):
             return self._return_call(node, value, kernel)
         read = self.typed(value, self.read(value))
         if isinstance(read.type, Kind):
-            return self._return_number(node, cast("Expression", read))
+            self._agree(node, (), None, read.type)
+            return [tree.Return(cast("Expression", read))]
         kept: list[Value] = []
         returned = self._returned(node, read, kept)
         results = tuple(Name(part.type, f"result_{place}")  # type: ignore[arg-type]
@@ -370,7 +360,8 @@ class KernelReader(CallReader):
     def _return_call(self, node: ast.Return, value: ast.Call, kernel: Kernel) -> list[Statement]:
         function, arguments = self.call(value, kernel)
         if function.value:
-            return self._return_number(node, tree.Invocation(function.value, function, arguments))
+            self._agree(node, (), None, function.value)
+            return [tree.Return(tree.Invocation(function.value, function, arguments))]
         given = dict(zip(function.parameters, arguments, strict=True))
 
         def rerooted(part: Returned) -> Returned:
@@ -383,10 +374,6 @@ class KernelReader(CallReader):
             raise self.refusal(node, f"{function.name} has no result")
         self._agree(node, function.results, rerooted(function.returned), None)
         return [tree.Invoke(function, arguments, function.results), tree.Return()]
-
-    def _return_number(self, node: ast.Return, number: Expression) -> list[Statement]:
-        self._agree(node, (), None, cast("Kind", number.type))
-        return [tree.Return(number)]
 
     def _agree(
         self, node: ast.Return, results: tuple[Name, ...], returned: Returned | None, value: Kind | None
@@ -414,14 +401,6 @@ class KernelReader(CallReader):
             raise self.refusal(node, SAME)
         kept.append(part)
         return Name(part.type, f"result_{len(kept) - 1}")
-
-    def _augmented(
-        self, target: ast.Name | ast.Subscript | ast.Attribute, sign: ast.operator, value: ast.expr
-    ) -> list[Statement]:  # fmt: skip
-        whole = ast.copy_location(ast.BinOp(target, sign, value), target)
-        if isinstance(target, ast.Name) and not isinstance(self.read(target).type, Kind):
-            raise self.refusal(target, "this is not a number that changes")
-        return self.assigned(target, whole)
 
 
 def root_of(target: ast.expr) -> str:

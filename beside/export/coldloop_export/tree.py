@@ -24,6 +24,11 @@ def filled(text: str, parts: Mapping[str, str]) -> str:
     return text
 
 
+def place_of(source: str) -> str:
+    """Return the last three parts of the path of a source, as printed text names it."""
+    return "/".join(source.split("/")[-3:])
+
+
 class Kind(Enum):
     """Types of scalars."""
 

@@ -129,7 +129,8 @@ class DisturbancesStudy:
 
     def requests(self, options: StudyOptions) -> list[RunRequest]:
         """Return every event with every pair of controllers."""
-        return [run for event in CASES.values() for load in _loads(event, options) for run in _runs(event, load).values()]
+        under = [(event, load) for event in CASES.values() for load in _loads(event, options)]
+        return [run for event, load in under for run in _runs(event, load).values()]
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Tabulate bands, pressures, modes and alarms of each run."""

@@ -25,6 +25,7 @@ import llvmlite  # type: ignore[import-untyped]
 import numba
 import numpy as np
 from numba.core import compiler, sigutils, types
+from numba.core.dispatcher import Dispatcher
 from numba.core.errors import NumbaWarning
 from numba.core.serialize import dumps
 from numpy.typing import NDArray
@@ -93,6 +94,11 @@ def _count(kinds: Iterable[Any]) -> int:
     for kind in kinds:
         count += _count(kind.types) if isinstance(kind, types.BaseTuple) else 1  # type: ignore[attr-defined]
     return count
+
+
+def python_of(value: object) -> Callable[..., Any] | None:
+    """Return the Python function that a kernel is compiled from; None of what is no kernel."""
+    return value.py_func if isinstance(value, Dispatcher) else None
 
 
 def _in_turn(dispatcher: Any) -> Any:  # noqa: ANN401
