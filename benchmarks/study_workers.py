@@ -7,9 +7,8 @@ from pathlib import Path
 
 from coldloop.process.cold_box import TICK_S
 from coldloop.process.updating_periods import duration
-from coldloop_studies.execution import Workers
+from coldloop_studies.execution import Workers, conduct
 from coldloop_studies.reproduction import STUDIES
-from coldloop_studies.results import conduct
 from coldloop_studies.study import StudyOptions
 
 

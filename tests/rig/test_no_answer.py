@@ -120,7 +120,7 @@ def test_a_compiled_stretch_ends_where_there_is_no_answer(gains_times: Break) ->
 def test_a_study_with_such_runs_ends_with_three(
     coldloop: Coldloop, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("coldloop_studies.results.conduct", lambda *_: StudyResult((), [], {}, failed_runs=2))
+    monkeypatch.setattr("coldloop_studies.execution.conduct", lambda *_: StudyResult((), [], {}, failed_runs=2))
     done = coldloop("study", "periods", "--quick", "--out", tmp_path)
     assert done.code == 3
     assert done.complaints == ["coldloop: in 2 runs updates have no answer: what the optimiser computed is not finite"]

@@ -9,9 +9,8 @@ import pytest
 from distributed import Client
 
 from coldloop_rig.results.indicators import Indicators
-from coldloop_studies.execution import Store, Workers
+from coldloop_studies.execution import Store, Workers, conduct
 from coldloop_studies.request import UPDATE_COLUMNS, Outcome, RunRequest, perform
-from coldloop_studies.results import conduct
 from coldloop_studies.study import RUNS, Load, Study, StudyOptions, StudyResult, draw_of
 
 Requests = Callable[[int], list[RunRequest]]

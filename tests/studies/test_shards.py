@@ -13,10 +13,9 @@ import pytest
 
 import coldloop_studies.execution
 from coldloop.errors import ResultsError, StudyError, UsageError
-from coldloop_studies.execution import Store, StoredOutcomes, Workers, perform_all
+from coldloop_studies.execution import Shard, Store, StoredOutcomes, Workers, conduct, conduct_shard, merge, perform_all
 from coldloop_studies.reproduction import STUDIES
 from coldloop_studies.request import RunRequest, perform
-from coldloop_studies.results import Shard, conduct, conduct_shard, merge
 from coldloop_studies.study import RUNS, StudyOptions
 
 if TYPE_CHECKING:

@@ -321,7 +321,7 @@ def cost_of(found: Sequence[int], worst: int | None = None) -> CallCost:
     return CallCost(least=min(found), mean=sum(found) / len(found), most=max(found), worst=worst)
 
 
-def counted_updates(optimizer: OptimizerProgram, golden: Iterable[GoldenUpdate]) -> dict[str, CallCost]:
+def counted_updates(optimizer: OptimizerProgram, updates: Iterable[GoldenUpdate]) -> dict[str, CallCost]:
     """Return the operations of the calls that golden updates take beside the iterations: plan, start, finish."""
     kernels = golden.OptimizerKernels(optimizer)
     begin, take, solve, _ = (each.name for each in kernels.entries)
@@ -331,7 +331,7 @@ def counted_updates(optimizer: OptimizerProgram, golden: Iterable[GoldenUpdate])
     empty = partial(empty_state, x, len(process.inputs), len(process.outputs), z, REAL)
     state = empty()
     noted = {name: program.noting(name) for name in (take, "pose", "warm_start", "deliver")}
-    for each in golden:
+    for each in updates:
         if each.fixed_ticks >= 0:
             c = c._replace(fixed_ticks=each.fixed_ticks)
             state = empty()
@@ -344,13 +344,13 @@ def counted_updates(optimizer: OptimizerProgram, golden: Iterable[GoldenUpdate])
     return {name: cost_of(found) for name, found in calls.items()}
 
 
-def counted_guard(kernels: GuardKernels, golden: Iterable[GoldenCall]) -> dict[str, CallCost]:
+def counted_guard(kernels: GuardKernels, calls: Iterable[GoldenCall]) -> dict[str, CallCost]:
     """Return the operations of the scans and judgements of golden calls of the output guard."""
     program, limits = CountedProgram(kernels.functions, np.float64), kernels.limits
     begin, resume, scan, judge, _ = (each.name for each in kernels.entries)
     state, twin = _guard_state(limits), _guard_state(limits)
     noted = {"scan": program.noting(scan), "judgement": program.noting(judge)}
-    for each in golden:
+    for each in calls:
         given = np.array(each.given)
         match each.call:
             case Call.RESTART:
@@ -389,8 +389,8 @@ def _guard_state(limits: Limits) -> GuardState:
     return state
 
 
-def latched(golden: GoldenUpdate) -> Latched:
+def latched(of: GoldenUpdate) -> Latched:
     """Return an update as the kernels take it."""
-    update = golden.update
+    update = of.update
     u_before, u, y, x, ahead = (np.array(each, REAL) for each in (update.u_before, update.u, update.y, update.x, ()))
     return Latched(update.update, update.tick, update.playing, REAL(update.load), u_before, u, y, x, ahead)

@@ -430,8 +430,7 @@ class Constants:
         """Return the configuration: these lists, a state, room for the self-test's verdict, one task for `cl_main`."""
         listed = section("VAR_GLOBAL", {global_name(path): self.printer.type(kind) for path, kind in state.items()})
         verdict = section("VAR_GLOBAL", {VERDICT: self.printer.array_type("DINT", LENGTH)})
-        lists = "".join([*self.lists(), listed, verdict])
-        return tree.filled(tree.template("structured_text/configuration.st"), {"LISTS": lists})
+        return configuration([*self.lists(), listed, verdict])
 
     def sum(self) -> int:
         """Return the sum over all of them that the self-test computes."""
@@ -466,6 +465,11 @@ class Constants:
             bits = f"cl_lreal_bits({element}, (offset MOD {PARTS}))" if double else f"cl_bits({element})"
             read = f"item := {bits if real else element};"
         return f"{pad}{part}:\n{pad}    {read.replace(chr(10), chr(10) + '    ')}\n"
+
+
+def configuration(lists: Iterable[str]) -> str:
+    """Return a configuration with these lists of variables, and one task that runs `cl_main`."""
+    return tree.filled(tree.template("structured_text/configuration.st"), {"LISTS": "".join(lists)})
 
 
 def in_pieces(constants: Mapping[Path, Array]) -> tuple[dict[Path, Array], Split]:

@@ -107,7 +107,7 @@ def execute_study(options: argparse.Namespace) -> int:
 
 
 def _do(study: "Study", options: argparse.Namespace) -> int:
-    from coldloop_studies.results import Shard, conduct, conduct_shard, merge
+    from coldloop_studies.execution import Shard, conduct, conduct_shard, merge
     from coldloop_studies.study import RUNS
 
     asked = _study_options(options)

@@ -1,34 +1,50 @@
-"""Execution of the runs of a study: by Dask workers, each run once; results that exist are read back.
+"""A study done: its runs by Dask workers, each once; its table, figures and section of the report; or its shards.
 
 Results do not depend on the number of workers: a run is a function of its request. A worker that dies costs only the
-runs it had in hand, which others do again; a stopped study resumes where it was. Workers write outcomes to the store
-themselves, a file each, named by the digest of its request: only requests go through the scheduler.
+runs it had in hand, which others do again; a stopped study resumes where it was: results that exist are read back.
+Workers write outcomes to the store themselves, a file each, named by the digest of its request: only requests go
+through the scheduler.
+
+Shard i of n has every n-th run of the study, from the i-th on, as by jobs of an array. Its folder gets a record of what
+it is a part of, so that shards of different options or versions are not mistaken for parts of one study.
 """
 
 import contextlib
+import csv
+import hashlib
+import io
+import json
 import logging
 import os
+import platform
+import re
 import signal
 import time
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, Self
 
 from distributed import Client, LocalCluster, as_completed
+from pydantic import BaseModel, ConfigDict
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from coldloop import __version__
 from coldloop.errors import ColdloopError, ResultsError, StudyError, UsageError
+from coldloop.parsing import parsed_json
 from coldloop.text_file import whole_text
 from coldloop_optimizer_plc.computing_settings import BudgetSettings, PlcBudget
 from coldloop_optimizer_plc.solvers import make_solver
+from coldloop_rig.figures.plot import save_figure
 from coldloop_rig.interruption import INTERRUPTION
 from coldloop_rig.progress import make_console
-from coldloop_rig.results.folders import prepare_folder, writing
-from coldloop_studies.request import Outcome, Procedure, RunRequest, check, decisive_digest, perform, programs_digest
-from coldloop_studies.settings import settings_of
-from coldloop_studies.study import RUNS, Study, StudyOptions
+from coldloop_rig.results.folders import installed_version, prepare_folder, write_json, writing
+from coldloop_rig.text_tables import markdown_table
+from coldloop_studies import request as requested
+from coldloop_studies.request import Outcome, Procedure, RunRequest, decisive_digest, programs_digest
+from coldloop_studies.settings import outside_digests, settings_of
+from coldloop_studies.study import RUNS, Study, StudyOptions, StudyResult
 
 REMEMBERED: Final = 64
 """Outcomes kept in memory: some MB each when they have a trace."""
@@ -120,7 +136,10 @@ def families(requests: Iterable[RunRequest]) -> list[list[RunRequest]]:
     groups: dict[str, list[tuple[int, RunRequest]]] = {}
     for request in dict.fromkeys(requests):
         limit = iteration_limit(request)
-        key = request.digest if limit is None else _digest_without_budget(request)
+        key = request.digest
+        if limit is not None:
+            settings = settings_of(request.assignments).with_program(budget=BudgetSettings())
+            key = decisive_digest(request, settings)
         groups.setdefault(key, []).append((limit or 0, request))
     return [
         [request for _, request in sorted(group, key=lambda one: one[0], reverse=True)] for group in groups.values()
@@ -138,10 +157,6 @@ def same_run(
         if iteration_limit(other) == limit or never_cut_off(outcomes[other], limit):
             return other
     return None
-
-
-def _digest_without_budget(request: RunRequest) -> str:
-    return decisive_digest(request, settings_of(request.assignments).with_program(budget=BudgetSettings()))
 
 
 CONNECT_PATIENCE_S: Final = 10
@@ -194,7 +209,7 @@ def checked_requests(study: Study, options: StudyOptions, folder: Path) -> Seque
     """
     requests = study.requests(options)
     for request in requests:
-        check(request)
+        requested.check(request)
     for name in (study.name, RUNS):
         prepare_folder(folder / name)
     return requests
@@ -243,16 +258,16 @@ class _Agenda:
     def next(self, after: RunRequest | None = None) -> list[RunRequest]:
         """Return what may be begun now that `after` was done, or at all; outcomes that are known are copied."""
         found = self._families if after is None else [self._family[after]]
-        wanted = [request for family in found for request in self._of_family(family)]
+        wanted: list[RunRequest] = []
+        for family in found:
+            known = [request for request in family if request in self._done]
+            missing = [request for request in family if request not in self._done | self._begun]
+            if known[:1] == family[:1]:
+                wanted += [request for request in missing if not self._copied(request, known)]
+            else:
+                wanted += [request for request in missing if request is family[0]]
         self._begun.update(wanted)
         return wanted
-
-    def _of_family(self, family: list[RunRequest]) -> list[RunRequest]:
-        known = [request for request in family if request in self._done]
-        missing = [request for request in family if request not in self._done | self._begun]
-        if known[:1] != family[:1]:
-            return [request for request in missing if request is family[0]]
-        return [request for request in missing if not self._copied(request, known)]
 
     def _copied(self, request: RunRequest, known: list[RunRequest]) -> bool:
         """Keep the outcome of the same run as this one's too, if there is one; or it has the same name already."""
@@ -295,7 +310,11 @@ def _done(client: Client, store: Store, agenda: _Agenda, first: Sequence[RunRequ
             raise StudyError(f"a run under load {request.load} failed: {reason}; what was done before is kept")
         if future.status != FINISHED:
             raise StudyError("the scheduler is gone, or has given up a run; what was done before is kept: do it again")
-        _await_file(store, request)
+        deadline = time.monotonic() + FILE_PATIENCE_S
+        while store.find(request) is None:
+            if time.monotonic() >= deadline:
+                raise StudyError(f"{store.path(request)}: a worker has written it, and it is not here; {_SHARED}")
+            time.sleep(0.5)
         yield request
         under_way.update(submit(agenda.next(request)))  # type: ignore[no-untyped-call]
         future.release()
@@ -313,19 +332,10 @@ def perform_and_keep(request: RunRequest, folder: str, programs: str) -> None:
     store = Store(Path(folder))
     if not store.folder.is_dir():
         raise ResultsError(f"{folder}: a worker has no such folder; {_SHARED}")
-    store.keep(request, perform(request))
+    store.keep(request, requested.perform(request))
 
 
 _SHARED: Final = "name an --out that all machines share, or do shards and merge them (`coldloop docs studies`)"
-
-
-def _await_file(store: Store, request: RunRequest) -> None:
-    """Wait until the file that a worker has written is seen here."""
-    deadline = time.monotonic() + FILE_PATIENCE_S
-    while store.find(request) is None:
-        if time.monotonic() >= deadline:
-            raise StudyError(f"{store.path(request)}: a worker has written it, and it is not here; {_SHARED}")
-        time.sleep(0.5)
 
 
 def _first_line(error: BaseException) -> str:
@@ -341,3 +351,200 @@ def _bar(title: str, total: int) -> Iterator[Progress]:
     with Progress(*columns, console=make_console(), refresh_per_second=2) as bar:
         bar.add_task(title, total=total)
         yield bar
+
+
+def conduct(study: Study, options: StudyOptions, workers: Workers, folder: Path) -> StudyResult:
+    """Do the missing runs of a study and write its files to `folder / study.name`.
+
+    Raises:
+        ColdloopError: A run failed, or a file cannot be written.
+    """
+    requests = checked_requests(study, options, folder)
+    outcomes = perform_all(requests, Store(folder / RUNS), workers, study.name)
+    result = study.evaluate(options, outcomes)
+    result.failed_runs = sum(outcome.failed_updates > 0 for outcome in outcomes.values())
+    outside: dict[str, str] = {}
+    for assignments in {request.assignments for request in requests}:
+        outside |= outside_digests(settings_of(assignments).optimizer_plc.program.outside)
+    runs = [
+        {
+            "load": request.load, "draw": request.draw, "duration_s": request.ticks * options.process.tick_s,
+            "updating_period_s": request.updating_period_s or "adaptive", "settings": request.assignments,
+            "outcome": f"{request.digest}.json",
+        }
+        for request in requests
+    ]  # fmt: skip
+    manifest = {
+        "study": study.name, "coldloop": __version__, "python": platform.python_version(),
+        "dependencies": {name: installed_version(name) for name in requested.LIBRARIES}, "programs": programs_digest(),
+        "outside": outside, "options": asdict(options), "runs": runs,
+    }  # fmt: skip
+    with writing(folder / study.name):
+        _write(study, result, folder / study.name)
+        write_json(folder / study.name / "manifest.json", manifest)
+    return result
+
+
+def _write(study: Study, result: StudyResult, folder: Path) -> None:
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(result.columns)
+    writer.writerows(result.rows)
+    whole_text(folder / "results.csv", table.getvalue())
+    for name, figure in result.figures.items():
+        save_figure(figure, folder / figure_file(name))
+        save_figure(figure, (folder / figure_file(name)).with_suffix(".pdf"))
+    whole_text(folder / "section.md", f"# {study.title}\n\n{section(result)}")
+
+
+def figure_file(name: str) -> str:
+    """Return the file name of a figure; LaTeX takes `%` for a comment."""
+    return re.sub(r"[^\w.-]+", "-", name) + ".png"
+
+
+def section(result: StudyResult, folder: str = "") -> str:
+    """Return figures, remarks and a table of up to 24 rows as Markdown; figures are looked for in `folder`."""
+    parts = [f"![{name}]({folder}{figure_file(name)})" for name in result.figures]
+    parts += result.remarks
+    if result.rows and (result.always_shown or len(result.rows) <= 24):
+        parts.append(markdown_table(result.columns, result.rows))
+    return "\n\n".join(parts) + "\n"
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of several parts of a study."""
+
+    number: int
+    """Number of the shard, from 1 to `of`."""
+    of: int
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Return the shard that is written as `2/7`. Raises UsageError if it is none."""
+        number, _, of = text.partition("/")
+        if not (number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of)):
+            raise UsageError(f"--shard {text}: write i/n with i from 1 to n, such as 2/7")
+        return cls(int(number), int(of))
+
+    def __str__(self) -> str:
+        """Write it as it is read."""
+        return f"{self.number}/{self.of}"
+
+    def part(self, requests: Sequence[RunRequest]) -> list[RunRequest]:
+        """Return the runs of this shard."""
+        return unique(requests)[self.number - 1 :: self.of]
+
+
+class ShardRecord(BaseModel):
+    """Study, options and programs that a shard is a part of."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    study: str
+    shard: int
+    of: int
+    options: dict[str, Any]
+    """Options of the study."""
+    programs: str
+    """Digest of the programs that do its runs."""
+    runs: str
+    """Digest of all runs of the study."""
+
+    @classmethod
+    def of_study(cls, study: Study, options: StudyOptions, shard: Shard) -> Self:
+        """Return the record of a shard that is about to be done."""
+        digests = [request.digest for request in unique(study.requests(options))]
+        runs = hashlib.sha256("\n".join(digests).encode()).hexdigest()[:20]
+        plain = parsed_json(json.dumps(asdict(options)))
+        return cls(
+            study=study.name, shard=shard.number, of=shard.of, options=plain, programs=programs_digest(), runs=runs
+        )
+
+
+def unique(requests: Sequence[RunRequest]) -> list[RunRequest]:
+    """Return one request for each run, in their order: the same run may be asked for in several ways."""
+    found: dict[str, RunRequest] = {}
+    for request in requests:
+        found.setdefault(request.digest, request)
+    return list(found.values())
+
+
+def conduct_shard(study: Study, options: StudyOptions, workers: Workers, folder: Path, shard: Shard) -> int:
+    """Do the missing runs of a shard; return how many runs it has.
+
+    Raises:
+        ColdloopError: A run failed, or a file cannot be written.
+    """
+    requests = checked_requests(study, options, folder)
+    path = folder / study.name / f"shard-{shard.number}-of-{shard.of}.json"
+    with writing(path):
+        write_json(path, ShardRecord.of_study(study, options, shard).model_dump())
+    mine = shard.part(requests)
+    perform_all(mine, Store(folder / RUNS), workers, f"{study.name} {shard}")
+    return len(mine)
+
+
+def merge(study: Study, options: StudyOptions, sources: Sequence[Path], folder: Path) -> None:
+    """Gather the runs of all shards in one store.
+
+    Raises:
+        UsageError: A folder has no shard of this study with these options, done by these programs.
+        StudyError: Runs are missing.
+        ResultsError: A file cannot be written.
+    """
+    of = _common_number(study, options, sources)
+    prepare_folder(folder / RUNS)
+    target = Store(folder / RUNS)
+    requests = unique(study.requests(options))
+    missing = []
+    for place, request in enumerate(requests):
+        if target.find(request) is not None:
+            continue
+        found = (Store(source / RUNS).text(request) for source in sources)
+        text = next((text for text in found if text is not None), None)
+        if text is None:
+            missing.append(f"{place % of + 1}/{of}")
+        else:
+            target.keep(request, text)
+    if missing:
+        shards = ", ".join(sorted(set(missing), key=lambda shard: int(shard.partition("/")[0])))
+        raise StudyError(
+            f"study {study.name}: {len(missing)} of {len(requests)} runs are missing or damaged, of shards {shards}; "
+            "do these with --shard, then merge again"
+        )
+
+
+def _common_number(study: Study, options: StudyOptions, sources: Sequence[Path]) -> int:
+    """Return in how many shards the study was cut; all records must agree, with each other and with what is asked."""
+    cuts = {}
+    for source in sources:
+        paths = sorted((source / study.name).glob("shard-*-of-*.json"))
+        if not paths:
+            raise UsageError(f"{source}: no shard of study {study.name}; name the --out folders of the shards")
+        for path in paths:
+            try:
+                record = ShardRecord.model_validate_json(path.read_text(encoding="utf-8"))
+            except OSError as error:
+                raise UsageError(f"{path}: {error.strerror}; do this shard again") from None
+            except ValueError:
+                raise UsageError(f"{path}: not the record of a shard; do this shard again") from None
+            _compare(path, record, ShardRecord.of_study(study, options, Shard(record.shard, record.of)))
+            cuts[record.of] = path
+    if len(cuts) > 1:
+        (of, path), (other, other_path) = list(cuts.items())[:2]
+        raise UsageError(f"{other_path}: one of {other} shards, while {path} is one of {of}; merge shards of one set")
+    return next(iter(cuts))
+
+
+def _compare(path: Path, record: ShardRecord, wanted: ShardRecord) -> None:
+    if record.programs != wanted.programs:
+        raise UsageError(f"{path}: done by another version of Coldloop; do all shards and the merge with the same one")
+    names = {**record.options, **wanted.options}
+    different = [
+        f"{name} {record.options.get(name)} there, {wanted.options.get(name)} here"
+        for name in names if record.options.get(name) != wanted.options.get(name)
+    ]  # fmt: skip
+    if different or record.runs != wanted.runs:
+        reason = "; ".join(different) or "load files differ"
+        raise UsageError(f"{path}: of another configuration ({reason}); give all shards and the merge the same options")

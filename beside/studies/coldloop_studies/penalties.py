@@ -262,11 +262,15 @@ class PenaltiesStudy:
             variant: np.array([outcomes[closed(load, variant)].indicators.J_BF for load in _closed_loads(options)])
             for variant in variants(options)
         }
-        timed = _period_costs(options, outcomes)
-        result = StudyResult(COLUMNS, _rows(options, found, loops, timed), {
-            "total cost": _figure(found),
-            "periods": _period_figure(timed, list(periods(options))),
-        })  # fmt: skip
+        timed: dict[PenaltyVariant, PeriodCosts] = {}
+        for load in hours(options):
+            for variant in _timed_variants(load, options):
+                runs = [outcomes[request].indicators for request in _period_runs(load, variant, options)]
+                timed.setdefault(variant, {})[load] = {
+                    cost: np.array([getattr(run, cost) for run in runs]) for cost in COSTS
+                }
+        figures = {"total cost": _figure(found), "periods": _period_figure(timed, periods(options))}
+        result = StudyResult(COLUMNS, _rows(options, found, loops, timed), figures)
         for preset, variant in PRESETS.items():
             result.values |= {
                 f"{preset}: crossing in total cost": found.crossings(None, variant),
@@ -282,49 +286,31 @@ class PenaltiesStudy:
             _crossing_text(found),
             *(_table(preset, options, found, loops) for preset in PRESETS),
             *_start_table(options, found),
-            *_period_remarks(timed, list(periods(options))),
+            *_period_remarks(timed, periods(options)),
         ]
         return result
 
 
-def _period_costs(options: StudyOptions, outcomes: Outcomes) -> dict[PenaltyVariant, PeriodCosts]:
-    costs: dict[PenaltyVariant, PeriodCosts] = {}
-    for load in hours(options):
-        for variant in _timed_variants(load, options):
-            runs = [outcomes[request].indicators for request in _period_runs(load, variant, options)]
-            costs.setdefault(variant, {})[load] = {
-                cost: np.array([getattr(run, cost) for run in runs]) for cost in COSTS
-            }
-    return costs
-
-
 def _rows(
-    options: StudyOptions,
-    found: Paired,
-    loops: Mapping[PenaltyVariant, Series],
+    options: StudyOptions, found: Paired, loops: Mapping[PenaltyVariant, Series],
     timed: Mapping[PenaltyVariant, PeriodCosts],
-) -> list[tuple[Cell, ...]]:
+) -> list[tuple[Cell, ...]]:  # fmt: skip
     def names(variant: PenaltyVariant | None) -> tuple[str, str]:
         return (variant.preset, variant.change) if variant else ("", QPOASES)
 
     nothing = (np.nan,) * 5
-    rows: list[tuple[Cell, ...]] = [
-        ("paired", load.name, *names(variant), power, *sums, np.nan, np.nan)
-        for (variant, power), draws in found.sums.items()
-        for load, sums in zip(found.loads, draws, strict=True)
-    ]
-    rows += [
-        ("closed", load.name, *names(variant), NOMINAL, *nothing, np.nan, float(cost))
-        for variant, costs in loops.items()
-        for load, cost in zip(_closed_loads(options), costs, strict=True)
-    ]
-    rows += [
-        ("period", load.name, *names(variant), period, *nothing, float(of_load["J_open_mean"][i]),
-         float(of_load["J_BF"][i]))
-        for variant, costs in timed.items() for load, of_load in costs.items()
-        for i, period in enumerate(periods(options))
+    return [
+        *(("paired", load.name, *names(variant), power, *sums, np.nan, np.nan)
+          for (variant, power), draws in found.sums.items()
+          for load, sums in zip(found.loads, draws, strict=True)),
+        *(("closed", load.name, *names(variant), NOMINAL, *nothing, np.nan, float(cost))
+          for variant, costs in loops.items()
+          for load, cost in zip(_closed_loads(options), costs, strict=True)),
+        *(("period", load.name, *names(variant), period, *nothing, float(of_load["J_open_mean"][i]),
+           float(of_load["J_BF"][i]))
+          for variant, costs in timed.items() for load, of_load in costs.items()
+          for i, period in enumerate(periods(options))),
     ]  # fmt: skip
-    return rows
 
 
 def _crossing_text(found: Paired) -> str:
@@ -411,17 +397,16 @@ def _start_table(options: StudyOptions, found: Paired) -> list[str]:
             base = found.over_lowest(PRESETS[variant.preset], SETTLED, which)
             return np.array([found.over_lowest(variant, power, which) / base for power in some])
 
-        distance = jackknife(_misfit_of(curve, theirs[places]), len(found.loads), above=0.0)
+        def off(which: Sequence[int], curve: Callable[[Sequence[int]], Series] = curve) -> float:
+            return misfit(curve(which), theirs[places])
+
+        distance = jackknife(off, len(found.loads), above=0.0)
         rows.append((variant.label, *(f"{value:.3f}" for value in curve(every)), distance.brief()))
     caption = (
         "**Starts**: total cost at few iterations over that of the same preset at P = 10, all draws together, and how "
         "far that is from the paper's points, over theirs at P = 25: root mean square of the logarithm of the ratio."
     )
     return [markdown_table(("start", *(f"P = {p:g}" for p in some), "misfit"), rows, caption)]
-
-
-def _misfit_of(curve: Callable[[Sequence[int]], Series], theirs: Series) -> Callable[[list[int]], float]:
-    return lambda which: misfit(curve(which), theirs)
 
 
 def _figure(found: Paired) -> Figure:

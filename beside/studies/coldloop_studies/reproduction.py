@@ -28,11 +28,10 @@ from coldloop_rig.text_tables import markdown_table
 from coldloop_studies.any_process import CompareStudy, PeriodsStudy
 from coldloop_studies.controllers import ClassicalStudy, ContestStudy, RobustnessStudy
 from coldloop_studies.drawing import published_comparison, published_periods
-from coldloop_studies.execution import Workers
+from coldloop_studies.execution import Workers, conduct, section
 from coldloop_studies.penalties import PenaltiesStudy
 from coldloop_studies.reference_plc import SLOW_DOWN, SPEED, CholeskyStudy, SinglePrecision
 from coldloop_studies.refrigerator import CouplingStudy, DisturbancesStudy
-from coldloop_studies.results import conduct, section
 from coldloop_studies.settings import settings_of
 from coldloop_studies.solver_comparison import SolverComparison, measures
 from coldloop_studies.study import USUAL_DRAWS, Study, StudyOptions, StudyResult

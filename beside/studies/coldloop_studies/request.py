@@ -211,7 +211,11 @@ def perform(request: RunRequest) -> str:
     recorder = Recorder(request.ticks)
     match request.procedure:
         case Procedure.PAIRED_PROBLEMS | Procedure.HARSH_PROBLEMS:
-            return _of_problems(request, settings, scenario).to_json()
+            sequence = problem_sequence(scenario, request.assignments)
+            run = paired_run if request.procedure is Procedure.PAIRED_PROBLEMS else harsh_run
+            columns = run(sequence, settings.optimizer_plc.program)
+            indicators = paired_indicators(columns, request.updating_period_s)
+            return Outcome(programs_digest(), indicators, "", 0, columns, {}).to_json()
         case Procedure.LINEAR_PLANT:
             LinearRig(settings).run(scenario, recorder)
         case Procedure.CONFIGURED if request.networked:
@@ -225,14 +229,6 @@ def perform(request: RunRequest) -> str:
 @lru_cache(maxsize=1)
 def _rig(assignments: tuple[str, ...]) -> OneProcessRig:
     return OneProcessRig(settings_of(assignments))
-
-
-def _of_problems(request: RunRequest, settings: Settings, scenario: Scenario) -> Outcome:
-    sequence, program = problem_sequence(scenario, request.assignments), settings.optimizer_plc.program
-    run = paired_run if request.procedure is Procedure.PAIRED_PROBLEMS else harsh_run
-    columns = run(sequence, program)
-    indicators = paired_indicators(columns, request.updating_period_s)
-    return Outcome(programs_digest(), indicators, "", 0, columns, {})
 
 
 def _outcome(recording: Recording, settings: Settings, trace_ticks: int) -> Outcome:

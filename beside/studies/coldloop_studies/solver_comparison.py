@@ -23,7 +23,6 @@ from coldloop_studies.paired_run import HARSH, INTERIOR_POINT_ITERATIONS
 from coldloop_studies.request import Outcome, Procedure, RunRequest, Series
 from coldloop_studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
 
-PERIOD_S = 5.0
 UNLIMITED = 50.0
 """Power at which qpOASES makes 526 recalculations in a period: more than any problem takes."""
 
@@ -32,14 +31,9 @@ def throttled(
     load: Load, solver: str, power: float, trace_ticks: int = 0, procedure: Procedure = Procedure.CONFIGURED
 ) -> RunRequest:
     """Return the run of a solver at a power, relative to the PLC of the paper."""
-    return load.request(
-        PERIOD_S,
-        f"{PROGRAM}solver={solver}",
-        f"{PROGRAM}budget.power={power}",
-        f"{PROGRAM}budget.preparation_slots=0",
-        trace_ticks=trace_ticks,
-        procedure=procedure,
-    )
+    settings = ("solver=" + solver, f"budget.power={power}", "budget.preparation_slots=0")
+    assignments = (PROGRAM + setting for setting in settings)
+    return load.request(5.0, *assignments, trace_ticks=trace_ticks, procedure=procedure)
 
 
 PAIRED_DRAWS: Final = 10
@@ -208,15 +202,6 @@ def open_loop_table(found: OpenLoop) -> str:
     return "\n\n".join(parts)
 
 
-def _open_loop_figure(found: OpenLoop) -> Figure:
-    with panels(1, 1, 3.0) as (figure, (place,)):
-        for (solver, powers), colour in zip(found.powers.items(), COLOURS, strict=False):
-            intervals = [found.interval(solver, power) for power in powers]
-            above_lowest(place, powers, intervals, colour, LABELS[solver])
-        legend_outside(figure, place)
-    return figure
-
-
 def _harsh_loads(options: StudyOptions) -> list[Load]:
     return loads(options, *"abcdef", usual=3)  # together they have more than 300 harsh problems
 
@@ -327,10 +312,13 @@ class SolverComparison:
                                         for power in powers.tolist()])} for solver in SOLVERS}
             for load in _closed_loads(options)
         ]  # fmt: skip
-        result = StudyResult(COLUMNS, [], {
-            "indicators": _figure(powers, tables, closed),
-            "paired open loop": _open_loop_figure(paired),
-        })  # fmt: skip
+        result = StudyResult(COLUMNS, [], {"indicators": _figure(powers, tables, closed)})
+        with panels(1, 1, 3.0) as (figure, (place,)):
+            for (solver, some), colour in zip(paired.powers.items(), COLOURS, strict=False):
+                intervals = [paired.interval(solver, power) for power in some]
+                above_lowest(place, some, intervals, colour, LABELS[solver])
+            legend_outside(figure, place)
+        result.figures["paired open loop"] = figure
         for load, table in zip(paired.loads, tables, strict=True):
             result.rows += [
                 ("paired", load.name, solver, power, *(columns[name][i] for name in INDICATORS[:-1]), np.nan,

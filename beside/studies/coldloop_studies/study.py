@@ -26,8 +26,6 @@ USUAL_DRAWS = 3
 """Draws of each load, unless the study or the command sets another number."""
 RUNS = "runs"
 """Folder, beside those of the studies, in which runs are kept: studies share them."""
-QUICK_TICKS = 2400
-"""Longest run of a quick study: ten minutes."""
 
 
 def noise(factor: float) -> tuple[str, ...]:
@@ -99,13 +97,9 @@ class Load:
     """Settings of its runs: those of the study, and noise."""
 
     def request(
-        self,
-        updating_period_s: float,
-        *assignments: str,
-        networked: bool = False,
-        trace_ticks: int = 0,
+        self, updating_period_s: float, *assignments: str, networked: bool = False, trace_ticks: int = 0,
         procedure: Procedure = Procedure.CONFIGURED,
-    ) -> RunRequest:
+    ) -> RunRequest:  # fmt: skip
         """Return the request for a run under this load."""
         return RunRequest(
             self.name, self.profile.times, self.profile.watts, self.ticks, updating_period_s,
@@ -120,8 +114,7 @@ def draw_of(name: str, draw: int, options: StudyOptions) -> Load:
     settings = settings_of(options.settings)
     profile = find_load(drawn, load_model(settings.model.file).w0, settings.process)
     ticks = options.ticks or natural_ticks(drawn, profile)
-    if options.quick:
-        ticks = min(ticks, QUICK_TICKS)
+    ticks = min(ticks, 2400) if options.quick else ticks  # ten minutes
     noise = NOISE if not named and len(options.draws) > 1 else ()
     return Load(drawn if named or draw == 1 else f"{name}#{draw}", draw, profile, ticks, options.settings + noise)
 
@@ -249,7 +242,7 @@ def _variant(file: Path, name: str, table: Any, own: tuple[str, ...]) -> Variant
     place = f"{file} [{name}]"
     if not isinstance(table, Mapping):
         raise UsageError(f"{file}: {name} is not in the table of a variant; write [NAME] above it")
-    if not 0 < len(name) <= LONGEST_NAME or any(map(_is_unsuitable, name)):
+    if not 0 < len(name) <= LONGEST_NAME or not name.isprintable() or NOT_IN_NAMES & {*name} or max(name) > LAST_LETTER:
         raise UsageError(
             f"{file} [{name[:LONGEST_NAME]!a}]: name it with 1 to {LONGEST_NAME} printable Latin, Greek or Cyrillic "
             "characters other than $, | and \\"
@@ -267,8 +260,3 @@ def _variant(file: Path, name: str, table: Any, own: tuple[str, ...]) -> Variant
         said = str(error).removeprefix(f"{place}: ")
         raise ConfigurationError(f"{place}: {said}") from None
     return Variant(name, (TUNED, *(f"{key}={as_toml(value)}" for key, value in sorted(settings.items()))))
-
-
-def _is_unsuitable(character: str) -> bool:
-    """Return whether a character cannot be in a name: figures have no letter for it, or read it as a mark."""
-    return not character.isprintable() or character in NOT_IN_NAMES or character > LAST_LETTER
