@@ -3,13 +3,11 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from coldloop.errors import UsageError
 from coldloop.service.command_line import add_configuration_options
 from coldloop_rig.cli.commands.options import Command, positive_count
-
-if TYPE_CHECKING:
-    from coldloop_rig.settings import Settings
 
 PLC: Final = Path("plc")
 SAID: Final = {"export": "a run as CSV, MATLAB or HDF5; the optimiser as C99 or Structured Text"}
@@ -18,7 +16,6 @@ GROUP: Final = {"export": "a run"}
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
     add_configuration_options(parser)
     parser.add_argument("run", type="folder", metavar="RUN", help="folder of a run; plc, with --target: the optimiser")
     kinds = parser.add_mutually_exclusive_group(required=True)
@@ -44,26 +41,28 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 def execute_export(options: argparse.Namespace) -> int:
     """A recorded run as CSV, MATLAB or HDF5 files, with units; or the optimiser as sources for a PLC."""
-    paths = _recorded_run(options) if options.target is None else _solver(options)
+    if options.target is not None:
+        paths = _optimizer(options)
+    elif options.ticks is not None:
+        raise UsageError("--ticks: is for coldloop export plc --target")
+    elif options.config or options.assignments or options.plc or options.score:
+        raise UsageError("--config, --set, --plc and --score: are for coldloop export plc --target")
+    else:
+        from coldloop_rig.results.run_folder import export
+
+        paths = export(options.run, options.kind, options.out or options.run, force=options.force)
     sys.stdout.writelines(f"{path}\n" for path in paths)
     return 0
 
 
-def _recorded_run(options: argparse.Namespace) -> list[Path]:
-    from coldloop.errors import UsageError
-    from coldloop_rig.results.run_folder import export
-
-    if options.ticks is not None:
-        raise UsageError("--ticks: is for coldloop export plc --target")
-    if options.config or options.assignments or options.plc or options.score:
-        raise UsageError("--config, --set, --plc and --score: are for coldloop export plc --target")
-    return export(options.run, options.kind, options.out or options.run, force=options.force)
-
-
-def _solver(options: argparse.Namespace) -> list[Path]:
-    from coldloop.errors import UsageError
+def _optimizer(options: argparse.Namespace) -> list[Path]:
+    """Write the optimiser of the paper's PLC, unless the user says otherwise."""
+    from coldloop.config import load_configuration
     from coldloop_export.folder import export_plc
+    from coldloop_export.golden import SINGLE
+    from coldloop_rig.cli import process_setting
     from coldloop_rig.plc_sizing.plc import find_profile
+    from coldloop_rig.settings import Settings
 
     if options.run != PLC:
         raise UsageError(f"{options.run}: has no target; coldloop export plc --target {options.target} --out FOLDER")
@@ -72,19 +71,9 @@ def _solver(options: argparse.Namespace) -> list[Path]:
     if options.score and options.target != "c":
         raise UsageError(f"--score: is for --target c; no linker makes a program of {options.target} here")
     profile = find_profile(options.plc) if options.plc else None
-    return export_plc(options.target, options.ticks, options.out, _settings(options), profile, score=options.score)
-
-
-def _settings(options: argparse.Namespace) -> "Settings":
-    """Return the settings of the optimiser: those of the paper's PLC, unless the user says otherwise."""
-    from coldloop.config import load_configuration
-    from coldloop_export.golden import SINGLE
-    from coldloop_rig.cli import process_setting
-    from coldloop_rig.settings import Settings
-
-    assignments = [*SINGLE, *options.assignments]
-    process = process_setting(options.assignments)
-    return load_configuration(Settings, file=options.config, assignments=assignments, options=process).settings
+    assignments, process = [*SINGLE, *options.assignments], process_setting(options.assignments)
+    loaded = load_configuration(Settings, file=options.config, assignments=assignments, options=process)
+    return export_plc(options.target, options.ticks, options.out, loaded.settings, profile, score=options.score)
 
 
 COMMANDS: Final = {"export": Command(_declare, execute_export)}

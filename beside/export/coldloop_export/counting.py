@@ -285,19 +285,16 @@ class Counter:
         self._program[self._entry](self.method, problem, guess, COUNTS, none, *room)
         return list(self._noted)
 
-    def unconstrained(self) -> int:
-        """Return the operations of an iteration without active rows and bounds."""
-        return self._constructed(FAR, FAR)
-
-    def worst(self) -> int:
-        """Return the operations of an iteration that does all that an iteration can do."""
-        return self._constructed(-FAR, NEAR)
-
-    def _constructed(self, rows: float, bounds: float) -> int:
+    def unconstrained(self, rows: float = FAR, bounds: float = FAR) -> int:
+        """Return the operations of an iteration without active rows and bounds, which are so far from the guess."""
         qp = self.problem
         n, gamma = len(qp.phi), np.full(len(qp.gamma), rows, REAL)
         guess, high = np.zeros(n, REAL), np.full(n, bounds, REAL)
         return max(self.iterations(qp._replace(gamma=gamma, low=-high, high=high), guess))
+
+    def worst(self) -> int:
+        """Return the operations of an iteration that does all that an iteration can do."""
+        return self.unconstrained(-FAR, NEAR)
 
 
 def counted_iterations(method: OdeMethod, vectors: Sequence[GoldenVector]) -> IterationCounts:

@@ -225,16 +225,14 @@ def integers_of(golden: GoldenUpdate) -> tuple[int, ...]:
             *answered)  # fmt: skip
 
 
-def reals_of(golden: GoldenUpdate) -> tuple[float, ...]:
-    """Return its numbers with a point, without the rows of the sequence."""
-    update, plan = golden.update, golden.plan
-    return (update.load, *update.u_before, *update.u, *update.y, *update.x, plan.load_step, plan.shortage)
-
-
 def update_tables(golden: Sequence[GoldenUpdate]) -> dict[str, Array]:
     """Return golden updates as tables of integers and of numbers with a point, a row each."""
-    return {"integers": np.array([integers_of(each) for each in golden], np.int32),
-            "reals": np.array([reals_of(each) for each in golden], np.float32)}  # fmt: skip
+    reals = [
+        (update.load, *update.u_before, *update.u, *update.y, *update.x, plan.load_step, plan.shortage)
+        for _, update, plan, _ in golden
+    ]
+    integers = np.array([integers_of(each) for each in golden], np.int32)
+    return {"integers": integers, "reals": np.array(reals, np.float32)}
 
 
 def refuse(settings: ProgramSettings) -> None:
@@ -448,9 +446,14 @@ class _Drawing:
             changed = self.random.choice((length - 1, self.random.randrange(length)))
             others = (self._row(0.0, 1.0)[0], *self._at_a_bound(), *NOT_FINITE)
             rows[changed] = self._moved(rows[changed]) if self._chance(0.6) else self._changed(rows[changed], others)
+        judgement = Judgement.OUT_OF_RANGE
+        if all(in_range(self.limits, row) for row in rows):
+            passes = judge(self.state, self.twin, self.limits, self.tick, meanwhile, 0, len(meanwhile), first_tick,
+                           rows, len(rows))  # fmt: skip
+            judgement = Judgement.ACCEPTED if passes else Judgement.RATE_EXCEEDED
         yield GoldenCall(
             Call.JUDGE, self.tick, self._applied(), self._applied(), meanwhile=meanwhile, first_tick=first_tick,
-            rows=tuple(rows), judgement=self._judgement(meanwhile, first_tick, rows),
+            rows=tuple(rows), judgement=judgement,
         )  # fmt: skip
 
     def _moved(self, row: Row) -> Row:
@@ -467,14 +470,6 @@ class _Drawing:
         return tuple(
             single(self.random.choice((low - beyond * slack, high + beyond * slack))) for low, high, slack in sides
         )
-
-    def _judgement(self, meanwhile: Sequence[Row], first_tick: int, rows: Sequence[Row]) -> Judgement:
-        """Return the guard's verdict on a sequence, as in the control PLC."""
-        limits, state, twin, tick = self.limits, self.state, self.twin, self.tick
-        if not all(in_range(limits, row) for row in rows):
-            return Judgement.OUT_OF_RANGE
-        passes = judge(state, twin, limits, tick, meanwhile, 0, len(meanwhile), first_tick, rows, len(rows))
-        return Judgement.ACCEPTED if passes else Judgement.RATE_EXCEEDED
 
     def _played(self, tick: int, *, moves: float, update: bool = False, as_wanted: bool = False) -> Row:
         """Return what the twin applies, where now and then something new is wanted; or that."""

@@ -13,17 +13,9 @@ from numpy.typing import NDArray
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
 from coldloop_rig.figures.plot import COLOURS
-from coldloop_rig.plc_sizing.intervals import (
-    ADAPTIVE,
-    Interval,
-    fixed_periods,
-    geometric_mean,
-    mean_ratio,
-    over_best_fixed,
-    pays,
-    require_costs,
-)
-from coldloop_rig.text_tables import markdown_table
+from coldloop_rig.plc_sizing import intervals
+from coldloop_rig.plc_sizing.intervals import ADAPTIVE, Interval, geometric_mean, mean_ratio, require_costs
+from coldloop_rig.text_tables import Cell, markdown_table
 from coldloop_studies.drawing import legend_outside, panels, ratio_rows, ratio_scale, spans_decade
 from coldloop_studies.request import RunRequest
 from coldloop_studies.settings import settings_of
@@ -125,7 +117,7 @@ def _other_rule(process: Process) -> tuple[str, str]:
 
 def periods(process: Process) -> tuple[float, ...]:
     """Return the updating periods that are compared, s, the adaptive one first."""
-    return (ADAPTIVE, *fixed_periods(process))
+    return (ADAPTIVE, *intervals.fixed_periods(process))
 
 
 class PeriodsStudy:
@@ -149,11 +141,12 @@ class PeriodsStudy:
         result = StudyResult((*COLUMNS, *(f"{one.name} outside (%)" for one in process.banded)), [], {})
         tried, named = periods(process), _other_rule(process)[1]
         costs, means, training = {}, {}, np.array([load.draw == 1 for load in drawn])
+        labels: list[Cell] = ["adaptive", *tried[1:], named]
         for regime, settings in _regimes(process).items():
             found = [[outcomes[run].indicators for run in _runs(load, process, settings)] for load in drawn]
             rows = [
                 [(regime, load.name, label, run.tau_u_mean, run.J_BF, *run.outside_band_pct.values())
-                 for label, run in zip(("adaptive", *tried[1:], named), runs, strict=True)]
+                 for label, run in zip(labels, runs, strict=True)]
                 for load, runs in zip(drawn, found, strict=True)
             ]  # fmt: skip
             result.rows += [row for of_load in rows for row in of_load[:-1]] + [of_load[-1] for of_load in rows]
@@ -163,7 +156,7 @@ class PeriodsStudy:
             best, ratio = judged(costs[regime], training)
             _, of_other = judged(np.vstack((every[-1], every[1:-1])), training)
             result.note(f"{regime}: J_BF of the adaptive period over fixed {tried[best]:g} s", ratio.value)
-            cells = f"{means[regime]:.2f}", f"{tried[best]:g}", ratio.text(), pays(ratio), of_other.text()
+            cells = f"{means[regime]:.2f}", f"{tried[best]:g}", ratio.text(), intervals.pays(ratio), of_other.text()
             summary.append((regime, *cells))
         fresh = _has_others(training)
         chosen = "on the first draws, judged on the others" if fresh else "on the same, which favours it"
@@ -187,8 +180,8 @@ def judged(costs: Array, training: NDArray[np.bool_]) -> tuple[int, Interval]:
     """
     require_costs(costs)
     if not _has_others(training):
-        return over_best_fixed(costs)
-    best, _ = over_best_fixed(costs[:, training])
+        return intervals.over_best_fixed(costs)
+    best, _ = intervals.over_best_fixed(costs[:, training])
     return best, mean_ratio(costs[0, ~training], costs[best, ~training])
 
 

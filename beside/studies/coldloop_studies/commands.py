@@ -3,7 +3,6 @@
 import argparse
 import os
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -15,7 +14,6 @@ from coldloop_rig.cli.commands.options import Command, check_load, configuration
 
 if TYPE_CHECKING:
     from coldloop_studies.execution import Workers
-    from coldloop_studies.instants import Judged
     from coldloop_studies.study import Study, StudyOptions
 
 
@@ -65,7 +63,6 @@ def _add_scale_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _workers(options: argparse.Namespace) -> "Workers":
-    """Return who does the runs. Raises UsageError if both workers and a scheduler are given."""
     from coldloop_studies.execution import Workers
 
     if options.scheduler and options.workers:
@@ -160,9 +157,9 @@ def _declare_design(parser: argparse.ArgumentParser) -> None:
 
 def execute_design(options: argparse.Namespace) -> int:
     """Which decision and constraint instants the problem needs, by what each set costs in the loop."""
-    from coldloop.errors import UsageError
     from coldloop.text_file import require_regular_file, whole_text
     from coldloop_rig.cli.commands.options import FIGURE_FORMATS
+    from coldloop_rig.figures.plot import save_figure
     from coldloop_rig.progress import make_console
     from coldloop_rig.results.folders import writing
     from coldloop_studies import instants
@@ -180,22 +177,14 @@ def execute_design(options: argparse.Namespace) -> int:
         )
     sys.stdout.write(instants.table(found, options.loads))
     if options.figure is not None:
-        _draw(found, options.loads, options.figure)
+        with writing(options.figure, "choose another --figure"):
+            save_figure(instants.drawn(found, options.loads), options.figure)
+        sys.stdout.write(f"figure in {options.figure}\n")
     if options.out is not None:
         with writing(options.out):
             whole_text(options.out, instants.configuration(found))
         sys.stdout.write(f"written to {options.out}\n")
     return 0
-
-
-def _draw(found: "Sequence[Judged]", loads: Sequence[str], path: Path) -> None:
-    from coldloop_rig.figures.plot import save_figure
-    from coldloop_rig.results.folders import writing
-    from coldloop_studies.instants import drawn
-
-    with writing(path, "choose another --figure"):
-        save_figure(drawn(found, loads), path)
-    sys.stdout.write(f"figure in {path}\n")
 
 
 COMMANDS: Final = {

@@ -38,8 +38,6 @@ Array = NDArray[np.float64]
 MOST_STEPS: Final = 200
 ROUNDING: Final = 1e-13
 """Share of the cost below which a step has won nothing."""
-SUFFICIENT: Final = 1e-4
-"""Share of the decrease that the slope promises, with which a step is taken (Armijo)."""
 UNBOUNDED: Final = 1e30
 
 
@@ -95,7 +93,11 @@ class PlayedProfiles:
         p = np.clip(self._problem.hold(parameters.u_before), qp.low, qp.high)[: self._n]
         for _ in range(MOST_STEPS):
             outside = self._outside(outputs + self._outputs @ p)
-            hessian, slope = self._piece(qp, outputs, outside)
+            rows = outside != 0.0
+            Y, weights = self._outputs[rows], 2.0 * self._weights[rows]
+            edges = np.where(outside > 0, self._high, self._low)[rows]
+            hessian = self._hessian + Y.T @ (weights[:, None] * Y)
+            slope = qp.phi[: self._n] + Y.T @ (weights * (outputs[rows] - edges))
             best = self._solved(qp, hessian, slope)
             if (self._outside(outputs + self._outputs @ best) == outside).all():
                 return self._with_slacks(best)
@@ -111,15 +113,6 @@ class PlayedProfiles:
     def _outside(self, y: Array) -> Array:
         """Return 1 for outputs above their band, -1 below, 0 inside."""
         return np.where(y > self._high, 1.0, np.where(y < self._low, -1.0, 0.0))
-
-    def _piece(self, qp: QuadraticProblem, outputs: Array, outside: Array) -> tuple[Array, Array]:
-        """Return Hessian and linear term of the cost where these outputs are outside."""
-        rows = outside != 0.0
-        Y, weights = self._outputs[rows], 2.0 * self._weights[rows]
-        edges = np.where(outside > 0, self._high, self._low)[rows]
-        return self._hessian + Y.T @ (weights[:, None] * Y), qp.phi[: self._n] + Y.T @ (
-            weights * (outputs[rows] - edges)
-        )
 
     def _solved(self, qp: QuadraticProblem, hessian: Array, slope: Array) -> Array:
         high = np.concatenate([qp.high[: self._n], qp.gamma[-len(self._rates) :]])
@@ -141,7 +134,7 @@ class PlayedProfiles:
         """Return the share of the way to `best` that lowers the cost enough; 0 if there is nothing to be won."""
         at_p, share = self._total(qp, outputs, p), 1.0
         while slope * share < -ROUNDING * abs(at_p):
-            if self._total(qp, outputs, p + share * (best - p)) <= at_p + SUFFICIENT * share * slope:
+            if self._total(qp, outputs, p + share * (best - p)) <= at_p + 1e-4 * share * slope:  # Armijo
                 return share
             share *= 0.5
         return 0.0
