@@ -47,7 +47,15 @@ class CallReader(expressions.ExpressionReader):
         if not isinstance(called, Python):
             raise self.refusal(node, "this cannot be called")
         if kernel := self.kernel(node):
-            return self._invocation(node, kernel)
+            alone = id(node) in self.alone
+            function, arguments = self.call(node, kernel)
+            if function.written and not alone:
+                raise self.refusal(node, f"the call of {function.name}, which writes, is a statement or an argument")
+            if function.value is not None:
+                return tree.Invocation(function.value, function, arguments)
+            if function.returned is None:
+                raise self.refusal(node, f"{function.name} has no result")
+            return self.received(node, function, arguments, function.returned, "")
         if called.value is type and len(node.args) == 1:
             return DType(cast("Kind", self.scalar(node.args[0]).type))
         if called.value is len and len(node.args) == 1:
@@ -184,17 +192,6 @@ class CallReader(expressions.ExpressionReader):
             case tree.View(_, array) | Item(_, array):
                 return self.is_constant(array)
         return False
-
-    def _invocation(self, node: ast.Call, kernel: Kernel) -> Value:
-        alone = id(node) in self.alone
-        function, arguments = self.call(node, kernel)
-        if function.written and not alone:
-            raise self.refusal(node, f"the call of {function.name}, which writes, is a statement or an argument")
-        if function.value is not None:
-            return tree.Invocation(function.value, function, arguments)
-        if function.returned is None:
-            raise self.refusal(node, f"{function.name} has no result")
-        return self.received(node, function, arguments, function.returned, "")
 
     def received(
         self, node: ast.AST, function: Function, arguments: tuple[Expression, ...], returned: Returned, name: str

@@ -9,7 +9,8 @@ import re
 import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, TypeAlias, cast
+from functools import reduce
+from typing import Any, ClassVar, Final, TypeAlias, TypeGuard, cast
 
 import numpy as np
 
@@ -389,29 +390,20 @@ class ExpressionReader:
 
     def _compare(self, node: ast.Compare) -> Value:
         operands = [node.left, *node.comparators]
-        result: Expression | None = None
-        for sign, left, right in zip(node.ops, operands, operands[1:], strict=False):
-            one = self._compared(node, sign, left, right)
-            result = Operation(Kind.BOOL, "and", (result, one)) if result else one
-        return cast("Expression", result)
-
-    def _compared(self, node: ast.Compare, sign: ast.cmpop, left: ast.expr, right: ast.expr) -> Expression:
-        if type(sign) not in COMPARISONS:
-            raise self.refusal(node, "this comparison is not in the subset")
-        read = [self.read(left), self.read(right)]
-        real = any(each.type is Kind.REAL for each in read)
-        one, other = (
-            Literal(Kind.REAL, each.value)
-            if real
-            and isinstance(each, Known)
-            and not isinstance(each.value, bool)
-            and float(np.float32(each.value)) == each.value  # exact in single precision: comparing it needs no type
-            else self.scalar(operand)
-            for each, operand in zip(read, (left, right), strict=True)
-        )
-        if one.type is not other.type or one.type is Kind.BOOL:
-            raise self.refusal(node, f"{named(one.type)} compared with {named(other.type)}")
-        return Operation(Kind.BOOL, COMPARISONS[type(sign)], (one, other))
+        compared = []
+        for sign, *both in zip(node.ops, operands, operands[1:], strict=False):
+            if type(sign) not in COMPARISONS:
+                raise self.refusal(node, "this comparison is not in the subset")
+            read = [self.read(each) for each in both]
+            real = any(each.type is Kind.REAL for each in read)
+            one, other = (
+                Literal(Kind.REAL, value.value) if real and is_exact(value) else self.scalar(operand)
+                for value, operand in zip(read, both, strict=True)
+            )
+            if one.type is not other.type or one.type is Kind.BOOL:
+                raise self.refusal(node, f"{named(one.type)} compared with {named(other.type)}")
+            compared.append(Operation(Kind.BOOL, COMPARISONS[type(sign)], (one, other)))
+        return reduce(lambda before, last: Operation(Kind.BOOL, "and", (before, last)), compared)
 
     def _boolop(self, node: ast.BoolOp) -> Value:
         sign = "and" if isinstance(node.op, ast.And) else "or"
@@ -430,6 +422,13 @@ class ExpressionReader:
         if one.type is not other.type:
             raise self.refusal(node, f"{named(one.type)} or {named(other.type)}")
         return tree.Select(cast("Kind", one.type), condition, one, other)
+
+
+def is_exact(value: Value) -> TypeGuard[Known]:
+    """Return whether a value is a known number that is exact in single precision: comparing it needs no type."""
+    if not isinstance(value, Known) or isinstance(value.value, bool):
+        return False
+    return float(np.float32(value.value)) == float(value.value)
 
 
 def added(one: Expression, other: Expression) -> Expression:

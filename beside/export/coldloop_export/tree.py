@@ -404,33 +404,30 @@ class UnfitKernelError(UsageError):
     """A kernel uses a construct that is not in the subset."""
 
 
-def rows_of(name: str, value: object) -> RowsType | None:
-    """Return the type of a structured array, whose records get this name; of anything else None."""
-    if not (isinstance(value, np.ndarray) and value.dtype.fields):
-        return None
-    numbers = tuple((field, KINDS[kind.kind]) for field, (kind, *_) in value.dtype.fields.items())
-    return RowsType(StructType(name, numbers), len(value))
-
-
-def type_of(value: object) -> Type:  # noqa: PLR0911 one case a type
+def type_of(value: object, records: str = "") -> Type:  # noqa: PLR0911 one case a type
     """Return the type of an argument: an array, numbers in a row, a NamedTuple, a dataclass, or a number.
+
+    A structured array is an argument where its records have a name, `records`.
 
     Raises:
         UnfitKernelError: It is something else.
     """
+    if records and isinstance(value, np.ndarray) and value.dtype.fields:
+        numbers = tuple((name, KINDS[kind.kind]) for name, (kind, *_) in value.dtype.fields.items())
+        return RowsType(StructType(records, numbers), len(value))
     if isinstance(value, np.ndarray) and value.dtype.kind in KINDS and value.ndim:
         return ArrayType(KINDS[value.dtype.kind], value.shape)
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         own = type(value).__name__
-        parts = tuple((name, rows_of(f"{own}{name.capitalize()}", part) or type_of(part))
+        parts = tuple((name, type_of(part, f"{own}{name.capitalize()}"))
                       for name, part in zip(value._fields, value, strict=True))  # fmt: skip
         state = any(isinstance(kind, RowsType) or (isinstance(kind, RecordType) and kind.state) for _, kind in parts)
         return RecordType(own, parts, state)
     if is_dataclass(value) and not isinstance(value, type):
         parts = tuple((each.name, type_of(getattr(value, each.name))) for each in fields(value))
         return RecordType(type(value).__name__, parts, state=True, mutable=True)
-    if isinstance(value, list | tuple) and (numbers := np.array(value)).dtype.kind in KINDS:
-        return ArrayType(KINDS[numbers.dtype.kind], numbers.shape)
+    if isinstance(value, list | tuple) and (listed := np.array(value)).dtype.kind in KINDS:
+        return ArrayType(KINDS[listed.dtype.kind], listed.shape)
     if isinstance(value, bool | np.bool_):
         return Kind.BOOL
     if isinstance(value, int | np.integer):

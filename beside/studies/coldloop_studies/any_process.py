@@ -158,7 +158,7 @@ class PeriodsStudy:
             result.note(f"{regime}: J_BF of the adaptive period over fixed {tried[best]:g} s", ratio.value)
             cells = f"{means[regime]:.2f}", f"{tried[best]:g}", ratio.text(), intervals.pays(ratio), of_other.text()
             summary.append((regime, *cells))
-        fresh = _has_others(training)
+        fresh = training.any() and not training.all()
         chosen = "on the first draws, judged on the others" if fresh else "on the same, which favours it"
         title = f"J_BF of the adaptive period over the best fixed one, chosen {chosen}"
         result.remarks.append(markdown_table((*SUMMARY, f"{named} over it"), summary, title))
@@ -179,14 +179,10 @@ def judged(costs: Array, training: NDArray[np.bool_]) -> tuple[int, Interval]:
         StudyError: A loop costs nothing.
     """
     require_costs(costs)
-    if not _has_others(training):
+    if training.all() or not training.any():
         return intervals.over_best_fixed(costs)
     best, _ = intervals.over_best_fixed(costs[:, training])
     return best, mean_ratio(costs[0, ~training], costs[best, ~training])
-
-
-def _has_others(training: NDArray[np.bool_]) -> bool:
-    return bool(training.any() and not training.all())
 
 
 def _runs(load: Load, process: Process, settings: tuple[str, ...]) -> list[RunRequest]:

@@ -349,9 +349,13 @@ def _table(preset: str, options: StudyOptions, found: Paired, loops: Mapping[Pen
         if variant.preset != preset:
             continue
         closed_loop = mean_ratio(loops[variant], loops[PRESETS[TUNED]])
+        settled: tuple[str, ...] = ("", "", "")  # total, J_dev and J_cst, if it was run until it has converged
+        if (variant, SETTLED) in found.sums:
+            parts = (found.over_converged(part, variant, SETTLED, None).brief() for part in ("J_dev", "J_cst"))
+            settled = found.interval(variant, SETTLED).brief(4), *parts
         rows.append((
             variant.change or f"**{preset}**",
-            found.interval(variant, NOMINAL).brief(4), *_settled(found, variant),
+            found.interval(variant, NOMINAL).brief(4), *settled,
             found.mean("c1", variant, NOMINAL).brief(), found.mean("c2", variant, NOMINAL).brief(),
             closed_loop.brief(4),
         ))  # fmt: skip
@@ -364,15 +368,6 @@ def _table(preset: str, options: StudyOptions, found: Paired, loops: Mapping[Pen
     )
     header = ("change", "total, P = 1", "total, P = 10", "J_dev", "J_cst", "c1", "c2", "J_BF")
     return markdown_table(header, rows, caption)
-
-
-def _settled(found: Paired, variant: PenaltyVariant) -> tuple[str, str, str]:
-    """Return total, J_dev and J_cst of a solver that has converged, if it was run to there."""
-    if (variant, SETTLED) not in found.sums:
-        return "", "", ""
-    total = found.interval(variant, SETTLED).brief(4)
-    dev, cst = (found.over_converged(part, variant, SETTLED, None).brief() for part in ("J_dev", "J_cst"))
-    return total, dev, cst
 
 
 def misfit(ours: Series, theirs: Series) -> float:

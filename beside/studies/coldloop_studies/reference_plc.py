@@ -27,7 +27,7 @@ from coldloop_rig.plc_sizing.budget import estimator_memory, footprint
 from coldloop_rig.plc_sizing.operations import dense_sizes
 from coldloop_rig.text_tables import Cell, markdown_table
 from coldloop_studies.drawing import panels, paper
-from coldloop_studies.request import Outcome, RunRequest, Series
+from coldloop_studies.request import RunRequest, Series
 from coldloop_studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
 
 SPEED: Final = "Mflop/s from n = 50 on"
@@ -169,14 +169,22 @@ class SinglePrecision:
                               for name, unit in INPUTS.items())), [], {})  # fmt: skip
         for load in _loads(options):
             double, single = (outcomes[request] for request in _both(load))
-            largest = [float(np.abs(_difference(double, single, name)).max()) for name in INPUTS]
+            apart = {name: single.series(name) - double.series(name) for name in INPUTS}
+            largest = [float(np.abs(each).max()) for each in apart.values()]
             change = single.indicators.J_BF / double.indicators.J_BF - 1.0
             result.rows.append((load.name, double.indicators.J_BF, single.indicators.J_BF, *largest))
             result.note("change of J_BF in single precision", change)
             for (name, unit), value in zip(INPUTS.items(), largest, strict=True):
                 result.note(f"largest difference of {name} ({unit}) in single precision", value)
             if not result.figures:
-                result.figures["difference of the inputs"] = _precision_figure(double, single)
+                with panels(3, 1, 4.0, sharex=True) as (figure, axes):
+                    for place, (name, unit), colour in zip(axes, INPUTS.items(), COLOURS, strict=False):
+                        hours = double.series("time_s") / 3600
+                        place.plot(hours, apart[name], color=colour, linewidth=0.7, label=name)
+                        place.set_ylabel(f"single - double ({unit})")
+                        legend_above(place)
+                    axes[-1].set_xlabel("plant time (h)")
+                result.figures["difference of the inputs"] = figure
         return result
 
 
@@ -189,19 +197,3 @@ def _both(load: Load) -> list[RunRequest]:
     return [
         load.request(2.5, f"{PROGRAM}arithmetic={arithmetic}", trace_ticks=1) for arithmetic in ("float64", "float32")
     ]
-
-
-def _difference(one: Outcome, other: Outcome, name: str) -> Series:
-    difference: Series = other.series(name) - one.series(name)
-    return difference
-
-
-def _precision_figure(double: Outcome, single: Outcome) -> Figure:
-    hours = double.series("time_s") / 3600
-    with panels(3, 1, 4.0, sharex=True) as (figure, axes):
-        for place, (name, unit), colour in zip(axes, INPUTS.items(), COLOURS, strict=False):
-            place.plot(hours, _difference(double, single, name), color=colour, linewidth=0.7, label=name)
-            place.set_ylabel(f"single - double ({unit})")
-            legend_above(place)
-        axes[-1].set_xlabel("plant time (h)")
-    return figure

@@ -36,10 +36,7 @@ def throttled(
     return load.request(5.0, *assignments, trace_ticks=trace_ticks, procedure=procedure)
 
 
-PAIRED_DRAWS: Final = 10
-"""Draws of each of the eight hours' families, an hour each, unless the command sets another number."""
 FEW_POWERS: Final = (0.2, 0.6, 1.0, 2.0, 4.0, 10.0)
-QUICK_POWERS: Final = (0.2, 1.0, 25.0)
 LABELS: Final = {
     "ode": "ODE", "qpoases": "qpOASES", "interior-point": "interior point", "osqp": "OSQP",
     "fast-gradient": "fast gradient", "daqp": "DAQP, one solve",
@@ -47,7 +44,9 @@ LABELS: Final = {
 
 
 def _paper_powers(options: StudyOptions) -> tuple[float, ...]:
-    return QUICK_POWERS if options.quick else tuple(drawing.published_comparison()["ode"]["normalized_power"].tolist())
+    return (
+        (0.2, 1.0, 25.0) if options.quick else tuple(drawing.published_comparison()["ode"]["normalized_power"].tolist())
+    )
 
 
 def powers_of(solver: str, options: StudyOptions) -> tuple[float, ...]:
@@ -58,8 +57,8 @@ def powers_of(solver: str, options: StudyOptions) -> tuple[float, ...]:
 
 
 def paired_loads(options: StudyOptions) -> list[Load]:
-    """Return the draws, an hour of each."""
-    return loads(options, "8h", usual=PAIRED_DRAWS, longest_ticks=HOUR_TICKS)
+    """Return ten draws of each of the eight hours' families, or as many as the command says, an hour of each."""
+    return loads(options, "8h", usual=10, longest_ticks=HOUR_TICKS)
 
 
 def paired_request(load: Load, solver: str, power: float) -> RunRequest:
