@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -82,17 +82,21 @@ class UpdatingPeriodStudy:
 
     def requests(self, options: StudyOptions) -> list[RunRequest]:
         """Return all runs; variants under the first draw only."""
-        hours = loads(options, *options.hours)
-        main = [request for load in hours for request in _main(load, options)]
+        main: list[RunRequest] = []
+        for load in loads(options, *options.hours):
+            main += [*_fixed_runs(load, options).values(), *_policy_runs(load).values()]
         return main + [request for *_, runs in _variants(options) for request in runs.values()]
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Rank fixed periods and rules in each hour."""
         result = StudyResult(COLUMNS, [], {})
-        hours = {load.name: _Hour.of(load, options, outcomes) for load in loads(options, *options.hours)}
-        for name, hour in hours.items():
-            for label, run in hour.runs():
-                result.rows.append(_row("", name, label, run))
+        hours: dict[str, _Hour] = {}
+        for load in loads(options, *options.hours):
+            fixed = {period: outcomes[run] for period, run in _fixed_runs(load, options).items()}
+            policies = {label: outcomes[run] for label, run in _policy_runs(load).items()}
+            hours[load.name] = _Hour(load, fixed, policies)
+            labelled = {f"fixed {period:g} s": run for period, run in fixed.items()} | policies
+            result.rows += [_row("", load.name, label, run) for label, run in labelled.items()]
         for variant, load, runs in _variants(options):
             result.rows += [_row(variant.label, load.name, label, outcomes[run]) for label, run in runs.items()]
         groups = first_and_fresh(hour.load for hour in hours.values())
@@ -122,15 +126,13 @@ def _row(variant: str, load: str, policy: str, run: Outcome) -> tuple[Cell, ...]
     return variant, load, policy, i.tau_u_mean, i.J_open_mean, i.J_BF, i.tau_u_mean_per_update
 
 
-def _periods(load: Load, options: StudyOptions) -> tuple[float, ...]:
-    if options.quick:
-        return FEW
-    return (*SHORTER, *NINE) if load.draw == 1 else NINE
+def _fixed_runs(load: Load, options: StudyOptions) -> dict[float, RunRequest]:
+    periods = FEW if options.quick else (*SHORTER, *NINE) if load.draw == 1 else NINE
+    return {period: load.request(period) for period in periods}
 
 
-def _main(load: Load, options: StudyOptions) -> list[RunRequest]:
-    fixed = [load.request(period) for period in _periods(load, options)]
-    return fixed + [load.request(policy.period_s, *policy.assignments) for policy in POLICIES]
+def _policy_runs(load: Load) -> dict[str, RunRequest]:
+    return {policy.label: load.request(policy.period_s, *policy.assignments) for policy in POLICIES}
 
 
 def _variants(options: StudyOptions) -> Iterator[tuple[PolicyVariant, Load, dict[str, RunRequest]]]:
@@ -145,27 +147,10 @@ def _variants(options: StudyOptions) -> Iterator[tuple[PolicyVariant, Load, dict
             )
 
 
-@dataclass(frozen=True)
-class _Hour:
-    """The outcomes of one hour."""
-
+class _Hour(NamedTuple):
     load: Load
     fixed: Mapping[float, Outcome]
     policies: Mapping[str, Outcome]
-
-    @classmethod
-    def of(cls, load: Load, options: StudyOptions, outcomes: Outcomes) -> "_Hour":
-        runs = [outcomes[request] for request in _main(load, options)]
-        periods = _periods(load, options)
-        labels = [policy.label for policy in POLICIES]
-        return cls(
-            load,
-            dict(zip(periods, runs[: len(periods)], strict=True)),
-            dict(zip(labels, runs[len(periods) :], strict=True)),
-        )
-
-    def runs(self) -> list[tuple[str, Outcome]]:
-        return [(f"fixed {period:g} s", run) for period, run in self.fixed.items()] + list(self.policies.items())
 
     def nine(self, indicator: str = "J_open_mean") -> Series:
         """Costs of the paper's periods."""
