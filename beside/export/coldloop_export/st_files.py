@@ -162,8 +162,8 @@ class OptimizerText:
     def __init__(self, optimizer: OptimizerProgram, updates: Sequence[golden.GoldenUpdate]) -> None:
         kernels, self.golden, self._process = OptimizerKernels(optimizer), updates, optimizer.process
         self._arrays = self._golden_arrays()
-        updates = sum(int(values[0].nbytes) for values in self._arrays.values())
-        self._page_length = st_printer.LARGEST_LIST // updates
+        one = sum(int(values[0].nbytes) for values in self._arrays.values())
+        self._page_length = st_printer.LARGEST_LIST // one
         """Golden updates that a block has within a list of constants."""
         begin, take, solve, note = kernels.entries
         constants, split = st_printer.in_pieces(constants_of(kernels))
