@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from coldloop_optimizer_plc.program import OptimizerProgram
     from coldloop_optimizer_plc.settings import ProgramSettings
     from coldloop_plant.settings import PlantKind
+    from coldloop_refrigerator.kind import RefrigeratorKind
 
 LOOK_S: Final = 0.2
 WAITING: Final = 2
@@ -34,10 +35,10 @@ SELDOM: Final = re.compile(r"/site-packages/(.*/tests?/|(pip|setuptools|mypy|myp
 def plant() -> None:
     """Make each plant that is ours, which compiles its kernels."""
     from coldloop_plant.settings import PlantKind  # noqa: PLC0415 not in every image
+    from coldloop_refrigerator.kind import RefrigeratorKind  # noqa: PLC0415
 
-    for kind in PlantKind:
-        if kind is not PlantKind.OF_PROCESS:
-            _make_plant(kind)
+    _make_plant(PlantKind.COLD_BOX)
+    _make_plant(PlantKind.REFRIGERATOR, RefrigeratorKind)  # a set-up has no entry points yet
 
 
 def default_plant() -> None:
@@ -48,15 +49,16 @@ def default_plant() -> None:
     _make_plant(PlantSection().kind)
 
 
-def _make_plant(kind: "PlantKind") -> None:
+def _make_plant(kind: "PlantKind", brought: "type[RefrigeratorKind] | None" = None) -> None:
     from coldloop.process.load_profile import LoadProfile  # noqa: PLC0415
     from coldloop.process.model_file import read_header  # noqa: PLC0415
     from coldloop.process.settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
     from coldloop_plant.kinds import plant_maker  # noqa: PLC0415
     from coldloop_plant.settings import PlantSection  # noqa: PLC0415
 
-    header = read_header(DEFAULT_MODEL_FILE)
-    plant_maker(header, PlantSection(kind=kind))(LoadProfile((0,), (header.w0,)), 1)
+    header, section = read_header(DEFAULT_MODEL_FILE), PlantSection(kind=kind)
+    make = brought().maker_of(header, section, lambda _: None) if brought else plant_maker(header, section)
+    make(LoadProfile((0,), (header.w0,)), 1)
 
 
 def nothing() -> None:
@@ -136,7 +138,7 @@ def linear_models() -> None:
     from coldloop.process.settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
     from coldloop_optimizer_plc.settings import ControlDesign  # noqa: PLC0415
     from coldloop_plant.cold_box.plant_file import PlantFile  # noqa: PLC0415
-    from coldloop_plant.refrigerator.model import make_refrigerator_file  # noqa: PLC0415
+    from coldloop_refrigerator.model import make_refrigerator_file  # noqa: PLC0415
     from coldloop_rig.cli.model_listing import describe_model  # noqa: PLC0415 not in the images
 
     describe_model(DEFAULT_MODEL_FILE, PlantFile(), ControlDesign())
@@ -167,6 +169,7 @@ def all_modules() -> None:
         for name in (
             "coldloop",
             "coldloop_plant",
+            "coldloop_refrigerator",
             "coldloop_control_plc",
             "coldloop_optimizer_plc",
             "coldloop_hmi",

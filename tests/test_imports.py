@@ -10,7 +10,7 @@ from tests.harness.processes import Processes
 
 ROOT = Path(__file__).parents[1]
 SERVICES = ("plant", "control_plc", "optimizer_plc", "hmi")
-BESIDE = ("chaos", "export", "studies")
+BESIDE = ("chaos", "export", "refrigerator", "studies")
 """Packages that nobody imports: they come in by entry points, as the parts of others do."""
 CORE = {
     "coldloop": ROOT / "shared", **{f"coldloop_{name}": ROOT / "services" / name for name in SERVICES},

@@ -11,7 +11,7 @@ FLOORS = {
     "shared/coldloop": [
         ["process"], ["kernels", "session"], ["registers"], ["safety", "modbus"], ["service"], ["operating"],
     ],
-    "services/plant/coldloop_plant": [["helium"], ["components"], ["cold_box"], ["refrigerator"]],
+    "services/plant/coldloop_plant": [["helium"], ["components"], ["cold_box"]],
     "services/optimizer_plc/coldloop_optimizer_plc": [["qp"], ["solvers"]],
     "rig/coldloop_rig": [
         ["results"], ["figures", "cosim"], ["plc_sizing"], ["runs"], ["process_file"], ["live"], ["testing"],

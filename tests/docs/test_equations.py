@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 
 from coldloop.process import cold_box, station
-from coldloop_plant.refrigerator.physics import COMMAND_NAMES, DISTURBANCE_NAMES, STATE_NAMES, STATE_UNITS
-from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_refrigerator.physics import COMMAND_NAMES, DISTURBANCE_NAMES, STATE_NAMES, STATE_UNITS
+from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR
 
 PAGE = (Path(__file__).parents[2] / "docs" / "equations.md").read_text(encoding="utf-8")
-PACKAGES = ("coldloop_plant.components", "coldloop_plant.helium", "coldloop_plant.refrigerator")
+PACKAGES = ("coldloop_plant.components", "coldloop_plant.helium", "coldloop_refrigerator")
 
 
 def rows(text: str) -> list[list[str]]:

@@ -10,16 +10,16 @@ from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop_plant.components.phase_separator import start_account
 from coldloop_plant.helium.properties import Helium, supply_cell
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.refrigerator.high_pressure import FIRST, MASS
-from coldloop_plant.refrigerator.physics import (
+from coldloop_refrigerator.high_pressure import FIRST, MASS
+from coldloop_refrigerator.physics import (
     COIL,
     SIGNAL_NAMES,
     Refrigerator,
     advance_refrigerator,
     evaluate_refrigerator,
 )
-from coldloop_plant.refrigerator.station_control import EquipmentLaw
-from coldloop_plant.refrigerator.tick import act
+from coldloop_refrigerator.station_control import EquipmentLaw
+from coldloop_refrigerator.tick import act
 from tests.harness.refrigerator_energy import refrigerator_energy_rates
 
 CROSSED, SIZE, TO_BATH, WORST = range(4)

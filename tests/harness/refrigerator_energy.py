@@ -9,7 +9,7 @@ from coldloop_plant.components.heat_exchanger import TRICKLE
 from coldloop_plant.components.phase_separator import content, outflow
 from coldloop_plant.helium.properties import WARM_CP, Helium, saturation, supply_cell
 from coldloop_plant.numeric import RealArray, at_least
-from coldloop_plant.refrigerator.high_pressure import (
+from coldloop_refrigerator.high_pressure import (
     CAPACITY,
     COMPRESSION,
     ENERGY,
@@ -23,7 +23,7 @@ from coldloop_plant.refrigerator.high_pressure import (
     side_pressure,
     supply_at,
 )
-from coldloop_plant.refrigerator.physics import BOX_STATES, STATION, Crossing, Refrigerator
+from coldloop_refrigerator.physics import BOX_STATES, STATION, Crossing, Refrigerator
 
 
 @kernel

@@ -21,10 +21,10 @@ from coldloop_plant.helium.properties import (
     supply_enthalpy_and_density,
 )
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.refrigerator.exergy import entropy, supply_entropy
-from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.precooler import BOILING_POINT, LATENT_HEAT, LIQUID_DENSITY, boil, nitrogen_level
-from coldloop_plant.refrigerator.station import SECOND_VIRIAL, GasVolume, gas_mass, gas_pressure
+from coldloop_refrigerator.exergy import entropy, supply_entropy
+from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_refrigerator.precooler import BOILING_POINT, LATENT_HEAT, LIQUID_DENSITY, boil, nitrogen_level
+from coldloop_refrigerator.station import SECOND_VIRIAL, GasVolume, gas_mass, gas_pressure
 
 HELIUM = load_helium()
 BATH = REFERENCE.separator

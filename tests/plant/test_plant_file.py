@@ -20,13 +20,13 @@ from coldloop_plant.cold_box.plant_file import REFERENCE, BoxParameters, PlantFi
 from coldloop_plant.helium.properties import load_helium
 from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.load import find_load
-from coldloop_plant.refrigerator.plant_file import (
+from coldloop_plant.settings import MismatchSettings, PlantSection
+from coldloop_refrigerator.plant_file import (
     REFERENCE_REFRIGERATOR,
     WARM_SECTIONS,
     RefrigeratorPlantFile,
     read_plant_file,
 )
-from coldloop_plant.settings import MismatchSettings, PlantSection
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "smaller_turbine.toml"

@@ -13,8 +13,8 @@ from coldloop_plant.helium.properties import load_helium
 from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.load import find_load
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.refrigerator.program import RefrigeratorProgram
 from coldloop_plant.settings import PlantSettings
+from coldloop_refrigerator.program import RefrigeratorProgram
 from coldloop_rig import Simulation, simulate
 from coldloop_rig.cosim.one_process import load_table
 from tests.harness.energy_account import CROSSED, SIZE, WORST, accounted_program_tick

@@ -15,7 +15,7 @@ from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_plant.cold_box.plant_file import PlantFile
 from coldloop_plant.load import find_load
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.refrigerator.plant_file import read_plant_file
+from coldloop_refrigerator.plant_file import read_plant_file
 from coldloop_rig import Simulation
 from coldloop_rig import simulate as run_in_process
 from coldloop_rig.cli.model_listing import describe_model

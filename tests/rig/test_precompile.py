@@ -16,7 +16,10 @@ from coldloop_rig.settings import Settings
 pytestmark = pytest.mark.usefixtures("programs")
 
 ROOT = Path(__file__).parents[2]
-OURS = ("coldloop", "coldloop_plant", "coldloop_control_plc", "coldloop_optimizer_plc", "coldloop_rig")
+OURS = (
+    "coldloop", "coldloop_plant", "coldloop_control_plc", "coldloop_optimizer_plc", "coldloop_refrigerator",
+    "coldloop_rig",
+)  # fmt: skip
 
 
 def compiled_kernels() -> int:

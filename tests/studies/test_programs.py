@@ -77,7 +77,7 @@ def test_the_compiled_step_of_a_plant_counts() -> None:
 def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The sources in another folder."""
     there = tmp_path_factory.mktemp("copy")
-    for name in ("shared", "services", "rig"):
+    for name in ("shared", "services", "rig", "beside/refrigerator"):
         shutil.copytree(ROOT / name, there / name, ignore=shutil.ignore_patterns("__pycache__"))
     return there
 
@@ -93,6 +93,7 @@ def digest_in(folder: Path, first: str = "", **environment: str) -> str:
             "services/optimizer_plc",
             "services/hmi",
             "rig",
+            "beside/refrigerator",
             ".",
         )
     )
@@ -116,7 +117,7 @@ def test_the_digest_is_the_same_elsewhere_and_whatever_was_imported_or_done_befo
 @pytest.mark.parametrize(
     ("file", "old", "new"),
     [
-        ("rig/coldloop_rig/cosim/compiled/cold_box_plants.py", "station[SIGNALS + 1]", "station[SIGNALS + 0]"),
+        ("beside/refrigerator/coldloop_refrigerator/compiled.py", "station[SIGNALS + 1]", "station[SIGNALS + 0]"),
         ("shared/coldloop/registers/plant.py", "MAX_STATE: Final = 1e9", "MAX_STATE: Final = 1e8"),
         ("services/plant/coldloop_plant/helium/properties.py", "COLDEST = 1.0", "COLDEST = 1.5"),
     ],

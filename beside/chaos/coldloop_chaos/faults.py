@@ -20,8 +20,7 @@ from coldloop.process.updating_periods import whole_ticks
 from coldloop.session import TimeMode
 from coldloop.text_file import read_text
 from coldloop_plant.load import concatenated, find_load, named_families, telegraph
-from coldloop_plant.refrigerator.settings import EventTarget, RefrigeratorEvent
-from coldloop_plant.settings import PlantKind
+from coldloop_plant.settings import EventTarget, PlantKind, RefrigeratorEvent
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.settings import Settings
 

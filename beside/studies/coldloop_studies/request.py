@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from functools import cached_property, lru_cache
 from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +26,7 @@ from coldloop.process.lti_model import load as load_model
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.service.start import main as start_service
 from coldloop_optimizer_plc.solvers import make_solver
+from coldloop_plant.kinds import GROUP
 from coldloop_rig.cosim.linear_plant import LinearRig
 from coldloop_rig.cosim.local_services import run_on_localhost
 from coldloop_rig.cosim.one_process import OneProcessRig
@@ -171,15 +173,21 @@ def _file_digest(path: Path) -> str:
 
 
 def programs() -> tuple[Any, ...]:
-    """Return what does a run: `perform`, and the services that it may start, which it knows by name."""
+    """Return what does a run: `perform`, the services that it may start and the further plants, known by name."""
     services = (import_module(f"coldloop_{service}.runtime").serve for service in SERVICES)
-    return (perform, start_service, *services)
+    return (perform, start_service, *services, *(point.load() for point in kinds_of_plants()))
+
+
+def kinds_of_plants() -> list[EntryPoint]:
+    """Return the entry points of plants that packages bring, in the order of their names."""
+    return sorted(entry_points(group=GROUP), key=lambda point: point.name)
 
 
 @lru_cache(maxsize=1)
 def programs_digest() -> str:
     """Return a digest of all that decides what a run gives: code, data files, versions of Python and of libraries."""
-    folders = (Path(folder) for name in PACKAGES_WITH_DATA for folder in import_module(name).__path__)
+    plants = (point.module.partition(".")[0] for point in kinds_of_plants())
+    folders = (Path(folder) for name in (*PACKAGES_WITH_DATA, *plants) for folder in import_module(name).__path__)
     files = [file for folder in folders for file in sorted(folder.rglob("*")) if file.suffix in DATA_SUFFIXES]
     versions = [(library, installed_version(library)) for library in LIBRARIES]
     return digest(programs(), files, versions, sys.implementation.cache_tag)[:16]

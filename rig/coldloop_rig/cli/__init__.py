@@ -134,7 +134,6 @@ GROUPS: Final = {
         "budget": "what a PLC can compute, and whether an adaptive period pays there",
         "model": "the prediction model",
         "identify": "how much the gains of the model should be scaled to predict a run",
-        "exergy": "where a refrigerator loses the exergy that it is given",
     },
     "help and settings": {
         "docs": "the pages of the documentation, one of them or a section",
@@ -147,7 +146,7 @@ MODULES: Final = {
     "runs": ("run", "record", "rerun", "plot", "report", "compare"),
     "rig": ("up", "down", "status", "set", "fault", "page"),
     "bus": ("events", "certificates", "registers"),
-    "plant": ("new", "process", "import", "budget", "model", "identify", "exergy"),
+    "plant": ("new", "process", "import", "budget", "model", "identify"),
     "help": ("docs", "config", "completion"),
 }
 BROKEN: Final = "commands that cannot be loaded"

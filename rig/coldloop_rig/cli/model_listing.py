@@ -8,11 +8,12 @@ import numpy as np
 from coldloop.errors import ModelFileError, printable
 from coldloop.process.cold_box import L1, T5
 from coldloop.process.lti_model import LtiModel, load
+from coldloop.process.model_file import COLD_BOX
 from coldloop.process.settings import InputLimits
-from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
 from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_plant.cold_box.model import (
     LOOP_MARGIN,
+    AtRest,
     Equilibrium,
     held_loads,
     linearisation_error,
@@ -22,9 +23,8 @@ from coldloop_plant.cold_box.model import (
 from coldloop_plant.cold_box.physics import ColdBox
 from coldloop_plant.cold_box.plant_file import PlantFile
 from coldloop_plant.helium.properties import load_helium
-from coldloop_plant.refrigerator.model import Rest, cold_part, cooled_file, refrigerator_operating_point
-from coldloop_plant.refrigerator.plant_file import RefrigeratorPlantFile
-from coldloop_plant.refrigerator.settings import StationSettings
+from coldloop_plant.kinds import kind_named
+from coldloop_plant.settings import StationSettings
 
 DEFAULT_CONTROL: Final = StationSettings()
 HORIZON_S = 100.0
@@ -59,17 +59,16 @@ def describe_model(
         NoEquilibriumError: The plant does not come to rest there; one line that says why.
     """
     helium = load_helium()
-    if isinstance(plant, RefrigeratorPlantFile):
-        found = refrigerator_operating_point(plant, helium, control.weights)
-        rest, box, model = cold_part(found.rest), cooled_file(plant, found.rest).box, found.model
-        station = [*_station_lines(found.rest), *_set_point_line(plant, control)]
+    if plant.kind == COLD_BOX:
+        found = operating_point(plant, helium)
+        at_rest = AtRest(found, plant.box, model_at(found, plant.box, helium, plant.parameters))
     else:
-        rest, box, station = operating_point(plant, helium), plant.box, []
-        model = model_at(rest, box, helium, plant.parameters)
+        at_rest = kind_named(plant.kind).at_rest(plant, control)
+    rest, box, model, lines_of_kind = at_rest
     error = linearisation_error(rest.x, rest.u, rest.w, box, helium)
     lines = [
         *_equilibrium_lines(model, rest),
-        *station,
+        *lines_of_kind,
         *_eigenvalue_lines(model, error),
         *_gain_lines(model),
         *_kink_line(error),
@@ -104,26 +103,6 @@ def _equilibrium_lines(model: LtiModel, rest: Equilibrium) -> list[str]:
         f"residual   {rest.residual:.2e} per second (2 kPa, 1 % of level, 1 K)",
         *(f"outputs    {'  '.join(outputs[i : i + 6])}" for i in range(0, len(outputs), 6)),
     ]
-
-
-def _station_lines(rest: Rest) -> list[str]:
-    signals = dict(zip(STATION_SIGNAL_NAMES, rest.signals.tolist(), strict=True))
-    openings = [f"{name} {value:.2f} %" for name, value in zip(STATION_VALVE_NAMES, rest.v.tolist(), strict=True)]
-    per_watt = 1e3 * signals["E_NC"] / float(rest.d[0] + rest.u[1])
-    return [
-        f"station    {'  '.join(openings)}",
-        f"           compressors {signals['M_NC']:.1f} g/s, {signals['E_NC']:.1f} kW, {per_watt:.0f} W/W",
-        f"           bypass {signals['M_CV956']:.1f} g/s, nitrogen {signals['M_GN2']:.2f} g/s",
-    ]
-
-
-def _set_point_line(plant: RefrigeratorPlantFile, control: StationSettings) -> list[str]:
-    """Return the settings to change where the steady-state pressures are not the setpoints."""
-    high, low = plant.boundaries.p_hp_bar, plant.boundaries.p_lp_bar
-    if (high, low) == (control.hp_bar, control.lp_bar):
-        return []
-    settings = f"--set plant.station.hp_bar={high:g} --set plant.station.lp_bar={low:g}"
-    return [f"set points {control.hp_bar:g} and {control.lp_bar:g} bar are not the pressures at rest: {settings}"]
 
 
 def _eigenvalue_lines(model: LtiModel, error: float) -> list[str]:

@@ -1,48 +1,78 @@
 """Plants by model file and configuration: a file's parameters, or those of the reference plant.
 
-A model of neither is refused at once.
+A model of neither is refused at once. A plant around the cold box comes with a package of its own, by an entry point.
 """
 
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import Final, Protocol, TypeVar
 
 from pydantic import ValidationError
 
 from coldloop.config import explained
-from coldloop.errors import ModelFileError
+from coldloop.errors import ConfigurationError, ModelFileError
+from coldloop.kernels.first_use import kernels_of
 from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.model_file import COLD_BOX, ModelHeader, read_header
-from coldloop_plant.cold_box.model import parameters_digest
+from coldloop.process.settings import InputLimits
+from coldloop_plant.cold_box.model import AtRest, parameters_digest
 from coldloop_plant.cold_box.physics import ColdBox
-from coldloop_plant.cold_box.plant_file import LISTING, BoxParameters
-from coldloop_plant.helium.properties import load_helium
-
-if TYPE_CHECKING:
-    from coldloop_plant.refrigerator.physics import Refrigerator
-from functools import partial
-from typing import TYPE_CHECKING, Final
-
-from coldloop.errors import ConfigurationError
-from coldloop.kernels.first_use import kernels_of
-from coldloop_plant.cold_box.plant_file import REFERENCE
+from coldloop_plant.cold_box.plant_file import LISTING, BoxParameters, PlantFile
 from coldloop_plant.cold_box.program import ColdBoxProgram, MismatchedPlant
 from coldloop_plant.components.valve import Valve
+from coldloop_plant.helium.properties import load_helium
 from coldloop_plant.program import HeatLoad, MakePlant, MeasurementNoise, PlantProgram
-from coldloop_plant.refrigerator.settings import EventSchedule, StationControlKind
-from coldloop_plant.settings import MismatchSettings, PlantKind, PlantSection, RefrigeratorStart, SensorSettings
+from coldloop_plant.settings import MismatchSettings, PlantKind, PlantSection, SensorSettings, StationSettings
 
-if TYPE_CHECKING:
-    from coldloop_plant.refrigerator.physics import Refrigerator
-    from coldloop_plant.refrigerator.program import RefrigeratorFile
-
-
+GROUP: Final = "coldloop.plant_kinds"
+"""Group of entry points: classes of `Kind`, by the names of kinds in `plant.kind` and in model files."""
 P = TypeVar("P", bound=BoxParameters)
 
 
+class Kind(Protocol):
+    """A kind of plant around the cold box; models and plant files name it."""
+
+    def box_of(self, model: ModelHeader | LtiModel, where: str) -> ColdBox:
+        """Return the cold box in the plant that a model file describes (`ModelFileError`); `where` names the file."""
+
+    def digest_of(self, model: ModelHeader, where: str) -> str:
+        """Return the digest of that plant's parameters (`ModelFileError`)."""
+
+    def maker_of(
+        self, header: ModelHeader, section: PlantSection, noise_of_seed: Callable[[int], MeasurementNoise | None]
+    ) -> MakePlant:
+        """Return what makes the plant of a model file, or around its reference cold box (`ColdloopError`)."""
+
+    def read_plant_file(self, path: Path | None, limits: InputLimits, *, whole: bool) -> PlantFile:
+        """Return what a plant file says: of this kind if it has one of its sections, or if `whole` is set.
+
+        It is the reference plant without a file; `limits` are those of the inputs (`ConfigurationError`).
+        """
+
+    def at_rest(self, file: PlantFile, control: StationSettings) -> AtRest:
+        """Return the plant of a file of this kind at rest (`NoEquilibriumError`)."""
+
+
+@cache
+def kind_named(name: str, where: str = "plant.kind") -> Kind:
+    """Return the kind of plant that a package brings; `where` says in a message what names it.
+
+    Raises:
+        ModelFileError: None brings one of this name.
+    """
+    there = entry_points(group=GROUP)
+    if name not in there.names:
+        known = ", ".join(sorted(there.names)) or "none is installed"
+        raise ModelFileError(f"{where}: no plant '{name}' among the entry points {GROUP}: {known}")
+    kind: Kind = there[name].load()()
+    return kind
+
+
 def own_header(file: Path) -> ModelHeader:
-    """Return the header of a model file whose plant can be made: a cold box alone, or the refrigerator.
+    """Return the header of a model file whose plant can be made: a cold box alone, or one of the further kinds.
 
     Raises:
         ModelFileError: The file cannot be read, its parameters cannot be used, or the model was made from others.
@@ -57,7 +87,7 @@ def own_header(file: Path) -> ModelHeader:
     if header.plant == COLD_BOX:
         own = _box_digest(box_of(header, str(file)))
     else:
-        own = _refrigerator_digest(refrigerator_in(header, str(file)))
+        own = kind_named(header.plant, str(file)).digest_of(header, str(file))
     if header.parameters_digest != own or names != (STATE_NAMES, INPUT_NAMES, OUTPUT_NAMES):
         raise ModelFileError(f"{file}: a model of another plant; make one with `coldloop model --out FILE`")
     return header
@@ -70,18 +100,12 @@ def box_of(model: ModelHeader | LtiModel, where: str = "model.file") -> ColdBox:
         ModelFileError: A parameter is unknown or out of range.
     """
     if model.plant == COLD_BOX:
-        return _parameters(model, BoxParameters, where).box
-    return refrigerator_in(model, where).box
+        return parameters_in(model, BoxParameters, where).box
+    return kind_named(model.plant, where).box_of(model, where)
 
 
-def refrigerator_in(model: ModelHeader | LtiModel, where: str = "model.file") -> "Refrigerator":
-    """Return the refrigerator that a model file describes, likewise."""
-    from coldloop_plant.refrigerator.plant_file import RefrigeratorParameters  # noqa: PLC0415 a cold box starts without it
-
-    return _parameters(model, RefrigeratorParameters, where).refrigerator
-
-
-def _parameters(model: ModelHeader | LtiModel, kind: type[P], where: str) -> P:
+def parameters_in(model: ModelHeader | LtiModel, kind: type[P], where: str) -> P:
+    """Return the parameters of a plant in a model file (`ModelFileError`: unknown or out of range)."""
     try:
         return kind.model_validate(model.plant_parameters)
     except ValidationError as error:
@@ -94,13 +118,6 @@ def _box_digest(box: ColdBox) -> str:
     return parameters_digest(box, load_helium())
 
 
-@cache
-def _refrigerator_digest(plant: "Refrigerator") -> str:
-    from coldloop_plant.refrigerator.program import refrigerator_digest  # noqa: PLC0415
-
-    return refrigerator_digest(plant, load_helium())
-
-
 NO_MISMATCH: Final = MismatchSettings()
 
 
@@ -108,9 +125,8 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
     """Return what makes the plant at its operating point, for a load and a seed.
 
     Raises:
-        ModelFileError: The refrigerator's file, or what the model file says of the plant, cannot be used.
-        ConfigurationError: Its gains are not of the configured weights, or it is to differ from its model in what it
-            cannot.
+        ModelFileError: What the model file, or a further one, says of the plant cannot be used.
+        ConfigurationError: The plant is to differ from its model in what it cannot, or is not as it is configured.
     """
     if bool(header.process) != (section.kind is PlantKind.OF_PROCESS):
         kinds = "of-process" if header.process else "cold-box or refrigerator"
@@ -130,27 +146,7 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
         return partial(make_program, header, section.sensors, mismatch=section.mismatch)
     if section.mismatch != NO_MISMATCH:
         raise ConfigurationError("plant.mismatch: for a cold box alone; set plant.kind to cold-box, or leave it out")
-    if header.plant == COLD_BOX and box_of(header) != REFERENCE:
-        raise ModelFileError("model.file: of another cold box than the refrigerator's; set plant.kind to cold-box")
-    plant, file = _refrigerator_and_rest(header, section.refrigerator.file)
-    if section.station.control is StationControlKind.LQ and section.station.weights != file.weights:
-        raise ConfigurationError(
-            "plant.station.weights: the gains of this refrigerator belong to other weights; make a file with"
-            " `python -m coldloop_plant.refrigerator.model FILE` and name it in plant.refrigerator.file, or, with a"
-            " plant file, its model file with `coldloop model --plant` and these weights"
-        )
-    return partial(_make_refrigerator, header, section, plant, file)
-
-
-def _refrigerator_and_rest(header: ModelHeader, named: Path | None) -> "tuple[Refrigerator, RefrigeratorFile]":
-    """Return the refrigerator that a model file describes, and its rest: of a file that is named, or of its own."""
-    from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR  # noqa: PLC0415 a cold box starts without it
-    from coldloop_plant.refrigerator.program import SHIPPED, read_refrigerator_file, rest_in  # noqa: PLC0415 as below
-
-    plant = REFERENCE_REFRIGERATOR if header.plant == COLD_BOX else refrigerator_in(header)
-    if named is None and header.plant_rest:
-        return plant, rest_in(header.plant_rest, plant, "model.file: plant_rest")
-    return plant, read_refrigerator_file(named or SHIPPED, plant)
+    return kind_named(section.kind).maker_of(header, section, partial(noise_of, section.sensors))
 
 
 def make_program(
@@ -177,27 +173,6 @@ def mismatched_box(box: ColdBox, mismatch: MismatchSettings) -> ColdBox:
             efficiency=mismatch.turbine_efficiency * turbine.efficiency,
         ),
     )
-
-
-def _make_refrigerator(
-    header: ModelHeader, section: PlantSection, plant: "Refrigerator", file: "RefrigeratorFile", load: HeatLoad,
-    seed: int,
-) -> PlantProgram:  # fmt: skip
-    from coldloop_plant.refrigerator.program import RefrigeratorProgram  # noqa: PLC0415
-
-    happening = section.refrigerator
-    with kernels_of("the refrigerator", about_s=20):
-        return RefrigeratorProgram(
-            plant=plant,
-            file=file,
-            u0=header.u0,
-            load=load,
-            station=section.station,
-            events=EventSchedule(happening.events, happening.ambient_k, happening.daily_swing_k),
-            noise=noise_of(section.sensors, seed),
-            seed=seed,
-            warm=happening.start is RefrigeratorStart.WARM,
-        )
 
 
 def noise_of(sensors: SensorSettings, seed: int) -> MeasurementNoise | None:

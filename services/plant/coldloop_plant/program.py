@@ -169,6 +169,10 @@ class PlantProgram:
         """
         raise ValueError(f"{surroundings._fields}: the plant is no refrigerator; set plant.kind to refrigerator")
 
+    def compiled(self) -> Any:  # noqa: ANN401 a `CompiledPlant` of the rig, which this package does not know
+        """Return what the rig's compiled loop takes for it, where that comes with its kind; None for others."""
+        return None
+
     def measure(self) -> tuple[float, ...]:
         """Return the outputs at the current tick, taken before inputs applied at this tick act."""
         return self._measured

@@ -41,7 +41,7 @@ Key = tuple[int, bool]
 
 PROJECT: Final = frozenset({
     "coldloop", "coldloop_plant", "coldloop_control_plc", "coldloop_optimizer_plc", "coldloop_hmi", "coldloop_rig",
-    "coldloop_chaos", "coldloop_export", "coldloop_studies", "tests",
+    "coldloop_chaos", "coldloop_export", "coldloop_refrigerator", "coldloop_studies", "tests",
 })  # fmt: skip
 """Packages that are ours wherever they are installed; what is not part of an installed distribution is ours, too."""
 NOT_DECISIVE: Final = frozenset({

@@ -16,7 +16,6 @@ from coldloop_rig.text_tables import aligned, fitted, width
 
 if TYPE_CHECKING:
     from coldloop_optimizer_plc.qp.problem import PredictiveProblem
-    from coldloop_plant.refrigerator.exergy import ExergyBalance
     from coldloop_rig.settings import Settings
 
 FILES: Final = ("process.toml", "my_plant.py")
@@ -163,9 +162,8 @@ def _declare_model(parser: argparse.ArgumentParser) -> None:
 def execute_model(options: argparse.Namespace) -> int:
     """The plant at its operating point, and its linear model as both PLCs run it."""
     from coldloop.process.lti_model import load
-    from coldloop_plant.cold_box.plant_file import PlantFile
     from coldloop_plant.equilibrium import NoEquilibriumError
-    from coldloop_plant.refrigerator.plant_file import RefrigeratorPlantFile, read_plant_file
+    from coldloop_plant.kinds import kind_named
     from coldloop_plant.settings import PlantKind
     from coldloop_rig.cli.model_listing import describe_model, held_line
 
@@ -174,10 +172,7 @@ def execute_model(options: argparse.Namespace) -> int:
     settings = configuration(options).settings
     in_use = settings.model.file
     whole = settings.plant.kind is PlantKind.REFRIGERATOR
-    if options.plant is not None:
-        plant = read_plant_file(options.plant, settings.limits, whole=whole)
-    else:
-        plant = RefrigeratorPlantFile() if whole else PlantFile()
+    plant = kind_named(PlantKind.REFRIGERATOR).read_plant_file(options.plant, settings.limits, whole=whole)
     if options.out is not None and options.plant is not None and options.out.resolve() == options.plant.resolve():
         raise UsageError(f"{options.out}: is the plant file; name another one with --out")
     try:
@@ -240,53 +235,6 @@ def execute_identify(options: argparse.Namespace) -> int:
         f"    coldloop run --set model.file={out}\n"
     )
     return 0
-
-
-def _declare_exergy(parser: argparse.ArgumentParser) -> None:
-    add_configuration_options(parser)
-    parser.add_argument("--plant", type="read", metavar="FILE", help="plant file (TOML) of another refrigerator")
-
-
-def execute_exergy(options: argparse.Namespace) -> int:
-    """Specific power of a refrigerator at rest, and where the exergy that it is given is lost."""
-    from coldloop_plant.equilibrium import NoEquilibriumError
-    from coldloop_plant.helium.properties import load_helium
-    from coldloop_plant.refrigerator.exergy import exergy_balance
-    from coldloop_plant.refrigerator.model import refrigerator_operating_point
-    from coldloop_plant.refrigerator.plant_file import RefrigeratorPlantFile, read_refrigerator
-
-    settings = configuration(options).settings
-    file = RefrigeratorPlantFile() if options.plant is None else read_refrigerator(options.plant, settings.limits)
-    try:
-        rest = refrigerator_operating_point(file, load_helium(), settings.plant.station.weights).rest
-    except NoEquilibriumError as error:
-        raise UsageError(f"{options.plant or 'the reference refrigerator'}: {error}") from None
-    sys.stdout.write("\n".join(lines_of(exergy_balance(rest, file.refrigerator, load_helium()))) + "\n")
-    return 0
-
-
-def lines_of(balance: "ExergyBalance") -> list[str]:
-    """Return a balance as text; rows are sorted by what is lost."""
-    rows = sorted(balance.destroyed.items(), key=lambda row: -row[1])
-    of_all, of_electricity = (100.0 * balance.useful / each for each in (balance.put_in, balance.electricity))
-    return [
-        f"cold power {balance.cold_power:.1f} W at {balance.T_bath:.3f} K, load and heater",
-        f"specific power {balance.specific_power:.0f} W/W of electricity; Carnot {balance.ideal_power:.1f} W/W",
-        f"Carnot fraction {of_electricity:.2f} % by the electricity, {of_all:.2f} % with the nitrogen's exergy",
-        "",
-        f"{'exergy':26} {'kW':>9} {'%':>8}",
-        _row("electricity", balance.electricity, balance.put_in),
-        _row("liquid nitrogen", balance.nitrogen, balance.put_in),
-        "",
-        *(_row(name, lost, balance.put_in) for name, lost in rows),
-        _row("useful: of the cold power", balance.useful, balance.put_in),
-        _row("sum", balance.useful + sum(balance.destroyed.values()), balance.put_in),
-    ]
-
-
-def _row(name: str, exergy: float, whole: float) -> str:
-    kilowatts, share = (round(value, 3) + 0.0 for value in (1e-3 * exergy, 100.0 * exergy / whole))  # no -0.000
-    return f"{name:26} {kilowatts:9.3f} {share:8.2f}"
 
 
 USUAL_SCENARIOS: Final = 100
@@ -425,5 +373,4 @@ COMMANDS: Final = {
     "budget": Command(_declare_budget, execute_budget),
     "model": Command(_declare_model, execute_model),
     "identify": Command(_declare_identify, execute_identify),
-    "exergy": Command(_declare_exergy, execute_exergy),
 }

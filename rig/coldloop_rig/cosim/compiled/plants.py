@@ -29,6 +29,9 @@ class CompiledPlant(Protocol):
 
 def compiled_plant(program: PlantProgram) -> CompiledPlant | None:
     """Return a program as the loop takes it; None where its ticks are not compiled."""
+    own: CompiledPlant | None = program.compiled()
+    if own is not None:
+        return own
     if program.process.has_station:
         from coldloop_rig.cosim.compiled.cold_box_plants import of_cold_box  # noqa: PLC0415 other processes have no such signals
 

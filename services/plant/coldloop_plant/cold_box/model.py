@@ -6,7 +6,7 @@ makes that of another one.
 
 import hashlib
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from math import isfinite, nan
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -91,6 +91,18 @@ class Equilibrium(NamedTuple):
     """Shape (22,)."""
     residual: float
     """Largest |dx/dt|, in units of 2 kPa, 1 % of level and 1 K, per second."""
+
+
+class AtRest(NamedTuple):
+    """A plant around a cold box at rest, as `coldloop model` describes it."""
+
+    rest: Equilibrium
+    """Rest of its cold box."""
+    box: ColdBox
+    """Its cold box with the temperature of the supplied gas that it has at rest."""
+    model: LtiModel
+    lines: Sequence[str] = ()
+    """Further lines of its kind."""
 
 
 def find_equilibrium(u: RealArray, level: float, box: ColdBox, helium: Helium) -> Equilibrium:

@@ -4,12 +4,13 @@ Every key is optional; the defaults are the reference plant. Numbers of cells ar
 of a key names its unit; components have SI units.
 """
 
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, ClassVar, Final
 
 from pydantic import Field
 from pydantic.fields import FieldInfo
 
 from coldloop.process import sections
+from coldloop.process.model_file import COLD_BOX
 from coldloop.process.model_range import SATURATION_BAR, SUPPLY_BAR
 from coldloop_plant.cold_box.physics import CELLS, ColdBox
 from coldloop_plant.components.heat_exchanger import HeatExchanger
@@ -217,6 +218,8 @@ REFERENCE: Final = BoxParameters().box
 class PlantFile(BoxParameters):
     """A cold box and its operating point."""
 
+    kind: ClassVar[str] = COLD_BOX
+    """Name of the kind of plant that it describes."""
     operating_point: OperatingPointSection = OperatingPointSection()
 
     @property

@@ -20,8 +20,8 @@ from coldloop.registers.plant import StationMode
 from coldloop_plant.components.valve import CHOKED, Valve
 from coldloop_plant.helium.properties import GAS_CONSTANT
 from coldloop_plant.numeric import PA_PER_BAR, RealArray
-from coldloop_plant.refrigerator.settings import StationControlKind, StationSettings
-from coldloop_plant.refrigerator.station import CompressionStation
+from coldloop_plant.settings import StationControlKind, StationSettings
+from coldloop_refrigerator.station import CompressionStation
 
 DESIGN_TEMPERATURE: Final = 300.0
 """K, at which the controller takes the valves' flows to be."""

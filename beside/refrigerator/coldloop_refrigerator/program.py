@@ -1,14 +1,16 @@
 """The whole refrigerator as a program: the plant, its station's controller, their disturbances, and how it starts.
 
-It starts at the operating point of its file, which `python -m coldloop_plant.refrigerator.model FILE` makes off line.
+It starts at the operating point of its file, which `python -m coldloop_refrigerator.model FILE` makes off line.
 Like the model file it is JSON with its own digest, so that every run, on any machine, begins with the same bits. Or it
 starts warm, before its cool-down.
 """
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from math import pi, sin
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -16,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from coldloop.config import explained
 from coldloop.errors import ModelFileError
 from coldloop.kernels.intrinsics import plain_tuples
+from coldloop.process.cold_box import TICK_S
 from coldloop.process.model_file import FORMAT, read_document, write_document
 from coldloop.process.model_range import present_model_range
 from coldloop.registers.plant import StationAlarm, StationMode, StationSample, StationStatus, Surroundings
@@ -25,7 +28,8 @@ from coldloop_plant.components.phase_separator import SUPERHEAT, content
 from coldloop_plant.helium.properties import Helium, load_helium, saturation, vapour_enthalpy_and_cp
 from coldloop_plant.numeric import RealArray
 from coldloop_plant.program import HeatLoad, MeasurementNoise
-from coldloop_plant.refrigerator.physics import (
+from coldloop_plant.settings import MEASURED, LqWeights, RefrigeratorEvent, StationSettings
+from coldloop_refrigerator.physics import (
     BOX_STATES,
     COIL,
     COMMAND_NAMES,
@@ -36,11 +40,10 @@ from coldloop_plant.refrigerator.physics import (
     inventory,
     read,
 )
-from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.settings import EventSchedule, LqWeights, StationSettings
-from coldloop_plant.refrigerator.station import gas_mass
-from coldloop_plant.refrigerator.station_control import Commands, station_law
-from coldloop_plant.refrigerator.tick import (
+from coldloop_refrigerator.plant_file import KIND, REFERENCE_REFRIGERATOR
+from coldloop_refrigerator.station import gas_mass
+from coldloop_refrigerator.station_control import Commands, station_law
+from coldloop_refrigerator.tick import (
     ACTING,
     ALARMS,
     DEVIATING,
@@ -56,9 +59,11 @@ from coldloop_plant.refrigerator.tick import (
     standing_equipment,
 )
 
-KIND: Final = "refrigerator"
 SHIPPED = Path(__file__).with_name("refrigerator.json")
-REMEDY = "make a new one with `python -m coldloop_plant.refrigerator.model FILE`"
+if TYPE_CHECKING:
+    from coldloop_refrigerator.compiled import CompiledRefrigerator
+
+REMEDY = "make a new one with `python -m coldloop_refrigerator.model FILE`"
 
 
 class RefrigeratorFile(BaseModel):
@@ -160,6 +165,44 @@ def warm_state(
         pressure *= elsewhere / (high + gas_mass(station.buffer, pressure, ambient))
     x[STATION : STATION + 3] = high, lp_line, elsewhere - high
     return x
+
+
+class EventSchedule:
+    """Boundary conditions at each tick: of two events for one time and target the later in the list holds.
+
+    `ambient` (K) is the temperature without an event, `daily_swing` (K) the amplitude of its sine over a day, whose
+    first six hours are the warmer.
+    """
+
+    def __init__(self, events: Sequence[RefrigeratorEvent], ambient: float, daily_swing: float) -> None:
+        self._swing = daily_swing
+        self._given = Surroundings(ambient=ambient)
+        self._changes = sorted(((event.tick, event.target, event.value) for event in events), key=itemgetter(0))
+        """Tick, what, and its value, in the order in which they are made."""
+        self._put: list[tuple[int, Surroundings]] = []
+
+    def put(self, tick: int, given: Surroundings) -> None:
+        """Let something hold from `tick` on, until an event that is planned for later."""
+        self._put.append((tick, given))
+
+    @property
+    def puts(self) -> list[tuple[int, Surroundings]]:
+        """Ticks and boundary conditions that `put` has taken."""
+        return list(self._put)
+
+    def at(self, tick: int) -> Surroundings:
+        """Return what is given from `tick` (0 or later) to the next, the day's swing left out."""
+        since, given = next(((at, put) for at, put in reversed(self._put) if at <= tick), (-1, self._given))
+        for at, target, value in self._changes:
+            if since < at <= tick:
+                changed: dict[str, Any] = {target.value: value if target in MEASURED else int(value)}
+                given = given._replace(**changed)
+        return given
+
+    def ambient(self, tick: int) -> float:
+        """Return the temperature of the surroundings (K) with the day's swing."""
+        swing = self._swing * sin(2.0 * pi * tick * TICK_S / 86_400.0) if self._swing else 0.0
+        return self.at(tick).ambient + swing
 
 
 AMBIENT: Final = GIVEN_NAMES.index("T_ambient")
@@ -288,6 +331,12 @@ class RefrigeratorProgram(ColdBoxProgram):
         """Resume at another tick with what `memory` and `measure` would return there; `u` was held up to it."""
         self.take_over(tick, memory.x[:BOX_STATES], u, y)
         self._memory = memory
+
+    def compiled(self) -> "CompiledRefrigerator":
+        """Return it as the rig's compiled loop takes it."""
+        from coldloop_refrigerator.compiled import CompiledRefrigerator  # noqa: PLC0415 the service has no such loop
+
+        return CompiledRefrigerator(self)
 
     def resume(self, *retained: Any, warm: Mapping[str, Any] | None = None, **named: Any) -> None:  # noqa: ANN401
         """Resume from what `retained` returned (ValueError or KeyError if it is not of this plant)."""

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from coldloop_plant.refrigerator.pressure_steps import LOAD, Response, pressures_after, response_of, table
-from coldloop_plant.refrigerator.program import SHIPPED, read_refrigerator_file
-from coldloop_plant.refrigerator.settings import StationControlKind
+from coldloop_plant.settings import StationControlKind
+from coldloop_refrigerator.pressure_steps import LOAD, Response, pressures_after, response_of, table
+from coldloop_refrigerator.program import SHIPPED, read_refrigerator_file
 
 pytestmark = pytest.mark.usefixtures("compiles")
 

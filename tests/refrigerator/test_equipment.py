@@ -8,11 +8,11 @@ import pytest
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.plant import StationAlarm, StationMode, Surroundings
-from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.program import SHIPPED, RefrigeratorProgram, read_refrigerator_file
-from coldloop_plant.refrigerator.settings import EventSchedule, RefrigeratorEvent, StationSettings
-from coldloop_plant.refrigerator.station_control import station_law
-from coldloop_plant.refrigerator.tick import (
+from coldloop_plant.settings import RefrigeratorEvent, StationSettings
+from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_refrigerator.program import SHIPPED, EventSchedule, RefrigeratorProgram, read_refrigerator_file
+from coldloop_refrigerator.station_control import station_law
+from coldloop_refrigerator.tick import (
     ADMISSION,
     BLOCKED,
     GIVEN_NAMES,

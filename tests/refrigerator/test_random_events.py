@@ -1,5 +1,7 @@
 """Helium and energy over random events: stuck valves and heaters, trips, leaks, lost nitrogen, blocked exchangers."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -16,8 +18,9 @@ from coldloop_plant.components.phase_separator import content
 from coldloop_plant.helium.properties import Helium, load_helium, supply_enthalpy_and_density
 from coldloop_plant.kinds import own_header
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.refrigerator.high_pressure import FIRST
-from coldloop_plant.refrigerator.physics import (
+from coldloop_plant.settings import StationSettings
+from coldloop_refrigerator.high_pressure import FIRST
+from coldloop_refrigerator.physics import (
     BOX_STATES,
     COIL,
     SIGNAL_NAMES,
@@ -26,11 +29,10 @@ from coldloop_plant.refrigerator.physics import (
     evaluate_refrigerator,
     inventory,
 )
-from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.program import SHIPPED, read_refrigerator_file
-from coldloop_plant.refrigerator.settings import StationSettings
-from coldloop_plant.refrigerator.station_control import EquipmentLaw, station_law
-from coldloop_plant.refrigerator.tick import ACTING, DEVIATING, resting_equipment
+from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_refrigerator.program import SHIPPED, read_refrigerator_file
+from coldloop_refrigerator.station_control import EquipmentLaw, station_law
+from coldloop_refrigerator.tick import ACTING, DEVIATING, resting_equipment
 from tests.harness.box_energy import energy_gained, energy_rates
 from tests.harness.energy_account import AHEAD, CROSSED, SIZE, TO_BATH, WEIGHTS, WORST, accounted_tick
 from tests.harness.refrigerator_energy import stored_energy
@@ -43,7 +45,6 @@ BATH = REFERENCE.separator
 HEADER = own_header(DEFAULT_MODEL_FILE)
 FILE = read_refrigerator_file(SHIPPED)
 M_LOST = STATE_NAMES.index("M_lost")
-LAW = station_law(StationSettings(), FILE.gains, FILE.v0, PLANT.station).equipment
 HP, LP = (SIGNAL_NAMES.index(name) for name in ("P12", "P11"))
 PLAIN, TABLES = plain_tuples(PLANT), plain_tuples(HELIUM)
 
@@ -55,11 +56,16 @@ happenings = st.tuples(
     st.floats(0.0, 6000.0), st.floats(275.0, 320.0), st.floats(0.0, 0.01), switch, switch, switch, exact, exact,
     switch, switch, switch, st.sampled_from([1.0, 1.0, 0.0, 2.0]), *[blocking] * 4,
 )  # fmt: skip
-"""In the order of `coldloop_plant.refrigerator.tick.GIVEN_NAMES`."""
+"""In the order of `coldloop_refrigerator.tick.GIVEN_NAMES`."""
 pieces = st.tuples(st.integers(40, 1200), inputs, st.tuples(percent, percent, percent, percent), happenings)
 
 
 Course = list[tuple[int, tuple[float, ...], tuple[float, ...], tuple[float, ...]]]
+
+
+@cache
+def law() -> EquipmentLaw:
+    return station_law(StationSettings(), FILE.gains, FILE.v0, PLANT.station).equipment
 
 
 @kernel
@@ -99,7 +105,7 @@ def balances_over_random_events(course: Course) -> tuple[float, float]:
     missing = crossed = 0.0
     for ticks, u, v, d in in_parts(course):
         energy = stored_energy(x, d[1], PLANT, HELIUM)
-        x, sums = held(x, equipment, np.array(u), np.array(v), np.array(d), ticks, PLAIN, TABLES, LAW)
+        x, sums = held(x, equipment, np.array(u), np.array(v), np.array(d), ticks, PLAIN, TABLES, law())
         assert np.all(np.isfinite(x))
         assert inventory(x, PLANT, HELIUM) + x[M_LOST] == pytest.approx(before, rel=1e-9)
         assert sums[WORST] < 1e-6 * sums[SIZE] / (0.25 * ticks) + 1e-6

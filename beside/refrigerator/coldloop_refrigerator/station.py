@@ -8,7 +8,7 @@ their gas is cooled to ambient.
 Sizes are those of a station for the flow that the cold box takes, 93.4 g/s from 1.05 to 16 bar; `docs/refrigerator.md`
 gives the reason of each. States, `STATION_STATES`: what the volumes hold and what was lost (kg), the speeds of the
 compressors (share of the full one), the openings of the valves (%). The exchangers' passes belong to the high-pressure
-line: its mass is theirs, too, and its pressure that of `coldloop_plant.refrigerator.high_pressure`.
+line: its mass is theirs, too, and its pressure that of `coldloop_refrigerator.high_pressure`.
 """
 
 from typing import Final, NamedTuple

@@ -16,8 +16,8 @@ from coldloop_plant.helium.properties import (
     load_helium,
 )
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.refrigerator.model import Rest, find_refrigerator_equilibrium, jacobian, lq_gains, rate_scales
-from coldloop_plant.refrigerator.physics import (
+from coldloop_refrigerator.model import Rest, find_refrigerator_equilibrium, jacobian, lq_gains, rate_scales
+from coldloop_refrigerator.physics import (
     COMMAND_NAMES,
     DISTURBANCE_NAMES,
     SIGNAL_NAMES,
@@ -26,8 +26,8 @@ from coldloop_plant.refrigerator.physics import (
     rates,
     read,
 )
-from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.program import SHIPPED, read_refrigerator_file, refrigerator_digest
+from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_refrigerator.program import SHIPPED, read_refrigerator_file, refrigerator_digest
 
 HELIUM = load_helium()
 PLANT = REFERENCE_REFRIGERATOR

@@ -17,8 +17,8 @@ from coldloop_plant.cold_box.physics import ColdBox
 from coldloop_plant.components.heat_exchanger import HeatExchanger
 from coldloop_plant.helium.properties import Helium
 from coldloop_plant.numeric import PA_PER_BAR, RealArray
-from coldloop_plant.refrigerator.high_pressure import COLUMNS
-from coldloop_plant.refrigerator.physics import (
+from coldloop_refrigerator.high_pressure import COLUMNS
+from coldloop_refrigerator.physics import (
     COIL,
     DISTURBANCE_NAMES,
     SIGNAL_NAMES,
@@ -29,8 +29,8 @@ from coldloop_plant.refrigerator.physics import (
     evaluate_refrigerator,
     move_valves,
 )
-from coldloop_plant.refrigerator.precooler import Precooler
-from coldloop_plant.refrigerator.station_control import (
+from coldloop_refrigerator.precooler import Precooler
+from coldloop_refrigerator.station_control import (
     MEMORY_SIZE,
     EquipmentLaw,
     StationLaw,
@@ -263,7 +263,7 @@ class RefrigeratorMemory(NamedTuple):
     slope: RealArray
     """dx/dt as the sensors were read, shape (48,); the next tick begins with it where the same acts."""
     cells: RealArray
-    """`coldloop_plant.refrigerator.high_pressure.Filling.cells` then."""
+    """`coldloop_refrigerator.high_pressure.Filling.cells` then."""
     acted: RealArray
     """Inputs, disturbances and blocked shares of the exchangers at that time, shape (13,); NaN before any reading."""
 

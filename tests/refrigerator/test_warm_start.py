@@ -10,10 +10,10 @@ from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.plant import StationMode
 from coldloop_plant.helium.properties import load_helium
 from coldloop_plant.kinds import own_header, plant_maker
-from coldloop_plant.refrigerator.physics import inventory
-from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.program import SHIPPED, RefrigeratorProgram, read_refrigerator_file, warm_state
 from coldloop_plant.settings import PlantSettings
+from coldloop_refrigerator.physics import inventory
+from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_refrigerator.program import SHIPPED, RefrigeratorProgram, read_refrigerator_file, warm_state
 
 pytestmark = pytest.mark.usefixtures("compiles")
 

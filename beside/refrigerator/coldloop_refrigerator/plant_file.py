@@ -5,7 +5,7 @@ refrigerator. `boundaries` are then its pressures at rest, and the temperature f
 """
 
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, ClassVar, Final
 
 from coldloop.config import load_configuration
 from coldloop.errors import ConfigurationError
@@ -21,9 +21,12 @@ from coldloop_plant.cold_box.plant_file import (
     within,
 )
 from coldloop_plant.components.valve import Actuator, ReliefValve, Valve
-from coldloop_plant.refrigerator.physics import Refrigerator
-from coldloop_plant.refrigerator.precooler import NEF6_CELLS, NitrogenBath, Precooler
-from coldloop_plant.refrigerator.station import CompressionStation, GasVolume, ScrewCompressor
+from coldloop_refrigerator.physics import Refrigerator
+from coldloop_refrigerator.precooler import NEF6_CELLS, NitrogenBath, Precooler
+from coldloop_refrigerator.station import CompressionStation, GasVolume, ScrewCompressor
+
+KIND: Final = "refrigerator"
+"""Kind of the plant in model files, and `plant.kind`."""
 
 CubicMetres = Annotated[float, within(0.05, 1000)]
 Area = Annotated[float, within(0.05, 100_000)]
@@ -183,6 +186,8 @@ REFERENCE_REFRIGERATOR: Final = RefrigeratorParameters().refrigerator
 class RefrigeratorPlantFile(RefrigeratorParameters, PlantFile):
     """A refrigerator and its operating point."""
 
+    kind: ClassVar[str] = KIND
+
     @property
     def parameters(self) -> dict[str, Any]:
         """Parameters of the plant in a model file; empty for the reference plant."""
@@ -194,7 +199,7 @@ WARM_SECTIONS: Final = set(RefrigeratorParameters.model_fields) - set(BoxParamet
 """Sections that a cold box's file has not."""
 
 
-def read_plant_file(path: Path, limits: InputLimits, *, whole: bool = False) -> PlantFile:
+def read_plant_file(path: Path | None, limits: InputLimits, *, whole: bool = False) -> PlantFile:
     """Return what a plant file says: of a refrigerator if it has one of its sections, or if `whole` is set.
 
     Raises:
@@ -206,13 +211,15 @@ def read_plant_file(path: Path, limits: InputLimits, *, whole: bool = False) -> 
     return PlantFile.model_validate(file.model_dump(include=set(PlantFile.model_fields)))
 
 
-def read_refrigerator(path: Path, limits: InputLimits) -> RefrigeratorPlantFile:
-    """Return what a plant file says of a refrigerator; what it leaves out is as in the reference plant.
+def read_refrigerator(path: Path | None, limits: InputLimits) -> RefrigeratorPlantFile:
+    """Return what a plant file says of a refrigerator; the rest, all without a file, is as in the reference plant.
 
     Raises:
         ConfigurationError: One line: the file cannot be read, a key is unknown or out of range, or the operating point
             is outside the limits of the inputs.
     """
+    if path is None:
+        return RefrigeratorPlantFile()
     file = load_configuration(
         RefrigeratorPlantFile, file=path, environment={}, option="--plant", listing=LISTING
     ).settings

@@ -25,12 +25,12 @@ from coldloop_plant.helium.properties import (
 )
 from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.refrigerator.model import jacobian, rate_scales
-from coldloop_plant.refrigerator.physics import DISTURBANCE_NAMES, STATE_NAMES, advance_refrigerator
-from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.program import SHIPPED, RefrigeratorProgram, read_refrigerator_file
-from coldloop_plant.refrigerator.tick import COMPRESSED, LEAST_FLOW, LP, TO_BOX, V1, act, control_tick, read_tick
 from coldloop_plant.settings import PlantSettings
+from coldloop_refrigerator.model import jacobian, rate_scales
+from coldloop_refrigerator.physics import DISTURBANCE_NAMES, STATE_NAMES, advance_refrigerator
+from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_refrigerator.program import SHIPPED, RefrigeratorProgram, read_refrigerator_file
+from coldloop_refrigerator.tick import COMPRESSED, LEAST_FLOW, LP, TO_BOX, V1, act, control_tick, read_tick
 
 HELIUM = load_helium()
 PLANT = REFERENCE_REFRIGERATOR

@@ -16,8 +16,8 @@ from coldloop_plant.helium.properties import (
     vapour_enthalpy_and_cp,
     vapour_temperature,
 )
-from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR, RefrigeratorParameters
-from coldloop_plant.refrigerator.precooler import (
+from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR, RefrigeratorParameters
+from coldloop_refrigerator.precooler import (
     BOILING_POINT,
     LATENT_HEAT,
     LIQUID_DENSITY,
@@ -26,7 +26,7 @@ from coldloop_plant.refrigerator.precooler import (
     nitrogen_level,
     transfer_warm,
 )
-from coldloop_plant.refrigerator.station import compress, gas_density, gas_mass, gas_pressure
+from coldloop_refrigerator.station import compress, gas_density, gas_mass, gas_pressure
 
 HELIUM = load_helium()
 STATION = REFERENCE_REFRIGERATOR.station

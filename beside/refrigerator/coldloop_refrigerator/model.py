@@ -1,6 +1,6 @@
 """The refrigerator at rest, off line: operating point, LQ gains of its station, prediction model, what is in their way.
 
-`python -m coldloop_plant.refrigerator.model FILE` makes the refrigerator's file; with `--config` or `--set
+`python -m coldloop_refrigerator.model FILE` makes the refrigerator's file; with `--config` or `--set
 plant.station.weights.lp_bar=0.02` its gains are of these weights. With `--prediction` it makes the prediction model of
 the file that is shipped.
 """
@@ -17,10 +17,12 @@ from scipy.linalg import expm, solve_discrete_are
 from coldloop.config import load_configuration
 from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, TICK_S
 from coldloop.process.lti_model import LtiModel
+from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
 from coldloop.service.command_line import add_configuration_options
 from coldloop.service.start import SECTIONS
 from coldloop_plant.cold_box import model as cold_box
 from coldloop_plant.cold_box.model import (
+    AtRest,
     Equilibrium,
     find_equilibrium,
     obstacles,
@@ -33,7 +35,8 @@ from coldloop_plant.cold_box.plant_file import OPERATING_INPUTS, OPERATING_LEVEL
 from coldloop_plant.equilibrium import Linear, Modes, NoEquilibriumError, complex_step, model_of, newton
 from coldloop_plant.helium.properties import Helium, load_helium
 from coldloop_plant.numeric import PA_PER_BAR, Array, RealArray
-from coldloop_plant.refrigerator.physics import (
+from coldloop_plant.settings import LqWeights, PlantSettings, StationSettings
+from coldloop_refrigerator.physics import (
     BOX_STATES,
     COIL,
     COMMAND_NAMES,
@@ -47,18 +50,15 @@ from coldloop_plant.refrigerator.physics import (
     rates,
     read,
 )
-from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR, RefrigeratorPlantFile
-from coldloop_plant.refrigerator.precooler import LIQUID_DENSITY
-from coldloop_plant.refrigerator.program import (
-    KIND,
+from coldloop_refrigerator.plant_file import KIND, REFERENCE_REFRIGERATOR, RefrigeratorPlantFile
+from coldloop_refrigerator.precooler import LIQUID_DENSITY
+from coldloop_refrigerator.program import (
     SHIPPED,
     RefrigeratorFile,
     read_refrigerator_file,
     refrigerator_digest,
 )
-from coldloop_plant.refrigerator.settings import LqWeights
-from coldloop_plant.refrigerator.station import GasVolume, compress, gas_mass
-from coldloop_plant.settings import PlantSettings
+from coldloop_refrigerator.station import GasVolume, compress, gas_mass
 
 AMBIENT: Final = 300.0
 V_L, M_HP, M_LP, M_BUFFER, M_LOST, M_N2, CV956, CV167 = (
@@ -434,6 +434,38 @@ def cooled_file(file: RefrigeratorPlantFile, rest: Rest) -> RefrigeratorPlantFil
     """Return the file with the temperature after the pre-cooler that it has at rest."""
     given = file.boundaries.model_copy(update={"t_in_k": float(rest.x[COIL])})
     return file.model_copy(update={"boundaries": given})
+
+
+def described_at_rest(file: RefrigeratorPlantFile, control: StationSettings) -> AtRest:
+    """Return the refrigerator of a plant file at rest, with its controller's setpoints and weights.
+
+    Raises:
+        NoEquilibriumError: As `refrigerator_operating_point`.
+    """
+    rest, model = refrigerator_operating_point(file, load_helium(), control.weights)
+    return AtRest(
+        cold_part(rest), cooled_file(file, rest).box, model, [*_station_lines(rest), *_set_point_line(file, control)]
+    )
+
+
+def _station_lines(rest: Rest) -> list[str]:
+    signals = dict(zip(STATION_SIGNAL_NAMES, rest.signals.tolist(), strict=True))
+    openings = [f"{name} {value:.2f} %" for name, value in zip(STATION_VALVE_NAMES, rest.v.tolist(), strict=True)]
+    per_watt = 1e3 * signals["E_NC"] / float(rest.d[0] + rest.u[1])
+    return [
+        f"station    {'  '.join(openings)}",
+        f"           compressors {signals['M_NC']:.1f} g/s, {signals['E_NC']:.1f} kW, {per_watt:.0f} W/W",
+        f"           bypass {signals['M_CV956']:.1f} g/s, nitrogen {signals['M_GN2']:.2f} g/s",
+    ]
+
+
+def _set_point_line(plant: RefrigeratorPlantFile, control: StationSettings) -> list[str]:
+    """Return the settings to change where the steady-state pressures are not the setpoints."""
+    high, low = plant.boundaries.p_hp_bar, plant.boundaries.p_lp_bar
+    if (high, low) == (control.hp_bar, control.lp_bar):
+        return []
+    settings = f"--set plant.station.hp_bar={high:g} --set plant.station.lp_bar={low:g}"
+    return [f"set points {control.hp_bar:g} and {control.lp_bar:g} bar are not the pressures at rest: {settings}"]
 
 
 def _modes(A: RealArray, names: Sequence[str], units: Sequence[str], plant: Refrigerator) -> Modes:

@@ -9,9 +9,9 @@ from coldloop.process.lti_model import load
 from coldloop.process.settings import SHIPPED_MODELS, ModelSettings
 from coldloop_optimizer_plc.qp.prediction import state_weights
 from coldloop_optimizer_plc.settings import ControlDesign
-from coldloop_plant.refrigerator.model import prediction_model
-from coldloop_plant.refrigerator.program import SHIPPED, RefrigeratorProgram, read_refrigerator_file
-from coldloop_plant.refrigerator.settings import EventSchedule, StationSettings
+from coldloop_plant.settings import StationSettings
+from coldloop_refrigerator.model import prediction_model
+from coldloop_refrigerator.program import SHIPPED, EventSchedule, RefrigeratorProgram, read_refrigerator_file
 
 MODEL = load(SHIPPED_MODELS["refrigerator"])
 FILE = read_refrigerator_file(SHIPPED)

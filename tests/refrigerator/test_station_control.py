@@ -12,10 +12,10 @@ from coldloop.process.settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.plant import StationAlarm, StationMode, Surroundings
 from coldloop_plant.kinds import plant_maker
-from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.program import SHIPPED, RefrigeratorProgram, read_refrigerator_file
-from coldloop_plant.refrigerator.settings import EventSchedule, RefrigeratorEvent, StationSettings
-from coldloop_plant.refrigerator.station_control import (
+from coldloop_plant.settings import PlantSection, RefrigeratorEvent, StationSettings
+from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_refrigerator.program import SHIPPED, EventSchedule, RefrigeratorProgram, read_refrigerator_file
+from coldloop_refrigerator.station_control import (
     MEMORY_SIZE,
     SHUT,
     Commands,
@@ -26,7 +26,6 @@ from coldloop_plant.refrigerator.station_control import (
     shut_by,
     station_law,
 )
-from coldloop_plant.settings import PlantSection
 
 FILE = read_refrigerator_file(SHIPPED)
 HP, LP, LEVEL, LOST = (STATION_SIGNAL_NAMES.index(name) for name in ("P12", "P11", "L_N2", "lost"))

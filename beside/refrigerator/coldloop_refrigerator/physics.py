@@ -26,7 +26,7 @@ from coldloop_plant.components.phase_separator import Content, add_to_account, c
 from coldloop_plant.components.valve import opening_rate
 from coldloop_plant.helium.properties import Helium
 from coldloop_plant.numeric import PA_PER_BAR, Array, RealArray
-from coldloop_plant.refrigerator.high_pressure import (
+from coldloop_refrigerator.high_pressure import (
     COARSE_CELL,
     COARSE_PRESSURE,
     FIRST,
@@ -40,14 +40,14 @@ from coldloop_plant.refrigerator.high_pressure import (
     side_pressure,
     start_gains,
 )
-from coldloop_plant.refrigerator.precooler import (
+from coldloop_refrigerator.precooler import (
     PRECOOLER_STATE_UNITS,
     PRECOOLER_STATES,
     Precooler,
     Precooling,
     nitrogen_level,
 )
-from coldloop_plant.refrigerator.station import (
+from coldloop_refrigerator.station import (
     STATION_STATE_UNITS,
     STATION_STATES,
     CompressionStation,

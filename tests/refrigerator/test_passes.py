@@ -1,5 +1,7 @@
 """The high-pressure passes take and give helium, and take up the work of the pressure."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +11,7 @@ from coldloop_plant.cold_box.physics import OUTPUTS
 from coldloop_plant.components.heat_exchanger import HeatExchanger
 from coldloop_plant.helium.properties import load_helium, supply_cell, supply_enthalpy_and_density
 from coldloop_plant.numeric import Array, RealArray
-from coldloop_plant.refrigerator.high_pressure import (
+from coldloop_refrigerator.high_pressure import (
     CAPACITY,
     COLUMNS,
     CUBICS,
@@ -23,6 +25,7 @@ from coldloop_plant.refrigerator.high_pressure import (
     Filling,
     H,
     Passing,
+    PipedPasses,
     hold_cells,
     hold_passes,
     march_flows,
@@ -33,8 +36,8 @@ from coldloop_plant.refrigerator.high_pressure import (
     side_pressure,
     supply_at,
 )
-from coldloop_plant.refrigerator.model import jacobian
-from coldloop_plant.refrigerator.physics import (
+from coldloop_refrigerator.model import jacobian
+from coldloop_refrigerator.physics import (
     BOX_STATES,
     SIGNALS,
     STATE_NAMES,
@@ -44,17 +47,15 @@ from coldloop_plant.refrigerator.physics import (
     inventory,
     rates,
 )
-from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.program import SHIPPED, read_refrigerator_file
-from coldloop_plant.refrigerator.station import gas_mass
+from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_refrigerator.program import SHIPPED, read_refrigerator_file
+from coldloop_refrigerator.station import gas_mass
 
 pytestmark = pytest.mark.usefixtures("compiles")
 
 HELIUM = load_helium()
 PLANT = REFERENCE_REFRIGERATOR
 FILE = read_refrigerator_file(SHIPPED)
-PIPES = piped(PLANT.box, PLANT.precooler)
-CELLS = slice(FIRST, PIPES.coil)
 M_HP, M_LOST = STATE_NAMES.index("M_HP"), STATE_NAMES.index("M_lost")
 AMBIENT, HOT = 300.0, 305.0
 VOLUME = PLANT.station.hp.volume
@@ -71,6 +72,16 @@ MOVES = {
 }
 
 
+@cache
+def pipes() -> PipedPasses:
+    return piped(PLANT.box, PLANT.precooler)
+
+
+@cache
+def cells() -> slice:
+    return slice(FIRST, pipes().coil)
+
+
 def filling(x: RealArray, u: RealArray, v: RealArray, d: RealArray) -> tuple[Filling, RealArray]:
     """Return how the passes fill, and dx/dt."""
     dx = np.empty_like(x)
@@ -80,10 +91,10 @@ def filling(x: RealArray, u: RealArray, v: RealArray, d: RealArray) -> tuple[Fil
 
 def held_by(x: RealArray) -> tuple[float, Array]:
     """Return the pressure (Pa) and what the cells hold."""
-    held = read_passes(x, PIPES, HELIUM)
+    held = read_passes(x, pipes(), HELIUM)
     P = side_pressure(VOLUME, x[M_HP], HOT, held.mass)
-    hold_passes(supply_at(P), PIPES, held)
-    return P, held.cells[CELLS, : ENERGY + 1]
+    hold_passes(supply_at(P), pipes(), held)
+    return P, held.cells[cells(), : ENERGY + 1]
 
 
 def moved(name: str, seconds: float) -> RealArray:
@@ -99,7 +110,7 @@ def test_at_rest_line_and_passes_hold_the_density_of_each_cell() -> None:
     sizes = [e.volume / e.cells for e in (box.nef1, box.nef2, box.nef34, nef6) for _ in range(e.cells)]
     in_passes = sum(
         size * supply_enthalpy_and_density(16e5, float(T), HELIUM)[1]
-        for size, T in zip(sizes, REST[FIRST : PIPES.coil], strict=True)
+        for size, T in zip(sizes, REST[FIRST : pipes().coil], strict=True)
     )
     assert in_passes == pytest.approx(2.1274, abs=1e-4)
     assert REST[M_HP] == pytest.approx(in_passes + gas_mass(PLANT.station.hp, 16e5, HOT), rel=1e-12)
@@ -108,21 +119,21 @@ def test_at_rest_line_and_passes_hold_the_density_of_each_cell() -> None:
 @given(P=st.floats(1e3, 26e5), warmth=st.floats(0.8, 6.0))
 def test_the_pressure_is_that_at_which_line_and_passes_hold_their_helium(P: float, warmth: float) -> None:
     x = REST.copy()
-    x[FIRST : PIPES.coil] *= warmth
+    x[FIRST : pipes().coil] *= warmth
     mass = high_pressure_mass(x, P, AMBIENT, PLANT, HELIUM)
-    held = read_passes(x, PIPES, HELIUM)
+    held = read_passes(x, pipes(), HELIUM)
     assert side_pressure(VOLUME, mass, HOT, held.mass) == pytest.approx(P, rel=1e-12)
 
 
 def test_the_pressure_of_passes_full_of_cold_helium_is_found_below_the_tables() -> None:
     x = REST.copy()
-    x[FIRST : PIPES.coil - 9] = 3.0
+    x[FIRST : pipes().coil - 9] = 3.0
     mass = high_pressure_mass(x, 3e5, AMBIENT, PLANT, HELIUM)
-    assert side_pressure(VOLUME, mass, HOT, read_passes(x, PIPES, HELIUM).mass) == pytest.approx(3e5, rel=1e-12)
+    assert side_pressure(VOLUME, mass, HOT, read_passes(x, pipes(), HELIUM).mass) == pytest.approx(3e5, rel=1e-12)
 
 
 def test_a_high_pressure_side_without_helium_has_no_pressure() -> None:
-    held = read_passes(REST, PIPES, HELIUM)
+    held = read_passes(REST, pipes(), HELIUM)
     assert side_pressure(VOLUME, 0.0, HOT, held.mass) == 0.0
     assert side_pressure(VOLUME, -1e-9, HOT, held.mass) == 0.0
     assert high_pressure_mass(REST, 1.0, AMBIENT, PLANT, HELIUM) == pytest.approx(0.0, abs=1e-4)
@@ -157,8 +168,8 @@ def test_pressure_mass_and_energy_move_as_their_rates_say(name: str, seconds: fl
     P_before, before = held_by(x - dt * dx)
     assert (P_later - P_before) / (2.0 * dt) == pytest.approx(now.P_rate, rel=1e-5, abs=1e-3)
     gained = (later - before) / (2.0 * dt)
-    assert gained[:, MASS] == pytest.approx(now.cells[CELLS, INFLOW], abs=1e-8)
-    assert gained[:, ENERGY] == pytest.approx(now.cells[CELLS, GAIN], abs=0.02)
+    assert gained[:, MASS] == pytest.approx(now.cells[cells(), INFLOW], abs=1e-8)
+    assert gained[:, ENERGY] == pytest.approx(now.cells[cells(), GAIN], abs=0.02)
 
 
 @pytest.mark.parametrize("name", MOVES)
@@ -166,7 +177,7 @@ def test_the_complex_step_gives_the_derivatives_of_the_rates(name: str) -> None:
     x, (u, v, d) = moved(name, 20.0), MOVES[name]
     J = jacobian(x, u, v, d, PLANT, HELIUM)
     sizes = np.where(np.abs(x) > 1.0, np.abs(x), 1.0) * 1e-6
-    for k in (0, *range(FIRST, PIPES.coil + 1, 3), M_HP, M_HP + 1):
+    for k in (0, *range(FIRST, pipes().coil + 1, 3), M_HP, M_HP + 1):
         step = np.zeros_like(x)
         step[k] = sizes[k]
         above, below = (rates(x + sign * step, u, v, d, PLANT, HELIUM) for sign in (1.0, -1.0))
@@ -238,9 +249,9 @@ def test_cells_keep_their_heat_capacity_at_all_pressures() -> None:
 
 def held_by_at(P: float) -> Array:
     """Return what the cells hold at a pressure, the temperatures of the operating point."""
-    held = read_passes(REST, PIPES, HELIUM)
-    hold_passes(supply_at(P), PIPES, held)
-    return held.cells[CELLS]
+    held = read_passes(REST, pipes(), HELIUM)
+    hold_passes(supply_at(P), pipes(), held)
+    return held.cells[cells()]
 
 
 @given(at=st.floats(0.0, 30.0))

@@ -11,7 +11,8 @@ from coldloop.process.cold_box import L1, OUTPUT_NAMES, T5
 from coldloop.process.settings import InputLimits
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop_plant.helium.properties import GAS_CONSTANT, load_helium
-from coldloop_plant.refrigerator.exergy import (
+from coldloop_plant.settings import LqWeights
+from coldloop_refrigerator.exergy import (
     LIQUID_NITROGEN,
     NITROGEN_VAPOUR,
     ExergyBalance,
@@ -19,11 +20,10 @@ from coldloop_plant.refrigerator.exergy import (
     exergy_balance,
     supply_entropy,
 )
-from coldloop_plant.refrigerator.model import Rest, refrigerator_operating_point
-from coldloop_plant.refrigerator.physics import read
-from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR, read_refrigerator
-from coldloop_plant.refrigerator.program import SHIPPED, read_refrigerator_file
-from coldloop_plant.refrigerator.settings import LqWeights
+from coldloop_refrigerator.model import Rest, refrigerator_operating_point
+from coldloop_refrigerator.physics import read
+from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR, read_refrigerator
+from coldloop_refrigerator.program import SHIPPED, read_refrigerator_file
 
 HELIUM = load_helium()
 EFFICIENT = read_refrigerator(Path(__file__).parents[2] / "examples" / "efficient_refrigerator.toml", InputLimits())

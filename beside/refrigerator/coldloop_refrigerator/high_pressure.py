@@ -37,8 +37,8 @@ from coldloop_plant.helium.properties import (
     supply_cubics,
 )
 from coldloop_plant.numeric import Array, at_least
-from coldloop_plant.refrigerator.precooler import Precooler, Precooling, precooler_flows
-from coldloop_plant.refrigerator.station import SECOND_VIRIAL
+from coldloop_refrigerator.precooler import Precooler, Precooling, precooler_flows
+from coldloop_refrigerator.station import SECOND_VIRIAL
 
 CUBICS = 18
 """Columns of `supply_cubics`."""

@@ -22,8 +22,8 @@ from coldloop_plant.helium.properties import (
     supply_enthalpy_and_density,
     vapour_enthalpy_and_cp,
 )
-from coldloop_plant.refrigerator.model import AMBIENT, Rest
-from coldloop_plant.refrigerator.physics import SIGNALS, Crossing, Refrigerator, evaluate_refrigerator
+from coldloop_refrigerator.model import AMBIENT, Rest
+from coldloop_refrigerator.physics import SIGNALS, Crossing, Refrigerator, evaluate_refrigerator
 
 LOWEST_ENTHALPY, HIGHEST_ENTHALPY = 7e3, 1580e3  # J/kg, within the table of `entropy_before_expansion`
 WARM_EXCESS, WARM_EXCESS_BY_P = 5.03e3, 3.27e-3  # J/kg, and per Pa: of the enthalpy of warm helium above cp T

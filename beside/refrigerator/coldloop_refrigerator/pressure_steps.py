@@ -1,6 +1,6 @@
 """Steps of each valve and of the load, and what both pressures do.
 
-`python -m coldloop_plant.refrigerator.pressure_steps` prints the table.
+`python -m coldloop_refrigerator.pressure_steps` prints the table.
 
 The refrigerator is at rest until the step. The controller's valves step by what is added to the openings that it asks
 for, as a positioner would that is off; in open loop they stay at the operating point otherwise.
@@ -15,11 +15,11 @@ import numpy as np
 from coldloop.process.cold_box import INPUT_NAMES, TICK_S
 from coldloop_plant.helium.properties import load_helium
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.refrigerator.physics import COMMAND_NAMES, SIGNAL_NAMES, STATE_NAMES, advance_refrigerator, read
-from coldloop_plant.refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_plant.refrigerator.program import SHIPPED, RefrigeratorFile, read_refrigerator_file
-from coldloop_plant.refrigerator.settings import StationControlKind, StationSettings
-from coldloop_plant.refrigerator.station_control import MEMORY_SIZE, StationMeasurement, control_station, station_law
+from coldloop_plant.settings import StationControlKind, StationSettings
+from coldloop_refrigerator.physics import COMMAND_NAMES, SIGNAL_NAMES, STATE_NAMES, advance_refrigerator, read
+from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR
+from coldloop_refrigerator.program import SHIPPED, RefrigeratorFile, read_refrigerator_file
+from coldloop_refrigerator.station_control import MEMORY_SIZE, StationMeasurement, control_station, station_law
 
 LOAD: Final = "load"
 STEPS: Final = (

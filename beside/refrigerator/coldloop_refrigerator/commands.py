@@ -1,0 +1,66 @@
+"""The command `exergy`."""
+
+import argparse
+import sys
+from typing import TYPE_CHECKING, Final
+
+from coldloop.service.command_line import add_configuration_options
+from coldloop_rig.cli.commands.options import Command, configuration
+
+if TYPE_CHECKING:
+    from coldloop_refrigerator.exergy import ExergyBalance
+
+SAID: Final = {"exergy": "where a refrigerator loses the exergy that it is given"}
+GROUP: Final = {"exergy": "a plant and its controller"}
+"""Group in which `coldloop --help` lists the command."""
+
+
+def _declare(parser: argparse.ArgumentParser) -> None:
+    add_configuration_options(parser)
+    parser.add_argument("--plant", type="read", metavar="FILE", help="plant file (TOML) of another refrigerator")
+
+
+def execute_exergy(options: argparse.Namespace) -> int:
+    """Specific power of a refrigerator at rest, and where the exergy that it is given is lost."""
+    from coldloop.errors import UsageError
+    from coldloop_plant.equilibrium import NoEquilibriumError
+    from coldloop_plant.helium.properties import load_helium
+    from coldloop_refrigerator.exergy import exergy_balance
+    from coldloop_refrigerator.model import refrigerator_operating_point
+    from coldloop_refrigerator.plant_file import read_refrigerator
+
+    settings = configuration(options).settings
+    file = read_refrigerator(options.plant, settings.limits)
+    try:
+        rest = refrigerator_operating_point(file, load_helium(), settings.plant.station.weights).rest
+    except NoEquilibriumError as error:
+        raise UsageError(f"{options.plant or 'the reference refrigerator'}: {error}") from None
+    sys.stdout.write("\n".join(lines_of(exergy_balance(rest, file.refrigerator, load_helium()))) + "\n")
+    return 0
+
+
+def lines_of(balance: "ExergyBalance") -> list[str]:
+    """Return a balance as text; rows are sorted by what is lost."""
+    rows = sorted(balance.destroyed.items(), key=lambda row: -row[1])
+    of_all, of_electricity = (100.0 * balance.useful / each for each in (balance.put_in, balance.electricity))
+    return [
+        f"cold power {balance.cold_power:.1f} W at {balance.T_bath:.3f} K, load and heater",
+        f"specific power {balance.specific_power:.0f} W/W of electricity; Carnot {balance.ideal_power:.1f} W/W",
+        f"Carnot fraction {of_electricity:.2f} % by the electricity, {of_all:.2f} % with the nitrogen's exergy",
+        "",
+        f"{'exergy':26} {'kW':>9} {'%':>8}",
+        _row("electricity", balance.electricity, balance.put_in),
+        _row("liquid nitrogen", balance.nitrogen, balance.put_in),
+        "",
+        *(_row(name, lost, balance.put_in) for name, lost in rows),
+        _row("useful: of the cold power", balance.useful, balance.put_in),
+        _row("sum", balance.useful + sum(balance.destroyed.values()), balance.put_in),
+    ]
+
+
+def _row(name: str, exergy: float, whole: float) -> str:
+    kilowatts, share = (round(value, 3) + 0.0 for value in (1e-3 * exergy, 100.0 * exergy / whole))  # no -0.000
+    return f"{name:26} {kilowatts:9.3f} {share:8.2f}"
+
+
+COMMANDS: Final = {"exergy": Command(_declare, execute_exergy)}
