@@ -5,11 +5,13 @@ A text is UTF-8, with a byte order mark or without, or UTF-16 with one. Only a r
 
 import codecs
 import errno
+import hashlib
 import os
 import socket
 import stat
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -23,9 +25,7 @@ HANDED_OVER: Final = ("/dev/stdin", "/dev/fd/", "/proc/self/fd/", os.devnull)
 """Beginnings of the names of what is read though it may be no regular file: a shell's pipes, and nothing."""
 
 
-def read_text(
-    path: Path, remedy: str, error: type[ColdloopError] = UsageError, most: int = MOST_BYTES
-) -> str:  # fmt: skip
+def read_text(path: Path, remedy: str, error: type[ColdloopError] = UsageError, most: int = MOST_BYTES) -> str:
     """Return the text of a file.
 
     Args:
@@ -44,9 +44,7 @@ def read_text(
         raise error(f"{path}: {not_text(failure)}") from None
 
 
-def read_bytes(
-    path: Path, remedy: str, error: type[ColdloopError] = UsageError, most: int = MOST_BYTES
-) -> bytes:  # fmt: skip
+def read_bytes(path: Path, remedy: str, error: type[ColdloopError] = UsageError, most: int = MOST_BYTES) -> bytes:
     """Return the content of a file, as `read_text` does."""
     try:
         with open(path, "rb", opener=_opened) as file:
@@ -57,6 +55,15 @@ def read_bytes(
     if not fits or len(data) > most:  # one that grows
         raise error(f"{path}: more than {most} bytes; {remedy}")
     return data
+
+
+def file_digest(path: Path, remedy: str = "make it readable", error: type[ColdloopError] = UsageError) -> str:
+    """Return the SHA-256 of a file of any size, in hexadecimal; `remedy` and `error` as those of `read_text`."""
+    try:
+        with open(path, "rb", opener=_opened) as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except (OSError, ValueError) as failure:
+        raise error(f"{path}: {getattr(failure, 'strerror', failure)}; {remedy}") from None
 
 
 def _opened(path: str, flags: int) -> int:
@@ -119,25 +126,61 @@ def require_regular_file(path: Path) -> None:
         raise UsageError(f"{path}: exists and is not a regular file; name another one")
 
 
+def draft_of(path: Path) -> Path:
+    """Return the name of a file until it is whole: another one for each process and thread."""
+    return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.{threading.get_native_id()}.draft")
+
+
 def whole_file(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` make the file under another name, then give it its own; others may do so at the same time."""
     require_regular_file(path)
-    writer = f"{socket.gethostname()}.{os.getpid()}.{threading.get_native_id()}"
-    draft = path.with_name(f".{path.name}.{writer}.draft")
-    try:
-        write(draft)
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
+    _give_name(path, write)
 
 
 def whole_text(path: Path, text: str, *, synced: bool = False) -> None:
     """Write a text; `synced`: the disk has it when it gets its name, also if power fails."""
+    require_regular_file(path)
+    replace_file(path, text.encode(), synced=synced)
+
+
+def replace_file(path: Path, data: bytes, *, synced: bool = False, private: bool = False) -> None:
+    """Let a file have this content, or the one that it had; whatever is there under its name is replaced.
+
+    Args:
+        path: The file.
+        data: Its content.
+        synced: The disk has the content before the name, and the name when this returns, also if power fails.
+        private: Nobody else can read it.
+
+    Raises:
+        OSError: It cannot be written.
+    """
 
     def write(draft: Path) -> None:
-        draft.write_text(text, encoding="utf-8")
-        if synced:
-            with draft.open("r+b") as file:
+        with draft.open("xb", buffering=0) as file:
+            if private:
+                os.fchmod(file.fileno(), 0o600)
+            rest = memoryview(data)
+            while rest:
+                rest = rest[file.write(rest) :]
+            if synced:
                 os.fsync(file.fileno())
 
-    whole_file(path, write)
+    _give_name(path, write)
+    if synced and os.name == "posix":  # only there a folder can be synced
+        descriptor = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def _give_name(path: Path, write: Callable[[Path], object]) -> None:
+    draft = draft_of(path)
+    try:
+        draft.unlink(missing_ok=True)  # left by a process of the same number; a link is not followed
+        write(draft)
+        draft.replace(path)
+    finally:
+        with suppress(OSError):  # half a draft would only fill the disk further
+            draft.unlink(missing_ok=True)

@@ -11,6 +11,7 @@ from typing import Any, Self
 import pytest
 
 from coldloop.safety.retained import RetainedFile, RetainedStateError, _description, encoded
+from coldloop.text_file import draft_of
 
 OLD = {"session": 3, "tick": 1000, "applied": [43.0, 75.0, 36.0]}
 NEW = {"session": 3, "tick": 1001, "applied": [43.1, 76.0, 36.0]}
@@ -54,7 +55,7 @@ def test_what_is_no_ordinary_file_is_neither_waited_for_nor_followed(tmp_path: P
     elsewhere = tmp_path / "elsewhere"
     kept(elsewhere).save(OLD)
     file = kept(tmp_path / "state")
-    for place in (file.path, tmp_path / "state.draft"):
+    for place in (file.path, draft_of(file.path)):
         if kind == "fifo":
             os.mkfifo(place)
         elif kind == "link":

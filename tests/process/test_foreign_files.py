@@ -15,9 +15,10 @@ from coldloop.errors import ColdloopError
 from coldloop.kernels.cache_folder import find_cache_folder
 from coldloop.process.model_file import read_document
 from coldloop.service.settings import TelemetrySettings
+from coldloop.text_file import file_digest
 from coldloop_chaos.faults import find_plan
 from coldloop_hmi.users import PageRole, Users, write_user
-from coldloop_plant.own_plants import _fmu_of, file_digest
+from coldloop_plant.own_plants import _fmu_of
 from coldloop_rig.cli.commands.options import _tls_site
 from coldloop_rig.plc_sizing.plc import find_profile
 from coldloop_rig.process_file.judgement import described

@@ -25,6 +25,7 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.service.start import main as start_service
+from coldloop.text_file import file_digest
 from coldloop_optimizer_plc.solvers import make_solver
 from coldloop_plant.kinds import GROUP
 from coldloop_rig.cosim.linear_plant import LinearRig
@@ -167,8 +168,8 @@ def _plain(value: object) -> object:
 @lru_cache(maxsize=16)
 def _file_digest(path: Path) -> str:
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError:
+        return file_digest(path)
+    except UsageError:
         return str(path)  # the run will say what is wrong with it
 
 

@@ -20,7 +20,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from coldloop.errors import ResultsError, UsageError
 from coldloop.modbus.access import ROLE_EXTENSION, encoded_role
 from coldloop.registers.declaration import Role
-from coldloop.text_file import read_bytes, whole_file
+from coldloop.text_file import read_bytes, replace_file, require_regular_file
 from coldloop_rig.cosim.wiring import SERVICES
 from coldloop_rig.results.folders import prepare_folder, writing
 
@@ -217,8 +217,8 @@ def revoke(out: Path, names: Sequence[str], days: int) -> tuple[int, Path]:
     certificates = [_certificate(out / f"{name}.crt") for name in names]
     revoked += [revoked_now(each) for each in certificates if each.serial_number not in present]
     with writing(out / REVOCATIONS):
-        fresh = authority.revocation_list(revoked, days)
-        whole_file(out / REVOCATIONS, lambda draft: draft.write_bytes(fresh))
+        require_regular_file(out / REVOCATIONS)
+        replace_file(out / REVOCATIONS, authority.revocation_list(revoked, days))
     return len(revoked), out / REVOCATIONS
 
 

@@ -120,14 +120,11 @@ def draw_run(curves: RunCurves) -> Figure:
     time = curves.series["time_s"] / scale_s
     process, labels = curves.process, labels_of(curves.process)
     heights = [1.0] * (len(labels) + len(curves.pressures)) + ([0.45] if curves.events else [])
-    units = dict(
-        zip(process.output_names + process.input_names, process.output_units + process.input_units, strict=True)
-    )
+    units = {one.name: one.unit for one in (*process.outputs, *process.inputs)}
     with styled():
         figure = Figure(figsize=(9.5, 13.5 + 1.6 * (len(labels) + len(curves.pressures) - 8)))
-        axes: list[Axes] = list(
-            figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, gridspec_kw=PANELS)
-        )
+        panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, gridspec_kw=PANELS)
+        axes: list[Axes] = list(panels)
         for place, (name, label) in zip(axes, labels.items(), strict=False):
             if name not in NOT_CURVES:
                 word = process.load.name if name == process.load.column else name
@@ -140,7 +137,11 @@ def draw_run(curves: RunCurves) -> Figure:
             _curve(place, time, curves.series[name], f"{name} (bar)", name)
             limit(place, curves.series[name], ends, f"no alarm from {ends_text(*ends)} bar")
         _updating_period(axes[behind + len(curves.pressures)], time, curves.series, process.sampling_period_s)
-        _cost(axes[behind + len(curves.pressures) + 1], time, curves.series["stage_cost"])
+        place, cost = axes[behind + len(curves.pressures) + 1], curves.series["stage_cost"]
+        place.plot(time, np.maximum(cost, LEAST_COST), color=INK, linewidth=1, label="stage cost")
+        place.set_ylabel("stage cost (1)")
+        if spans_a_decade(cost):
+            place.set_yscale("log")
         if curves.events:
             _ribbons(axes[-1], curves.events, scale_s, float(time[-1]))
         for place, letter in zip(axes, LETTERS, strict=False):
@@ -241,8 +242,7 @@ def draw_tau_u(axes: Axes, time: Series, tau_u: Series, time_s: Series, colour: 
     if chatters:
         step = float(np.median(np.diff(time_s))) or 1.0
         mean = np.where(np.isfinite(tau_u), moving_mean(tau_u, max(1, round(SMOOTHING_S / step))), np.nan)
-        axes.plot(time, mean, color=colour, linewidth=1.3,
-                  label=f"{label}, mean over {SMOOTHING_S:g} s")  # fmt: skip
+        axes.plot(time, mean, color=colour, linewidth=1.3, label=f"{label}, mean over {SMOOTHING_S:g} s")
 
 
 def moving_mean(values: Series, window: int) -> Series:
@@ -253,13 +253,6 @@ def moving_mean(values: Series, window: int) -> Series:
     total = np.convolve(np.where(known, values, 0.0), kernel, "same")
     mean: Series = np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0.5)
     return mean
-
-
-def _cost(axes: Axes, time: Series, cost: Series) -> None:
-    axes.plot(time, np.maximum(cost, LEAST_COST), color=INK, linewidth=1, label="stage cost")
-    axes.set_ylabel("stage cost (1)")
-    if spans_a_decade(cost):
-        axes.set_yscale("log")
 
 
 def spans_a_decade(cost: Series) -> bool:
@@ -334,28 +327,21 @@ def save_figure(figure: Figure, path: Path) -> None:
 def curves_of(run: RunFolder) -> RunCurves:
     """Return what is drawn of a run."""
     pressures = pressure_limits(run.configuration) if (run.path / STATION).exists() else {}
-    process = run.process
+    process, configuration = run.process, run.configuration
     series = run.series([*labels_of(process)])
     if pressures:
         series |= at_times(run.series(list(pressures), file_name=STATION), series["time_s"])
-    return RunCurves(
-        process,
-        series,
-        run.events(),
-        Bounds.of(run.configuration, process),
-        title_of(run.configuration, process, run.manifest["way"]),
-        identity_of(run.manifest),
-        pressures,
-    )
+    bounds, title = Bounds.of(configuration, process), title_of(configuration, process, run.manifest["way"])
+    return RunCurves(process, series, run.events(), bounds, title, identity_of(run.manifest), pressures)
 
 
 def pressure_limits(configuration: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
     """Return the pressures of a station with the limits of their alarms, bar."""
-    alarms = {
-        key: float(configuration[f"plant.station.alarms.{key}_bar"])
-        for key in ("hp_low", "hp_high", "lp_low", "lp_high")
+    alarms = "plant.station.alarms."
+    return {
+        name: (float(configuration[f"{alarms}{side}_low_bar"]), float(configuration[f"{alarms}{side}_high_bar"]))
+        for name, side in (("P12", "hp"), ("P11", "lp"))
     }
-    return {"P12": (alarms["hp_low"], alarms["hp_high"]), "P11": (alarms["lp_low"], alarms["lp_high"])}
 
 
 def at_times(series: Curves, times_s: NDArray[np.float64]) -> Curves:
@@ -414,9 +400,7 @@ def compare(paths: Sequence[Path], out: Path) -> str:
 
 
 def _comparison_table(runs: Sequence[RunFolder], labels: Sequence[str]) -> str:
-    summaries = [run.summary for run in runs]
-    rows = [["", *labels]]
-    process = runs[0].process
+    summaries, process, rows = [run.summary for run in runs], runs[0].process, [["", *labels]]
     shares = (f"{one.name}_outside_band_pct" for one in process.banded)
     figures = (*FIGURES, *shares, *excess_keys(process), "deadline_misses", "trace_sha256")
     rows += [[name, *(_cell(summary.get(name)) for summary in summaries)] for name in figures]
@@ -447,7 +431,13 @@ def _draw_comparison(runs: Sequence[RunFolder], labels: Sequence[str]) -> Figure
                     draw_tau_u(place, one["time_s"] / scale_s, one[name], one["time_s"], colour, label)
                 else:
                     place.plot(one["time_s"] / scale_s, one[name], color=colour, linewidth=0.9, label=label)
-        _scale(axes, runs[0], curves)
+        bounds = Bounds.of(runs[0].configuration, runs[0].process)
+        for name, edges in {**bounds.bands, **bounds.inputs}.items():
+            values, what = np.concatenate([one[name] for one in curves]), "band" if name in bounds.bands else "bounds"
+            limit(axes[name], values, edges, f"{what} {ends_text(*edges)}")
+        axes["tau_u_s"].set_ylim(0, runs[0].process.sampling_period_s + 0.3)
+        axes["stage_cost"].set_yscale("log")
+        axes["stage_cost"].set_ylim(bottom=LEAST_COST)
         for name, label in named.items():
             axes[name].set_ylabel(label)
             legend_above(axes[name])
@@ -457,13 +447,3 @@ def _draw_comparison(runs: Sequence[RunFolder], labels: Sequence[str]) -> Figure
         figure.align_ylabels(list(axes.values()))
         figure.suptitle("  ·  ".join(labels))
     return figure
-
-
-def _scale(axes: dict[str, Axes], first: RunFolder, curves: Sequence[Curves]) -> None:
-    bounds = Bounds.of(first.configuration, first.process)
-    for name, edges in {**bounds.bands, **bounds.inputs}.items():
-        values = np.concatenate([one[name] for one in curves])
-        limit(axes[name], values, edges, f"{'band' if name in bounds.bands else 'bounds'} {ends_text(*edges)}")
-    axes["tau_u_s"].set_ylim(0, first.process.sampling_period_s + 0.3)
-    axes["stage_cost"].set_yscale("log")
-    axes["stage_cost"].set_ylim(bottom=1e-6)

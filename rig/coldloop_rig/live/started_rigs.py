@@ -26,6 +26,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from coldloop.errors import ColdloopError, UsageError
 from coldloop.modbus.settings import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
+from coldloop.text_file import replace_file
 from coldloop_rig import PYTHON
 from coldloop_rig.cosim.wiring import REQUIRED, RigEndpoints
 from coldloop_rig.interruption import INTERRUPTION
@@ -125,11 +126,8 @@ def write_own(file: Path, text: str) -> None:
     Raises:
         OSError: It cannot be written.
     """
-    draft = file.with_name(f".{file.name}.draft")
     try:
-        with new_own(draft) as content:
-            content.write(text.encode())
-        draft.replace(file)
+        replace_file(file, text.encode(), private=True)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(file)) from None
 

@@ -29,18 +29,19 @@ INVERSE: Final = 0.1
 
 def described(made: Made) -> str:
     """Return the description of a process and its model; first come how late an update may be and a warning."""
-    warnings = _warnings(made)
-    lines = [
-        *_late(made),
-        *warnings[:1],
-        *_rest(made),
-        *made.linear.notes,
-        *_modes(made),
-        *_gains(made),
-        *warnings[1:],
-        f"model      sha256 {made.model.digest}",
-    ]
-    return "\n".join(lines) + "\n"
+    warnings, late = _warnings(made), []
+    values = sorted(np.linalg.eigvals(made.own_A), key=lambda value: -value.real)
+    values = [complex(v.real if abs(v.real) > NOTHING else 0.0, v.imag) for v in values]
+    if values[0].real <= NOTHING:  # of another plant the first warning says it
+        late = [f"late       no mode grows: no period loses the plant{leaves_its_band(made.model, made.process)}"]
+    texts = [f"{v.real:.3g}" if abs(v.imag) < 1e-12 else f"{v.real:.3g}{v.imag:+.3g}i" for v in values]
+    modes = [f"modes      {'  '.join(texts[i : i + 8])} /s" for i in range(0, len(texts), 8)]
+    if made.linear.error:
+        modes.append(f"derivatives within {made.linear.error:.1e} of those with steps twice as wide")
+    digest = f"model      sha256 {made.model.digest}\n"
+    return "\n".join([
+        *late, *warnings[:1], *_rest(made), *made.linear.notes, *modes, *_gains(made), *warnings[1:], digest
+    ])  # fmt: skip
 
 
 def _values(names: tuple[str, ...], values: Array, units: tuple[str, ...], reach: Array | None = None) -> str:
@@ -54,40 +55,18 @@ def _values(names: tuple[str, ...], values: Array, units: tuple[str, ...], reach
 
 def _rest(made: Made) -> list[str]:
     m, process = made.model, made.process
-    load = (
-        "" if not m.F.any() and not m.G.any() else f"; load {m.load_name} {number_text(m.w0, 5)} {m.load_unit}".rstrip()
-    )
+    acts = m.F.any() or m.G.any()
+    load = f"; load {m.load_name} {number_text(m.w0, 5)} {m.load_unit}".rstrip() if acts else ""
     problem = len(process.decision_instants) * (len(process.inputs) + 2 * len(process.bands))
     named = ((m.input_names, "input"), (m.output_names, "output"), (m.state_names, "state"))
     counted = ", ".join(f"{len(names)} {noun}{'s' * (len(names) != 1)}" for names, noun in named)
-    sizes = (
-        f"{process.name}: {counted}; "
-        f"tick {process.tick_s:g} s, sampling period {process.tick_s * process.ticks_per_sample:g} s, horizon "
-        f"{process.horizon_s:g} s, {problem} variables"
-    )
+    times = f"tick {process.tick_s:g} s, sampling period {process.sampling_period_s:g} s"
     return [
-        sizes,
+        f"{process.name}: {counted}; {times}, horizon {process.horizon_s:g} s, {problem} variables",
         f"inputs     {_values(m.input_names, m.u0, m.input_units)}{load}",
         f"outputs    {_values(m.output_names, m.y0, m.output_units)}",
         f"states     {_values(m.state_names, m.x0, m.state_units)}",
     ]
-
-
-def _modes(made: Made) -> list[str]:
-    values = sorted(np.linalg.eigvals(made.own_A), key=lambda value: -value.real)
-    values = [complex(v.real if abs(v.real) > NOTHING else 0.0, v.imag) for v in values]
-    texts = [f"{v.real:.3g}" if abs(v.imag) < 1e-12 else f"{v.real:.3g}{v.imag:+.3g}i" for v in values]
-    lines = [f"modes      {'  '.join(texts[i : i + 8])} /s" for i in range(0, len(texts), 8)]
-    if made.linear.error:
-        lines.append(f"derivatives within {made.linear.error:.1e} of those with steps twice as wide")
-    return lines
-
-
-def _late(made: Made) -> list[str]:
-    """Return that a plant without a mode that grows waits for any update; the first warning says it of another."""
-    if np.linalg.eigvals(made.own_A).real.max() > NOTHING:
-        return []
-    return [f"late       no mode grows: no period loses the plant{leaves_its_band(made.model, made.process)}"]
 
 
 def _gains(made: Made) -> list[str]:
@@ -98,28 +77,18 @@ def _gains(made: Made) -> list[str]:
     effects = np.column_stack([m.C @ held.B + m.D, m.C @ held.F + m.G, (m.C @ held.A)[:, n:]])
     names = (*m.input_names, m.load_name, *m.state_names[n:])
     units = (*m.input_units, m.load_unit, *m.state_units[n:])
-    reach = _reaches(made, horizon_s)
-    return [
-        *(
-            [f"gains      all within +- with a probability of {100 * LEVEL:g} %, by the noise of the record"]
-            if reach
-            else []
-        ),
-        *(
-            f"after {horizon_s:g} s of +1 {unit} {name}: ".replace("  ", " ")
-            + _values(m.output_names, column, m.output_units, reach.get(name))
-            for name, unit, column in zip(names, units, effects.T, strict=True)
-            if column.any()
-        ),
+    reach: dict[str, Array] = {}  # half the intervals of what each input of a record does to the outputs
+    lines = []
+    if made.linear.record is not None:
+        record, found = made.linear.record
+        reach = dict(zip(record.input_names, half_widths(record, found, horizon_s).T, strict=True))
+        lines = [f"gains      all within +- with a probability of {100 * LEVEL:g} %, by the noise of the record"]
+    return lines + [
+        f"after {horizon_s:g} s of +1 {unit} {name}: ".replace("  ", " ")
+        + _values(m.output_names, column, m.output_units, reach.get(name))
+        for name, unit, column in zip(names, units, effects.T, strict=True)
+        if column.any()
     ]
-
-
-def _reaches(made: Made, horizon_s: float) -> dict[str, Array]:
-    """Return half the intervals of what each input of a record does to the outputs, by its name."""
-    if made.linear.record is None:
-        return {}
-    record, found = made.linear.record
-    return dict(zip(record.input_names, half_widths(record, found, horizon_s).T, strict=True))
 
 
 def _rank_deficit(matrix: Array) -> int:
@@ -127,33 +96,19 @@ def _rank_deficit(matrix: Array) -> int:
     return int((sizes < SMALL * max(sizes.max(), 1e-300)).sum()) if sizes.size else 0
 
 
-def _loops(made: Made, effect: Array) -> list[str]:
-    """Return what is wrong with the loops of the fallback; `effect` is what inputs do to the outputs with a band."""
-    inputs, found = [one.name for one in made.process.inputs], list[str]()
-    for row, output in zip(effect, made.process.banded, strict=True):
-        loop = output.loop
-        if loop is not None and loop.gain * row[inputs.index(loop.input)] < 0:
-            found.append(f"the gain of {output.name} by {loop.input} has the wrong sign: it would drive it away")
-    return found
-
-
 def _coarse(process: Process) -> list[str]:
     """Return what registers and on-line arithmetic, which have single precision, do not resolve."""
-    found = []
-    for one in process.inputs:
-        found += _too_coarse(one, (one.low, one.high), SHARE * one.rate, "its rate")
-    for signal in process.outputs:
-        found += _too_coarse(signal, signal.range, signal.noise, "the noise of its sensor")
-    for band, signal in zip(process.bands, process.banded, strict=True):
-        found += _too_coarse(signal, signal.range, SHARE * (band.high - band.low), "its band")
-    return found
-
-
-def _too_coarse(signal: Input | Output, ends: tuple[float, float], least: float, what: str) -> list[str]:
-    step = float(np.spacing(np.float32(max(map(abs, ends)))))
-    if step <= least:
-        return []
-    return [f"{signal.name} has steps of {step:.2g} {signal.unit}, too coarse for {what}; count it from another zero"]
+    bands = zip(process.banded, process.bands, strict=True)
+    resolved: list[tuple[Input | Output, tuple[float, float], float, str]] = [
+        *((one, (one.low, one.high), SHARE * one.rate, "its rate") for one in process.inputs),
+        *((one, one.range, one.noise, "the noise of its sensor") for one in process.outputs),
+        *((one, one.range, SHARE * (band.high - band.low), "its band") for one, band in bands),
+    ]
+    return [
+        f"{one.name} has steps of {step:.2g} {one.unit}, too coarse for {what}; count it from another zero"
+        for one, ends, least, what in resolved
+        if (step := float(np.spacing(np.float32(max(map(abs, ends)))))) > least
+    ]
 
 
 def unheld(banded: Sequence[Output], A: Array) -> str:
@@ -163,16 +118,6 @@ def unheld(banded: Sequence[Output], A: Array) -> str:
     return "nothing holds this plant when MPC has no answer: a mode grows, and no output has a loop"
 
 
-def _dead_times(made: Made) -> list[str]:
-    """Return which dead times are not whole ticks; the simulated plant has the nearest that is."""
-    tick_s, lags = made.process.tick_s, made.linear.parameters.get("lags", ())
-    return [
-        f"{lag['output']} after {lag['source']}, {lag['delay_s']:g} s, is simulated as {near:g} s"
-        for lag in lags
-        if abs((near := round(lag["delay_s"] / tick_s) * tick_s) - lag["delay_s"]) > SMALL * tick_s
-    ]
-
-
 def _inverse_responses(made: Made) -> list[str]:
     """Return which outputs with a band first move to the other side after a step of an input than where they end."""
     m, process, n, quarters = made.model, made.process, len(made.own_A), 4
@@ -180,7 +125,7 @@ def _inverse_responses(made: Made) -> list[str]:
     delays = [lag["delay_s"] for lag in made.linear.parameters.get("lags", ())]  # approximated by what moves so
     if any(delays) or poles.real.max() > NOTHING or (abs(poles.imag[poles.real > -NOTHING]) > NOTHING).any():
         return []
-    part_s = process.tick_s * process.ticks_per_sample / quarters
+    part_s = process.sampling_period_s / quarters
     times = part_s * np.arange(1, quarters * process.decision_instants[-1] + 1)
     part, x = m.discretised(part_s), np.zeros_like(m.B)
     moves = np.array([m.C @ (x := part.A @ x + part.B) + m.D for _ in times])
@@ -236,7 +181,7 @@ def _exchanged(model: LtiModel, bath: Bath, horizon_s: float) -> list[str]:
 def _warnings(made: Made) -> list[str]:
     """Return what a control engineer would want to know, in words."""
     m, process, found = made.model, made.process, list[str]()
-    sample_s = process.tick_s * process.ticks_per_sample
+    sample_s, tick_s, lags = process.sampling_period_s, process.tick_s, made.linear.parameters.get("lags", ())
     poles = np.linalg.eigvals(made.own_A)
     fastest, slowest = -poles.real.min(), -poles.real.max()
     if poles.real.max() > NOTHING:
@@ -262,9 +207,17 @@ def _warnings(made: Made) -> list[str]:
         found.append(f"kink: derivatives differ by {made.linear.error:.1e} with the step; the model holds for one side")
     if process.bath is not None:
         found += _exchanged(m, process.bath, process.horizon_s)
-    found += [f"loop: {text}" for text in _loops(made, effect)]
+    found += [
+        f"loop: the gain of {one.name} by {one.loop.input} has the wrong sign: it would drive it away"
+        for row, one in zip(effect, process.banded, strict=True)
+        if one.loop is not None and one.loop.gain * row[process.input_names.index(one.loop.input)] < 0
+    ]
     found += _inverse_responses(made)
-    found += [f"dead time: {text}" for text in _dead_times(made)]
+    found += [  # the simulated plant has the nearest dead time in whole ticks
+        f"dead time: {lag['output']} after {lag['source']}, {lag['delay_s']:g} s, is simulated as {near:g} s"
+        for lag in lags
+        if abs((near := round(lag["delay_s"] / tick_s) * tick_s) - lag["delay_s"]) > SMALL * tick_s
+    ]
     found += [f"single precision: {text}" for text in _coarse(process)]
     steady = m.A_tick - np.eye(len(m.A))
     if _rank_deficit(np.vstack([steady, m.C])):

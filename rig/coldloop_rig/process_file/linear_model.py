@@ -17,16 +17,7 @@ from coldloop.process.declaration import Process
 from coldloop.process.sections import Lag, PlantSource
 from coldloop.text_file import MOST_BYTES, read_bytes
 from coldloop_plant.equilibrium import Linear, central_differences
-from coldloop_plant.own_plants import (
-    LINEAR,
-    PYTHON,
-    TRANSFER_FUNCTIONS,
-    Equations,
-    equations_of,
-    evaluated,
-    made_by,
-    outside,
-)
+from coldloop_plant import own_plants as plants
 from coldloop_rig.process_file.reading import source_of
 
 if TYPE_CHECKING:
@@ -142,7 +133,7 @@ def from_matrices(file: Process, folder: Path, given: str) -> Linearised:
     u, w = operating_point(file)
     return Linearised(
         **full, x0=np.zeros(n), u0=u, w0=w, y0=given_outputs(file), states={f"x{i}": "" for i in range(1, n + 1)},
-        kind=LINEAR, parameters={}, digest="", error=0.0,
+        kind=plants.LINEAR, parameters={}, digest="", error=0.0,
     )  # fmt: skip
 
 
@@ -166,7 +157,7 @@ def _of_state_space(file: Process, folder: Path, given: str) -> dict[str, Array]
 
     Its inputs are those of the file, then the load, if there is one, and the other disturbances.
     """
-    space = made_by(*source_of(folder, given), given)
+    space = plants.made_by(*source_of(folder, given), given)
     if getattr(space, "dt", None) not in (None, 0):
         raise UsageError(f"{given}: has a sampling time of {space.dt} s; give it in continuous time")
     with foreign(
@@ -227,15 +218,15 @@ def from_equations(file: Process, place: str, source: str, name: str) -> Lineari
     Raises:
         ColdloopError: The class cannot be made, or does not rest: one line.
     """
-    equations = equations_of(source, name, place)
+    equations = plants.equations_of(source, name, place)
     u, w = operating_point(file)
     n, m, p = len(equations.states), len(u), len(file.outputs)
     x = _rest(equations, u, w, place, file.tick_s * file.ticks_per_sample) if n else np.zeros(0)
 
     def evaluate(z: Array) -> Array:
-        point = z[:n], z[n : n + m], outside(z[n + m :])
-        rates = evaluated(equations.derivatives, *point, size=n, where=place)
-        return np.append(rates, evaluated(equations.outputs, *point, size=p, where=place))
+        point = z[:n], z[n : n + m], plants.outside(z[n + m :])
+        rates = plants.evaluated(equations.derivatives, *point, size=n, where=place)
+        return np.append(rates, plants.evaluated(equations.outputs, *point, size=p, where=place))
 
     at = np.array([*x, *u, *w])
     y = evaluate(at)[n:]
@@ -249,17 +240,17 @@ def from_equations(file: Process, place: str, source: str, name: str) -> Lineari
     ]
     parameters = {"file": place.partition(":")[0], "class": name, "source": source}
     return Linearised(
-        *Linear.of(fine, n, m), x, u, w, y, dict(equations.states), PYTHON, parameters, "", float(np.max(apart)),
+        *Linear.of(fine, n, m), x, u, w, y, dict(equations.states), plants.PYTHON, parameters, "", float(np.max(apart)),
     )  # fmt: skip
 
 
-def _sizes(x: Array, equations: Equations) -> Array:
+def _sizes(x: Array, equations: plants.Equations) -> Array:
     """Return how large states are: their values at rest, or at the guess, or 1 where both are 0."""
     size = np.maximum(np.abs(x), np.abs(np.array(equations.guess, dtype=np.float64)))
     return np.where(size > 0.0, size, 1.0)
 
 
-def _rest(equations: Equations, u: Array, w: Array, place: str, sample_s: float) -> Array:
+def _rest(equations: plants.Equations, u: Array, w: Array, place: str, sample_s: float) -> Array:
     """Return the state that does not move: in a sample by no more than `AT_REST` of its size."""
     from scipy.optimize import root  # noqa: PLC0415
 
@@ -267,10 +258,8 @@ def _rest(equations: Equations, u: Array, w: Array, place: str, sample_s: float)
     size = _sizes(guess, equations)
 
     def motion(scaled: Array) -> Array:
-        slope = evaluated(
-            equations.derivatives, scaled * size, u, outside(w), size=len(size), where=f"{place}, near guess"
-        )
-        return sample_s * slope / size
+        point, where = (scaled * size, u, plants.outside(w)), f"{place}, near guess"
+        return sample_s * plants.evaluated(equations.derivatives, *point, size=len(size), where=where) / size
 
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -296,21 +285,19 @@ def from_lags(file: Process, plant: PlantSource) -> Linearised:
             unknown = lag.source if lag.source not in sources else lag.output
             raise UsageError(f"plant.transfer_functions: {unknown} is no signal of this file")
     parts = [lag_model(lag) for lag in lags]
-    n = sum(len(a) for a, _, _ in parts)
-    k = 1 + len(file.disturbances)
+    n, k = sum(len(a) for a, _, _ in parts), 1 + len(file.disturbances)
     A, B, C = np.zeros((n, n)), np.zeros((n, m + k)), np.zeros((len(outputs), n))
     states: dict[str, str] = {}
     first = 0
     for lag, (a, b, c) in zip(lags, parts, strict=True):
-        place = slice(first, first + len(a))
+        place = slice(first, first := first + len(a))
         A[place, place], B[place, sources[lag.source]], C[outputs[lag.output], place] = a, b, c
         unit = file.outputs[outputs[lag.output]].unit
         states |= {f"{lag.output}_{lag.source}_{i}": unit for i in range(1, len(a) + 1)}
-        first += len(a)
     u, w = operating_point(file)
     return Linearised(
         A, B[:, :m], B[:, m:], C, np.zeros((len(outputs), m)), np.zeros((len(outputs), k)), np.zeros(n), u, w,
-        given_outputs(file), states, TRANSFER_FUNCTIONS, {"lags": [lag.model_dump() for lag in lags]}, "", 0.0,
+        given_outputs(file), states, plants.TRANSFER_FUNCTIONS, {"lags": [lag.model_dump() for lag in lags]}, "", 0.0,
     )  # fmt: skip
 
 
@@ -332,13 +319,12 @@ def _dead_time(delay_s: float) -> tuple[Array, Array, Array, float]:
     Golub and Van Loan, Matrix Computations, section 9.3.
     """
     k = 2  # order of the approximation in the prediction model; the simulated plant has dead times exactly
-    share = [
+    share = np.array([
         factorial(2 * k - j) * factorial(k) / (factorial(2 * k) * factorial(j) * factorial(k - j)) for j in range(k + 1)
-    ]
-    above = np.array([(-1) ** j * share[j] for j in range(k + 1)]) / share[k]  # rising powers of s times the delay
-    below = np.array(share) / share[k]
+    ])  # fmt: skip
+    below = share / share[k]  # rising powers of s times the delay
+    above = below * (-1.0) ** np.arange(k + 1)
     d = above[k]
-    a = np.zeros((k, k))
-    a[:-1, 1:] = np.eye(k - 1)
+    a = np.eye(k, k=1)
     a[-1] = -below[:k]
     return a / delay_s, np.array([*np.zeros(k - 1), 1.0]) / delay_s, above[:k] - d * below[:k], d

@@ -15,27 +15,13 @@ from coldloop.errors import ModelFileError, UsageError
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel, discretise
 from coldloop.process.sections import Bath, Output, State
+from coldloop.text_file import file_digest
 from coldloop_plant.equilibrium import Linear, central_differences, model_of
 from coldloop_plant.fmu import DOUBLE, Fmu, FmuSimulation, Wiring
-from coldloop_plant.own_plants import FMU, PYTHON, file_digest
+from coldloop_plant.own_plants import FMU, PYTHON
 from coldloop_rig.plc_sizing.operations import ProblemSizes, iteration_shares
-from coldloop_rig.process_file.linear_model import (
-    STEP,
-    Linearised,
-    from_equations,
-    from_lags,
-    from_matrices,
-    operating_point,
-    with_disturbances,
-)
-from coldloop_rig.process_file.reading import (
-    courses_of,
-    drawing_of,
-    forecasts_of,
-    installed_source,
-    read_process_file,
-    source_of,
-)
+from coldloop_rig.process_file import linear_model, reading
+from coldloop_rig.process_file.linear_model import STEP, Linearised, operating_point
 from coldloop_rig.process_file.step_test import Record, from_step_test, identified, model_identified, record_compared
 
 Array = NDArray[np.float64]
@@ -78,22 +64,23 @@ def made_from(path: Path) -> Made:
     Raises:
         ColdloopError: One line that names file, key and remedy.
     """
-    said = read_process_file(path)
+    said = reading.read_process_file(path)
     file = with_units(said, path.parent)
     linear = linearised(file, path.parent)
     file = _with_sensors(file, linear.y0.tolist())
+    shown = [*file.input_names, *file.output_names, *(["load"] if file.has_load else [])]
     process = file.model_copy(update={
         "states": _states(file, linear), "constants": file.constants or _constants(file, linear),
         "iterations": iteration_shares(_sizes(file, len(linear.states))),
-        "forecasts": forecasts_of(file, path.parent), "drawing": _drawing(file, path.parent),
+        "forecasts": reading.forecasts_of(file, path.parent),
+        "drawing": reading.drawing_of(path.parent / file.mimic, shown) if file.mimic else "",
     })  # fmt: skip
-    _check_room(process)
-    _check_rest(file, linear)
+    _check_fits(process, linear)
     matrices = Linear(linear.A, linear.B, linear.F[:, 0], linear.C, linear.D, linear.G[:, 0])
     model = model_of(
         matrices, linear.x0, linear.u0, float(linear.w0[0]), linear.y0, process, linear.states, linear.digest,
         plant=linear.kind, note=f"made from {path.name}", process=process.model_dump(mode="json"),
-        plant_parameters=linear.parameters | courses_of(file, path.parent),
+        plant_parameters=linear.parameters | reading.courses_of(file, path.parent),
         declaration_digest=declaration_digest(said, path.parent),
     )  # fmt: skip
     if process.bath is not None:
@@ -109,17 +96,17 @@ def linearised(file: Process, folder: Path) -> Linearised:
     """
     plant = file.plant
     if plant.python is not None:
-        found = from_equations(file, plant.python, *source_of(folder, plant.python))
+        found = linear_model.from_equations(file, plant.python, *reading.source_of(folder, plant.python))
     elif plant.installed is not None:
-        found = from_equations(file, plant.installed, *installed_source(plant.installed))
+        found = linear_model.from_equations(file, plant.installed, *reading.installed_source(plant.installed))
     elif plant.matrices is not None:
-        found = from_matrices(file, folder, plant.matrices)
+        found = linear_model.from_matrices(file, folder, plant.matrices)
     elif plant.step_test is not None:
         found = from_step_test(file, folder / plant.step_test)
     elif plant.fmu is not None:
         found = from_fmu(file, folder, plant.fmu)
     else:
-        found = from_lags(file, plant)
+        found = linear_model.from_lags(file, plant)
     if not len(found.A):
         raise UsageError(
             "plant: it has no states, so there is nothing to predict; give the dynamics of its actuators at least"
@@ -129,7 +116,7 @@ def linearised(file: Process, folder: Path) -> Linearised:
     for name in ("A", "B", "F", "C", "D", "G", "x0", "y0"):
         if not np.isfinite(getattr(found, name)).all():
             raise UsageError(f"plant: {name} of the linear model is not finite; look at the plant's equations there")
-    return with_disturbances(file, found)
+    return linear_model.with_disturbances(file, found)
 
 
 def _by_record(file: Process, plant: Linearised, path: Path) -> Linearised:
@@ -173,15 +160,10 @@ def declaration_digest(file: Process, folder: Path) -> str:
     said = file.model_dump(mode="json")
     look(said)
     if file.plant.installed:
-        named[file.plant.installed] = hashlib.sha256(installed_source(file.plant.installed)[0].encode()).hexdigest()
+        named[file.plant.installed] = hashlib.sha256(
+            reading.installed_source(file.plant.installed)[0].encode()
+        ).hexdigest()
     return hashlib.sha256(json.dumps([said, named], sort_keys=True).encode()).hexdigest()
-
-
-def _drawing(file: Process, folder: Path) -> str:
-    if file.mimic is None:
-        return ""
-    names = [*(one.name for one in file.inputs), *(one.name for one in file.outputs)]
-    return drawing_of(folder / file.mimic, [*names, "load"] if file.has_load else names)
 
 
 def _with_sensors(file: Process, y0: Sequence[float]) -> Process:
@@ -228,19 +210,14 @@ def _constants(file: Process, linear: Linearised) -> tuple[str, ...]:
         left = [place for place in own if (file.outputs[place].edges is not None) == is_banded]
         while left and modes.shape[1] < len(modes):
             wider = [np.hstack([modes, np.eye(len(modes))[:, [len(linear.A) + place]]]) for place in left]
-            apart = [_told_apart(each) for each in wider]
+            sized = (each / np.maximum(np.linalg.norm(each, axis=0), TINY) for each in wider)
+            apart = [float(np.linalg.svd(each, compute_uv=False)[-1]) for each in sized]
             best = int(np.argmax(apart))
             if apart[best] <= TOLD_APART:
                 break
             modes = wider[best]
             found.append(left.pop(best))
     return tuple(file.outputs[place].name for place in sorted(found))
-
-
-def _told_apart(columns: Array) -> float:
-    """Return the least singular value of columns scaled to size 1."""
-    scaled = columns / np.maximum(np.linalg.norm(columns, axis=0), TINY)
-    return float(np.linalg.svd(scaled, compute_uv=False)[-1])
 
 
 def _sizes(file: Process, states: int) -> ProblemSizes:
@@ -253,8 +230,12 @@ def _sizes(file: Process, states: int) -> ProblemSizes:
     )  # fmt: skip
 
 
-def _check_room(process: Process) -> None:
-    """Check that what the link exchanges in each scan and update fits into one request (`UsageError`)."""
+def _check_fits(process: Process, linear: Linearised) -> None:
+    """Check that the link exchanges a scan and an update in one request, and that sensors show the plant at rest.
+
+    Raises:
+        UsageError: One line that says what does not fit.
+    """
     inputs, outputs, states = len(process.inputs), len(process.outputs), len(process.states)
     words = {
         "the latched update": 12 + 2 * (2 * inputs + outputs + states),
@@ -266,11 +247,7 @@ def _check_room(process: Process) -> None:
             f"{inputs} inputs, {outputs} outputs and {states} states are too many: {longest} is {words[longest]} "
             f"registers, and one Modbus request carries {REGISTERS_OF_A_REQUEST}"
         )
-
-
-def _check_rest(file: Process, linear: Linearised) -> None:
-    """Check that steady-state outputs are within the ranges of their sensors (`UsageError`)."""
-    for one, value in zip(file.outputs, linear.y0, strict=True):
+    for one, value in zip(process.outputs, linear.y0, strict=True):
         if not one.range[0] <= value <= one.range[1]:
             raise UsageError(
                 f"outputs: {one.name} rests at {value:.5g}, outside the range of its sensor, {one.range[0]:g} to "
@@ -293,25 +270,19 @@ def _check_bath(file: Process, model: LtiModel, bath: Bath) -> None:
         raise UsageError(f"bath: {min(disturbances)} is a disturbance, and no state of the bath; take it out")
     if bath.holdable_load is not None and not bath.holdable_load[0] <= model.w0 <= bath.holdable_load[1]:
         raise UsageError(f"bath: holdable_load is without the operating point, {model.w0:g}, which is held; widen it")
-    if not _rests(model, bath):
+    moved, row = model.moved, model.output_names.index(bath.level)
+    equations = np.block([
+        [model.A[np.ix_(moved, moved)], model.F[moved, None]], [model.C[[row]][:, moved], model.G[[[row]]]],
+    ])  # fmt: skip
+    for axis in (1, 0, 1, 0):
+        size = np.abs(equations).max(axis=axis, keepdims=True)
+        equations = equations / np.where(size > 0.0, size, 1.0)  # a row or a column of zeros stays one
+    sizes = np.linalg.svd(equations, compute_uv=False)
+    if not sizes[-1] > SINGULAR * sizes[0]:
         raise UsageError(
             f"bath: with constant inputs no load lets the states and {bath.level} rest: either the load does not move "
             "it, or something else does that never rests"
         )
-
-
-def _rests(model: LtiModel, bath: Bath) -> bool:
-    moved, level = model.moved, model.output_names.index(bath.level)
-    equations = np.block([
-        [model.A[np.ix_(moved, moved)], model.F[moved, None]], [model.C[[level]][:, moved], model.G[[[level]]]],
-    ])  # fmt: skip
-    for axis in (1, 0, 1, 0):
-        size = np.abs(equations).max(axis=axis, keepdims=True)
-        if not size.all():
-            return False
-        equations = equations / size
-    sizes = np.linalg.svd(equations, compute_uv=False)
-    return bool(sizes[-1] > SINGULAR * sizes[0])
 
 
 STILL: Final = 1e-6
@@ -347,14 +318,13 @@ def with_units(file: Process, folder: Path) -> Process:
 
 
 def from_fmu(file: Process, folder: Path, name: str) -> Linearised:
-    """Return the model of an FMU.
+    """Return the linear model of an FMU at steady state: by its derivatives, by differences, or from a step test of it.
 
     Raises:
         ColdloopError: It cannot be run, or does not come to rest.
     """
     fmu = Fmu(folder / name)
-    wiring = _wiring(file, fmu)
-    simulation, wiring = _at_rest(file, fmu, wiring)
+    simulation, wiring = _at_rest(file, fmu, _wiring(file, fmu))
     y, x = simulation.outputs(), simulation.states()
     notes = [f"warning    FMU: {finding}" for finding in fmu.findings[:MOST_FINDINGS]]
     notes += [
@@ -393,23 +363,18 @@ def _wiring(file: Process, fmu: Fmu) -> Wiring:
         if variable is not None and variable.causality != "input" and variable.variability != "tunable":
             raise UsageError(f"inputs: {variable.name} is no input of {fmu.path} but its {variable.causality}")
     load = file.load if file.has_load else None
+    derivatives = [each.variable for each in fmu.description.derivatives]
+    states = [each.derivative for each in derivatives]  # which it may hide, and what it calls so may be an input
+    hidden = None in states or any(each.causality == "input" for each in [*derivatives, *states])
     return Wiring(
         inputs=[one.variable or one.name for one in file.inputs],
         outputs=[one.variable or one.name for one in file.outputs],
         load=(load.variable or load.name) if load else None,
         disturbances=[one.variable or one.name for one in file.disturbances],
-        states=_shown_states(fmu),
+        states=[] if hidden or any(each.dimensions for each in states) else [each.name for each in states],
         start=dict(file.plant.start),
         steps_per_tick=_steps_per_tick(file, fmu),
     )
-
-
-def _shown_states(fmu: Fmu) -> list[str]:
-    """Return the names of an FMU's states; none where it hides them, or where what it calls so is an input."""
-    derivatives = [each.variable for each in fmu.description.derivatives]
-    states = [each.derivative for each in derivatives]
-    hidden = None in states or any(each.causality == "input" for each in [*derivatives, *states])
-    return [] if hidden or any(each.dimensions for each in states) else [each.name for each in states]
 
 
 def _steps_per_tick(file: Process, fmu: Fmu) -> int:

@@ -1,4 +1,4 @@
-"""Reads a process file and what it names: sources of plants, courses of disturbances; or has its model file made."""
+"""Reads a process file and what it names: sources of plants, courses of disturbances, a drawing; or makes its model."""
 
 import math
 import re
@@ -121,7 +121,14 @@ def courses_of(file: Process, folder: Path) -> dict[str, Any]:
     """
     if not file.disturbances:
         return {}
-    return {"disturbances": [_course(one, folder, file.tick_s) for one in file.disturbances]}
+    courses = [
+        ([0], [one.at]) if one.course is None else _steps(one, folder / one.course, file.tick_s)
+        for one in file.disturbances
+    ]
+    return {"disturbances": [
+        {"ticks": ticks, "values": values, "measured": one.noise is not None}
+        for one, (ticks, values) in zip(file.disturbances, courses, strict=True)
+    ]}  # fmt: skip
 
 
 def forecasts_of(file: Process, folder: Path) -> tuple[Forecast, ...]:
@@ -136,11 +143,6 @@ def forecasts_of(file: Process, folder: Path) -> tuple[Forecast, ...]:
         if one.forecast is not None
         for ticks, values in [_steps(one, folder / one.forecast, file.tick_s)]
     )
-
-
-def _course(one: Disturbance, folder: Path, tick_s: float) -> dict[str, Any]:
-    ticks, values = ([0], [one.at]) if one.course is None else _steps(one, folder / one.course, tick_s)
-    return {"ticks": ticks, "values": values, "measured": one.noise is not None}
 
 
 def _steps(one: Load | Disturbance, path: Path, tick_s: float) -> tuple[list[int], list[float]]:
@@ -226,8 +228,7 @@ def model_file_of(path: Path, *, in_child: bool = False) -> tuple[Path, list[str
         made.model.save(out)
         return f"{out}\n{described(made)}"
 
-    said = text_of_child(path, work, limit_s=300) if in_child else work()
-    out, *lines = said.splitlines()
+    out, *lines = (text_of_child(path, work, limit_s=300) if in_child else work()).splitlines()
     return Path(out), [line for line in lines if line.startswith("warning")]
 
 
@@ -259,7 +260,9 @@ PREFIX: Final = "mimic-"
 
 
 def drawing_of(path: Path, signals: Collection[str]) -> str:
-    """Return the drawing of an SVG file as it is in the model file; it may show these signals.
+    """Return the drawing of an SVG file as it is in the model file; texts such as {h1} in it show these signals.
+
+    Whatever is not drawing is left out, where an editor has written it, or refused, where it would act.
 
     Raises:
         UsageError: One line that names file, element and remedy.

@@ -124,8 +124,7 @@ def identified(record: Record, order: int = 0) -> Identified:
 def unexplained(A: Array, B: Array, C: Array, D: Array, record: Record) -> Array:
     """Return what a model in continuous time leaves of a record: rms error of each output over its deviation."""
     left = record.outputs - simulated(A, B, C, D, record)
-    error: Array = np.sqrt((left**2).mean(axis=0)) / np.maximum(record.outputs.std(axis=0), 1e-12)
-    return error
+    return np.asarray(np.sqrt((left**2).mean(axis=0)) / np.maximum(record.outputs.std(axis=0), 1e-12))
 
 
 def simulated(A: Array, B: Array, C: Array, D: Array, record: Record) -> Array:
@@ -140,8 +139,7 @@ def simulated(A: Array, B: Array, C: Array, D: Array, record: Record) -> Array:
     left = record.outputs - responses[:, :, q : q + n * m] @ at.B.ravel() - u @ D.T
     free = np.delete(responses, np.s_[q : q + n * m], axis=2) / scale[:, np.newaxis]
     unknowns = np.linalg.lstsq(free.reshape(-1, free.shape[2]), (left / scale).ravel())[0]
-    made: Array = record.outputs - left + scale * (free @ unknowns)
-    return made
+    return np.asarray(record.outputs - left + scale * (free @ unknowns))
 
 
 def _check_moves(record: Record, deviations: Array) -> None:
@@ -196,20 +194,13 @@ def _states(u: Array, y: Array, pieces: list[Places], past: int) -> _States:
     return _States(rows / rows.std(axis=0), u[at], y[at], np.diff(at) == 1)
 
 
-def _matrices(states: _States, order: int) -> tuple[Array, Array]:
-    """Return A (n, n) and C (p, n) of the first states."""
-    x, one = states.rows[:, :order], np.ones((len(states.rows), 1))
-    seen = np.hstack([x, one])
-    C = np.asarray(np.linalg.lstsq(seen, states.y)[0].T, float)
-    innovations = states.y - seen @ C.T
-    known = np.hstack([x, states.u, innovations, one])[:-1][states.followed]
-    A = np.linalg.lstsq(known, x[1:][states.followed])[0][:order].T
-    return _admissible(A), C[:, :order]
-
-
 def _fitted(states: _States, u: Array, y: Array, pieces: list[Places], used: list[Places], order: int) -> _Fit:
     """Return the model of an order that the rows used of each piece give, and its errors on the others."""
-    A, C = _matrices(states, order)
+    x, one = states.rows[:, :order], np.ones((len(states.rows), 1))
+    seen = np.hstack([x, one])
+    shown = np.asarray(np.linalg.lstsq(seen, states.y)[0].T, float)
+    known = np.hstack([x, states.u, states.y - seen @ shown.T, one])[:-1][states.followed]  # with the innovations
+    A, C = _admissible(np.linalg.lstsq(known, x[1:][states.followed])[0][:order].T), shown[:, :order]
     responses, of = _responses(A, C, u, pieces), np.concatenate(used)
     unknowns = np.asarray(np.linalg.lstsq(responses[of].reshape(-1, responses.shape[2]), y[of].ravel())[0], float)
     left, held = np.delete(y - responses @ unknowns, of, axis=0), np.delete(y, of, axis=0)
@@ -226,8 +217,7 @@ def _admissible(A: Array) -> Array:
     moved = moved / np.maximum(np.abs(moved), 1.0)
     if np.array_equal(moved, poles):
         return A
-    found: Array = np.real(modes @ np.diag(moved) @ np.linalg.inv(modes))
-    return found
+    return np.asarray(np.real(modes @ np.diag(moved) @ np.linalg.inv(modes)))
 
 
 def _responses(A: Array, C: Array, u: Array, pieces: list[Places]) -> Array:
@@ -266,8 +256,7 @@ WIDER: Final = 1.5
 
 def gains_after(found: Identified, horizon_s: float) -> Array:
     """Return what 1 of each input, held, does to the outputs after a horizon: shape (p, m)."""
-    result: Array = found.C @ discretise(found.A, found.B, np.zeros(len(found.A)), horizon_s).B
-    return result
+    return np.asarray(found.C @ discretise(found.A, found.B, np.zeros(len(found.A)), horizon_s).B)
 
 
 def half_widths(record: Record, found: Identified, horizon_s: float) -> Array:
@@ -288,8 +277,7 @@ def half_widths(record: Record, found: Identified, horizon_s: float) -> Array:
         noise = np.roll(left, random.integers(1, count), axis=0) * random.choice([-1.0, 1.0])
         errors.append(gains_after(identified(record._replace(outputs=y + noise), order), horizon_s) - best)
     quantile = WIDER * stdtrit(DRAWS - 1, 1.0 - (1.0 - LEVEL) / (2 * best.size))
-    widths: Array = quantile * np.sqrt((np.array(errors) ** 2).mean(axis=0))
-    return widths
+    return np.asarray(quantile * np.sqrt((np.array(errors) ** 2).mean(axis=0)))
 
 
 PIECE: Final = "piece"
@@ -310,22 +298,30 @@ def from_step_test(file: Process, path: Path) -> Linearised:
     Raises:
         UsageError: One line that names file, line and remedy.
     """
-    table = _table(file, path)
-    record, moved = _recorded(file, table)
+    record, moved, table = _recorded(file, path)
     found = identified(record)
-    notes = [f"record     {path.name}: {note}" for note in (*table.notes, *_unused(table, record, file))]
+    used = {table.place(name) for name in (TIME, PIECE, *record.input_names, *file.output_names)}
+    left = ", ".join(name for place, name in enumerate(table.names) if name and place not in used)
+    notes = [f"record     {path.name}: {note}" for note in (*table.notes, *([f"not used: {left}"] if left else []))]
     notes += [
         f"unknown    {path.name} has no column {one.name}: the model does not know what it does"
         for one in file.outside
         if one not in moved
     ]
-    model = model_identified(file, found, _outputs(file, found), moved)
+    missing = next((one.name for one in file.outputs if one.at is None), None)
+    if not found.rests and missing is not None:
+        raise UsageError(
+            f"outputs: {missing} needs at, its value at the operating point: by its record the plant does not rest"
+        )
+    rest = zip(file.outputs, found.constant, strict=True)
+    y0 = np.array([constant if one.at is None else one.at for one, constant in rest])
+    model = model_identified(file, found, y0, moved)
     return model._replace(notes=(*model.notes, *notes), record=(record, found))
 
 
 def record_compared(file: Process, path: Path, plant: Linearised, model: Linearised) -> list[str]:
     """Return which outputs of a record the plant that it is for explains by far worse than the model found in it."""
-    record, moved = _recorded(file, _table(file, path))
+    record, moved, _ = _recorded(file, path)
     places = _places(file, moved)
     by_plant, by_model = (
         unexplained(one.A, np.hstack([one.B, one.F[:, places]]), one.C, np.hstack([one.D, one.G[:, places]]), record)
@@ -339,19 +335,10 @@ def record_compared(file: Process, path: Path, plant: Linearised, model: Lineari
     ]
 
 
-def _table(file: Process, path: Path) -> Table:
+def _recorded(file: Process, path: Path) -> tuple[Record, list[Load | Disturbance], Table]:
+    """Return a record in samples of the model, what moved in it beside the inputs, and the table that holds it."""
     named = (*file.inputs, *file.outside, *file.outputs)
-    return read_table(path, [TIME, *(one.name for one in named)], "name a CSV file beside the process file")
-
-
-def _unused(table: Table, record: Record, file: Process) -> list[str]:
-    used = {table.place(name) for name in (TIME, PIECE, *record.input_names, *(one.name for one in file.outputs))}
-    left = [name for place, name in enumerate(table.names) if name and place not in used]
-    return [f"not used: {', '.join(left)}"] if left else []
-
-
-def _recorded(file: Process, table: Table) -> tuple[Record, list[Load | Disturbance]]:
-    """Return a record in samples of the model, and what moved in it beside the inputs."""
+    table = read_table(path, [TIME, *(one.name for one in named)], "name a CSV file beside the process file")
     moved = [one for one in file.outside if table.place(one.name) is not None]
     names = [one.name for one in (*file.inputs, *moved)]
     rows = np.array(table.columns([TIME, *names, *(one.name for one in file.outputs)])).T
@@ -366,7 +353,7 @@ def _recorded(file: Process, table: Table) -> tuple[Record, list[Load | Disturba
     held = inputs.reshape(len(used) // every, every, -1).mean(axis=1)
     at, ends = np.array([one.at for one in (*file.inputs, *moved)]), np.cumsum(counts)
     cut = tuple(slice(end - count, end) for count, end in zip(counts, ends, strict=True))
-    return Record(period_s * every, held, outputs[::every], at, tuple(names), table.where, cut), moved
+    return Record(period_s * every, held, outputs[::every], at, tuple(names), table.where, cut), moved, table
 
 
 def _places(file: Process, moved: Sequence[Load | Disturbance]) -> list[int]:
@@ -380,10 +367,8 @@ def model_identified(file: Process, found: Identified, y0: Array, moved: Sequenc
     n, m, p = len(found.A), len(u), len(y0)
     F = np.zeros((n, len(w)))
     F[:, _places(file, moved)] = found.B[:, m:]
-    poor = [one.name for one, share in zip(file.outputs, found.fit, strict=True) if share < POOR]
-    warning = (
-        (f"warning    fit: the record does not explain {', '.join(poor)}; something else moves it",) if poor else ()
-    )
+    poor = ", ".join(one.name for one, share in zip(file.outputs, found.fit, strict=True) if share < POOR)
+    warning = (f"warning    fit: the record does not explain {poor}; something else moves it",) if poor else ()
     fit = "  ".join(f"{one.name} {100 * share:.1f} %" for one, share in zip(file.outputs, found.fit, strict=True))
     return Linearised(
         found.A, found.B[:, :m], F, found.C, np.zeros((p, m)), np.zeros((p, len(w))), np.zeros(n), u, w, y0,
@@ -392,28 +377,8 @@ def model_identified(file: Process, found: Identified, y0: Array, moved: Sequenc
     )  # fmt: skip
 
 
-def _outputs(file: Process, found: Identified) -> Array:
-    """Return the outputs at the operating point: as given, else where the model rests.
-
-    Raises:
-        UsageError: One is not given, and the model does not rest.
-    """
-    missing = next((one.name for one in file.outputs if one.at is None), None)
-    if not found.rests and missing is not None:
-        raise UsageError(
-            f"outputs: {missing} needs at, its value at the operating point: by its record the plant does not rest"
-        )
-    return np.array(
-        [rest if one.at is None else one.at for one, rest in zip(file.outputs, found.constant, strict=True)]
-    )
-
-
 def _check_readings(file: Process, path: str, outputs: Array) -> None:
-    """Check that readings are such as the file's sensors give.
-
-    Raises:
-        UsageError: A record is in another unit, or an output never moves.
-    """
+    """Check that a record is in the units of the file's sensors, and that each output moves."""
     for one, column in zip(file.outputs, outputs.T, strict=True):
         low, high = one.range
         wrong = column[(column < low) | (column > high)]

@@ -176,23 +176,19 @@ def _station(process: Process, maps: Maps) -> tuple[Column, ...]:
 
 def schema_document(process: Process, *, station: bool = False) -> dict[str, Any]:
     """Return the content of `schema.json`; with the station's file where there is one."""
+
+    def described(one: Column) -> dict[str, Any]:
+        values = {"values": {str(value.value): value.name for value in one.values}} if one.values else {}
+        return {"name": one.name, "type": str(one.kind), "unit": one.unit, "description": one.description, **values}
+
     return {
         "format": FORMAT,
         "files": {
-            name: {"description": file.description, "columns": [_described(column) for column in file.columns]}
+            name: {"description": file.description, "columns": [described(column) for column in file.columns]}
             for name, file in files_of(process).items()
             if station or name != STATION
         },
     }
-
-
-def _described(column: Column) -> dict[str, Any]:
-    text: dict[str, Any] = {
-        "name": column.name, "type": str(column.kind), "unit": column.unit, "description": column.description,
-    }  # fmt: skip
-    if column.values is not None:
-        text["values"] = {str(value.value): value.name for value in column.values}
-    return text
 
 
 def excess_keys(process: Process) -> list[str]:

@@ -1,6 +1,7 @@
-"""Sinks that write the files of a run while it runs, row group by row group, in constant memory.
+"""Samples, updates and events as Arrow tables, and the sinks that write them while a run lasts, in constant memory.
 
-Space on the disk is reserved for ending a run in good order when the disk is full.
+The columns are those of `columns.py`, in the same order. Files are written row group by row group; space on the disk is
+reserved for ending a run in good order when the disk is full.
 """
 
 import errno
@@ -11,6 +12,7 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Mapping, Sequence
 from functools import partial
+from io import FileIO
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Generic, NamedTuple, TypeVar
 
@@ -67,40 +69,24 @@ class DiskReserve:
             self._file = None
 
 
-class ReservedFile:
+class ReservedFile(FileIO):
     """A file for writing that draws on a reserve when the disk is full."""
 
     def __init__(self, path: Path, reserve: DiskReserve) -> None:
-        self._file = path.open("wb", buffering=0)
+        super().__init__(path, "wb")
         self._reserve = reserve
 
-    def write(self, data: bytes) -> int:
+    def write(self, data: Any) -> int:  # noqa: ANN401 any buffer
         """Write all of `data`. Raises OSError if it cannot be written, not even with the reserve."""
         rest = memoryview(data).cast("B")
         while rest:
             try:
-                rest = rest[self._file.write(rest) :]
+                rest = rest[super().write(rest) :]
             except OSError as error:
                 if error.errno not in FULL or self._reserve.released:
                     raise
                 self._reserve.release()
         return len(data)
-
-    def tell(self) -> int:
-        """Return the position."""
-        return self._file.tell()
-
-    def flush(self) -> None:
-        """Do nothing: there is no buffer."""
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-    @property
-    def closed(self) -> bool:
-        """Whether the file is closed."""
-        return self._file.closed
 
 
 T = TypeVar("T")
@@ -320,7 +306,7 @@ class DrivingHistory:
         starts = [state.tick for state in self._states[1:]]
         places = np.searchsorted(starts, ticks, side="right")
         texts = [_texts(state, self.process.output_names) for state in self._states]
-        return [text_array([text[name] for text in texts], places) for name in _TEXTS]
+        return [text_array(each, places) for each in zip(*texts, strict=True)]
 
     def measured(self, ticks: NDArray[np.int64], y: NDArray[np.float32]) -> list[pa.Array]:
         """Return what the sensors of banded outputs showed at N ticks in a row; null where it was no number.
@@ -353,15 +339,12 @@ class DrivingHistory:
             del faults[: max(0, bisect_right([fault.tick for fault in faults], tick) - 1)]
 
 
-_TEXTS: Final = ("mode", "cause", "driver", "bad_sensors")
-
-
-def _texts(state: Driving, output_names: Sequence[str]) -> dict[str, str | None]:
+def _texts(state: Driving, output_names: Sequence[str]) -> tuple[str | None, ...]:
+    """Return mode, cause, driver and bad sensors."""
     bad = " ".join(output_names[output] for output in sorted(state.bad))
     if state.mode is None:
-        return dict(zip(_TEXTS, (None, None, None, bad), strict=True))
-    words = (Mode.word_of(state.mode), Cause.word_of(state.cause), DRIVERS.get(state.mode), bad)
-    return dict(zip(_TEXTS, words, strict=True))
+        return None, None, None, bad
+    return Mode.word_of(state.mode), Cause.word_of(state.cause), DRIVERS.get(state.mode), bad
 
 
 def _shown_by(fault: SensorFaultRecord | None, true: float, held: float) -> float:
@@ -415,13 +398,8 @@ def _held(ticks: Any, updates: Sequence[Optimization], tick_s: float) -> list[An
     """
     latest = np.searchsorted([row.tick for row in updates], ticks, side="right") - 1
     none = latest < 0
-    values: list[list[float]] = [
-        [row.update for row in updates],
-        [row.tau_u * tick_s for row in updates],
-        [row.iterations for row in updates],
-        [row.j_effective for row in updates],
-    ]
-    return [(np.asarray(column or [0])[np.maximum(latest, 0)], none) for column in values]
+    rows = [(row.update, row.tau_u * tick_s, row.iterations, row.j_effective) for row in updates] or [(0, 0.0, 0, 0.0)]
+    return [(np.asarray(column)[np.maximum(latest, 0)], none) for column in zip(*rows, strict=True)]
 
 
 def updates_table(updates: Sequence[Optimization], process: Process) -> pa.Table:

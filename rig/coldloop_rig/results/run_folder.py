@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cached_property
+from functools import cached_property, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -301,15 +301,10 @@ def _reduced(series: Curves, every: int) -> Curves:
     if every == 1:
         return series
     starts = np.arange(0, len(series["time_s"]), every)
-    reduced: Curves = {}
-    for name, values in series.items():
-        pair = [np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)]
-        reduced[name] = np.stack(pair, axis=1).ravel()
-    return reduced
-
-
-Tables = dict[str, pq.ParquetFile]
-"""Files of a run by the name of their table."""
+    return {
+        name: np.stack([np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)], axis=1).ravel()
+        for name, values in series.items()
+    }
 
 
 def export(run: Path, kind: str, out: Path, *, force: bool) -> list[Path]:
@@ -320,8 +315,7 @@ def export(run: Path, kind: str, out: Path, *, force: bool) -> list[Path]:
         ResultsError: A file cannot be written.
     """
     folder = RunFolder(run)
-    writers = _WRITERS[kind](folder)
-    paths = {out / name: write for name, write in writers.items()}
+    paths = {out / name: write for name, write in _WRITERS[kind](folder).items()}
     for path in paths:
         if path.exists() and not force:
             raise UsageError(f"{path}: exists; name another folder with --out, or overwrite with --force")
@@ -339,7 +333,8 @@ Writers = dict[str, Callable[[Path], object]]
 """Functions that write a file, by the file's name."""
 
 
-def _tables(run: RunFolder, most: int = LONGEST_TICKS) -> Tables:
+def _tables(run: RunFolder, most: int = LONGEST_TICKS) -> dict[str, pq.ParquetFile]:
+    """Return the files of a run by the name of their table."""
     present = [name for name in FILES if name != STATION or (run.path / name).exists()]
     return {name.removesuffix(".parquet"): run.file(name, most) for name in present}
 
@@ -347,26 +342,26 @@ def _tables(run: RunFolder, most: int = LONGEST_TICKS) -> Tables:
 def _csv(run: RunFolder) -> Writers:
     """Return writers of CSV files: a header of names with units follows `schema.json`, null is an empty field."""
 
-    def writer(file: pq.ParquetFile) -> Callable[[Path], None]:
-        def write(path: Path) -> None:
-            with pyarrow.csv.CSVWriter(path, file.schema_arrow) as target:
-                for batch in file.iter_batches():
-                    target.write_batch(batch)
+    def write(file: pq.ParquetFile, path: Path) -> None:
+        with pyarrow.csv.CSVWriter(path, file.schema_arrow) as target:
+            for batch in file.iter_batches():
+                target.write_batch(batch)
 
-        return write
-
-    return {f"{name}.csv": writer(file) for name, file in _tables(run).items()}
+    return {f"{name}.csv": partial(write, file) for name, file in _tables(run).items()}
 
 
 def _mat(run: RunFolder) -> Writers:
     """Return the writer of a MATLAB file, version 5: structures `trace`, `updates`, `events`, `units`, `run`."""
     from scipy.io import savemat  # noqa: PLC0415 only MATLAB needs it
 
+    def shown(column: pa.ChunkedArray) -> Any:  # noqa: ANN401 an array of numbers, null is NaN, or of texts
+        is_text = pa.types.is_string(column.type)
+        return np.array(column.fill_null("").to_pylist(), dtype=object) if is_text else column.to_numpy()
+
     def write(path: Path) -> None:
         tables = {name: file.read() for name, file in _tables(run, MOST_IN_MEMORY).items()}
         content: dict[str, Any] = {
-            name: {column: _for_matlab(table[column]) for column in table.column_names}
-            for name, table in tables.items()
+            name: {column: shown(table[column]) for column in table.column_names} for name, table in tables.items()
         }
         content["units"] = {name: units_of(table.schema) for name, table in tables.items()}
         content["run"] = {name: run.manifest[name] for name in ("complete", "started_utc", "coldloop", "way")}
@@ -374,12 +369,6 @@ def _mat(run: RunFolder) -> Writers:
             savemat(file, content, do_compression=True, long_field_names=True, oned_as="column")
 
     return {"run.mat": write}
-
-
-def _for_matlab(column: pa.ChunkedArray) -> Any:  # noqa: ANN401 an array of numbers or of texts
-    if pa.types.is_string(column.type):
-        return np.array(column.fill_null("").to_pylist(), dtype=object)
-    return column.to_numpy()  # null becomes NaN
 
 
 def _hdf5(run: RunFolder) -> Writers:
@@ -402,7 +391,9 @@ def _hdf5(run: RunFolder) -> Writers:
 def _fill(h5py: Any, group: Any, file: pq.ParquetFile) -> None:  # noqa: ANN401 h5py has no types
     schema, rows = file.schema_arrow, file.metadata.num_rows
     for field in schema:
-        kind = h5py.string_dtype() if pa.types.is_string(field.type) else _hdf5_type(field)
+        kind = h5py.string_dtype() if pa.types.is_string(field.type) else field.type.to_pandas_dtype()
+        if field.name in ("update", "iterations"):  # whole numbers that may be missing become numbers with NaN
+            kind = np.float64
         dataset = group.create_dataset(field.name, shape=(rows,), dtype=kind)
         dataset.attrs["unit"] = field.metadata[b"unit"].decode()
         dataset.attrs["description"] = field.metadata[b"description"].decode()
@@ -413,12 +404,6 @@ def _fill(h5py: Any, group: Any, file: pq.ParquetFile) -> None:  # noqa: ANN401 
             column = (values.fill_null("") if pa.types.is_string(field.type) else values).to_numpy(zero_copy_only=False)
             group[field.name][first : first + len(column)] = column
         first += batch.num_rows
-
-
-def _hdf5_type(field: pa.Field) -> Any:  # noqa: ANN401 a numpy type
-    """Return the type of a dataset: whole numbers that may be missing become numbers with NaN."""
-    nullable = field.name in ("update", "iterations")
-    return np.float64 if nullable else field.type.to_pandas_dtype()
 
 
 def units_of(schema: pa.Schema) -> dict[str, str]:

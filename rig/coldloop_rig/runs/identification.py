@@ -135,7 +135,9 @@ def identify(model: LtiModel, record: Record) -> Identification:
     half = len(changes) // 2
     fit, held = slice(half), slice(half + window, None)  # no sample is in the windows of both
     spread = np.maximum(changes[fit].std(axis=0), record.sensors)
-    moments = _moments(_centred(effects[fit]) / spread[:, np.newaxis], _centred(changes[fit]) / spread)
+    effects_fit, changes_fit = _centred(effects[fit]) / spread[:, np.newaxis], _centred(changes[fit]) / spread
+    blocks = zip(np.array_split(effects_fit, BLOCKS), np.array_split(changes_fit, BLOCKS), strict=True)
+    moments = [(np.einsum("kpi,kpj->ij", z, z), np.einsum("kpi,kp->i", z, y)) for z, y in blocks]
     reach = (np.abs(effects[fit]) / record.sensors[:, np.newaxis]).max(axis=(0, 1))
     begin, end = skipped * ticks, (skipped + half) * ticks
     moved = np.ptp(record.inputs[begin:end], axis=0)
@@ -159,32 +161,21 @@ def scaled(model: LtiModel, factors: tuple[Factor, ...], note: str) -> LtiModel:
 def _samples(rows: RealArray, ticks: int) -> RealArray:
     """Return the means over whole samples of so many ticks, shape (samples, columns)."""
     count = len(rows) // ticks
-    means: RealArray = rows[: count * ticks].reshape(count, ticks, -1).mean(axis=1)
-    return means
+    return np.asarray(rows[: count * ticks].reshape(count, ticks, -1).mean(axis=1))
 
 
 def _centred(rows: RealArray) -> RealArray:
-    centred: RealArray = rows - rows.mean(axis=0)
-    return centred
-
-
-def _moments(effects: RealArray, changes: RealArray) -> tuple[RealArray, RealArray]:
-    """Return matrices and right sides of the normal equations of each block, shapes (BLOCKS, q, q) and (BLOCKS, q)."""
-    blocks = [
-        (np.einsum("kpi,kpj->ij", z, z), np.einsum("kpi,kp->i", z, y))
-        for z, y in zip(np.array_split(effects, BLOCKS), np.array_split(changes, BLOCKS), strict=True)
-    ]
-    return np.array([N for N, _ in blocks]), np.array([right for _, right in blocks])
+    return np.asarray(rows - rows.mean(axis=0))
 
 
 def _factors(
-    model: LtiModel, moments: tuple[RealArray, RealArray], reach: RealArray, moved: RealArray
+    model: LtiModel, moments: list[tuple[RealArray, RealArray]], reach: RealArray, moved: RealArray
 ) -> tuple[Factor, ...]:
     """Fit all identifiable factors; the least certain one is fixed at 1 first, which makes the others more certain.
 
     Args:
         model: Names inputs and load.
-        moments: Of each block.
+        moments: Matrix (q, q) and right side (q,) of the normal equations of each block.
         reach: Largest change by each input, over the sensor's standard deviation, shape (q,).
         moved: By how much each moved, shape (q,).
     """
@@ -201,9 +192,9 @@ def _factors(
     return tuple(Factor(*row) for row in zip(*columns, strict=True))
 
 
-def _least_squares(moments: tuple[RealArray, RealArray], free: NDArray[np.bool_]) -> tuple[RealArray, RealArray]:
+def _least_squares(moments: list[tuple[RealArray, RealArray]], free: NDArray[np.bool_]) -> tuple[RealArray, RealArray]:
     """Return the factors, those not free 1, and their standard errors by the jackknife over blocks, shape (q,) each."""
-    matrices, right_sides = moments
+    matrices, right_sides = (np.array(each) for each in zip(*moments, strict=True))
 
     def solution(blocks: Sequence[int]) -> RealArray:
         N, right = matrices[blocks].sum(axis=0), right_sides[blocks].sum(axis=0)
@@ -216,20 +207,22 @@ def _least_squares(moments: tuple[RealArray, RealArray], free: NDArray[np.bool_]
     return solution(every), np.sqrt((BLOCKS - 1) * without.var(axis=0))
 
 
-HEADER: Final = ("input", "factor", "95 % interval", "moved by", "verdict")
-
-
 def describe(model: LtiModel, found: Identification) -> str:
     """Return the factors and the prediction errors as tables."""
-    names, units = model.output_names, model.output_units
+    columns = zip(model.output_names, model.output_units, found.before, found.after, strict=True)
     errors = [
         (name, unit, f"{before:.4f}", f"{after:.4f}")
-        for name, unit, before, after in zip(names, units, found.before, found.after, strict=True)
+        for name, unit, before, after in columns
         if max(before, after) >= 5e-5  # the others do not move
     ]
+    rows = []
+    for one in found.factors:
+        value, within = ("1", "") if one.reason else (f"{one.value:.3f}", f"{one.low:.3f} to {one.high:.3f}")
+        verdict = f"not fitted: {one.reason}" if one.reason else "fitted"
+        rows.append((one.name, value, within, f"{one.moved:.3g} {one.unit}", verdict))
     verdict = "less than before" if found.improved else "not less than before"
     return "\n".join([
-        aligned([HEADER, *map(_row, found.factors)]),
+        aligned([("input", "factor", "95 % interval", "moved by", "verdict"), *rows]),
         f"error (RMS) of predicted changes over {WINDOW_S:g} s in the half held back",
         aligned([("output", "", "before", "after"), *errors], numbers=True),
         f"mean square of all, each over its spread: {verdict}\n",
@@ -241,10 +234,3 @@ def note_of(run: RunFolder, model: LtiModel, found: Identification) -> str:
     factors = ", ".join(f"{each.name} x {each.value:.4f}" for each in found.factors if not each.reason)
     trace = str(run.manifest["hashes"]["trace_sha256"])[:12]
     return f"gains of model {model.digest[:12]} scaled by coldloop identify from trace {trace}: {factors}"
-
-
-def _row(factor: Factor) -> tuple[str, ...]:
-    moved = f"{factor.moved:.3g} {factor.unit}"
-    if factor.reason:
-        return factor.name, "1", "", moved, f"not fitted: {factor.reason}"
-    return factor.name, f"{factor.value:.3f}", f"{factor.low:.3f} to {factor.high:.3f}", moved, "fitted"

@@ -25,13 +25,12 @@ from coldloop import __version__
 from coldloop.config import Configuration, load_configuration
 from coldloop.errors import ColdloopError, ResultsError, UsageError, printable
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.lti_model import load
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import read_document
 from coldloop.process.settings import SHIPPED_MODELS
 from coldloop.registers.plant import PlantSample
 from coldloop.session import TimeMode
-from coldloop.text_file import held_file, read_bytes
+from coldloop.text_file import file_digest, held_file, read_bytes
 from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.qp.linear_algebra import real_of
 from coldloop_optimizer_plc.settings import AdaptiveSettings, ProgramSettings, RuleName
@@ -62,26 +61,21 @@ def _copy_inputs(settings: Settings, profile: LoadProfile, folder: Path) -> dict
     """
     (folder / INPUTS).mkdir(exist_ok=True)
     name, model_file = settings.plant.load, settings.model.file
+
+    def copied(source: Path, copy: str) -> dict[str, str]:
+        content = read_bytes(source, RESTORE)
+        (folder / copy).write_bytes(content)
+        return {"source": str(source), "file": copy, "sha256": hashlib.sha256(content).hexdigest()}
+
     load: dict[str, Any] = {"source": name, "file": None, "profile_sha256": json_digest([profile.times, profile.watts])}
     if with_copied_load(settings, profile, folder) is not settings:
-        load |= {"file": LOAD_COPY, "sha256": file_digest(folder / LOAD_COPY)}
-    model = _copied(model_file, folder, MODEL_COPY)
+        load |= {"file": LOAD_COPY, "sha256": file_digest(folder / LOAD_COPY, RESTORE)}
+    model = copied(model_file, MODEL_COPY)
     if model_file == SHIPPED_MODELS["cold-box"]:
         model["source"] = "shipped"
     rest = settings.plant.refrigerator.file
-    more = {} if rest is None else {"refrigerator": _copied(rest, folder, REFRIGERATOR_COPY)}
+    more = {} if rest is None else {"refrigerator": copied(rest, REFRIGERATOR_COPY)}
     return {"load": load, "model": model, **more}
-
-
-def _copied(source: Path, folder: Path, name: str) -> dict[str, str]:
-    content = read_bytes(source, RESTORE)
-    (folder / name).write_bytes(content)
-    return {"source": str(source), "file": name, "sha256": hashlib.sha256(content).hexdigest()}
-
-
-def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes. Raises UsageError if it cannot be read."""
-    return hashlib.sha256(read_bytes(path, RESTORE)).hexdigest()
 
 
 def json_digest(content: object) -> str:
@@ -90,12 +84,11 @@ def json_digest(content: object) -> str:
 
 
 def _changed_inputs(manifest: dict[str, Any], folder: Path) -> list[str]:
+    copies = {name: entry for name, entry in manifest["inputs"].items() if entry and entry["file"] is not None}
     changed = [
         f"{folder / entry['file']}: is not the {name} that the run read"
-        for name, entry in manifest["inputs"].items()
-        if entry
-        and entry["file"] is not None
-        and file_digest(held_file(folder, entry["file"], RESTORE)) != entry.get("sha256")
+        for name, entry in copies.items()
+        if file_digest(held_file(folder, entry["file"], RESTORE), RESTORE) != entry.get("sha256")
     ]
     if json_digest(manifest["configuration"]) != manifest["hashes"]["configuration_sha256"]:
         changed.append(f"{folder / 'manifest.json'}: the configuration is not the one that the run had")
@@ -113,35 +106,22 @@ def _now_utc() -> str:
 
 
 def _first_manifest(
-    effective: Configuration[Settings], scenario: Scenario, inputs: Mapping[str, Any], way: str,
-    arguments: Mapping[str, Any],
-) -> dict[str, Any]:  # fmt: skip
+    effective: Configuration[Settings], ticks: int, inputs: Mapping[str, Any], way: str, arguments: Mapping[str, Any]
+) -> dict[str, Any]:
     configured = {key: value for key, value, _ in effective.effective() if value is not None}  # None is "not set"
     model = load_model(effective.settings.model.file)
     return {
-        "format": FORMAT,
-        "complete": False,
-        "reason": "the run has not ended, or its process was killed",
-        "started_utc": _now_utc(),
-        "ended_utc": None,
-        "coldloop": __version__,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
+        "format": FORMAT, "complete": False, "reason": "the run has not ended, or its process was killed",
+        "started_utc": _now_utc(), "ended_utc": None,
+        "coldloop": __version__, "python": platform.python_version(), "platform": platform.platform(),
         "dependencies": {name: installed_version(name) for name in DEPENDENCIES},
-        "command": sys.argv[1:],
-        "arguments": dict(arguments),
-        "way": way,
-        "ticks": scenario.ticks,
-        "recorded_ticks": 0,
-        "configuration": configured,
-        "inputs": dict(inputs),
+        "command": sys.argv[1:], "arguments": dict(arguments), "way": way, "ticks": ticks, "recorded_ticks": 0,
+        "configuration": configured, "inputs": dict(inputs),
         "hashes": {
-            "configuration_sha256": json_digest(configured),
-            "model_sha256": model.digest,
-            "plant_parameters_sha256": model.parameters_digest,
-            "trace_sha256": None,
+            "configuration_sha256": json_digest(configured), "model_sha256": model.digest,
+            "plant_parameters_sha256": model.parameters_digest, "trace_sha256": None,
         },
-    }
+    }  # fmt: skip
 
 
 def plain_arguments(options: argparse.Namespace) -> dict[str, str]:
@@ -182,9 +162,8 @@ class RunFiles:
         self._realtime = scenario.realtime
         with contextlib.ExitStack() as failed:
             failed.callback(self._reserve.close)
-            self._manifest = _first_manifest(
-                effective, scenario, _copy_inputs(settings, scenario.load, folder), way, arguments
-            )
+            inputs = _copy_inputs(settings, scenario.load, folder)
+            self._manifest = _first_manifest(effective, scenario.ticks, inputs, way, arguments)
             write_json(folder / "manifest.json", self._manifest)
             is_whole = settings.plant.kind is PlantKind.REFRIGERATOR
             write_json(folder / "schema.json", schema_document(process, station=is_whole))
@@ -215,7 +194,9 @@ class RunFiles:
             with contextlib.suppress(OSError):
                 self.folder.rmdir()  # it stays if it has logs
             raise _results_error(error, self.folder)
-        reason = None if error is None else _reason(error)
+        reason = None if error is None else f"{type(error).__name__}: {error}"
+        if isinstance(error, OSError | ColdloopError):
+            reason = f"{getattr(error, 'strerror', None) or error}"
         summary = summary_of(self._evaluation, self.recorder, realtime=self._realtime, reason=reason)
         hashes = {**self._manifest["hashes"], "trace_sha256": self._evaluation.trace_sha256}
         ended = {"complete": reason is None, "reason": reason, "ended_utc": _now_utc(), "recorded_ticks": recorded}
@@ -244,32 +225,15 @@ def summary_of(evaluation: RunEvaluation, recorder: Recorder, *, realtime: bool,
     wall_s, link = recorder.wall_seconds, recorder.link
     lateness = link._asdict() if realtime else dict.fromkeys(link._fields)
     figures = {
-        "complete": reason is None,
-        "reason": reason,
-        "ticks": evaluation.ticks,
-        "missing_ticks": recorder.missing_ticks,
-        "updates": evaluation.updates,
-        "failed_updates": evaluation.failed_updates,
-        "trace_sha256": evaluation.trace_sha256,
-        **evaluation.indicators.by_name,
-        **evaluation.excesses,
-        **lateness,
-        "deadline_misses": link.deadline_misses,
-        "wall_seconds": round(wall_s, 3),
+        "complete": reason is None, "reason": reason, "ticks": evaluation.ticks,
+        "missing_ticks": recorder.missing_ticks, "updates": evaluation.updates,
+        "failed_updates": evaluation.failed_updates, "trace_sha256": evaluation.trace_sha256,
+        **evaluation.indicators.by_name, **evaluation.excesses, **lateness,
+        "deadline_misses": link.deadline_misses, "wall_seconds": round(wall_s, 3),
         "realtime_factor": round(evaluation.ticks * evaluation.process.tick_s / wall_s, 2) if wall_s else None,
-    }
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in figures.items()
-    }
-
-
-def _reason(error: BaseException) -> str:
-    if isinstance(error, ColdloopError):
-        return str(error)
-    if isinstance(error, OSError):
-        return f"{error.strerror or error}"
-    return f"{type(error).__name__}: {error}"
+    }  # fmt: skip
+    unknown = {name: None for name, value in figures.items() if isinstance(value, float) and not math.isfinite(value)}
+    return figures | unknown
 
 
 def _results_error(error: BaseException, folder: Path, kept: str = "") -> BaseException:
@@ -330,24 +294,19 @@ def run_into(
         stop.recorder = files.recorder
         error: BaseException | None = stop.error
         try:
-            if error is None:
-                _drive(job, files.recorder, folder, stop)
+            if error is None and job.way is Way.IN_PROCESS:
+                with INTERRUPTION.in_one_process():
+                    OneProcessRig(job.effective.settings).run(job.scenario, files.recorder)
+            elif error is None:
+                from coldloop_rig.cosim import networked_run  # noqa: PLC0415 one process starts without the bus
+
+                networked_run.drive(job, files.recorder, folder, stop)
         except BaseException as of_run:  # noqa: BLE001 raised again by `finish`, after the files are closed
             error = of_run
         summary = files.finish(error, figure)
     if stop.error is not None:
         raise stop.error
     return summary
-
-
-def _drive(job: Job, recorder: Recorder, folder: Path, stop: StopRequest) -> None:
-    if job.way is Way.IN_PROCESS:
-        with INTERRUPTION.in_one_process():
-            OneProcessRig(job.effective.settings).run(job.scenario, recorder)
-        return
-    from coldloop_rig.cosim import networked_run  # noqa: PLC0415 a run in one process starts without the bus
-
-    networked_run.drive(job, recorder, folder, stop)
 
 
 def repeat(folder: Path, out: Path | None, *, force: bool, trusted: Path | None) -> tuple[bool, str]:
@@ -365,16 +324,15 @@ def repeat(folder: Path, out: Path | None, *, force: bool, trusted: Path | None)
     """
     run = RunFolder(folder)
     manifest = run.manifest
-    if manifest["way"] == Way.CHAOS:
-        raise UsageError(
-            f"{folder}: a run with faults, which depend on the machine; `coldloop chaos` runs the plan again"
-        )
-    if manifest["way"] == Way.RECORDED:
-        raise UsageError(f"{folder}: a session under way was recorded, from its middle on: it cannot be repeated")
+    refused = {
+        Way.CHAOS: "a run with faults, which depend on the machine; `coldloop chaos` runs the plan again",
+        Way.RECORDED: "a session under way was recorded, from its middle on: it cannot be repeated",
+    }
+    if why := refused.get(manifest["way"]):
+        raise UsageError(f"{folder}: {why}")
     if not manifest["recorded_ticks"]:
         raise UsageError(f"{folder}: the run has no ticks: {manifest['reason']}")
-    changed = _changed_inputs(manifest, folder)
-    if changed:
+    if changed := _changed_inputs(manifest, folder):
         raise UsageError("; ".join(changed))
     if trusted is not None:
         own, ours = run.model, read_document(trusted)
@@ -405,8 +363,9 @@ def _recorded_configuration(run: RunFolder) -> Configuration[Settings]:
             values.pop(key, None)
         elif key in values and named_families(str(values[key])) is None:
             raise UsageError(f"{run.path / 'manifest.json'}: {key}: the folder has no copy of it")
-    options: Mapping[str, tuple[object, str]] = {key: (value, "manifest") for key, value in values.items()}
-    return load_configuration(Settings, environment={}, options=options)
+    return load_configuration(
+        Settings, environment={}, options={key: (value, "manifest") for key, value in values.items()}
+    )
 
 
 def _repeated_trace(effective: Configuration[Settings], scenario: Scenario, out: Path | None, *, force: bool) -> str:
@@ -431,19 +390,15 @@ def _differences(manifest: Mapping[str, Any], run: RunFolder, trace: str) -> str
     lines = [f"another trace: {trace} instead of {manifest['hashes']['trace_sha256']}"]
     if manifest["coldloop"] != __version__:
         lines.append(f"coldloop {__version__} instead of {manifest['coldloop']}")
-    for name in DEPENDENCIES:
-        there, then = installed_version(name), manifest["dependencies"].get(name, "absent")
-        if there != then:
-            lines.append(f"{name} {there} instead of {then}")
-    misses = run.summary["deadline_misses"]
-    if misses:
+    versions = {name: (installed_version(name), manifest["dependencies"].get(name, "absent")) for name in DEPENDENCIES}
+    lines += [f"{name} {there} instead of {then}" for name, (there, then) in versions.items() if there != then]
+    if misses := run.summary["deadline_misses"]:
         lines.append(f"the run missed {misses} deadlines, which depend on the machine")
     if len(lines) == 1:
         lines.append("inputs, configuration and versions are the same: the programs have changed, or the machine")
     return "".join(f"{printable(line)}\n" for line in lines)
 
 
-UNSET = AdaptiveSettings.model_fields
 PERIOD = "optimizer_plc.program.updating_period_s"
 
 
@@ -467,7 +422,8 @@ def remarks(effective: Configuration[Settings]) -> list[str]:
         found.append(f"load {effective.settings.plant.load}: the {process.name} has no load; only the length is taken")
     adaptive = program.adaptive
     unused = {"q_first", "q_min", "q_max", "delta"} & adaptive.model_fields_set
-    if adaptive.rule is RuleName.CONTRACTION and any(getattr(adaptive, one) != UNSET[one].default for one in unused):
+    usual = AdaptiveSettings.model_fields
+    if adaptive.rule is RuleName.CONTRACTION and any(getattr(adaptive, one) != usual[one].default for one in unused):
         found.append(
             f"adaptive.{', adaptive.'.join(sorted(unused))}: of Algorithm 1; the rule is adaptive.rule=contraction"
         )
@@ -492,7 +448,8 @@ def certificate(settings: Settings, *, only_lost: bool = False) -> str:
     """
     limits, program, process, more = settings.limits, settings.optimizer_plc.program, settings.process, ""
     reach, shortest_s = np.array([limits.low, limits.high, limits.rate]), _shortest_s(program)
-    needs, fixed_s = waiting(load(settings.model.file), process, reach, limits.rate_share), program.updating_period_s
+    needs = waiting(load_model(settings.model.file), process, reach, limits.rate_share)
+    fixed_s = program.updating_period_s
     rule = "adaptive.contraction" if program.adaptive.rule is RuleName.CONTRACTION else "adaptive"
     most = program.adaptive.contraction.q_max if rule == "adaptive.contraction" else program.adaptive.q_max
     period_s, longest_s = max(fixed_s, shortest_s), _budget(program).times.period(most) * process.tick_s

@@ -27,16 +27,7 @@ from coldloop.process.lti_model import load as load_model
 from coldloop.process.updating_periods import duration, whole_ticks
 from coldloop.registers.audit import Event
 from coldloop_rig.cosim.one_process import OneProcessRig
-from coldloop_rig.figures.plot import (
-    Bounds,
-    RunCurves,
-    at_times,
-    draw_run,
-    labels_of,
-    pressure_limits,
-    save_figure,
-    title_of,
-)
+from coldloop_rig.figures import plot
 from coldloop_rig.results.file_sinks import DrivingHistory, events_table, station_table, trace_table, updates_table
 from coldloop_rig.results.indicators import RunEvaluation, StageCost
 from coldloop_rig.results.recording import MemorySink, Recorder, Recording
@@ -68,8 +59,7 @@ class Table:
 
     def to_dict(self) -> dict[str, list[Any]]:
         """Return the columns as lists by name."""
-        columns: dict[str, list[Any]] = self.arrow.to_pydict()
-        return columns
+        return dict(self.arrow.to_pydict())
 
 
 @dataclass(frozen=True)
@@ -117,24 +107,18 @@ class Simulation:
 
     def plot(self, path: str | Path | None = None) -> Figure:
         """Return the figure of the run; with a path it is written there too, as .png, .pdf or .svg."""
-        (batch,) = self.trace.arrow.select(["time_s", *labels_of(self.process)]).to_batches()
+        (batch,) = self.trace.arrow.select(["time_s", *plot.labels_of(self.process)]).to_batches()
         series, block = batch_series(batch), self.recording.block
-        pressures = pressure_limits(self.configuration) if block.station.size else {}
+        pressures = plot.pressure_limits(self.configuration) if block.station.size else {}
         if pressures:
             (station,) = station_table(block, self.process).select(["time_s", *pressures]).to_batches()
-            series |= at_times(batch_series(station), series["time_s"])
-        curves = RunCurves(
-            self.process,
-            series,
-            self.events.arrow.to_pylist(),
-            Bounds.of(self.configuration, self.process),
-            title_of(self.configuration, self.process),
-            f"trace {self.summary['trace_sha256'][:12]}  ·  coldloop {__version__}  ·  in-process",
-            pressures,
-        )
-        figure = draw_run(curves)
+            series |= plot.at_times(batch_series(station), series["time_s"])
+        identity = f"trace {self.summary['trace_sha256'][:12]}  ·  coldloop {__version__}  ·  in-process"
+        process, events = self.process, self.events.arrow.to_pylist()
+        bounds, title = plot.Bounds.of(self.configuration, process), plot.title_of(self.configuration, process)
+        figure = plot.draw_run(plot.RunCurves(process, series, events, bounds, title, identity, pressures))
         if path is not None:
-            save_figure(figure, Path(path))
+            plot.save_figure(figure, Path(path))
         return figure
 
 
@@ -183,25 +167,20 @@ def simulate(
     slow, lost = too_slow(effective.settings.optimizer_plc.program), certificate(effective.settings, only_lost=True)
     for line in filter(None, (slow, lost)):
         warnings.warn(line, stacklevel=2)
-    return _run(effective, _ticks(duration_s, effective.settings.process.tick_s))
+    return _run(effective, duration_s)
 
 
-def _ticks(duration_s: float | str | None, tick_s: float) -> int | None:
-    if duration_s is None:
-        return None
+def _run(effective: Configuration[Settings], duration_s: float | str | None) -> Simulation:
+    settings, tick_s, ticks = effective.settings, effective.settings.process.tick_s, None
     if isinstance(duration_s, str):
         try:
-            return duration(duration_s).ticks(tick_s, "duration_s")
+            ticks = duration(duration_s).ticks(tick_s, "duration_s")
         except ArgumentTypeError as error:
             raise UsageError(f"duration_s: {error}") from None
-    ticks = whole_ticks(duration_s, tick_s)
-    if ticks is None or ticks <= 0:
-        raise UsageError(f"duration_s={duration_s}: not a positive multiple of {tick_s} s")
-    return ticks
-
-
-def _run(effective: Configuration[Settings], ticks: int | None) -> Simulation:
-    settings = effective.settings
+    elif duration_s is not None:
+        ticks = whole_ticks(duration_s, tick_s)
+        if ticks is None or ticks <= 0:
+            raise UsageError(f"duration_s={duration_s}: not a positive multiple of {tick_s} s")
     scenario = make_scenario(settings, ticks)
     model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
     evaluation, memory = RunEvaluation(model, design), MemorySink()

@@ -28,6 +28,7 @@ from coldloop.process.lti_model import LtiModel
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import ModelHeader
 from coldloop.process.sections import Lag
+from coldloop.text_file import file_digest
 from coldloop_plant.numeric import RealArray
 from coldloop_plant.program import HeatLoad, MakePlant, MeasurementNoise, PlantProgram
 
@@ -456,16 +457,11 @@ def _fmu_of(header: ModelHeader) -> Path:
     """Return the FMU that a model was made from: where it was then, or beside the model file."""
     source = Path(header.plant_parameters["file"])
     for place in (source, header.file.parent / source.name):
-        if place.is_file() and file_digest(place) == header.parameters_digest:
+        if place.is_file() and file_digest(place, error=ModelFileError) == header.parameters_digest:
             return place
     raise ModelFileError(
         f"{header.file}: made from another {source} than is there or beside it; make it again, `coldloop process`"
     )
-
-
-def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file that a plant is made from, in hexadecimal."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def own_plant_maker(header: ModelHeader, noise_of_seed: Callable[[int], MeasurementNoise | None]) -> MakePlant:

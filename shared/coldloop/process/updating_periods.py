@@ -1,4 +1,4 @@
-"""Updating periods, and what a PLC computes in each."""
+"""Times of any process: in ticks, as people write them; updating periods, and what a PLC computes in each."""
 
 import math
 import re
@@ -66,7 +66,7 @@ def whole_ticks(seconds: float, tick_s: float) -> int | None:
 
 LONGEST_TICKS: Final = 2**32 - 1
 """Ticks are 32-bit numbers on the bus."""
-_UNITS = {"": 1.0, "s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
+UNITS: Final = {"": 1.0, "s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
 
 
 class Duration(NamedTuple):
@@ -96,9 +96,9 @@ class Duration(NamedTuple):
 def duration(text: str) -> Duration:
     """Return a duration such as 90, 90s, 15min or 2h."""
     match = re.fullmatch(r"([+-]?\d+(?:\.\d+)?)\s*([a-z]*)", text.strip().lower())
-    if match is None or match[2] not in _UNITS:
+    if match is None or match[2] not in UNITS:
         raise ArgumentTypeError(f"'{text}' is not a duration; write 90s, 15min or 2h")
-    seconds = float(match[1]) * _UNITS[match[2]]
+    seconds = float(match[1]) * UNITS[match[2]]
     if seconds <= 0:
         raise ArgumentTypeError(f"'{text}' is not positive; write 90s, 15min or 2h")
     return Duration(text, seconds)

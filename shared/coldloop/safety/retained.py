@@ -1,12 +1,11 @@
 """State that survives a restart: one small file, replaced whole or not at all.
 
-A draft is written beside it, synced to the disk and renamed over it, and the folder is synced: a process that is killed
-at any byte, or a power cut, leaves the old state or the new one. What cannot be trusted (torn, of another program or
-model, no state, no ordinary file) is refused with a reason, and set aside. `RetainedStateWriter` writes in a thread:
-the scan never waits for a disk.
+A draft is written beside it, synced to the disk and renamed over it, and the folder is synced (`replace_file`): a
+process that is killed at any byte, or a power cut, leaves the old state or the new one. What cannot be trusted (torn, of
+another program or model, no state, no ordinary file) is refused with a reason, and set aside. `RetainedStateWriter`
+writes in a thread: the scan never waits for a disk.
 """
 
-import contextlib
 import json
 import logging
 import os
@@ -15,7 +14,6 @@ import threading
 import time
 import zlib
 from collections.abc import Mapping
-from io import FileIO
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +21,7 @@ from pydantic import BaseModel, ConfigDict
 
 from coldloop.errors import ColdloopError
 from coldloop.parsing import parsed_json
+from coldloop.text_file import replace_file
 
 MAGIC = "coldloop-retained"
 MOST_BYTES: Final = 2**26
@@ -113,7 +112,7 @@ class RetainedFile:
         if _is_device(self.path):
             raise RetainedStateError(f"{self.path}: a device; name another file in retain.file")
         try:
-            _replace(self.path, encoded(state, self._owner, self._digest), synced=synced)
+            replace_file(self.path, encoded(state, self._owner, self._digest), synced=synced)
         except OSError as error:
             raise RetainedStateError(f"{self.path}: {error.strerror}; name another file in retain.file") from None
 
@@ -162,38 +161,6 @@ def _read(path: Path) -> bytes:
         if status.st_size > MOST_BYTES:
             raise RetainedStateError(f"{status.st_size} bytes are too many for a state; it is not used")
         return file.read(MOST_BYTES)
-
-
-def _new(path: Path) -> FileIO:
-    """Create a draft; a leftover one is removed and not followed."""
-    try:
-        return path.open("xb", buffering=0)
-    except FileExistsError:
-        path.unlink()
-        return path.open("xb", buffering=0)
-
-
-def _replace(path: Path, data: bytes, *, synced: bool) -> None:
-    """Let a file have this content, or the one that it had."""
-    draft = path.with_name(f"{path.name}.draft")
-    try:
-        with _new(draft) as file:
-            rest = memoryview(data)
-            while rest:
-                rest = rest[file.write(rest) :]
-            if synced:
-                os.fsync(file.fileno())
-        draft.replace(path)
-    except OSError:
-        with contextlib.suppress(OSError):  # half a draft would only fill the disk further
-            draft.unlink(missing_ok=True)
-        raise
-    if synced and os.name == "posix":  # let the disk have the names in the folder
-        descriptor = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 log = logging.getLogger("coldloop.safety.retained")
