@@ -70,21 +70,22 @@ class Authority:
 
     def issue_client(self, name: str, role: str | None, days: float | None = None) -> Pair:
         """Return a client's certificate with a role, or with none."""
-        extension = _role_extension(role) if role is not None else None
+        identifier, extension = x509.ObjectIdentifier(ROLE_EXTENSION), None
+        if role is not None:
+            extension = x509.UnrecognizedExtension(identifier, encoded_role(role))
         return self._issue(name, ExtendedKeyUsageOID.CLIENT_AUTH, extension, days)
 
     def revocation_list(self, revoked: Iterable[x509.RevokedCertificate], days: float) -> bytes:
         """Return the PEM list of revoked certificates, valid from a day ago and for so many days from now."""
         authority, now = self.pair.certificate, datetime.now(UTC)
+        identifier = x509.AuthorityKeyIdentifier.from_issuer_public_key(self.pair.key.public_key())
         builder = (
             x509.CertificateRevocationListBuilder()
             .issuer_name(authority.subject)
             .last_update(now - timedelta(days=1))
             .next_update(now + timedelta(days=days))
             .add_extension(x509.CRLNumber(int(now.timestamp())), critical=False)
-            .add_extension(
-                x509.AuthorityKeyIdentifier.from_issuer_public_key(self.pair.key.public_key()), critical=False
-            )
+            .add_extension(identifier, critical=False)
         )
         for each in revoked:
             builder = builder.add_revoked_certificate(each)
@@ -112,10 +113,6 @@ def revoked_now(certificate: x509.Certificate) -> x509.RevokedCertificate:
     """Return the entry of a certificate that is revoked now."""
     builder = x509.RevokedCertificateBuilder().serial_number(certificate.serial_number)
     return builder.revocation_date(datetime.now(UTC)).build()
-
-
-def _role_extension(role: str) -> x509.UnrecognizedExtension:
-    return x509.UnrecognizedExtension(x509.ObjectIdentifier(ROLE_EXTENSION), encoded_role(role))
 
 
 def _draft(name: str, issuer: str, key: ec.EllipticCurvePrivateKey, end: datetime) -> x509.CertificateBuilder:
@@ -165,13 +162,9 @@ OURS = "name the folder of `coldloop certificates`"
 MADE = "name a certificate that `coldloop certificates` has made"
 KEY = "the key of the authority is needed to revoke"
 OWNERS = {
-    "plant.server.tls": "plant",
-    "control_plc.server.tls": "control_plc",
-    "optimizer_plc.server.tls": "optimizer_plc",
-    "control_plc.plant.tls": "control",
-    "optimizer_plc.control_plc.tls": "optimizer",
-    "rig.tls": "operator",
-}
+    "plant.server.tls": "plant", "control_plc.server.tls": "control_plc", "optimizer_plc.server.tls": "optimizer_plc",
+    "control_plc.plant.tls": "control", "optimizer_plc.control_plc.tls": "optimizer", "rig.tls": "operator",
+}  # fmt: skip
 """Sections of the configuration, and whose certificate goes there."""
 
 
@@ -186,16 +179,18 @@ def write_site(out: Path, hosts: Sequence[str], days: int) -> tuple[int, Path]:
     pairs = {"ca": authority.pair}
     pairs |= {name: authority.issue_server(name, ["localhost", "127.0.0.1", *hosts]) for name in SERVICES}
     pairs |= {name: authority.issue_client(name, role) for name, role in CLIENTS.items()}
-    present = [name for name in _names(pairs) if (out / name).exists()]
-    if present:
-        raise UsageError(f"{out / present[0]} exists: name another folder with --out, or remove the old files")
+    files = {f"{name}.crt": pair.certificate_pem for name, pair in pairs.items()}
+    files |= {f"{name}.key": pair.key_pem for name, pair in pairs.items()}
+    files |= {REVOCATIONS: authority.revocation_list([], days), CONFIGURATION: _configuration(out.resolve()).encode()}
+    if present := next((name for name in files if (out / name).exists()), None):
+        raise UsageError(f"{out / present} exists: name another folder with --out, or remove the old files")
     prepare_folder(out)
     try:
-        for name, pair in pairs.items():
-            _write(out / f"{name}.crt", pair.certificate_pem, 0o644)
-            _write(out / f"{name}.key", pair.key_pem, 0o600)
-        _write(out / REVOCATIONS, authority.revocation_list([], days), 0o644)
-        _write(out / CONFIGURATION, _configuration(out.resolve()).encode(), 0o644)
+        for name, data in files.items():
+            mode = 0o600 if name.endswith(".key") else 0o644  # a key is private from the start
+            descriptor = os.open(out / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+            with os.fdopen(descriptor, "wb") as stream:
+                stream.write(data)
     except OSError as error:
         raise ResultsError(f"{error.filename or out}: {error.strerror}; choose another --out") from None
     return len(pairs), out / CONFIGURATION
@@ -237,16 +232,6 @@ def _key(file: Path) -> ec.EllipticCurvePrivateKey:
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise UsageError(f"{file}: not a key that `coldloop certificates` has made")
     return key
-
-
-def _names(pairs: dict[str, Pair]) -> list[str]:
-    return [*[f"{name}.{kind}" for name in pairs for kind in ("crt", "key")], REVOCATIONS, CONFIGURATION]
-
-
-def _write(file: Path, data: bytes, mode: int) -> None:
-    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)  # a key is private from the start
-    with os.fdopen(descriptor, "wb") as stream:
-        stream.write(data)
 
 
 def _configuration(folder: Path) -> str:

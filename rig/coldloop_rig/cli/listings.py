@@ -23,8 +23,6 @@ from coldloop_rig.text_tables import markdown_table
 Schema = Mapping[str, Any]
 """A JSON schema, or a part of one."""
 
-KEY_HEADER: Final = ("key", "value", "if not given", "meaning")
-NEEDED: Final = "*needed*"
 WORDS: Final = {
     "integer": "whole number", "number": "number", "string": "text", "object": "table", "boolean": "true or false",
 }  # fmt: skip
@@ -78,12 +76,13 @@ def _attribute_docstrings(model: type[BaseModel]) -> dict[str, str]:
 def _tables(section: Schema, declared: Schema, place: str, told: dict[str, str]) -> Iterator[str]:
     """Yield the table of a section, and of those within it, whose names begin with `place`; each kind once."""
     keys: Schema = section["properties"]
-    rows = [
-        (f"`{key}`", _value(said, declared), NEEDED if key in section.get("required", ()) else _default(said, declared),
-         _meaning(said, declared))
-        for key, said in keys.items()
-    ]  # fmt: skip
-    yield f"{markdown_table(KEY_HEADER, rows)}\n"
+    rows = []
+    for key, said in keys.items():
+        default = "*needed*" if key in section.get("required", ()) else _default(said, declared)
+        held = str(_declared(said, declared).get("description", "")).partition("\n\n")[0]
+        meaning = " ".join(str(said.get("description") or held).split())
+        rows.append((f"`{key}`", _value(said, declared), default, meaning))
+    yield f"{markdown_table(('key', 'value', 'if not given', 'meaning'), rows)}\n"
     for key, said in keys.items():
         within = _section(said, declared)
         if within is not None:
@@ -140,15 +139,6 @@ def _default(said: Schema, declared: Schema) -> str:
     return "" if _section(said, declared) or default in (None, "", [], {}) else f"`{as_toml(default)}`"
 
 
-def _meaning(said: Schema, declared: Schema) -> str:
-    """Return what is said of a key, else of what it holds."""
-    told = said.get("description") or str(_declared(said, declared).get("description", "")).partition("\n\n")[0]
-    return " ".join(str(told).split())
-
-
-OPTION_HEADER: Final = ("option", "meaning")
-
-
 def command_listing() -> str:
     """Return a section for each group of commands, with a table of the options of each."""
     parts = []
@@ -164,14 +154,14 @@ def _of_command(parser: argparse.ArgumentParser, name: str, level: str) -> Itera
     yield f"{level} `{name}`\n"
     if summary.strip():
         yield f"{_cell(summary.strip()[0].upper() + summary.strip()[1:])}\n"
-    actions = [each for each in parser._actions if each.dest != "help"]  # noqa: SLF001 argparse has no other way
     rows = [
         (_written(each), _cell(each.help or ""))
-        for each in actions
-        if each.help != argparse.SUPPRESS and not isinstance(each, argparse._SubParsersAction)  # noqa: SLF001
-    ]
+        for each in parser._actions  # noqa: SLF001 argparse has no other way
+        if each.dest != "help" and each.help != argparse.SUPPRESS
+        and not isinstance(each, argparse._SubParsersAction)  # noqa: SLF001
+    ]  # fmt: skip
     if rows:
-        yield f"{markdown_table(OPTION_HEADER, rows)}\n"
+        yield f"{markdown_table(('option', 'meaning'), rows)}\n"
     for sub, one in _subparsers(parser).items():
         yield from _of_command(one, f"{name} {sub}", f"{level}#")
 

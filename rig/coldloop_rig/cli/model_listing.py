@@ -1,5 +1,6 @@
 """The cold box at its operating point, and its linear model as both PLCs run it, as text."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -11,15 +12,7 @@ from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_file import COLD_BOX
 from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.settings import ControlDesign
-from coldloop_plant.cold_box.model import (
-    LOOP_MARGIN,
-    AtRest,
-    Equilibrium,
-    held_loads,
-    linearisation_error,
-    model_at,
-    operating_point,
-)
+from coldloop_plant.cold_box import model as cold_box
 from coldloop_plant.cold_box.physics import ColdBox
 from coldloop_plant.cold_box.plant_file import PlantFile
 from coldloop_plant.helium.properties import load_helium
@@ -60,36 +53,25 @@ def describe_model(
     """
     helium = load_helium()
     if plant.kind == COLD_BOX:
-        found = operating_point(plant, helium)
-        at_rest = AtRest(found, plant.box, model_at(found, plant.box, helium, plant.parameters))
+        found = cold_box.operating_point(plant, helium)
+        at_rest = cold_box.AtRest(found, plant.box, cold_box.model_at(found, plant.box, helium, plant.parameters))
     else:
         at_rest = kind_named(plant.kind).at_rest(plant, control)
     rest, box, model, lines_of_kind = at_rest
-    error = linearisation_error(rest.x, rest.u, rest.w, box, helium)
+    error = cold_box.linearisation_error(rest.x, rest.u, rest.w, box, helium)
+    kink = "kink       derivatives differ on both sides: the second law limits cells of NEF1 or NEF2; less UA there"
     lines = [
-        *_equilibrium_lines(model, rest),
-        *lines_of_kind,
-        *_eigenvalue_lines(model, error),
-        *_gain_lines(model),
-        *_kink_line(error),
-        *_band_lines(rest, design),
-        f"model      sha256 {model.digest}",
-        *_in_use_line(in_use),
-    ]
+        *_equilibrium_lines(model, rest), *lines_of_kind, *_eigenvalue_lines(model, error), *_gain_lines(model),
+        *([kink] if error >= TWO_SIDED else []), *_band_lines(rest, design), f"model      sha256 {model.digest}",
+    ]  # fmt: skip
+    with suppress(ModelFileError):  # the command then says what is wrong with it
+        configured = load(in_use)
+        lines.append(f"in use     sha256 {configured.digest} ({in_use})")
+        lines += [f"           {printable(configured.note)}"] if configured.note else []
     return Description(model, "\n".join(lines) + "\n", box)
 
 
-def _in_use_line(file: Path) -> list[str]:
-    """Return digest and note of the configured model; nothing where there is none, which the command then says."""
-    try:
-        model = load(file)
-    except ModelFileError:
-        return []
-    note = [f"           {printable(model.note)}"] if model.note else []
-    return [f"in use     sha256 {model.digest} ({file})", *note]
-
-
-def _equilibrium_lines(model: LtiModel, rest: Equilibrium) -> list[str]:
+def _equilibrium_lines(model: LtiModel, rest: cold_box.Equilibrium) -> list[str]:
     inputs = ", ".join(
         f"{name} {value:g} {unit}"
         for name, value, unit in zip(model.input_names, rest.u, model.input_units, strict=True)
@@ -125,27 +107,20 @@ def _gain_lines(model: LtiModel) -> list[str]:
     ]
 
 
-def _kink_line(error: float) -> list[str]:
-    """Return that the model holds for one side only, if so."""
-    if error < TWO_SIDED:
-        return []
-    return ["kink       derivatives differ on both sides: the second law limits cells of NEF1 or NEF2; less UA there"]
-
-
 def held_line(box: ColdBox, level: float, design: ControlDesign, limits: InputLimits) -> str:
     """Return which loads are held with L1 as in its file and T5 within its band: some seconds of computing."""
     openings = [np.linspace(limits.low[k], limits.high[k], count) for k, count in zip((0, 2), GRID, strict=True)]
     heater, warmth = (limits.low[1], limits.high[1]), (design.output_low[1], design.output_high[1])
     try:
         with np.errstate(all="ignore"):
-            held = held_loads(box, load_helium(), level, openings[0], heater, openings[1], warmth)
+            held = cold_box.held_loads(box, load_helium(), level, openings[0], heater, openings[1], warmth)
     except ValueError:
         return "holds      no load with T5 within its band\n"
-    loads = f"[{max(held.least.w, 0.0):.0f},{max(held.largest.w - LOOP_MARGIN, 0.0):.0f}]"
+    loads = f"[{max(held.least.w, 0.0):.0f},{max(held.largest.w - cold_box.LOOP_MARGIN, 0.0):.0f}]"
     return f"holds      loads of {loads} W at least: --set optimizer_plc.program.holdable_load_w={loads}\n"
 
 
-def _band_lines(rest: Equilibrium, design: ControlDesign) -> list[str]:
+def _band_lines(rest: cold_box.Equilibrium, design: ControlDesign) -> list[str]:
     """Return the settings to change where a steady-state output is outside its band."""
     bands = zip((L1, T5), ("L1", "T5"), ("%", "K"), design.output_low, design.output_high, strict=True)
     return [

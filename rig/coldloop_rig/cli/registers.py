@@ -88,13 +88,12 @@ def as_table(maps: Sequence[RegisterMap]) -> str:
 def as_markdown(maps: Sequence[RegisterMap]) -> str:
     """Return the register map's documentation."""
     parts = []
-    for register_map in maps:
-        parts.append(
-            f"## {register_map.service} (port {PORTS[register_map.service]}, map version {register_map.version}, "
-            f"digest {register_map.digest:08x})\n"
-        )
-        parts.append(f"Addresses 0 to {register_map.end - 1}; those in no table read 0 and are not written.\n")
-        parts += [_block_markdown(register_map.service, block) for block in register_map.shown]
+    for one in maps:
+        parts += [
+            f"## {one.service} (port {PORTS[one.service]}, map version {one.version}, digest {one.digest:08x})\n",
+            f"Addresses 0 to {one.end - 1}; those in no table read 0 and are not written.\n",
+            *(_block_markdown(one.service, block) for block in one.shown),
+        ]
     return "\n".join(parts)
 
 
@@ -104,17 +103,10 @@ def _block_markdown(service: str, block: Block) -> str:
     caption = f"### {block.name}: {block.description} ({writer}{many})\n\n`{mbpoll_line(service, block)}`"
     header = ("address", "4xxxx", "name", "type", "unit", "range", "description")
     rows = [
-        (
-            r.address,
-            modicon(r.address),
-            r.name,
-            r.kind.label,
-            r.unit,
-            "" if r.low is r.high is None else f"{_text(r.low)}..{_text(r.high)}",
-            r.description,
-        )
+        (r.address, modicon(r.address), r.name, r.kind.label, r.unit,
+         "" if r.low is r.high is None else f"{_text(r.low)}..{_text(r.high)}", r.description)
         for r in block.registers()
-    ]
+    ]  # fmt: skip
     return markdown_table(header, rows, caption) + "\n"
 
 
@@ -127,12 +119,7 @@ def mbpoll_line(service: str, block: Block) -> str:
     return f"mbpoll -0 -1 -m tcp -p {PORTS[service]} -t {options} -r {run[0].address} -c {count} 127.0.0.1"
 
 
-FORMATS: Final[dict[str, Callable[[Sequence[RegisterMap]], str]]] = {
-    "table": as_table,
-    "markdown": as_markdown,
-    "csv": as_csv,
-    "json": as_json,
-}
+FORMATS: Final = {"table": as_table, "markdown": as_markdown, "csv": as_csv, "json": as_json}
 
 
 WIDTH: Final = 24
@@ -297,21 +284,14 @@ def as_telegraf(maps: Sequence[RegisterMap], places: Places) -> str:
     for register_map in maps:
         place = places[register_map.service]
         lines += [
-            "[[inputs.modbus]]",
-            f'  name = "{register_map.service}"',
-            f'  controller = "tcp://{place.host}:{place.port}"',
-            '  configuration_type = "request"',
-            '  timeout = "2s"',
-        ]
+            "[[inputs.modbus]]", f'  name = "{register_map.service}"',
+            f'  controller = "tcp://{place.host}:{place.port}"', '  configuration_type = "request"', '  timeout = "2s"',
+        ]  # fmt: skip
         for run in runs(list(exported(register_map))):
             lines += [
-                "  [[inputs.modbus.request]]",
-                "    slave_id = 1",
-                '    byte_order = "ABCD"',
-                '    register = "holding"',
-                f'    measurement = "coldloop_{register_map.service}"',
-                "    fields = [",
-            ]
+                "  [[inputs.modbus.request]]", "    slave_id = 1", '    byte_order = "ABCD"',
+                '    register = "holding"', f'    measurement = "coldloop_{register_map.service}"', "    fields = [",
+            ]  # fmt: skip
             for tag in run:
                 kind = types[tag.register.kind]
                 lines.append(f'      {{ address = {tag.register.address}, name = "{tag.name}", type = "{kind}" }},')
@@ -338,8 +318,7 @@ def as_node_red(maps: Sequence[RegisterMap], places: Places) -> str:
     nodes: list[dict[str, Any]] = []
     for register_map in maps:
         service, place = register_map.service, places[register_map.service]
-        tab, client = _id(service, "tab"), _id(service, "client")
-        link = _id(service, "out")
+        tab, client, link = (_id(service, what) for what in ("tab", "client", "out"))
         nodes += [
             {"id": tab, "type": "tab", "label": f"Coldloop {service}"},
             {
@@ -417,13 +396,11 @@ def as_ignition(maps: Sequence[RegisterMap], places: Places) -> str:
         place = places[register_map.service]
         for tag in exported(register_map):
             designator, data_type = designators[tag.register.kind]
-            writer.writerow(
-                (
-                    f"coldloop/{register_map.service}", tag.name, "OPC", data_type, "Ignition OPC UA Server",
-                    f"[{register_map.service}]{designator}{tag.register.address + 1}", "Read_Only", tag.register.unit,
-                    f"{tag.register.description} ({place.host}:{place.port})",
-                )
-            )  # fmt: skip
+            writer.writerow((
+                f"coldloop/{register_map.service}", tag.name, "OPC", data_type, "Ignition OPC UA Server",
+                f"[{register_map.service}]{designator}{tag.register.address + 1}", "Read_Only", tag.register.unit,
+                f"{tag.register.description} ({place.host}:{place.port})",
+            ))  # fmt: skip
     return text.getvalue()
 
 

@@ -5,7 +5,6 @@ A program is given its process with its model file (`coldloop.process.settings`)
 """
 
 import json
-from collections.abc import Sequence
 from functools import cached_property
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -13,21 +12,8 @@ from typing import Annotated, Any, Final, Self
 
 from pydantic import Field, model_validator
 
-from coldloop.process.sections import (
-    NO_LOAD,
-    Band,
-    Bath,
-    Disturbance,
-    Forecast,
-    Input,
-    Instants,
-    Load,
-    Output,
-    PlantSource,
-    Range,
-    Section,
-    State,
-)
+from coldloop.process import sections
+from coldloop.process.sections import NO_LOAD, Bath, Disturbance, Input, Load, Output, Range, State
 
 LAST_TICK: Final = 2**32 - 2**16 - 1
 """Last tick of a session, after 34 years: what is planned from there still fits a register."""
@@ -41,7 +27,7 @@ MOST_SIGNALS: Final = 32
 """Outputs at most: registers have a bit for each."""
 
 
-class Process(Section):
+class Process(sections.Section):
     """A process with its time, its signals and its control problem: a value, equal to any of the same content."""
 
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,31}$")]
@@ -50,7 +36,7 @@ class Process(Section):
     """The basic period, in which PLCs scan."""
     ticks_per_sample: Annotated[int, Field(ge=2, le=100)] = 20
     """Ticks of a sampling period of the prediction model, which is the longest updating period."""
-    plant: PlantSource = PlantSource()
+    plant: sections.PlantSource = sections.PlantSource()
     """Source of the plant."""
     inputs: Annotated[tuple[Input, ...], Field(min_length=1, max_length=MOST_SIGNALS)]
     """Inputs: what the controller moves."""
@@ -64,7 +50,7 @@ class Process(Section):
     """Process noises of states by name; of others 1 % of what they move by with the inputs, a sample."""
     bath: Bath | None = None
     """Signals of a bath that the cold end of a refrigerator fills; leave it out for other plants."""
-    prediction: Instants = Instants()
+    prediction: sections.Instants = sections.Instants()
     """The problem that is solved on-line."""
     mimic: str | None = None
     """SVG file with a drawing for the operator's page, beside the process file."""
@@ -85,17 +71,16 @@ class Process(Section):
     """Path of a drawing that comes with the page, whose values name their registers."""
     iterations: dict[str, float] = Field(default_factory=dict)
     """Found with the model: times of iterations and of a preparation, over those with the cold box's problem."""
-    forecasts: tuple[Forecast, ...] = ()
+    forecasts: tuple[sections.Forecast, ...] = ()
     """Found with the model: what the files say that load and disturbances name in `forecast`."""
     drawing: str = ""
     """Found with the model: the text of `mimic`."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        for what in (self.inputs, self.outputs, self.states):
-            names = [each.name for each in what]
-            if len(set(names)) < len(names):
-                raise ValueError(f"{next(name for name in names if names.count(name) > 1)} is declared twice")
+        for names in (self.input_names, self.output_names, self.state_names):
+            if twice := next((name for name in names if names.count(name) > 1), None):
+                raise ValueError(f"{twice} is declared twice")
         if not self.banded:
             raise ValueError("outputs: none has a band or a setpoint; give one to at least one of them")
         moved = [band.loop.input for band in self.bands if band.loop is not None]
@@ -110,23 +95,27 @@ class Process(Section):
         return self
 
     def _check_bath(self, bath: Bath) -> None:
-        inputs = [one.name for one in self.inputs]
-        if sorted(bath.inputs) != sorted(inputs):
-            raise ValueError(
-                f"bath: its inputs are feed, heater and turbine_valve, each once; the process has {', '.join(inputs)}"
-            )
-        self._check_names("output", bath.outputs, self.outputs)
-        self._check_names("output with a band", bath.banded, self.banded)
+        if sorted(bath.inputs) != sorted(self.input_names):
+            known = ", ".join(self.input_names)
+            raise ValueError(f"bath: its inputs are feed, heater and turbine_valve, each once; the process has {known}")
+        banded = tuple(one.name for one in self.banded)
+        for what, names, known in (
+            ("output", bath.outputs, self.output_names), ("output with a band", bath.banded, banded),
+        ):  # fmt: skip
+            for name in names:
+                if name not in known:
+                    raise ValueError(f"bath: {name or 'an empty name'} is no {what}")
+                if names.count(name) > 1:
+                    raise ValueError(f"bath: {name} is named twice")
         if len(bath.turbine_pressures) != 2 * bool(bath.turbine_speed):
             raise ValueError("bath: give turbine_speed with two turbine_pressures, before and behind it, or neither")
         self._check_laws(bath)
 
     def _check_laws(self, bath: Bath) -> None:
         """Check that units, loops and loads are those that the laws of a bath are written for."""
-        units = dict.fromkeys((bath.level, bath.feed), "%") | dict.fromkeys(
-            (bath.temperature, bath.feed_temperature, bath.turbine_outlet), "K"
-        )
-        declared = {one.name: one.unit for one in self.inputs} | {one.name: one.unit for one in self.outputs}
+        temperatures = (bath.temperature, bath.feed_temperature, bath.turbine_outlet)
+        units = dict.fromkeys((bath.level, bath.feed), "%") | dict.fromkeys(temperatures, "K")
+        declared = {one.name: one.unit for one in (*self.inputs, *self.outputs)}
         for name, unit in units.items():
             if declared[name] != unit:
                 raise ValueError(f"bath: {name} has to be in {unit}, not in '{declared[name]}'")
@@ -141,14 +130,6 @@ class Process(Section):
             raise ValueError("bath: holdable_load: give the least load that can be held, then the largest")
         if min(bath.load_reserve, bath.least_load_error) < 0.0:
             raise ValueError("bath: load_reserve and least_load_error are 0 or more")
-
-    @staticmethod
-    def _check_names(what: str, names: Sequence[str], declared: Sequence[Output | State]) -> None:
-        for name in names:
-            if name not in [each.name for each in declared]:
-                raise ValueError(f"bath: {name or 'an empty name'} is no {what}")
-            if names.count(name) > 1:
-                raise ValueError(f"bath: {name} is named twice")
 
     @cached_property
     def content(self) -> str:
@@ -262,7 +243,7 @@ class Process(Section):
         return tuple(output for output in self.outputs if output.edges is not None)
 
     @property
-    def bands(self) -> tuple[Band, ...]:
+    def bands(self) -> tuple[sections.Band, ...]:
         """Their bands."""
         return tuple(output.kept for output in self.outputs if output.kept is not None)
 

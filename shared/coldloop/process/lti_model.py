@@ -8,22 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import ModelFileError
-from coldloop.process.model_file import (
-    COLD_BOX,
-    FORMAT,
-    REMEDY,
-    VECTORS,
-    ModelDescription,
-    declared_process,
-    digest_of,
-    header_of,
-    read_document,
-    write_document,
-)
+from coldloop.process import model_file
+from coldloop.process.model_file import REMEDY, VECTORS
 
 RealArray: TypeAlias = NDArray[np.float64]
 UNNAMED: dict[str, Any] = {
-    "plant": COLD_BOX, "note": "", "plant_parameters": {}, "plant_rest": {}, "process": {}, "declaration_digest": "",
+    "plant": model_file.COLD_BOX, "note": "", "declaration_digest": "",
+    "plant_parameters": {}, "plant_rest": {}, "process": {},
 }  # fmt: skip
 """Values of the keys that a model file leaves out."""
 MATRICES = ("A", "B", "F", "C", "D", "G", "A_tick", "B_tick", "F_tick")
@@ -47,7 +38,7 @@ class DiscreteModel:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LtiModel(ModelDescription):
+class LtiModel(model_file.ModelDescription):
     """dx/dt = A x + B u + F w, y = C x + D u + G w, in deviations from the operating point (x0, u0, w0, y0).
 
     n states, m inputs, p outputs, one load; physical units throughout, time in seconds. The arrays are read-only.
@@ -112,7 +103,7 @@ class LtiModel(ModelDescription):
     @property
     def digest(self) -> str:
         """SHA-256 of the content, in hexadecimal: of each bit of the matrices."""
-        return digest_of(self._document())
+        return model_file.digest_of(self._document())
 
     @property
     def short_digest(self) -> int:
@@ -121,7 +112,7 @@ class LtiModel(ModelDescription):
 
     def save(self, path: Path) -> None:
         """Write the model as JSON with its digest; the file appears whole or not at all (OSError if it cannot)."""
-        write_document(path, self._document())
+        model_file.write_document(path, self._document())
 
     def discretised(self, period_s: float) -> DiscreteModel:
         """Return the model sampled every `period_s` (s, positive), inputs and load held in between.
@@ -132,7 +123,7 @@ class LtiModel(ModelDescription):
         return discretise(self.A, self.B, self.F, period_s)
 
     def _document(self) -> dict[str, Any]:
-        document: dict[str, Any] = {"format": FORMAT}
+        document: dict[str, Any] = {"format": model_file.FORMAT}
         for name in (each.name for each in fields(self)):
             value = getattr(self, name)
             if name in UNNAMED and value == UNNAMED[name]:
@@ -167,22 +158,18 @@ def load(path: Path) -> LtiModel:
     Raises:
         ModelFileError: the file is missing, not JSON, of another version, damaged, not finite or of wrong shape.
     """
-    document = read_document(path)
-    header = header_of(document, path)
-    described: dict[str, Any] = {
-        name: value for name, value in vars(header).items() if name not in ("digest", "file", *VECTORS)
-    }
+    document = model_file.read_document(path)
+    header = model_file.header_of(document, path)
+    described = {name: value for name, value in vars(header).items() if name not in ("digest", "file", *VECTORS)}
     try:
         arrays: dict[str, Any] = {name: np.array(document[name], dtype=np.float64) for name in (*MATRICES, *VECTORS)}
         model = LtiModel(**described, **arrays)
     except (KeyError, TypeError, ValueError) as error:
         raise ModelFileError(f"{path}: {error} in the model file; {REMEDY}") from error
-    process = declared_process(document, path)
+    process = model_file.declared_process(document, path)
     if len(model.state_names) < len(process.states):
-        raise ModelFileError(
-            f"{path}: {len(model.state_names)} states in the model file, a {process.name} has {len(process.states)}; "
-            f"{REMEDY}"
-        )
+        found, needed = len(model.state_names), len(process.states)
+        raise ModelFileError(f"{path}: {found} states in the model file, a {process.name} has {needed}; {REMEDY}")
     if not model.process and not _is_of_tick(model, process.tick_s):
         raise ModelFileError(f"{path}: A_tick is not that of A over a tick of {process.tick_s:g} s; {REMEDY}")
     return model

@@ -1,8 +1,8 @@
 """State that survives a restart: one small file, replaced whole or not at all.
 
 A draft is written beside it, synced to the disk and renamed over it, and the folder is synced (`replace_file`): a
-process that is killed at any byte, or a power cut, leaves the old state or the new one. What cannot be trusted (torn, of
-another program or model, no state, no ordinary file) is refused with a reason, and set aside. `RetainedStateWriter`
+process that is killed at any byte, or a power cut, leaves the old state or the new one. What cannot be trusted (torn,
+of another program or model, no state, no ordinary file) is refused with a reason, and set aside. `RetainedStateWriter`
 writes in a thread: the scan never waits for a disk.
 """
 
