@@ -120,7 +120,7 @@ def draw_run(curves: RunCurves) -> Figure:
     time = curves.series["time_s"] / scale_s
     process, labels = curves.process, labels_of(curves.process)
     heights = [1.0] * (len(labels) + len(curves.pressures)) + ([0.45] if curves.events else [])
-    units = {one.name: one.unit for one in (*process.outputs, *process.inputs)}
+    units = {one.name: one.unit for one in process.outputs} | {one.name: one.unit for one in process.inputs}
     with styled():
         figure = Figure(figsize=(9.5, 13.5 + 1.6 * (len(labels) + len(curves.pressures) - 8)))
         panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, gridspec_kw=PANELS)

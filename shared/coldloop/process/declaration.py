@@ -96,8 +96,8 @@ class Process(sections.Section):
 
     def _check_bath(self, bath: Bath) -> None:
         if sorted(bath.inputs) != sorted(self.input_names):
-            known = ", ".join(self.input_names)
-            raise ValueError(f"bath: its inputs are feed, heater and turbine_valve, each once; the process has {known}")
+            there = ", ".join(self.input_names)
+            raise ValueError(f"bath: its inputs are feed, heater and turbine_valve, each once; the process has {there}")
         banded = tuple(one.name for one in self.banded)
         for what, names, known in (
             ("output", bath.outputs, self.output_names), ("output with a band", bath.banded, banded),
@@ -115,7 +115,7 @@ class Process(sections.Section):
         """Check that units, loops and loads are those that the laws of a bath are written for."""
         temperatures = (bath.temperature, bath.feed_temperature, bath.turbine_outlet)
         units = dict.fromkeys((bath.level, bath.feed), "%") | dict.fromkeys(temperatures, "K")
-        declared = {one.name: one.unit for one in (*self.inputs, *self.outputs)}
+        declared = {one.name: one.unit for one in self.inputs} | {one.name: one.unit for one in self.outputs}
         for name, unit in units.items():
             if declared[name] != unit:
                 raise ValueError(f"bath: {name} has to be in {unit}, not in '{declared[name]}'")
