@@ -16,7 +16,7 @@ from coldloop_control_plc.settings import ControlSection
 from coldloop_hmi.settings import HmiSection
 from coldloop_optimizer_plc.settings import OptimizerSection
 from coldloop_plant.settings import PlantSection
-from coldloop_rig.operator_settings import RigSection
+from coldloop_rig.cosim.wiring import RigSection
 
 
 class Settings(RootSettings):

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from tests.conftest import Coldloop
 
 HEAVY = {"numpy", "numba", "scipy", "matplotlib", "pydantic", "pyarrow", "distributed", "rich", "plotly", "argcomplete"}
+SERVICES = {"coldloop_plant", "coldloop_control_plc", "coldloop_optimizer_plc", "coldloop_hmi"}
 PATIENCE_S = 300.0
 """The first run on a machine compiles the kernels."""
 
@@ -185,7 +186,7 @@ def test_commands_to_a_rig_import_nothing_that_takes_time(free_port: int, python
     assert all("no rig" in line for line in complaints)
     assert len(complaints) == len(commands)
     assert "coldloop" in loaded
-    assert not loaded & (HEAVY - {"pydantic"} | {"plant", "control_plc", "optimizer_plc"})
+    assert not loaded & (HEAVY - {"pydantic"} | SERVICES)
 
 
 @pytest.mark.parametrize("key", ["plant.seed=3", "optimizer_plc.program.solver=osqp", "plat.seed=3"])

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel
 
 from coldloop import __version__
 from coldloop.config import selected
@@ -138,10 +138,8 @@ class ExportedProgram(OptimizerProgram):
 # -- an export for a run -----------------------------------------------------------------------------------------------
 
 
-class _Manifest(BaseModel):
+class _Manifest(BaseModel, extra="ignore", strict=True):
     """Keys of an export's manifest that are read here."""
-
-    model_config = ConfigDict(extra="ignore", strict=True)
 
     format: int
     coldloop: str

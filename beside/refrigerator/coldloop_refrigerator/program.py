@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from coldloop.config import explained
 from coldloop.errors import ModelFileError
@@ -66,10 +66,8 @@ if TYPE_CHECKING:
 REMEDY = "make a new one with `python -m coldloop_refrigerator.model FILE`"
 
 
-class RefrigeratorFile(BaseModel):
+class RefrigeratorFile(BaseModel, frozen=True):
     """The operating point of a refrigerator, and its pressure controller's gains."""
-
-    model_config = ConfigDict(frozen=True)
 
     state_names: tuple[str, ...] = STATE_NAMES
     command_names: tuple[str, ...] = COMMAND_NAMES

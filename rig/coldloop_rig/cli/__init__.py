@@ -155,6 +155,7 @@ MODULE_OF: Final = {name: module for module, names in MODULES.items() for name i
 """Modules of `coldloop_rig.cli.commands`."""
 QUESTION: Final = """Can this predictive controller run on that PLC, and how often should it update?
 A networked PLC rig for fast MPC."""
+VERSION: Final = f"coldloop {__version__} (Python {platform.python_version()})"
 EXTRAS: Final = {
     "CoolProp": "tables", "aiohttp": "hmi", "casadi": "qpoases", "distributed": "studies", "fmpy": "fmu",
     "h5py": "hdf5", "jinja2": "report", "markdown_it": "report", "pandas": "records", "plotly": "report",
@@ -188,11 +189,12 @@ class OneLineParser(argparse.ArgumentParser):
 
 def make_parser(chosen: str | None) -> argparse.ArgumentParser:
     """Return the parser of all commands, with the options of the chosen one; other commands are not imported."""
+    known = chosen in COMMANDS or chosen in _beside()
     parser = OneLineParser(
-        prog="coldloop", description=QUESTION, epilog="" if chosen in command_names() else _by_group(),
+        prog="coldloop", description=QUESTION, epilog="" if known else _by_group(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    parser.add_argument("--version", action="version", version=_version())
+    parser.add_argument("--version", action="version", version=VERSION)
     parser.add_argument(OPTION, metavar="FILE", help="another process than the cold box: a process file, or a"
                         " model file made from one")  # fmt: skip
     parser.set_defaults(execute=None)
@@ -200,23 +202,16 @@ def make_parser(chosen: str | None) -> argparse.ArgumentParser:
     for name in COMMANDS if chosen in COMMANDS else command_names():
         command = commands.add_parser(name)
         if name == chosen:
-            declare, execute, command.description = _command(name)
             with _of_its_package(name):
+                own = f"coldloop_rig.cli.commands.{MODULE_OF.get(name)}"
+                module = import_module(own) if name in COMMANDS else _beside()[name].load()
+                declare, execute = module.COMMANDS[name]
+                said = str(execute.__doc__)
+                command.description = f"`coldloop {name}`: {said[0].lower()}{said[1:]}"
                 declare(command)
-            command.set_defaults(execute=execute)
-    version = commands.add_parser("version")
-    version.set_defaults(execute=_print_version)
+                command.set_defaults(execute=execute)
+    commands.add_parser("version").set_defaults(execute=_print_version)
     return parser
-
-
-def _command(name: str) -> tuple[Any, Any, str]:
-    """Return what declares the options of a command, what does it, and what describes it."""
-    with _of_its_package(name):
-        own = name in COMMANDS
-        module = import_module(f"coldloop_rig.cli.commands.{MODULE_OF[name]}") if own else _beside()[name].load()
-        declare, execute = module.COMMANDS[name]
-        said = str(execute.__doc__)
-        return declare, execute, f"`coldloop {name}`: {said[0].lower()}{said[1:]}"
 
 
 @cache
@@ -269,12 +264,8 @@ def _by_group() -> str:
     )
 
 
-def _version() -> str:
-    return f"coldloop {__version__} (Python {platform.python_version()})"
-
-
 def _print_version(_: argparse.Namespace) -> int:
-    sys.stdout.write(f"{_version()}\n")
+    sys.stdout.write(f"{VERSION}\n")
     return 0
 
 

@@ -7,12 +7,18 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import AbstractContextManager, asynccontextmanager
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
+
+from pydantic import BaseModel, Field
 
 from coldloop.errors import PeerUnreachableError, UsageError
-from coldloop.modbus.settings import PLANT_PORT, Endpoint
+from coldloop.modbus.settings import PLANT_PORT, Endpoint, TlsSettings
+from coldloop.process.settings import InputLimits, RootSettings
+from coldloop.registers.codec import WordOrder
 from coldloop.safety.retained import RetainSettings
-from coldloop_rig.settings import Settings
+
+if TYPE_CHECKING:  # commands to a rig import no service, so that they answer at once
+    from coldloop_rig.settings import Settings
 
 REQUIRED: Final = ("plant", "control_plc")
 """Services of every rig; an optimiser may be somebody else's (`up --without optimizer`)."""
@@ -26,6 +32,33 @@ RETAINING: Final = ("plant", "control_plc")
 """Services that resume after a restart, from a state file."""
 START_PATIENCE_S: Final = 600.0
 """Services that need other kernels than before compile them first, on a slow machine for minutes."""
+
+
+OTHERS: Final = ("session", "telemetry", "hmi")
+"""Sections that a configuration may have and an operator's client does not read."""
+
+
+class RigSection(BaseModel, frozen=True, extra="forbid"):
+    """Section `rig` of the configuration."""
+
+    tls: TlsSettings | None = None
+    """The operator's certificate, for servers with TLS."""
+
+
+class ServerPlace(BaseModel, frozen=True, extra="ignore"):
+    """Keys of a service that its clients need; the other keys are the service's own."""
+
+    word_order: WordOrder = WordOrder.HIGH_FIRST
+
+
+class OperatorSettings(RootSettings):
+    """Keys of a configuration that an operator's client reads."""
+
+    limits: InputLimits = Field(default_factory=InputLimits)
+    plant: ServerPlace = ServerPlace()
+    control_plc: ServerPlace = ServerPlace()
+    optimizer_plc: ServerPlace = ServerPlace()
+    rig: RigSection = RigSection()
 
 
 class RigEndpoints(NamedTuple):
@@ -127,7 +160,7 @@ def fault_injection(part: str) -> Any:  # noqa: ANN401 a class
     return found[part].load()
 
 
-def endpoints_on(ports: Sequence[int], settings: Settings) -> RigEndpoints:
+def endpoints_on(ports: Sequence[int], settings: "Settings") -> RigEndpoints:
     """Return where the services are for the rig, on these ports."""
     ends, tls = [], settings.rig.tls
     for service, port in zip(SERVICES, ports, strict=True):
@@ -137,7 +170,7 @@ def endpoints_on(ports: Sequence[int], settings: Settings) -> RigEndpoints:
     return RigEndpoints(*ends)
 
 
-def retaining(settings: Settings, folder: Path, *, always: bool) -> Settings:
+def retaining(settings: "Settings", folder: Path, *, always: bool) -> "Settings":
     """Return settings with which services retain their state in a folder; what an earlier rig left there is removed.
 
     Unless `always`, those that have a file of their own keep it.
@@ -152,7 +185,7 @@ def retaining(settings: Settings, folder: Path, *, always: bool) -> Settings:
     return settings.model_copy(update=sections)
 
 
-def wired(settings: Settings, endpoints: RigEndpoints, detours: Detours | None = None) -> Settings:
+def wired(settings: "Settings", endpoints: RigEndpoints, detours: Detours | None = None) -> "Settings":
     """Return the settings with the servers on these endpoints and the clients pointed at them, or at the detours."""
 
     def client(endpoint: Endpoint, configured: Endpoint, detour: int | None) -> Endpoint:

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 
 from coldloop.errors import UsageError, printable
 from coldloop.parsing import parsed_json
@@ -66,10 +66,8 @@ MOST_LISTED: Final = 500_000
 Ticks = Annotated[int, Field(ge=0, le=LONGEST_TICKS)]
 
 
-class _Part(BaseModel):
+class _Part(BaseModel, extra="allow", strict=True):
     """A part of a manifest, with what those who read it count on."""
-
-    model_config = ConfigDict(extra="allow", strict=True)
 
 
 class _Hashes(_Part):

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Final, Literal, NamedTuple, Self
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, FiniteFloat, model_validator
 
 from coldloop.process.declaration import Process
 from coldloop.process.sections import Range
@@ -96,10 +96,8 @@ def _known_name(name: str) -> str:
 Delay = Annotated[FiniteFloat, within(lambda process: (0, 345_600 * process.tick_s))]
 
 
-class RuleSettings(BaseModel):
+class RuleSettings(BaseModel, frozen=True, extra="forbid"):
     """Changes to the default rule of an alarm; what is not given keeps its default."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     priority: Literal["low", "medium", "high", "critical"] | None = None
     on_delay_s: Delay | None = None

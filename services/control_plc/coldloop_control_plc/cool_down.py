@@ -13,17 +13,15 @@ Pure: measured outputs in, wanted inputs out. How far the turbine may open is it
 from collections.abc import Collection, Sequence
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import CoolDownStep
 from coldloop.safety.writers import Inputs
 
 
-class CoolDownSettings(BaseModel):
+class CoolDownSettings(BaseModel, frozen=True, extra="forbid"):
     """Settings of the cool-down: when it begins, and when its steps end."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     warm_k: Annotated[float, Field(ge=5, le=300)] = 20.0
     """Its temperature at the beginning of a session, or after a restart, above which a bath without liquid is cooled

@@ -4,7 +4,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
+from pydantic import BaseModel, Field, PositiveFloat, model_validator
 
 from coldloop.modbus.settings import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT, Endpoint, TlsSettings
 from coldloop.process.settings import RootSettings
@@ -39,10 +39,8 @@ class PolledOptimizer(Endpoint):
     timeout_s: PositiveFloat = TIMEOUT_S
 
 
-class HttpsSettings(BaseModel):
+class HttpsSettings(BaseModel, frozen=True, extra="forbid"):
     """Files for HTTPS, PEM."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     certificate: Path
     """Certificate, and those that lead to an authority."""
@@ -50,7 +48,7 @@ class HttpsSettings(BaseModel):
     """Its key."""
 
 
-class LoginSettings(BaseModel):
+class LoginSettings(BaseModel, frozen=True, extra="forbid"):
     """Who may do what.
 
     Args:
@@ -61,15 +59,13 @@ class LoginSettings(BaseModel):
         longest_minutes: Every session ends after this time.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     users: Path | None = None
     anonymous_view: bool = True
     idle_minutes: PositiveFloat = 30.0
     longest_minutes: PositiveFloat = 600.0
 
 
-class HmiSection(BaseModel):
+class HmiSection(BaseModel, frozen=True, extra="forbid"):
     """Section `hmi` of the configuration.
 
     Args:
@@ -91,8 +87,6 @@ class HmiSection(BaseModel):
         connections: Most connections at a time; one that waits gives way to a new one. With all else that is open,
             fewer than the system's limit of open files.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=0xFFFF)] = PAGE_PORT

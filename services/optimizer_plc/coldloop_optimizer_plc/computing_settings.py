@@ -12,7 +12,7 @@ from functools import cached_property
 from importlib.metadata import entry_points
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, field_validator, model_validator
+from pydantic import BaseModel, Field, PositiveFloat, field_validator, model_validator
 
 from coldloop.errors import ConfigurationError, foreign
 from coldloop.process.declaration import Process
@@ -343,10 +343,8 @@ class DaqpSettings(ProcessSettings):
     """One solve in an updating period of 5 s at P = 1: an oracle's time, not a measured one."""
 
 
-class OutsideSettings(BaseModel):
+class OutsideSettings(BaseModel, frozen=True, extra="forbid"):
     """Parts that are installed beside this package, by the names of entry points: `coldloop.solvers` and so on."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     solver: str = ""
     """Used instead of `optimizer_plc.program.solver`."""
@@ -422,10 +420,8 @@ class InteriorPointSettings(ProcessSettings):
     """From an upper bound of our code's 78,769 operations, 0.149 s at 0.529 Mflop/s (`docs/budget.md`)."""
 
 
-class HybridSettings(BaseModel):
+class HybridSettings(BaseModel, frozen=True, extra="forbid"):
     """Settings of the choice between the interior-point method and the ODE-based solver."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     switch: Annotated[float, Field(gt=1.0)] = 2.0
     """Cost of a guess over that of the last answer from which on the interior-point method gets the problem."""

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Annotated, Final, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, StringConstraints
+from pydantic import BaseModel, StringConstraints
 from pymodbus.constants import DeviceInformation
 from pymodbus.pdu.mei_message import ReadDeviceInformationRequest, ReadDeviceInformationResponse
 
@@ -90,10 +90,8 @@ _REGULAR_CONFORMITY: Final = 0x82
 _ObjectText = Annotated[str, StringConstraints(max_length=240, pattern=r"^[ -~]*$")]
 
 
-class DeviceIdentity(BaseModel):
+class DeviceIdentity(BaseModel, frozen=True, extra="forbid"):
     """Who a server says it is. Without `url` only the basic objects exist."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     vendor: _ObjectText = "Coldloop"
     product: _ObjectText

@@ -15,7 +15,7 @@ LOOPBACK: Final[Networks] = (IPv4Network("127.0.0.0/8"), IPv6Network("::1/128"))
 EVERYBODY: Final[Networks] = (IPv4Network("0.0.0.0/0"), IPv6Network("::/0"))
 
 
-class AccessSettings(BaseModel):
+class AccessSettings(BaseModel, frozen=True, extra="forbid"):
     """Where the clients of each role are, and who may read. A client may have several roles; who has one may read.
 
     None of this counts with TLS: there the client's certificate says its role, and who has a certificate may read.
@@ -27,15 +27,13 @@ class AccessSettings(BaseModel):
         readers: Who may read, without a role.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     control: Networks = LOOPBACK
     optimizer: Networks = LOOPBACK
     operator: Networks = LOOPBACK
     readers: Networks = EVERYBODY
 
 
-class TlsSettings(BaseModel):
+class TlsSettings(BaseModel, frozen=True, extra="forbid"):
     """Files for Modbus/TCP Security, all PEM; `coldloop certificates` makes a set.
 
     Args:
@@ -46,8 +44,6 @@ class TlsSettings(BaseModel):
             when the list has expired.
         warn_days: How long before one of these files expires there is a warning, days.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     certificate: Path
     key: Path

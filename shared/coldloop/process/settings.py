@@ -222,10 +222,8 @@ def _named(value: object) -> object:
     return SHIPPED_MODELS.get(value, value) if isinstance(value, str) else value
 
 
-class ModelSettings(BaseModel):
+class ModelSettings(BaseModel, frozen=True, extra="forbid"):
     """The LTI model file, downloaded into both PLCs."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     file: Annotated[Path, BeforeValidator(_named)] = made_by(_MODEL.get)
     """A file, or `cold-box` or `refrigerator` for one that is shipped. It says which process it is."""

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel
 
 from coldloop.errors import ColdloopError
 from coldloop.parsing import parsed_json
@@ -40,10 +40,8 @@ class RetainedStateError(ColdloopError):
     """A retained state cannot be trusted, or cannot be written."""
 
 
-class RetainSettings(BaseModel):
+class RetainSettings(BaseModel, frozen=True, extra="forbid"):
     """Folder of the retained state."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     file: Path | None = None
     """None keeps nothing: a restarted service has no state."""

@@ -20,8 +20,7 @@ from coldloop_rig.cli import process_setting
 
 if TYPE_CHECKING:
     from coldloop.config import Configuration
-    from coldloop_rig.cosim.wiring import RigEndpoints
-    from coldloop_rig.operator_settings import OperatorSettings
+    from coldloop_rig.cosim.wiring import OperatorSettings, RigEndpoints
     from coldloop_rig.settings import Settings
 
 
@@ -313,7 +312,7 @@ def operator_settings(options: argparse.Namespace) -> "OperatorSettings":
         UsageError: A key was set that has no effect on it.
     """
     from coldloop.config import load_configuration
-    from coldloop_rig.operator_settings import OTHERS, OperatorSettings
+    from coldloop_rig.cosim.wiring import OTHERS, OperatorSettings
 
     assignments = [*options.assignments, *vars(options).get("further_assignments", ())]
     site = process_setting(assignments) | (_tls_site(options.tls) if options.tls is not None else {})
