@@ -6,7 +6,7 @@ import contextlib
 import csv
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TextIO
@@ -96,7 +96,13 @@ async def _show_journal(options: argparse.Namespace) -> None:
     from coldloop.operating.observer import JournalReader
     from coldloop.registers.maps import maps_of
 
-    process, place = _place(options)
+    settings = operator_settings(options)
+    process = settings.process
+    if options.endpoint is not None and (options.rig or options.port_base):
+        raise UsageError("HOST:PORT, --rig and --port-base: give one of them")
+    if options.endpoint is not None:
+        options.rig = [options.endpoint] * len(SERVICES)
+    place: Endpoint = getattr(rig_endpoints(options, settings), options.service)
     client = RegisterClient.at(maps_of(process).by_service[options.service], place)
     reader = JournalReader(client, options.since.number, options.kind)
     output = _CsvFile(options.csv, process) if options.csv else _Lines(process)
@@ -108,39 +114,23 @@ async def _show_journal(options: argparse.Namespace) -> None:
         output.close()
 
 
-def _place(options: argparse.Namespace) -> "tuple[Process, Endpoint]":
-    """Return the process, and the endpoint of the service whose journal is read."""
-    settings = operator_settings(options)
-    if options.endpoint is not None and (options.rig or options.port_base):
-        raise UsageError("HOST:PORT, --rig and --port-base: give one of them")
-    if options.endpoint is not None:
-        options.rig = [options.endpoint] * len(SERVICES)
-    place: Endpoint = getattr(rig_endpoints(options, settings), options.service)
-    return settings.process, place
-
-
 async def _copy(reader: "JournalReader", options: argparse.Namespace, output: "_Lines | _CsvFile", peer: str) -> None:
     """Read once, or again and again, and say what cannot be read."""
     warned: set[str] = set()
     while True:
         events = await reader.read_on()
-        for warning in _warnings(reader, peer):
-            if warning not in warned:
+        for happened, warning in (
+            (reader.limited, f"no operator role at {peer}: only its last 256 events can be read"),
+            (reader.missed, f"{reader.missed} events are no longer kept"),
+            (reader.restarted, f"{peer} was restarted, and numbers its events from 1 again: it retains no state"),
+        ):
+            if happened and warning not in warned:
                 warned.add(warning)
                 sys.stderr.write(f"coldloop: {warning}\n")
         output.write([event for event in events if event.utc + event.milliseconds / 1000 >= options.since.utc])
         if not options.follow:
             return
         await asyncio.sleep(LOOK_AGAIN_S)
-
-
-def _warnings(reader: "JournalReader", peer: str) -> Iterator[str]:
-    if reader.limited:
-        yield f"no operator role at {peer}: only its last 256 events can be read"
-    if reader.missed:
-        yield f"{reader.missed} events are no longer kept"
-    if reader.restarted:
-        yield f"{peer} was restarted, and numbers its events from 1 again: it retains no state"
 
 
 class _Lines:
@@ -173,43 +163,36 @@ class _CsvFile:
 
     def write(self, events: "Sequence[Event]") -> None:
         """Append events."""
+        from coldloop.service.journal import describe, utc_text
+
         present = self._path.exists()
+        texts = [describe(event, self._process) for event in events]
+        rows = [
+            (event.number, event.boot, utc_text(event), event.tick, f"{event.tick * self._process.tick_s:.2f}",
+             text.kind, text.subject, text.cause, text.value, text.who)
+            for event, text in zip(events, texts, strict=True)
+        ]  # fmt: skip
         try:
             if self._file is None:
                 self._file = self._path.open("w", encoding="utf-8", newline="")
                 csv.writer(self._file, lineterminator="\n").writerow(COLUMNS)
-            csv.writer(self._file, lineterminator="\n").writerows(_cells(event, self._process) for event in events)
+            csv.writer(self._file, lineterminator="\n").writerows(rows)
             self._file.flush()
         except OSError as error:
-            self._give_up(remove=not present)
+            with contextlib.suppress(OSError):  # without what could not be written
+                if self._file is not None:
+                    self._file.close()
+            self._file = None
+            if not present:
+                self._path.unlink(missing_ok=True)
             raise ResultsError(f"{self._path}: {error.strerror}; choose another --csv") from None
         self._events += len(events)
-
-    def _give_up(self, *, remove: bool) -> None:
-        """Close the file without what could not be written."""
-        with contextlib.suppress(OSError):
-            if self._file is not None:
-                self._file.close()
-        self._file = None
-        if remove:
-            self._path.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Close the file, and say what is in it."""
         if self._file is not None:
             self._file.close()
             sys.stdout.write(f"{self._events} events in {self._path}\n")
-
-
-def _cells(event: "Event", process: "Process") -> list[str]:
-    from coldloop.service.journal import describe, utc_text
-
-    text = describe(event, process)
-    time = f"{event.tick * process.tick_s:.2f}"
-    return [
-        str(event.number), str(event.boot), utc_text(event), str(event.tick), time, text.kind, text.subject, text.cause,
-        text.value, text.who,
-    ]  # fmt: skip
 
 
 def _declare_certificates(parser: argparse.ArgumentParser) -> None:

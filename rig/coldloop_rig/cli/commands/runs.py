@@ -115,7 +115,15 @@ def _do(job: "Job", options: argparse.Namespace, figure: "FigureProcess") -> int
     _tell(out, summary, job.effective.settings.process)
     if not summary["failed_updates"]:
         return 0
-    sys.stderr.write(f"coldloop: {_failure(summary, job)}\n")
+    from coldloop.process.lti_model import load
+    from coldloop_rig.process_file.judgement import unheld
+
+    failed, settings = summary["failed_updates"], job.effective.settings
+    sys.stderr.write("coldloop: " + "; ".join(filter(None, (
+        f"{failed} of {failed + summary['updates']} updates have no answer: what the optimiser computed is not finite",
+        unheld(settings.process.banded, load(settings.model.file).A),
+        "`coldloop docs fail-safe#no-answer`",
+    ))) + "\n")  # fmt: skip
     return NOT_FINITE
 
 
@@ -131,18 +139,6 @@ def _progress(job: "Job") -> "Iterator[list[Sink]]":
 
     with RunProgress(job.scenario.ticks, job.effective.settings.process) as progress:
         yield [progress]
-
-
-def _failure(summary: dict[str, Any], job: "Job") -> str:
-    from coldloop.process.lti_model import load
-    from coldloop_rig.process_file.judgement import unheld
-
-    failed, model = summary["failed_updates"], load(job.effective.settings.model.file)
-    return "; ".join(filter(None, (
-        f"{failed} of {failed + summary['updates']} updates have no answer: what the optimiser computed is not finite",
-        unheld(job.effective.settings.process.banded, model.A),
-        "`coldloop docs fail-safe#no-answer`",
-    )))  # fmt: skip
 
 
 def _tell(out: Path, summary: dict[str, Any], process: "Process") -> None:
@@ -171,22 +167,18 @@ def execute_record(options: argparse.Namespace) -> int:
 
     It leaves the folder that a run leaves; `coldloop page FOLDER` replays it.
     """
-    from coldloop_rig.figures.worker import FigureProcess
-
-    with FigureProcess(options.figures) as figure:
-        return _do(_record_job(options), options, figure)
-
-
-def _record_job(options: argparse.Namespace) -> "Job":
     from coldloop_rig.cosim.networked_run import as_attached, session_under_way
     from coldloop_rig.cosim.scenario import Job
+    from coldloop_rig.figures.worker import FigureProcess
     from coldloop_rig.results.recording import Way
 
-    effective = configuration(options)
-    ends = tuple(rig_endpoints(options, effective.settings))
-    effective = as_attached(effective, ends)
-    ticks = options.duration.ticks(effective.settings.process.tick_s)
-    return Job(effective, session_under_way(effective, ends).scenario(ticks), Way.RECORDED, ends)
+    with FigureProcess(options.figures) as figure:
+        effective = configuration(options)
+        ends = tuple(rig_endpoints(options, effective.settings))
+        effective = as_attached(effective, ends)
+        ticks = options.duration.ticks(effective.settings.process.tick_s)
+        job = Job(effective, session_under_way(effective, ends).scenario(ticks), Way.RECORDED, ends)
+        return _do(job, options, figure)
 
 
 def _declare_rerun(parser: argparse.ArgumentParser) -> None:
@@ -238,7 +230,7 @@ def _declare_report(parser: argparse.ArgumentParser) -> None:
 def execute_report(options: argparse.Namespace) -> int:
     """One HTML page of a recorded run, with interactive plots, alarms and settings."""
     from coldloop.text_file import require_regular_file, whole_text
-    from coldloop_rig.figures.run_page import run_page
+    from coldloop_rig.figures.plot import run_page
     from coldloop_rig.results.folders import writing
 
     path: Path = options.out or options.run / "report.html"
