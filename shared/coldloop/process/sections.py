@@ -9,16 +9,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, Final, Self
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    FiniteFloat,
-    NonNegativeFloat,
-    PositiveFloat,
-    field_validator,
-    model_validator,
-)
+import pydantic
+from pydantic import Field, FiniteFloat, NonNegativeFloat, PositiveFloat, model_validator
 
 LOAD_IN_WATTS: Final = "load_w"
 """Column of a load in watts; in a file it is understood for any load."""
@@ -34,10 +26,10 @@ Limits = tuple[int | FiniteFloat, int | FiniteFloat]
 """Limits of registers, whose digest knows whole numbers."""
 
 
-class Section(BaseModel):
+class Section(pydantic.BaseModel):
     """A section of a process file."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", ignored_types=(cached_property,))
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", ignored_types=(cached_property,))
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """Return a copy with changes, without what was computed of the original."""
@@ -414,7 +406,7 @@ class Instants(Section):
     """Sampling periods at which bands and setpoints count, rising, within the horizon; `coldloop design` compares sets.
     """
 
-    _rising = field_validator("decision_instants", "constraint_instants")(rising_instants)
+    _rising = pydantic.field_validator("decision_instants", "constraint_instants")(rising_instants)
 
     @model_validator(mode="after")
     def _within_the_horizon(self) -> Self:

@@ -14,20 +14,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    FiniteFloat,
-    GetCoreSchemaHandler,
-    GetJsonSchemaHandler,
-    ModelWrapValidatorHandler,
-    PositiveFloat,
-    PrivateAttr,
-    ValidationError,
-    model_validator,
-)
+import pydantic
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
 from pydantic_core import CoreSchema, to_jsonable_python
 from pydantic_core.core_schema import no_info_after_validator_function
 
@@ -100,7 +88,7 @@ class Checked:
     """Raises ValueError."""
     shown: Callable[[Process], dict[str, Any]]
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401
+    def __get_pydantic_core_schema__(self, source: Any, handler: pydantic.GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401
         """Check what the type lets pass."""
 
         def checked(value: Any) -> Any:  # noqa: ANN401 of any type
@@ -109,7 +97,9 @@ class Checked:
 
         return no_info_after_validator_function(checked, handler(source))
 
-    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: pydantic.GetJsonSchemaHandler
+    ) -> dict[str, Any]:
         """Show it."""
         return {**handler(schema), **self.shown(_PROCESS.get())}
 
@@ -159,7 +149,7 @@ class ProcessSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    _process: Process = PrivateAttr(default_factory=settings_process)
+    _process: Process = pydantic.PrivateAttr(default_factory=settings_process)
 
     @property
     def process(self) -> Process:
@@ -240,12 +230,12 @@ class RootSettings(ProcessSettings):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _for_its_process(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:  # noqa: ANN401 as given
+    def _for_its_process(cls, values: Any, handler: pydantic.ModelWrapValidatorHandler[Self]) -> Self:  # noqa: ANN401 as given
         if not isinstance(values, Mapping):
             return handler(values)
         try:
             model = ModelSettings.model_validate(values.get("model", {}))
-        except ValidationError:
+        except pydantic.ValidationError:
             return handler(values)  # which says so
         if model.file == Path() or "\0" in str(model.file):
             return handler(values)  # no file: that is said of any key

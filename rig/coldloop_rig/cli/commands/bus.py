@@ -12,19 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TextIO
 
 from coldloop.errors import ResultsError, UsageError
-from coldloop_rig.cli.commands.options import (
-    REGISTER_FORMATS,
-    SERVICES,
-    TAG_FORMATS,
-    Command,
-    HostPort,
-    add_rig_options,
-    endpoint,
-    number_within,
-    operator_settings,
-    port_base,
-    rig_endpoints,
-)
+from coldloop_rig.cli.commands import options as common
 from coldloop_rig.interruption import run_until_interrupted
 
 if TYPE_CHECKING:
@@ -40,10 +28,10 @@ LOOK_AGAIN_S: Final = 1.0
 
 
 def _declare_events(parser: argparse.ArgumentParser) -> None:
-    add_rig_options(parser)
-    parser.add_argument("endpoint", nargs="?", type=endpoint, metavar="HOST:PORT",
+    common.add_rig_options(parser)
+    parser.add_argument("endpoint", nargs="?", type=common.endpoint, metavar="HOST:PORT",
                         help="where the service is, of a rig that is not up here")  # fmt: skip
-    parser.add_argument("--service", choices=SERVICES, default="control_plc", help="default: control_plc")
+    parser.add_argument("--service", choices=common.SERVICES, default="control_plc", help="default: control_plc")
     parser.add_argument("--kind", type=_kinds, default=(), metavar="KIND,...",
                         help="only events of these kinds, such as alarm-raised,mode")  # fmt: skip
     parser.add_argument("--since", type=_since, default=Since(1, 0.0), metavar="NUMBER|TIME",
@@ -96,13 +84,13 @@ async def _show_journal(options: argparse.Namespace) -> None:
     from coldloop.operating.observer import JournalReader
     from coldloop.registers.maps import maps_of
 
-    settings = operator_settings(options)
+    settings = common.operator_settings(options)
     process = settings.process
     if options.endpoint is not None and (options.rig or options.port_base):
         raise UsageError("HOST:PORT, --rig and --port-base: give one of them")
     if options.endpoint is not None:
-        options.rig = [options.endpoint] * len(SERVICES)
-    place: Endpoint = getattr(rig_endpoints(options, settings), options.service)
+        options.rig = [options.endpoint] * len(common.SERVICES)
+    place: Endpoint = getattr(common.rig_endpoints(options, settings), options.service)
     client = RegisterClient.at(maps_of(process).by_service[options.service], place)
     reader = JournalReader(client, options.since.number, options.kind)
     output = _CsvFile(options.csv, process) if options.csv else _Lines(process)
@@ -212,7 +200,7 @@ def _host(text: str) -> str:
 
 
 def _days(text: str) -> int:
-    return number_within(text, 1, 3650, "a number of days from 1 to 3650")
+    return common.number_within(text, 1, 3650, "a number of days from 1 to 3650")
 
 
 def execute_certificates(options: argparse.Namespace) -> int:
@@ -237,11 +225,11 @@ def execute_certificates(options: argparse.Namespace) -> int:
 
 
 def _declare_registers(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--format", choices=(*REGISTER_FORMATS, *TAG_FORMATS), default="table",
+    parser.add_argument("--format", choices=(*common.REGISTER_FORMATS, *common.TAG_FORMATS), default="table",
                         help="fuxa, grafana, ignition, node-red, telegraf: files for these programs")  # fmt: skip
-    parser.add_argument("--service", choices=SERVICES, help="default: all")
+    parser.add_argument("--service", choices=common.SERVICES, help="default: all")
     parser.add_argument("--host", default="127.0.0.1", help="where these programs find the rig (default: 127.0.0.1)")
-    parser.add_argument("--port-base", type=port_base, metavar="PORT", help="first of three consecutive ports")
+    parser.add_argument("--port-base", type=common.port_base, metavar="PORT", help="first of three consecutive ports")
 
 
 def execute_registers(options: argparse.Namespace) -> int:
@@ -259,13 +247,13 @@ def execute_registers(options: argparse.Namespace) -> int:
     from coldloop_rig.live.started_rigs import ports_from
 
     ports = ports_from(options.port_base)
-    places = {service: HostPort(options.host, port) for service, port in zip(IN_ORDER, ports, strict=True)}
+    places = {service: common.HostPort(options.host, port) for service, port in zip(IN_ORDER, ports, strict=True)}
     sys.stdout.write(EXPORTS[options.format](maps, places))
     return 0
 
 
 COMMANDS: Final = {
-    "events": Command(_declare_events, execute_events),
-    "certificates": Command(_declare_certificates, execute_certificates),
-    "registers": Command(_declare_registers, execute_registers),
+    "events": common.Command(_declare_events, execute_events),
+    "certificates": common.Command(_declare_certificates, execute_certificates),
+    "registers": common.Command(_declare_registers, execute_registers),
 }

@@ -10,25 +10,7 @@ from typing import TYPE_CHECKING, Final
 from coldloop.errors import UsageError
 from coldloop.process.updating_periods import LONGEST_TICKS
 from coldloop.service.command_line import add_configuration_options
-from coldloop_rig.cli.commands.options import (
-    PLACES,
-    WITHOUT,
-    Command,
-    add_loop_options,
-    add_rig_options,
-    add_to_subcommands,
-    check_load,
-    configuration,
-    exported,
-    first_port_here,
-    operator_settings,
-    port_base,
-    refuse_ineffective,
-    rig_endpoints,
-    rig_services,
-    say,
-    tell,
-)
+from coldloop_rig.cli.commands import options as common
 from coldloop_rig.interruption import run_until_interrupted
 from coldloop_rig.text_tables import coloured, cut, fitted, width
 
@@ -42,15 +24,15 @@ if TYPE_CHECKING:
 def _declare_up(parser: argparse.ArgumentParser) -> None:
     add_configuration_options(parser)
     parser.add_argument("--factor", type=float, help="seconds of plant time per second (default: 1)")
-    add_loop_options(parser, "or, its end held, ")
+    common.add_loop_options(parser, "or, its end held, ")
     parser.add_argument("--tls", type="folder", metavar="FOLDER",
                         help="Modbus/TCP Security with what `coldloop certificates --out FOLDER` made")  # fmt: skip
-    parser.add_argument("--port-base", type=port_base, metavar="PORT",
+    parser.add_argument("--port-base", type=common.port_base, metavar="PORT",
                         help="first of three consecutive ports (default: 5020)")  # fmt: skip
     parser.add_argument("--page", action="store_true", help="serve the operator's page, too")
     parser.add_argument("--page-port", type=int, metavar="PORT", help="its port (default: 8020); implies --page")
     other = parser.add_mutually_exclusive_group()
-    other.add_argument("--without", choices=WITHOUT, metavar="|".join(WITHOUT),
+    other.add_argument("--without", choices=common.WITHOUT, metavar="|".join(common.WITHOUT),
                        help="leave its place to a client of your own (`coldloop docs your-optimiser`)")  # fmt: skip
     other.add_argument("--optimizer", type="export", metavar="export:FOLDER",
                        help="the exported optimiser in the place of ours (`coldloop docs plc-export`)")  # fmt: skip
@@ -64,17 +46,17 @@ def _declare_up(parser: argparse.ArgumentParser) -> None:
 
 def execute_up(options: argparse.Namespace) -> int:
     """The rig on fixed ports, in real time, until Ctrl-C."""
-    check_load(options.load)
+    common.check_load(options.load)
     from coldloop_rig.live.started_rigs import RigLock, check_ports, detached, ports_from
     from coldloop_rig.runs.running import check_certificates, remarks
 
-    effective = configuration(options)
-    refuse_ineffective(
-        effective, {**dict.fromkeys(PLACES, "give --port-base"), "session.autostart": "it begins a session"}
+    effective = common.configuration(options)
+    common.refuse_ineffective(
+        effective, {**dict.fromkeys(common.PLACES, "give --port-base"), "session.autostart": "it begins a session"}
     )
     check_certificates(effective.settings)
     told = [] if options.without else remarks(effective)
-    optimizer = exported(options.optimizer, effective.settings)
+    optimizer = common.exported(options.optimizer, effective.settings)
     ports = ports_from(options.port_base)
     lock = RigLock(ports[0], options.locked)
     check_ports(ports)
@@ -89,7 +71,7 @@ def execute_up(options: argparse.Namespace) -> int:
     from coldloop_rig.live.up import UpRig
 
     for line in told:
-        tell(line)
+        common.tell(line)
     services = REQUIRED if options.without else SERVICES
     rig = UpRig(effective.settings, ports, options.tls, page=page, cuttable=options.cuttable, services=services,
                 optimizer=optimizer)  # fmt: skip
@@ -101,13 +83,13 @@ def execute_down(options: argparse.Namespace) -> int:
     """Ends a rig that `coldloop up` has started here."""
     from coldloop_rig.live.started_rigs import take_down
 
-    pid = take_down(first_port_here(options), patience_s=15.0)
+    pid = take_down(common.first_port_here(options), patience_s=15.0)
     sys.stdout.write(f"the rig is down (process {pid})\n")
     return 0
 
 
 def _declare_status(parser: argparse.ArgumentParser) -> None:
-    add_rig_options(parser)
+    common.add_rig_options(parser)
     parser.add_argument("--follow", action="store_true", help="a line a second until Ctrl-C")
 
 
@@ -121,15 +103,15 @@ async def _show_status(options: argparse.Namespace) -> None:
     from coldloop.operating.execution import clients_of
     from coldloop_rig.live.status import colour, line, page, read_status
 
-    settings = operator_settings(options)
-    endpoints = rig_endpoints(options, settings)
-    clients = clients_of({each: getattr(endpoints, each) for each in rig_services(options)}, settings.process)
+    settings = common.operator_settings(options)
+    endpoints = common.rig_endpoints(options, settings)
+    clients = clients_of({each: getattr(endpoints, each) for each in common.rig_services(options)}, settings.process)
     try:
         status = await read_status(clients)
         if not options.follow:
             sys.stdout.write(fitted(page(status), width()))
         while options.follow:
-            say(coloured(cut(line(status), width()), colour(status)))
+            common.say(coloured(cut(line(status), width()), colour(status)))
             await asyncio.sleep(1.0)
             status = await read_status(clients)
     finally:
@@ -140,7 +122,7 @@ async def _show_status(options: argparse.Namespace) -> None:
 def _declare_set(parser: argparse.ArgumentParser) -> None:
     from coldloop.process.settings import settings_process
 
-    add_rig_options(parser)
+    common.add_rig_options(parser)
     process = settings_process()
     number = f"{_unit(process)}, or a CSV file time_s,{process.load.column}"
     what = parser.add_subparsers(title="what", metavar="WHAT", required=True)
@@ -168,7 +150,7 @@ def _declare_set(parser: argparse.ArgumentParser) -> None:
     acknowledge = what.add_parser("acknowledge", help="an alarm, or all")
     acknowledge.add_argument("alarm", nargs="?", metavar="ALARM", help="such as mode (default: all)")
     acknowledge.set_defaults(document=_acknowledgement)
-    add_to_subcommands(what)
+    common.add_to_subcommands(what)
 
 
 def _unit(process: "Process") -> str:
@@ -200,12 +182,12 @@ def execute_set(options: argparse.Namespace) -> int:
 async def _send(options: argparse.Namespace) -> None:
     from coldloop_rig.live.status import ask
 
-    settings = operator_settings(options)
+    settings = common.operator_settings(options)
     services, work = _stream(options, settings.process) if _is_stream(options) else _command(options, settings.limits)
-    there = rig_services(options)
+    there = common.rig_services(options)
     concerned = [service for service in services if service in there]
     text = await ask(
-        rig_endpoints(options, settings), settings.process, concerned, work, limited=not _is_stream(options)
+        common.rig_endpoints(options, settings), settings.process, concerned, work, limited=not _is_stream(options)
     )
     sys.stdout.write(f"{text}\n")
 
@@ -229,7 +211,7 @@ def _stream(options: argparse.Namespace, process: "Process") -> tuple[tuple[str,
     if not Path(options.new_load).is_file():
         raise UsageError(f"load '{options.new_load}': neither {_unit(process)} nor a file")
     load = read_load_file(Path(options.new_load), process)
-    return ("plant",), lambda clients: stream_load(clients, load, _tick(options), tell)
+    return ("plant",), lambda clients: stream_load(clients, load, _tick(options), common.tell)
 
 
 def _is_stream(options: argparse.Namespace) -> bool:
@@ -272,7 +254,7 @@ SENSOR_FAULTS: Final = {"none": 0, "dead": 1, "stuck": 2}
 
 
 def _declare_fault(parser: argparse.ArgumentParser) -> None:
-    add_rig_options(parser)
+    common.add_rig_options(parser)
     what = parser.add_subparsers(title="what", metavar="WHAT", required=True)
     kill = what.add_parser("kill", help="kill a service (SIGKILL); `coldloop up` restarts it")
     kill.add_argument("service", choices=SERVICES, metavar="|".join(SERVICES))
@@ -289,7 +271,7 @@ def _declare_fault(parser: argparse.ArgumentParser) -> None:
     sensor.add_argument("output", metavar="OUTPUT", help="its name")
     sensor.add_argument("shows", metavar="dead|stuck|VALUE|none", help="none ends the fault")
     sensor.set_defaults(fault=_sensor)
-    add_to_subcommands(what)
+    common.add_to_subcommands(what)
 
 
 def _real_time(text: str) -> float:
@@ -308,22 +290,22 @@ def execute_fault(options: argparse.Namespace) -> int:
     A service that is killed is started again by `coldloop up`. More can happen to links by `coldloop proxy` and
     `chaos`.
     """
-    operator_settings(options)  # report an unreadable configuration even if the fault does not need it
+    common.operator_settings(options)  # report an unreadable configuration even if the fault does not need it
     return 130 if run_until_interrupted(lambda: options.fault(options)) else 0
 
 
 async def _kill(options: argparse.Namespace) -> None:
     from coldloop_rig.live.started_rigs import process_of
 
-    process_of(first_port_here(options), options.service).send(signal.SIGKILL)
+    process_of(common.first_port_here(options), options.service).send(signal.SIGKILL)
     sys.stdout.write(f"killed the {options.service} service; `coldloop up` restarts it\n")
 
 
 async def _pause(options: argparse.Namespace) -> None:
     from coldloop_rig.live.started_rigs import pause, process_of
 
-    process = process_of(first_port_here(options), options.service)
-    tell(f"the {options.service} service is suspended for {options.seconds:g} s (Ctrl-C resumes it)")
+    process = process_of(common.first_port_here(options), options.service)
+    common.tell(f"the {options.service} service is suspended for {options.seconds:g} s (Ctrl-C resumes it)")
     runs = await pause(process, options.seconds)
     sys.stdout.write(f"the {options.service} service {'runs again' if runs else 'has ended meanwhile'}\n")
 
@@ -331,7 +313,7 @@ async def _pause(options: argparse.Namespace) -> None:
 async def _cut(options: argparse.Namespace) -> None:
     from coldloop_rig.live.up import cut
 
-    await cut(first_port_here(options), options.link, options.seconds)
+    await cut(common.first_port_here(options), options.link, options.seconds)
     sys.stdout.write(f"the {options.link} link is cut for {options.seconds:g} s\n")
 
 
@@ -340,13 +322,13 @@ async def _sensor(options: argparse.Namespace) -> None:
     from coldloop.operating.execution import WORK
     from coldloop_rig.live.status import ask
 
-    settings = operator_settings(options)
+    settings = common.operator_settings(options)
     process = settings.process
     if options.output not in process.output_names:
         raise UsageError(f"unknown output '{options.output}'; choose from {', '.join(process.output_names)}")
     command = read_command({"kind": "sensor_fault", "output": options.output, **_shown(options.shows)}, process)
     services, work = WORK[type(command)]
-    text = await ask(rig_endpoints(options, settings), process, services, lambda clients: work(clients, command))
+    text = await ask(common.rig_endpoints(options, settings), process, services, lambda clients: work(clients, command))
     sys.stdout.write(f"{text}\n")
 
 
@@ -360,7 +342,7 @@ def _shown(text: str) -> dict[str, float]:
 
 
 def _declare_page(parser: argparse.ArgumentParser) -> None:
-    add_rig_options(parser)
+    common.add_rig_options(parser)
     parser.add_argument("runs", nargs="*", type="folder", metavar="RUN",
                         help="folder of a recorded run; two: side by side; none: a rig that is up")  # fmt: skip
     parser.add_argument("--page-port", type=int, metavar="PORT", help="port of the page (default: 8020)")
@@ -372,7 +354,7 @@ def execute_page(options: argparse.Namespace) -> int:
         raise UsageError(f"{len(options.runs)} runs: one is replayed, or two side by side")
     from coldloop_rig.live.up import check_page
 
-    effective = configuration(options).settings
+    effective = common.configuration(options).settings
     check_page(effective.hmi)
     if options.runs:
         return 130 if run_until_interrupted(lambda: _replay(options.runs, effective)) else 0
@@ -384,7 +366,7 @@ async def _replay(folders: list[Path], settings: "Settings") -> None:
     from coldloop_rig.live.recorded_page import RecordedPage
     from coldloop_rig.results.run_folder import RunFolder
 
-    await serve_replays([RecordedPage(RunFolder(folder)) for folder in folders], settings.hmi, say)
+    await serve_replays([RecordedPage(RunFolder(folder)) for folder in folders], settings.hmi, common.say)
 
 
 async def _watch(options: argparse.Namespace, settings: "Settings") -> None:
@@ -393,19 +375,19 @@ async def _watch(options: argparse.Namespace, settings: "Settings") -> None:
     from coldloop_rig.live.started_rigs import make_own_folder
     from coldloop_rig.live.up import pointed_at, with_own_files
 
-    pointed = pointed_at(settings.hmi, rig_endpoints(options, settings))
+    pointed = pointed_at(settings.hmi, common.rig_endpoints(options, settings))
     section, login = with_own_files(pointed, make_own_folder(f"page-{pointed.port}"))
-    say(f"http{'s' if section.https else ''}://{section.host}:{section.port}/")
+    common.say(f"http{'s' if section.https else ''}://{section.host}:{section.port}/")
     if login is not None:
-        say(login.line.strip())
+        common.say(login.line.strip())
     await serve(HmiSettings(model=settings.model, hmi=section))
 
 
 COMMANDS: Final = {
-    "up": Command(_declare_up, execute_up),
-    "down": Command(add_rig_options, execute_down),
-    "status": Command(_declare_status, execute_status),
-    "set": Command(_declare_set, execute_set),
-    "fault": Command(_declare_fault, execute_fault),
-    "page": Command(_declare_page, execute_page),
+    "up": common.Command(_declare_up, execute_up),
+    "down": common.Command(common.add_rig_options, execute_down),
+    "status": common.Command(_declare_status, execute_status),
+    "set": common.Command(_declare_set, execute_set),
+    "fault": common.Command(_declare_fault, execute_fault),
+    "page": common.Command(_declare_page, execute_page),
 }

@@ -10,22 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from coldloop.errors import NOT_FINITE, UsageError
 from coldloop.process.updating_periods import duration
 from coldloop.service.command_line import add_configuration_options
-from coldloop_rig.cli.commands.options import (
-    FIGURE_FORMATS,
-    MODES,
-    OWN_PORTS,
-    PLACES,
-    Command,
-    add_loop_options,
-    add_result_options,
-    add_rig_options,
-    check_load,
-    configuration,
-    endpoint,
-    exported,
-    refuse_ineffective,
-    rig_endpoints,
-)
+from coldloop_rig.cli.commands import options as common
 
 if TYPE_CHECKING:
     from coldloop.process.declaration import Process
@@ -36,22 +21,22 @@ if TYPE_CHECKING:
 
 def _declare_run(parser: argparse.ArgumentParser) -> None:
     add_configuration_options(parser)
-    parser.add_argument("--mode", choices=MODES, help="default: lockstep")
+    parser.add_argument("--mode", choices=common.MODES, help="default: lockstep")
     parser.add_argument("--factor", type=float, help="real time only: seconds of plant time per second (default: 1)")
     way = parser.add_mutually_exclusive_group()
     way.add_argument("--in-process", action="store_true", help="one process and direct calls instead of Modbus/TCP")
-    way.add_argument("--attach", nargs=3, type=endpoint, metavar="HOST:PORT",
+    way.add_argument("--attach", nargs=3, type=common.endpoint, metavar="HOST:PORT",
                      help="use a rig that is up: plant, control PLC, optimiser PLC")  # fmt: skip
     way.add_argument("--optimizer", type="export", metavar="export:FOLDER",
                      help="the exported optimiser in the place of ours (`coldloop docs plc-export`)")  # fmt: skip
     parser.add_argument("--duration", type=duration, help="plant time, such as 2h or 90s (default: that of the load)")
-    add_loop_options(parser, "another draw such as a@2, or ")
-    add_result_options(parser, "<load>")
+    common.add_loop_options(parser, "another draw such as a@2, or ")
+    common.add_result_options(parser, "<load>")
 
 
 def execute_run(options: argparse.Namespace) -> int:
     """One run of the loop, recorded, evaluated and drawn."""
-    check_load(options.load)
+    common.check_load(options.load)
     from coldloop_rig.figures.worker import FigureProcess
 
     with FigureProcess(options.figures) as figure:
@@ -69,7 +54,7 @@ def _run_job(options: argparse.Namespace) -> "Job":
     from coldloop_rig.results.recording import Way
     from coldloop_rig.runs.running import check_certificates, make_scenario
 
-    effective = configuration(options)
+    effective = common.configuration(options)
     settings = effective.settings
     realtime = settings.session.mode == "realtime"
     if options.in_process and realtime:
@@ -87,11 +72,13 @@ def _run_job(options: argparse.Namespace) -> "Job":
             Endpoint(host=end.host, port=end.port, tls=settings.rig.tls, timeout_s=QUIET_S) for end in options.attach
         ]
         return Job(as_attached(effective, ends), scenario, Way.ATTACHED, tuple(ends))
-    refuse_ineffective(effective, {**dict.fromkeys(PLACES, OWN_PORTS), "session.autostart": "it begins a session"})
+    common.refuse_ineffective(
+        effective, {**dict.fromkeys(common.PLACES, common.OWN_PORTS), "session.autostart": "it begins a session"}
+    )
     if options.in_process:
         return Job(effective, scenario, Way.IN_PROCESS)
     check_certificates(settings)
-    return Job(effective, scenario, Way.LOCALHOST, optimizer=exported(options.optimizer, settings))
+    return Job(effective, scenario, Way.LOCALHOST, optimizer=common.exported(options.optimizer, settings))
 
 
 def _do(job: "Job", options: argparse.Namespace, figure: "FigureProcess") -> int:
@@ -156,10 +143,10 @@ def _tell(out: Path, summary: dict[str, Any], process: "Process") -> None:
 
 
 def _declare_record(parser: argparse.ArgumentParser) -> None:
-    add_rig_options(parser)
+    common.add_rig_options(parser)
     parser.add_argument("--duration", type=duration, default=duration("1h"),
                         help="plant time, such as 2h or 90s (default: 1h; Ctrl-C ends it before)")  # fmt: skip
-    add_result_options(parser, "session")
+    common.add_result_options(parser, "session")
 
 
 def execute_record(options: argparse.Namespace) -> int:
@@ -173,8 +160,8 @@ def execute_record(options: argparse.Namespace) -> int:
     from coldloop_rig.results.recording import Way
 
     with FigureProcess(options.figures) as figure:
-        effective = configuration(options)
-        ends = tuple(rig_endpoints(options, effective.settings))
+        effective = common.configuration(options)
+        ends = tuple(common.rig_endpoints(options, effective.settings))
         effective = as_attached(effective, ends)
         ticks = options.duration.ticks(effective.settings.process.tick_s)
         job = Job(effective, session_under_way(effective, ends).scenario(ticks), Way.RECORDED, ends)
@@ -206,7 +193,7 @@ def execute_rerun(options: argparse.Namespace) -> int:
 
 def _declare_plot(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type="folder", metavar="RUN", help="folder of a run")
-    parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png", "pdf", "svg"],
+    parser.add_argument("--figures", nargs="+", choices=common.FIGURE_FORMATS, default=["png", "pdf", "svg"],
                         metavar="FORMAT", help="png, pdf, svg (default: all)")  # fmt: skip
 
 
@@ -257,7 +244,7 @@ def execute_compare(options: argparse.Namespace) -> int:
 
     if len(options.runs) < 2:
         raise UsageError("compare: name two runs or more")
-    if options.out.suffix.removeprefix(".") not in FIGURE_FORMATS:
+    if options.out.suffix.removeprefix(".") not in common.FIGURE_FORMATS:
         raise UsageError(f"--out {options.out}: name a .png, .pdf or .svg file")
     if options.out.exists() and not options.force:
         raise UsageError(f"{options.out}: exists; name another figure with --out, or overwrite with --force")
@@ -266,10 +253,10 @@ def execute_compare(options: argparse.Namespace) -> int:
 
 
 COMMANDS: Final = {
-    "run": Command(_declare_run, execute_run),
-    "record": Command(_declare_record, execute_record),
-    "rerun": Command(_declare_rerun, execute_rerun),
-    "plot": Command(_declare_plot, execute_plot),
-    "report": Command(_declare_report, execute_report),
-    "compare": Command(_declare_compare, execute_compare),
+    "run": common.Command(_declare_run, execute_run),
+    "record": common.Command(_declare_record, execute_record),
+    "rerun": common.Command(_declare_rerun, execute_rerun),
+    "plot": common.Command(_declare_plot, execute_plot),
+    "report": common.Command(_declare_report, execute_report),
+    "compare": common.Command(_declare_compare, execute_compare),
 }
