@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from enum import IntFlag
 from typing import Annotated, Any, Final, NamedTuple, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from coldloop.kernels.single_precision import single
 from coldloop.process.cold_box import COLD_BOX
@@ -137,10 +137,8 @@ def next_generation(generation: int) -> int:
 Count = Annotated[int, Field(ge=0, lt=2**32)]
 
 
-class RetainedPlantState(BaseModel):
+class RetainedPlantState(BaseModel, frozen=True, extra="forbid"):
     """The state of a rack between two ticks."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     boot: Count
     events: Annotated[int, Field(ge=0, lt=2**31)]
