@@ -81,7 +81,11 @@ def fitted(text: str, columns: int | None) -> str:
 
 def _fitted(lines: list[str], columns: int, *, table: bool) -> Iterator[str]:
     longest = max(map(len, lines))
-    ends = _column_ends(lines, longest) if table else [2, longest]
+    ends = [2, longest]
+    if table:
+        cells = zip(*(line.ljust(longest) for line in lines), strict=True)
+        filled = "".join(" " if set(column) == {" "} else "x" for column in cells)
+        ends = [*(gap.end() for gap in GAP.finditer(filled)), longest]
     if longest <= columns:
         yield from lines
     elif len(ends) <= 2 or len(lines) == 1:
@@ -94,9 +98,3 @@ def _fitted(lines: list[str], columns: int, *, table: bool) -> Iterator[str]:
             if ends[0] + following - begin > columns:
                 yield from (f"{line[: ends[0]]:{ends[0]}}{line[begin:end]}".rstrip() for line in lines)
                 begin = end
-
-
-def _column_ends(lines: list[str], longest: int) -> list[int]:
-    cells = zip(*(line.ljust(longest) for line in lines), strict=True)
-    filled = "".join(" " if set(column) == {" "} else "x" for column in cells)
-    return [*(gap.end() for gap in GAP.finditer(filled)), longest]

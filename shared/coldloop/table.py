@@ -90,7 +90,14 @@ class Table:
             )
         if not self.rows:
             raise self.error(f"{self.where}: no line of numbers; add some")
-        self._check_quality(set(self.qualities()) - set(places))
+        qualities = set(self.qualities()) - set(places)
+        for line, cells in self.rows if qualities else ():
+            bad = next((place for place in qualities if not is_good(cells[place])), None)
+            if bad is not None:
+                raise self.error(
+                    f"{self.where}, line {line}, {self.names[bad]}: {cells[bad][:QUOTED]!r} is not known as good; "
+                    "`coldloop import` leaves out readings that are not"
+                )
         return [self._numbers(place, name) for place, name in zip(places, wanted, strict=True) if place is not None]
 
     def qualities(self) -> list[int]:
@@ -102,15 +109,6 @@ class Table:
             if "qual" in plain(self.names[place])
             or (any(map(is_good, texts)) and all(text.isdigit() or math.isnan(self.number(text)) for text in texts))
         ]  # fmt: skip
-
-    def _check_quality(self, places: Collection[int]) -> None:
-        for line, cells in self.rows if places else ():
-            bad = next((place for place in places if not is_good(cells[place])), None)
-            if bad is not None:
-                raise self.error(
-                    f"{self.where}, line {line}, {self.names[bad]}: {cells[bad][:QUOTED]!r} is not known as good; "
-                    "`coldloop import` leaves out readings that are not"
-                )
 
     def _numbers(self, place: int, name: str) -> list[float]:
         cells = [(line, cells[place]) for line, cells in self.rows]
@@ -179,8 +177,13 @@ def table_of(
     text = "\n" + text[hint.end() :] if hint else text
     names, head = {plain(name) for name in wanted}, "".join(islice(io.StringIO(text, newline=""), HEAD))
     separators = [hint[1]] if hint else [*SEPARATORS]
-    heads = [(each, _header(list(_rows(head, each, where, error)), names)) for each in separators]
-    separator, at = next(((each, at) for each, at in heads if at is not None), (separators[-1], 0))
+    heads = (
+        (each, at)
+        for each in separators
+        for at, (_, row) in enumerate(_rows(head, each, where, error))
+        if len(row) > 1 and names & {*map(plain, row)}
+    )
+    separator, at = next(heads, (separators[-1], 0))
     before = list(_rows(text, separator, where, error))
     header = [" ".join(name.split()).lstrip("# ") for name in before[at][1]] if before else []
     rows = [(line, row + [""] * (len(header) - len(row))) for line, row in before[at + 1 :] if row[0][:1] != "#"]
@@ -191,11 +194,6 @@ def table_of(
     decimal = _decimal([cell for _, row in rows for cell in row], separator)
     said += ["decimal commas"] if decimal == "," else []
     return Table(where, tuple(header), tuple(rows), decimal, (*notes, *said), error)
-
-
-def _header(rows: Sequence[tuple[int, list[str]]], names: set[str]) -> int | None:
-    """Return which row has one of the names, and others."""
-    return next((at for at, (_, row) in enumerate(rows) if len(row) > 1 and names & {*map(plain, row)}), None)
 
 
 def _rows(text: str, separator: str, where: str, error: type[UsageError]) -> Iterator[tuple[int, list[str]]]:

@@ -33,7 +33,16 @@ def named_process(arguments: Sequence[str]) -> Iterator[list[str]]:
     Raises:
         ColdloopError: There is no such file, or it cannot be made into a model file.
     """
-    left, named = _split(arguments)
+    left, named, rest = list[str](), None, iter(arguments)
+    for argument in rest:
+        if argument == OPTION:
+            named = next(rest, None)
+            if named is None:
+                raise UsageError(f"{OPTION}: name a process file or a model file")
+        elif argument.startswith(f"{OPTION}="):
+            named = argument.removeprefix(f"{OPTION}=")
+        else:
+            left.append(argument)
     model = _configured(left)
     if named is not None:
         from coldloop_rig.process_file.reading import model_file_of  # noqa: PLC0415 most commands are for the cold box
@@ -91,20 +100,6 @@ def process_setting(assignments: Iterable[str]) -> dict[str, tuple[object, str]]
     if any(assignment.partition("=")[0].strip() == MODEL for assignment in assignments):
         raise UsageError(f"--set {MODEL}: {OPTION} names the process; drop one of them")
     return {MODEL: (str(named), OPTION)}
-
-
-def _split(arguments: Sequence[str]) -> tuple[list[str], str | None]:
-    left, named, rest = [], None, iter(arguments)
-    for argument in rest:
-        if argument == OPTION:
-            named = next(rest, None)
-            if named is None:
-                raise UsageError(f"{OPTION}: name a process file or a model file")
-        elif argument.startswith(f"{OPTION}="):
-            named = argument.removeprefix(f"{OPTION}=")
-        else:
-            left.append(argument)
-    return left, named
 
 
 GROUPS: Final = {

@@ -20,11 +20,15 @@ except ImportError:  # Windows: two runs may share a folder
     fcntl = None  # type: ignore[assignment]
 
 
+_LOCKED: Final[dict[tuple[int, int], int]] = {}
+"""Descriptors of the folders that this process has claimed, by device and inode; they are held to its end."""
+
+
 def claim_folder(folder: Path, *, force: bool) -> None:
-    """Make the folder of a run, which is a new or an empty one unless `force` is set.
+    """Make the folder of a run, new or empty unless `force` is set, and keep other processes from it to our end.
 
     Raises:
-        UsageError: It has files in it, or it cannot be written to.
+        UsageError: It has files in it, it cannot be written to, or another process has claimed it.
     """
     if not str(folder).isprintable():
         raise UsageError(f"{str(folder)!a}: a name that cannot be printed; choose another --out")
@@ -35,19 +39,6 @@ def claim_folder(folder: Path, *, force: bool) -> None:
     if taken:
         raise UsageError(f"{folder}: the folder is not empty; name another one with --out, or overwrite with --force")
     prepare_folder(folder)
-    _lock(folder)
-
-
-_LOCKED: Final[dict[tuple[int, int], int]] = {}
-"""Descriptors of the folders that this process has claimed, by device and inode; they are held to its end."""
-
-
-def _lock(folder: Path) -> None:
-    """Keep other processes from claiming a folder while this one lives.
-
-    Raises:
-        UsageError: Another one has claimed it.
-    """
     if fcntl is None:
         return
     descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)

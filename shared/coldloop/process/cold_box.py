@@ -18,7 +18,6 @@ TICKS_PER_SAMPLE: Final = COLD_BOX.ticks_per_sample
 SAMPLING_PERIOD_S: Final = COLD_BOX.sampling_period_s
 INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES = COLD_BOX.input_names, COLD_BOX.output_names, COLD_BOX.state_names
 INPUT_UNITS, OUTPUT_UNITS, STATE_UNITS = COLD_BOX.input_units, COLD_BOX.output_units, COLD_BOX.state_units
-CONTROLLED: Final = COLD_BOX.controlled
 LEVEL_LOOP, T5_LOOP = (output.loop for output in COLD_BOX.outputs if output.loop is not None)
 LEVEL_BAND, T5_BAND = ((band.low, band.high) for band in COLD_BOX.bands)
 """Bands of L1 (%) and T5 (K) (paper, section IV)."""

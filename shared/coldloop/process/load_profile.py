@@ -64,25 +64,18 @@ def _profile(table: Table, process: Process) -> LoadProfile:
     column = own if table.place(own) is not None or table.place(LOAD_IN_WATTS) is None else LOAD_IN_WATTS
     ticks: list[int] = []
     loads = table.columns([TIME, column])
+    tick_s, unit, (low, high) = process.tick_s, process.load.unit, process.load.stored_span
     for (line, _), time, load in zip(table.rows, *loads, strict=True):
-        ticks.append(_step(time, load, ticks, f"{table.where}, line {line}", process))
+        where, tick = f"{table.where}, line {line}", round(time / tick_s)
+        if not 0 <= time < LAST_TICK * tick_s:
+            raise LoadFileError(f"{where}: {time:g} s is outside 0 to {LAST_TICK * tick_s:g} s")
+        if not low <= load <= high:
+            raise LoadFileError(f"{where}: {load:g} {unit} is outside {low:g} to {high:g} {unit}")
+        if abs(tick * tick_s - time) > 1e-6:
+            raise LoadFileError(f"{where}: {time:g} s is not a multiple of {tick_s} s")
+        if not ticks and tick != 0:
+            raise LoadFileError(f"{where}: the first step is at {time:g} s; begin at 0 s")
+        if ticks and tick <= ticks[-1]:
+            raise LoadFileError(f"{where}: {time:g} s does not come after {ticks[-1] * tick_s:g} s; sort by time_s")
+        ticks.append(tick)
     return LoadProfile(tuple(ticks), tuple(loads[1]))
-
-
-def _step(time: float, load: float, before: list[int], where: str, process: Process) -> int:
-    """Return the tick of a step, if it may follow those before."""
-    tick_s = process.tick_s
-    if not 0 <= time < LAST_TICK * tick_s:
-        raise LoadFileError(f"{where}: {time:g} s is outside 0 to {LAST_TICK * tick_s:g} s")
-    low, high = process.load.stored_span
-    if not low <= load <= high:
-        unit = process.load.unit
-        raise LoadFileError(f"{where}: {load:g} {unit} is outside {low:g} to {high:g} {unit}")
-    tick = round(time / tick_s)
-    if abs(tick * tick_s - time) > 1e-6:
-        raise LoadFileError(f"{where}: {time:g} s is not a multiple of {tick_s} s")
-    if not before and tick != 0:
-        raise LoadFileError(f"{where}: the first step is at {time:g} s; begin at 0 s")
-    if before and tick <= before[-1]:
-        raise LoadFileError(f"{where}: {time:g} s does not come after {before[-1] * tick_s:g} s; sort by time_s")
-    return tick

@@ -4,8 +4,9 @@ import argparse
 import asyncio
 import signal
 import sys
+from collections.abc import Coroutine
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from coldloop.errors import UsageError
 from coldloop.process.updating_periods import LONGEST_TICKS
@@ -322,23 +323,19 @@ async def _sensor(options: argparse.Namespace) -> None:
     from coldloop.operating.execution import WORK
     from coldloop_rig.live.status import ask
 
-    settings = common.operator_settings(options)
+    settings, shows = common.operator_settings(options), options.shows
     process = settings.process
     if options.output not in process.output_names:
         raise UsageError(f"unknown output '{options.output}'; choose from {', '.join(process.output_names)}")
-    command = read_command({"kind": "sensor_fault", "output": options.output, **_shown(options.shows)}, process)
+    shown: dict[str, float] = {"fault": 3}
+    try:
+        shown |= {"fault": SENSOR_FAULTS[shows]} if shows in SENSOR_FAULTS else {"value": float(shows)}
+    except ValueError:
+        raise UsageError(f"'{shows}': a sensor shows {', '.join(SENSOR_FAULTS)}, or a value") from None
+    command = read_command({"kind": "sensor_fault", "output": options.output, **shown}, process)
     services, work = WORK[type(command)]
     text = await ask(common.rig_endpoints(options, settings), process, services, lambda clients: work(clients, command))
     sys.stdout.write(f"{text}\n")
-
-
-def _shown(text: str) -> dict[str, float]:
-    if text in SENSOR_FAULTS:
-        return {"fault": SENSOR_FAULTS[text]}
-    try:
-        return {"fault": 3, "value": float(text)}
-    except ValueError:
-        raise UsageError(f"'{text}': a sensor shows {', '.join(SENSOR_FAULTS)}, or a value") from None
 
 
 def _declare_page(parser: argparse.ArgumentParser) -> None:
@@ -356,17 +353,16 @@ def execute_page(options: argparse.Namespace) -> int:
 
     effective = common.configuration(options).settings
     check_page(effective.hmi)
-    if options.runs:
-        return 130 if run_until_interrupted(lambda: _replay(options.runs, effective)) else 0
-    return 130 if run_until_interrupted(lambda: _watch(options, effective)) else 0
-
-
-async def _replay(folders: list[Path], settings: "Settings") -> None:
+    if not options.runs:
+        return 130 if run_until_interrupted(lambda: _watch(options, effective)) else 0
     from coldloop_hmi.runtime import serve_replays
     from coldloop_rig.live.recorded_page import RecordedPage
     from coldloop_rig.results.run_folder import RunFolder
 
-    await serve_replays([RecordedPage(RunFolder(folder)) for folder in folders], settings.hmi, common.say)
+    def replayed() -> Coroutine[Any, Any, None]:
+        return serve_replays([RecordedPage(RunFolder(run)) for run in options.runs], effective.hmi, common.say)
+
+    return 130 if run_until_interrupted(replayed) else 0
 
 
 async def _watch(options: argparse.Namespace, settings: "Settings") -> None:
