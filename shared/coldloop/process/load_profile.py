@@ -66,11 +66,12 @@ def _profile(table: Table, process: Process) -> LoadProfile:
     loads = table.columns([TIME, column])
     tick_s, unit, (low, high) = process.tick_s, process.load.unit, process.load.stored_span
     for (line, _), time, load in zip(table.rows, *loads, strict=True):
-        where, tick = f"{table.where}, line {line}", round(time / tick_s)
+        where = f"{table.where}, line {line}"
         if not 0 <= time < LAST_TICK * tick_s:
             raise LoadFileError(f"{where}: {time:g} s is outside 0 to {LAST_TICK * tick_s:g} s")
         if not low <= load <= high:
             raise LoadFileError(f"{where}: {load:g} {unit} is outside {low:g} to {high:g} {unit}")
+        tick = round(time / tick_s)
         if abs(tick * tick_s - time) > 1e-6:
             raise LoadFileError(f"{where}: {time:g} s is not a multiple of {tick_s} s")
         if not ticks and tick != 0:
