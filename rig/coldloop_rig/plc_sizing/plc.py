@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Final, NamedTuple, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, Field, PositiveFloat, ValidationError, field_validator, model_validator
 from scipy.optimize import nnls
 
 from coldloop.config import load_configuration
@@ -95,10 +95,8 @@ LARGEST_SIZE: Final = 10_000
 SHORTEST_MS, LONGEST_MS = 1e-6, 1e9
 
 
-class PlcProfile(BaseModel):
+class PlcProfile(BaseModel, frozen=True, extra="forbid", use_attribute_docstrings=True):
     """Properties of a PLC that decide whether a controller runs on it."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     name: Annotated[str, Field(min_length=1, max_length=80)]
     """As sentences and tables have it."""
@@ -198,10 +196,8 @@ COLUMNS: Final = ("call", "least", "mean", "most recorded", "worst case")
 Count = Annotated[float, Field(ge=0)]
 
 
-class CallCost(BaseModel):
+class CallCost(BaseModel, frozen=True, extra="forbid"):
     """Operations of a call of one kind."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     least: Count
     mean: Count
@@ -216,10 +212,8 @@ class CallCost(BaseModel):
         return self.worst or self.most
 
 
-class ExportCost(BaseModel):
+class ExportCost(BaseModel, frozen=True, extra="ignore"):
     """Operations and bytes that an export needs."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
 
     variables: Annotated[int, Field(ge=1)]
     operations: dict[str, CallCost]

@@ -12,7 +12,7 @@ from math import inf
 from typing import Annotated, Any, ClassVar, Final, Self
 
 import pydantic
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, ValidationInfo
+from pydantic import AfterValidator, BaseModel, Field, FiniteFloat, PositiveFloat, ValidationInfo
 
 from coldloop.config import as_toml, flattened
 from coldloop.modbus.settings import CONTROL_PORT, OPTIMIZER_PORT, Endpoint, ServerSettings
@@ -267,10 +267,8 @@ class RuleName(StrEnum):
     CONTRACTION = "contraction"
 
 
-class ContractionSettings(BaseModel):
+class ContractionSettings(BaseModel, frozen=True, extra="forbid"):
     """Parameters of the contraction rule, chosen on the draws 101 to 103 of the six families of hours."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     q_rest: Annotated[int, Field(ge=1)] = 2
     """Least q, that of quiet."""
@@ -290,10 +288,8 @@ class ContractionSettings(BaseModel):
         return self
 
 
-class AdaptiveSettings(BaseModel):
+class AdaptiveSettings(BaseModel, frozen=True, extra="forbid"):
     """Rule that adapts the updating period, and its parameters; those by their names are Algorithm 1's."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     rule: RuleName = RuleName.ALGORITHM_1
     contraction: ContractionSettings = ContractionSettings()
@@ -324,10 +320,8 @@ def left_out(key: str, estimator: computing.EstimatorSettings) -> str:
     return ""
 
 
-class ProgramSettings(ProcessSettings):
+class ProgramSettings(ProcessSettings, validate_default=True):
     """Settings of the optimiser's program."""
-
-    model_config = ConfigDict(validate_default=True)
 
     solver: SolverName = SolverName.ODE
     arithmetic: Arithmetic = Arithmetic.FLOAT64
