@@ -312,10 +312,8 @@ class FaultTransition(NamedTuple):
     fault: LinkFault
 
 
-class LinkPlan(BaseModel):
+class LinkPlan(BaseModel, frozen=True, extra="forbid"):
     """Faults of one link. Instants are real time, from the start of the proxy."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
     """Decides which frames are hit."""

@@ -14,7 +14,7 @@ from contextlib import suppress
 from typing import Any, Final, NamedTuple, Protocol
 
 from aiohttp import web
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from coldloop.errors import DamagedAnswerError, LinkError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
@@ -222,10 +222,8 @@ class RecordedRun(Protocol):
         """Return the alarms after these events, by number."""
 
 
-class ReplayRequest(BaseModel):
+class ReplayRequest(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     """Request of a browser to a replay."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     playing: bool | None = None
     speed: float | None = Field(default=None, gt=0, le=10_000)

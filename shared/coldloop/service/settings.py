@@ -3,13 +3,13 @@
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, field_validator, model_validator
+from pydantic import BaseModel, Field, PositiveFloat, field_validator, model_validator
 
 from coldloop.errors import ConfigurationError
 from coldloop.text_file import read_text
 
 
-class MetricsSettings(BaseModel):
+class MetricsSettings(BaseModel, frozen=True, extra="forbid"):
     """Address at which a service serves its registers as metrics.
 
     Args:
@@ -17,16 +17,12 @@ class MetricsSettings(BaseModel):
         port: TCP port; 0 is off.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=0xFFFF)] = 0
 
 
-class TelemetrySettings(BaseModel):
+class TelemetrySettings(BaseModel, frozen=True, extra="forbid"):
     """Settings of the broker to publish to."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     broker: str = ""
     """Host of the broker; empty is off."""

@@ -3,7 +3,7 @@
 from enum import StrEnum
 from typing import Annotated, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 
 class TimeMode(StrEnum):
@@ -15,10 +15,8 @@ class TimeMode(StrEnum):
     """The clock."""
 
 
-class SessionSettings(BaseModel):
+class SessionSettings(BaseModel, frozen=True, extra="forbid"):
     """Settings of the session that a service begins when it starts, before the first command."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     autostart: bool = False
     """Begin session 1 at once instead of waiting for an operator."""
