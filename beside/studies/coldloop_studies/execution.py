@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from distributed import Client, LocalCluster, as_completed
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from coldloop import __version__
@@ -436,10 +436,8 @@ class Shard:
         return unique(requests)[self.number - 1 :: self.of]
 
 
-class ShardRecord(BaseModel):
+class ShardRecord(BaseModel, frozen=True, extra="forbid"):
     """Study, options and programs that a shard is a part of."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     study: str
     shard: int
