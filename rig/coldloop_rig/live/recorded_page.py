@@ -98,7 +98,12 @@ class RecordedPage:
         cause = _CAUSES.get(self._causes[tick], int(Cause.NONE))
         suspect, faulty = self._doubts[max(0, bisect_right(self._doubts, tick, key=lambda one: one[0]) - 1)][1:]
         doubts = Doubts(suspect, bad=self._bad_sensors[tick], simulated=faulty)
-        return ReplayFrame(ProcessNow(tick, load, u, y), mode, cause, self._since[tick], doubts, self._station_at(tick))
+        station = None
+        if self._station is not None and tick < len(self._station):
+            *signals, station_mode, alarms = self._station[tick].tolist()
+            if not math.isnan(station_mode):
+                station = StationSample(tick, tuple(signals), int(station_mode), int(alarms))
+        return ReplayFrame(ProcessNow(tick, load, u, y), mode, cause, self._since[tick], doubts, station)
 
     @cached_property
     def _doubts(self) -> list[tuple[int, int, int]]:
@@ -123,14 +128,6 @@ class RecordedPage:
     def alarms(self, events: Sequence[JournalEntry]) -> list[Alarm]:
         """Return the alarms after these events."""
         return alarms_after(events, self._folder.process)
-
-    def _station_at(self, tick: int) -> StationSample | None:
-        if self._station is None or tick >= len(self._station):
-            return None
-        *signals, mode, alarms = self._station[tick].tolist()
-        if math.isnan(mode):
-            return None
-        return StationSample(tick, tuple(signals), int(mode), int(alarms))
 
 
 def _beginnings(modes: Sequence[str]) -> list[int]:

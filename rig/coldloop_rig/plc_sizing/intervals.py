@@ -1,4 +1,4 @@
-"""What sampled loops say, with confidence: 95 % intervals, certified iterations, whether an adaptive period pays.
+"""Findings of sampled loops, with confidence: 95 % intervals, certified iterations, whether an adaptive period pays.
 
 The certified number of iterations is by sampled scenarios and the binomial bound.
 

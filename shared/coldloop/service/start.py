@@ -85,7 +85,12 @@ class LineWriter:
         return self.flush(within_s)
 
     def _run(self) -> None:
-        while (line := self._next()) is not None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._lines or self._closed)
+                if not self._lines:
+                    return
+                self._writing, line = True, self._lines.popleft()
             try:
                 self._write(line)
             except (OSError, ValueError):  # the reader has gone, or the stream is closed
@@ -94,14 +99,6 @@ class LineWriter:
             with self._changed:
                 self._writing = False
                 self._changed.notify_all()
-
-    def _next(self) -> str | None:
-        """Wait for a line and take it; None when there will be none."""
-        with self._changed:
-            while not self._lines and not self._closed:
-                self._changed.wait()
-            self._writing = bool(self._lines)
-            return self._lines.popleft() if self._lines else None
 
 
 def to_stream(stream: TextIO) -> Write:
