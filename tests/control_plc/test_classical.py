@@ -13,9 +13,9 @@ from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits, RateReference
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.plant import Measurement
-from coldloop_control_plc.classical import ClassicalLoops, ClassicalSettings, LevelLoop, PiController, PiSettings
 from coldloop_control_plc.program import ControlProgram, make_program
-from coldloop_control_plc.settings import ControlSection, ControlStrategy
+from coldloop_control_plc.scan import execute, move_loops, want
+from coldloop_control_plc.settings import ClassicalSettings, ControlSection, ControlStrategy, LevelLoop
 from coldloop_plant.kinds import make_program as make_plant
 from coldloop_plant.load import find_load
 from coldloop_plant.settings import SensorSettings
@@ -28,13 +28,35 @@ REST = Row(*HEADER.u0)
 PERIOD = 20
 
 
-def controller(gain: float = 2.0, integral_time_s: float = 50.0, reach: float = 10.0) -> PiController:
-    tuning = PiSettings(gain=gain, integral_time_s=integral_time_s)
-    return PiController(tuning, setpoint=60.0, period_s=5.0, low=0.0, high=100.0, reach=reach)
+class PiController:
+    """The loop of the level alone, with a setpoint of 60 and bounds of its own."""
+
+    def __init__(self, gain: float = 2.0, integral_time_s: float = 50.0, reach: float = 10.0) -> None:
+        program = make_program(HEADER, ControlSection(), InputLimits())
+        c, self._ladder = program.scan_constants, program.ladder
+        self._loop = c.loops.outputs.index(L1)
+        loops = {"gains": gain, "integral_times_s": integral_time_s, "setpoints": 60.0, "reaches": reach}
+        limits = c.limits._replace(low=(0.0,) * 3, high=(100.0,) * 3)
+        alone = c.loops._replace(**{name: [value] * 2 for name, value in loops.items()})
+        self._constants = c._replace(limits=limits, loops=alone)
+
+    def execute(self, measured: float, applied: float) -> float:
+        return execute(self._constants, self._ladder, self._loop, measured, applied, 5.0)
 
 
-def loops(tuning: ClassicalSettings | None = None, limits: InputLimits | None = None) -> ClassicalLoops:
-    return ClassicalLoops(tuning or ClassicalSettings(), limits or InputLimits(), HEADER.y0)
+class ClassicalLoops:
+    """The loops alone, at the operating point."""
+
+    def __init__(self, tuning: ClassicalSettings | None = None) -> None:
+        section = ControlSection(classical=tuning or ClassicalSettings())
+        self._program = make_program(HEADER, section, InputLimits())
+
+    def wanted(self, tick: int, y: tuple[float, ...], applied: Row) -> Row:
+        c, s = self._program.scan_constants, self._program.scan
+        s.sensors.good[:], s.guard.applied[:] = y, applied
+        want(s.ladder, applied)
+        move_loops(c, s, tick)
+        return Row(*s.ladder.wanted)
 
 
 def outputs(level: float = 0.0, temperature: float = 0.0) -> tuple[float, ...]:
@@ -62,12 +84,12 @@ def classical_program(limits: InputLimits | None = None, **section: object) -> C
 
 @given(applied=st.floats(10.0, 90.0), error=st.floats(-2.0, 2.0))
 def test_a_start_is_bumpless_from_any_input(applied: float, error: float) -> None:
-    start = controller().execute(60.0 - error, applied)
+    start = PiController().execute(60.0 - error, applied)
     assert start - applied == pytest.approx(2.0 * error * 5.0 / 50.0), "one integral step and no proportional kick"
 
 
 def test_it_is_the_textbook_pi_as_long_as_nothing_limits_it() -> None:
-    pi, applied, integral = controller(), 50.0, 50.0
+    pi, applied, integral = PiController(), 50.0, 50.0
     for k in range(30):
         error = math.sin(0.3 * k)
         applied = pi.execute(60.0 - error, applied)
@@ -77,7 +99,7 @@ def test_it_is_the_textbook_pi_as_long_as_nothing_limits_it() -> None:
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_after_an_hour_at_a_bound_the_input_comes_back_as_soon_as_the_error_turns(direction: float) -> None:
-    pi, applied = controller(), 50.0
+    pi, applied = PiController(), 50.0
     for _ in range(720):
         applied = pi.execute(60.0 - 5.0 * direction, applied)
     assert applied == (100.0 if direction > 0 else 0.0)
@@ -85,7 +107,7 @@ def test_after_an_hour_at_a_bound_the_input_comes_back_as_soon_as_the_error_turn
 
 
 def test_behind_a_rate_limit_nothing_winds_up() -> None:
-    pi, applied = controller(gain=50.0, reach=0.1), 50.0
+    pi, applied = PiController(gain=50.0, reach=0.1), 50.0
     for _ in range(20):
         applied = pi.execute(59.0, applied)
     assert applied == pytest.approx(52.0)
@@ -93,14 +115,14 @@ def test_behind_a_rate_limit_nothing_winds_up() -> None:
 
 
 def test_it_goes_on_from_what_somebody_else_has_applied() -> None:
-    pi = controller()
+    pi = PiController()
     pi.execute(60.0, 50.0)
     assert pi.execute(60.0, 70.0) == 70.0
 
 
 @pytest.mark.parametrize("fault", [math.nan, math.inf, -math.inf])
 def test_a_sensor_that_tells_no_number_leaves_the_input_and_the_return_is_bumpless(fault: float) -> None:
-    pi = controller()
+    pi = PiController()
     applied = pi.execute(60.0, 50.0)
     assert pi.execute(fault, applied) == applied
     assert pi.execute(59.0, applied) == pytest.approx(applied + 2.0 * 5.0 / 50.0)
@@ -114,7 +136,7 @@ def test_a_sensor_that_tells_no_number_leaves_the_input_and_the_return_is_bumple
 def test_whatever_is_measured_it_asks_for_nothing_outside_bounds_and_reach(
     gain: float, integral_time_s: float, readings: list[float]
 ) -> None:
-    pi, applied = controller(gain, integral_time_s, reach=0.7), 50.0
+    pi, applied = PiController(gain, integral_time_s, reach=0.7), 50.0
     for reading in readings:
         wanted = pi.execute(reading, applied)
         assert 0.0 <= wanted <= 100.0
@@ -126,17 +148,17 @@ def test_whatever_is_measured_it_asks_for_nothing_outside_bounds_and_reach(
 
 
 def test_at_the_operating_point_nothing_moves() -> None:
-    assert all(loops().wanted(tick, outputs(), REST) == REST for tick in range(60))
+    assert all(ClassicalLoops().wanted(tick, outputs(), REST) == REST for tick in range(60))
 
 
 def test_setpoints_may_be_moved_from_the_operating_point() -> None:
     tuning = ClassicalSettings(level=LevelLoop(setpoint_offset=0.5))
-    assert loops(tuning).wanted(0, outputs(level=0.5), REST) == REST
+    assert ClassicalLoops(tuning).wanted(0, outputs(level=0.5), REST) == REST
 
 
 def test_between_executions_the_loops_ask_for_what_is_applied() -> None:
     tuning = ClassicalSettings(period_s=2.5)
-    both = loops(tuning)
+    both = ClassicalLoops(tuning)
     moved = [tick for tick in range(40) if both.wanted(tick, outputs(1.0, 1.0), REST) != REST]
     assert moved == [0, 10, 20, 30]
 

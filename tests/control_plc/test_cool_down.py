@@ -8,8 +8,9 @@ import pytest
 from coldloop.process.cold_box import L1, OUTPUT_NAMES, T1, T5
 from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import Cause, CoolDownStep, Mode, Operator, OperatorMode
-from coldloop_control_plc.cool_down import CoolDown, CoolDownSettings
-from coldloop_control_plc.ladder import Ladder, LadderInputs
+from coldloop_control_plc.program import ControlProgram, OperatingPoint
+from coldloop_control_plc.scan import choose, cool, follow_cool_down, want
+from coldloop_control_plc.settings import ControlSection, CoolDownSettings
 from tests.harness.records import Row
 
 if TYPE_CHECKING:
@@ -25,13 +26,43 @@ def outputs(level: float, bath: float, exhaust: float) -> list[float]:
     return y
 
 
-def make() -> CoolDown:
-    rest = outputs(60.0, 4.44, 10.4)
-    return CoolDown(CoolDownSettings(settled_s=10.0), InputLimits(), INPUTS, rest)
+class CoolDown:
+    """The cool-down alone."""
+
+    def __init__(self) -> None:
+        point = OperatingPoint(INPUTS, tuple(outputs(60.0, 4.44, 10.4)), 0)
+        section = ControlSection(cool_down=CoolDownSettings(settled_s=10.0))
+        program = ControlProgram(limits=InputLimits(), point=point, section=section)
+        self._constants, self.scan = program.scan_constants, program.scan
+
+    def observe(self, tick: int, y: list[float]) -> bool:
+        self.scan.sensors.good[:] = y
+        return follow_cool_down(self._constants, self.scan, tick)
+
+    @property
+    def step(self) -> CoolDownStep:
+        return CoolDownStep(self.scan.ladder.step)
+
+    @property
+    def is_active(self) -> bool:
+        return self.step is not CoolDownStep.FINISHED
+
+    @property
+    def standing(self) -> list[int]:
+        return [output for output, stands in enumerate(self.scan.sensors.standing) if stands]
+
+    def wanted(self, by_loops: Row) -> tuple[float, ...]:
+        want(self.scan.ladder, by_loops)
+        cool(self._constants, self.scan.ladder)
+        return tuple(self.scan.ladder.wanted)
+
+    def mode(self, operator: OperatorMode) -> tuple[int, int]:
+        self.scan.ladder.operator = operator
+        return choose(self._constants, self.scan, 1, plays=True)
 
 
 def test_a_cold_plant_is_not_cooled_down_even_if_its_bath_runs_dry_later() -> None:
-    sequence = make()
+    sequence = CoolDown()
     assert not sequence.observe(0, outputs(60.0, 4.44, 10.4))
     assert not sequence.observe(1, outputs(0.0, 250.0, 200.0))
     assert not sequence.is_active
@@ -40,13 +71,13 @@ def test_a_cold_plant_is_not_cooled_down_even_if_its_bath_runs_dry_later() -> No
 
 @pytest.mark.parametrize("lying", [outputs(60.0, 290.0, 10.4), outputs(0.0, 4.44, 10.4)], ids=["T1", "L1"])
 def test_one_sensor_that_lies_does_not_have_a_cold_plant_cooled_down(lying: list[float]) -> None:
-    sequence = make()
+    sequence = CoolDown()
     assert not sequence.observe(0, lying)
     assert not sequence.is_active
 
 
 def test_a_warm_plant_goes_through_the_steps_in_their_order_and_each_has_its_inputs() -> None:
-    sequence = make()
+    sequence = CoolDown()
     courses = (
         (0, outputs(0.0, 300.0, 300.0), CoolDownStep.TURBINE, (60.0, 0.0, 36.0)),
         (1, outputs(0.0, 250.0, 10.3), CoolDownStep.BATH, (60.0, 0.0, 30.0)),
@@ -61,7 +92,7 @@ def test_a_warm_plant_goes_through_the_steps_in_their_order_and_each_has_its_inp
 
 
 def test_it_ends_when_both_outputs_have_stayed_in_their_bands() -> None:
-    sequence, inside = make(), outputs(60.0, 4.44, 10.4)
+    sequence, inside = CoolDown(), outputs(60.0, 4.44, 10.4)
     for tick, y in enumerate((outputs(0.0, 300.0, 300.0), outputs(0.0, 250.0, 10.0), outputs(2.0, 4.4, 10.0), inside)):
         sequence.observe(tick, y)
     for tick in range(4, 30):
@@ -76,14 +107,14 @@ def test_it_ends_when_both_outputs_have_stayed_in_their_bands() -> None:
 
 @pytest.mark.parametrize("operator", OperatorMode)
 def test_while_it_lasts_the_ladder_is_classical_unless_an_operator_drives(operator: OperatorMode) -> None:
-    ladder = Ladder(120, Mode.HOLD, Cause.SESSION_STARTED)
-    ladder.step(1, LadderInputs(operator, cooling=True, sensors_unusable=True, row=True, late=False))
+    sequence = CoolDown()
+    assert sequence.observe(0, outputs(0.0, 300.0, 300.0))
     chosen = {
         OperatorMode.AUTO: (Mode.CLASSICAL, Cause.COOL_DOWN),
         OperatorMode.CLASSICAL: (Mode.CLASSICAL, Cause.OPERATOR),
         OperatorMode.MANUAL: (Mode.MANUAL, Cause.OPERATOR),
     }
-    assert (ladder.mode, ladder.cause) == chosen[operator]
+    assert sequence.mode(operator) == chosen[operator]
 
 
 @pytest.mark.parametrize("reached", [CoolDownStep.FILLING, CoolDownStep.SETTLING])
@@ -97,10 +128,10 @@ def test_a_control_plc_that_is_restarted_goes_on_from_the_step_it_had_reached(
     program.resume(1, 500, applied, updates=0, operator=Operator(OperatorMode.AUTO, tuple(applied)), cool_down=reached)
     bench.readings = {L1: 30.0}
     bench.scans(5)
-    assert program.cool_down.step is reached
+    assert program.cool_down is reached
     assert (program.mode, program.ladder.cause) == (Mode.CLASSICAL, Cause.COOL_DOWN)
     assert not program.player.invited
     bench.readings = {}
     bench.scans(4 * 620)
-    assert program.cool_down.step is CoolDownStep.FINISHED
+    assert program.cool_down is CoolDownStep.FINISHED
     assert program.player.invited

@@ -35,9 +35,8 @@ from coldloop.service.journal import Journal
 from coldloop.session import TimeBase
 from coldloop_control_plc.plant_link import PlantLink
 from coldloop_control_plc.program import make_program
-from coldloop_control_plc.rack_clock import PHASE, RackClock
-from coldloop_control_plc.retained_state import ControlStateStore, RetainedControlState
-from coldloop_control_plc.scan_cycle import ScanCycle
+from coldloop_control_plc.rack import PHASE, RackClock, ScanCycle
+from coldloop_control_plc.sessions import ControlStateStore, RetainedControlState
 from coldloop_control_plc.settings import ControlSection
 from coldloop_plant.rack import Rack, Session
 from coldloop_plant.settings import SafeAction, WatchdogSettings

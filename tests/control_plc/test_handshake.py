@@ -2,13 +2,15 @@
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
 from coldloop.process.settings import InputLimits
 from coldloop.registers.control_plc import Mode, Verdict
 from coldloop.registers.safety import AlarmKind, AlarmState
+from coldloop_control_plc import scan
+from coldloop_control_plc.scan import move_loops
 from tests.control_plc.conftest import HOLD_TICKS, alarm
 from tests.harness.records import Row, as_transmitted
 
@@ -94,7 +96,7 @@ def test_loops_that_have_waited_for_the_hold_to_end_do_not_wait_for_a_late_optim
     rig.scan()
     rig.play([at()] * 2, ticks=2)
     at_work: list[int] = []
-    monkeypatch.setattr(rig.program._loops, "wanted", lambda tick, _, applied, **__: at_work.append(tick) or applied)  # noqa: SLF001
+    monkeypatch.setattr(scan, "move_loops", lambda _, __, tick: at_work.append(tick))
     while rig.program.mode is not Mode.CLASSICAL:
         if rig.program.player.awaiting_plan:
             rig.plan(20)
@@ -113,12 +115,11 @@ class LoopsAtWork:
         self.program.abandon()
         self.begun = self.program.tick
         self.ticks: list[int] = []
-        self._wanted = self.program._loops.wanted  # noqa: SLF001
-        monkeypatch.setattr(self.program._loops, "wanted", self._work)  # noqa: SLF001
+        monkeypatch.setattr(scan, "move_loops", self._work)
 
-    def _work(self, tick: int, *arguments: Any, **named: Any) -> Row:  # noqa: ANN401 - as they are
+    def _work(self, c: scan.ScanConstants, s: scan.Scan, tick: int) -> None:
         self.ticks.append(tick)
-        return self._wanted(tick, *arguments, **named)
+        move_loops(c, s, tick)
 
     def check(self) -> None:
         """Demand that they are held for 5 s at a time, and then not for 30 s."""

@@ -66,7 +66,7 @@ def test_an_operator_takes_over_without_a_bump_and_gives_back_without_one(
     program.operate(Operator(mode, tuple(applied[-1])))
     applied += rig.scans(40)
     assert program.mode is (Mode.CLASSICAL if mode is OperatorMode.CLASSICAL else Mode.MANUAL)
-    assert program.ladder.cause is Cause.OPERATOR
+    assert program.ladder.cause == Cause.OPERATOR
     assert not program.awaiting_plan
     assert rig.offer(stale).verdict == Verdict.NOT_INVITED
     program.operate(Operator(OperatorMode.AUTO, tuple(applied[-1])))
@@ -168,7 +168,7 @@ def test_a_controlled_output_that_stays_bad_ends_mpc_and_only_the_loop_that_need
     assert rig.program.mode is not Mode.CLASSICAL, "it is bridged for 10 s"
     applied = rig.scans(60)
     assert rig.program.mode is Mode.CLASSICAL
-    assert rig.program.ladder.cause is Cause.SENSOR_BAD
+    assert rig.program.ladder.cause == Cause.SENSOR_BAD
     assert len({row[stands] for row in applied}) == 1
     assert len({row[moves] for row in applied}) > 1
     assert rig.offer(stale).verdict == Verdict.NOT_INVITED
@@ -388,7 +388,7 @@ def test_a_sensor_that_fails_now_and_then_is_not_bridged_for_ever(rig: "Bench") 
         rig.readings[L1] = math.nan if tick % 8 == 0 else 60.0
         rig.scan()
     assert rig.program.mode is Mode.CLASSICAL
-    assert rig.program.ladder.cause is Cause.SENSOR_BAD
+    assert rig.program.ladder.cause == Cause.SENSOR_BAD
 
 
 def test_an_operator_who_gives_back_the_loops_to_nobody_sees_the_alarm(rig: "Bench") -> None:

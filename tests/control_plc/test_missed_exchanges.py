@@ -68,5 +68,5 @@ def test_a_load_that_makes_no_sense_ends_mpc_as_a_bad_sensor(load: float, bench:
     assert bench.program.mode is Mode.MPC
     bench.load = load
     bench.scans(2)
-    assert bench.program.ladder.cause is Cause.SENSOR_BAD
+    assert bench.program.ladder.cause == Cause.SENSOR_BAD
     assert all(map(math.isfinite, bench.scan()[0]))

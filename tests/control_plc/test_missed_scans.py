@@ -13,7 +13,7 @@ from coldloop.registers.control_plc import LinkCause, Mode, Operator, OperatorMo
 from coldloop.registers.safety import AlarmKind
 from coldloop.session import TimeBase
 from coldloop_control_plc.output_limits import OutputGuard
-from coldloop_control_plc.retained_state import ControlStateStore, RetainedControlState
+from coldloop_control_plc.sessions import ControlStateStore, RetainedControlState
 from tests.harness.records import Row, as_transmitted
 
 if TYPE_CHECKING:

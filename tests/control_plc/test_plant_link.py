@@ -12,7 +12,7 @@ from coldloop.registers.safety import AlarmKind
 from coldloop.service.journal import Journal
 from coldloop_control_plc.alarms import AlarmPanel
 from coldloop_control_plc.plant_link import FROZEN_TICKS, PlantLink
-from coldloop_control_plc.scan_cycle import cause_of
+from coldloop_control_plc.rack import cause_of
 
 HOLDER = 77
 U = (43.0, 75.0, 36.0)

@@ -26,8 +26,8 @@ from coldloop.safety.writers import SIMPLE_CLIENT
 from coldloop.service.journal import Journal
 from coldloop_control_plc.plant_link import PlantLink
 from coldloop_control_plc.program import make_program
+from coldloop_control_plc.rack import ScanCycle
 from coldloop_control_plc.runtime import ControlPlc
-from coldloop_control_plc.scan_cycle import ScanCycle
 from coldloop_control_plc.settings import ControlSection, ControlSettings
 from coldloop_plant.rack import AppliedOutputs
 from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP, as_transmitted, sealed

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.process.cold_box import TICK_S
-from coldloop_control_plc.rack_clock import MAX_CORRECTION, PHASE, RackClock
+from coldloop_control_plc.rack import MAX_CORRECTION, PHASE, RackClock
 
 
 def follow(ppm: float, factor: float, ticks: int, *, jitter_s: float = 0.0, seed: int = 1) -> tuple[RackClock, float]:

@@ -33,9 +33,8 @@ from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.safety.retained import RetainedFile
 from coldloop_control_plc.program import ControlProgram
-from coldloop_control_plc.retained_state import OWNER
 from coldloop_control_plc.runtime import EXPIRES_SOON, UNREADABLE, ControlPlc
-from coldloop_control_plc.sessions import ADOPT_AFTER_S
+from coldloop_control_plc.sessions import ADOPT_AFTER_S, OWNER
 from coldloop_control_plc.settings import ControlSettings
 from coldloop_rig.cli.certificates import Authority
 from coldloop_rig.cosim.wiring import ReservedPorts
@@ -137,7 +136,7 @@ async def test_scans_that_are_not_made_are_alarmed_from_outside_of_them(monkeypa
     ended = asyncio.Event()
     async with running(SmallRack(1)) as plc:
         monkeypatch.setattr(plc, "_scan", ended.wait)
-        monkeypatch.setattr("coldloop_control_plc.rack_finder.SEARCH_S", WITHIN_S)
+        monkeypatch.setattr("coldloop_control_plc.rack.SEARCH_S", WITHIN_S)
         watch = asyncio.create_task(plc.watch_scans())
         ask(plc, ControlSession(1, 1, 10.0))
         await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.SYNCHRONISED)

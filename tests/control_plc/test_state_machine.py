@@ -27,7 +27,7 @@ from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, Ala
 from coldloop.safety.writers import InputSequence, with_checksum
 from coldloop.session import TimeBase
 from coldloop_control_plc.program import ControlProgram, make_program
-from coldloop_control_plc.retained_state import ControlStateStore, RetainedControlState
+from coldloop_control_plc.sessions import ControlStateStore, RetainedControlState
 from coldloop_control_plc.settings import ControlSection
 from tests.harness.records import Row, as_transmitted
 

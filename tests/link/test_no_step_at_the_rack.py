@@ -15,7 +15,7 @@ from coldloop.registers.plant import Actuators
 from coldloop.registers.safety import AlarmKind, WatchdogTime
 from coldloop.safety.retained import RetainedFile
 from coldloop_chaos.faults import Direction
-from coldloop_control_plc.retained_state import OWNER
+from coldloop_control_plc.sessions import OWNER
 from tests.harness.records import PLANT_MAP
 
 if TYPE_CHECKING:

@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.settings import InputLimits, settings_of
-from coldloop_control_plc.cool_down import CoolDown, CoolDownSettings
+from coldloop_control_plc.program import ControlProgram, OperatingPoint
+from coldloop_control_plc.scan import cool, follow_cool_down, want
 from coldloop_control_plc.sensors import SensorCheckSettings, SensorMonitor, may_stand
+from coldloop_control_plc.settings import ControlSection, CoolDownSettings
 from coldloop_optimizer_plc.computing_settings import signals_of
 from coldloop_optimizer_plc.decisions import Latched, begin_again, most_open, shortage
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.qp.prediction import bounds_at, find_target, least_warm_load, loads_held, state_weights
 from coldloop_optimizer_plc.scheme import problem_at
 from coldloop_optimizer_plc.settings import ProgramSettings
-from tests.harness.records import Row
 
 Array = NDArray[np.float64]
 
@@ -70,12 +71,16 @@ class Laws:
 
 def cool_down(model: LtiModel, courses: list[dict[str, float]], by_loops: list[float]) -> list[list[float]]:
     """Return after each measurement the step and the wanted inputs."""
-    inputs = tuple(model.u0.tolist())
-    sequence = CoolDown(CoolDownSettings(settled_s=0.0), InputLimits(), inputs, model.y0.tolist())
-    found = []
+    point = OperatingPoint(tuple(model.u0.tolist()), tuple(model.y0.tolist()), 0)
+    section = ControlSection(cool_down=CoolDownSettings(settled_s=0.0))
+    program = ControlProgram(limits=InputLimits(), point=point, section=section)
+    c, s, found = program.scan_constants, program.scan, []
     for tick, y in enumerate(courses):
-        sequence.observe(tick, measured(model.declared, y))
-        found.append([sequence.step, *sequence.wanted(Row(*by_loops))])
+        s.sensors.good[:] = measured(model.declared, y)
+        follow_cool_down(c, s, tick)
+        want(s.ladder, by_loops)
+        cool(c, s.ladder)
+        found.append([s.ladder.step, *s.ladder.wanted])
     return found
 
 

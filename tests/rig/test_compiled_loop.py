@@ -16,9 +16,11 @@ from coldloop.process.declaration import LAST_NUMBER
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.settings import InputLimits, RateReference
 from coldloop.registers.audit import EventKind
+from coldloop.registers.control_plc import Cause, CoolDownStep, Mode, OperatorMode
 from coldloop_control_plc.output_limits import admit, beginning, plain
-from coldloop_control_plc.player import begin_sequence, latch, latches
-from coldloop_control_plc.program import ControlProgram, Scan, make_program, observe
+from coldloop_control_plc.player import latch, latches
+from coldloop_control_plc.program import make_program
+from coldloop_control_plc.scan import Scan, decide, observe
 from coldloop_plant.kinds import own_header
 from coldloop_rig.cosim.compiled import stretches
 from coldloop_rig.cosim.compiled.records import as_arrays, record_of, scan_records
@@ -154,23 +156,24 @@ def test_the_guard_is_the_same_compiled(
             tick += 1
 
 
-@kernel
-def compiled_tick(c: Any, parts: Any, tick: int, y: Any, x: Any, load: float, u: Any, cooling: bool) -> bool:  # noqa: ANN401, FBT001 a kernel
-    """Do what the control PLC does in a tick beside its outputs."""
-    s = Scan(parts.guard[0], parts.player[0], parts.sensors[0], parts.alarms[0], parts.watchdog[0])
-    begin_sequence(s.player, tick)
-    told = observe(c, s, tick, y, x, load, u, cooling)
+def do_tick(c: Any, s: Scan, tick: int, rows: Any, y: Any, x: Any, load: float) -> tuple[bool, bool]:  # noqa: ANN401 rows
+    """Do what the control PLC does in a tick."""
+    changed = decide(c, s, tick, rows)
+    told = observe(c, s, tick, y, x, load)
     if latches(s.player, tick, load):
         latch(s.player, tick, load, 20)
-    return told
+    return changed, told
 
 
-def plain_tick(program: ControlProgram, tick: int, y: Any, x: Any, load: float, u: Any, *, cooling: bool) -> bool:  # noqa: ANN401 rows
-    begin_sequence(program.player, tick)
-    told = observe(program.scan_constants, program.scan, tick, y, x, load, u, cooling=cooling)
-    if latches(program.player, tick, load):
-        latch(program.player, tick, load, 20)
-    return told
+inner_tick = kernel(do_tick)
+
+
+@kernel
+def compiled_tick(c: Any, parts: Any, tick: int, rows: Any, y: Any, x: Any, load: float) -> tuple[bool, bool]:  # noqa: ANN401 a kernel
+    s = Scan(
+        parts.guard[0], parts.ladder[0], parts.player[0], parts.sensors[0], parts.alarms[0], parts.watchdog[0]
+    )  # fmt: skip
+    return inner_tick(c, s, tick, rows, y, x, load)
 
 
 counts = st.integers(0, 300)
@@ -187,6 +190,16 @@ def any_scan(draw: st.DrawFn) -> dict[str, dict[str, Any]]:
 
     flags = st.booleans()
     return {
+        "guard": {"lag": draw(st.integers(0, 3)), "newest": draw(st.integers(0, 305)), "start": draw(counts)},
+        "ladder": {
+            "mode": draw(st.sampled_from(Mode)).value, "cause": draw(st.sampled_from(Cause)).value,
+            "since": draw(counts), "setpoints": some(readings, 3), "errors": some(readings, 22),
+            "step": draw(st.sampled_from(CoolDownStep)).value, "has_begun": draw(flags), "settled_since": draw(ticks),
+            "operator": draw(st.sampled_from(OperatorMode)).value, "optimizer_present": draw(flags),
+            "is_measured": draw(flags), "handshake_failed": draw(counts), "held_from": draw(st.integers(-1, 300)),
+            "held_for_answer": draw(flags), "answer_failed": draw(flags), "seen": draw(ticks), "executed": draw(ticks),
+        },
+        "watchdog": {"triggered": draw(counts), "expired": draw(flags), "time": draw(st.sampled_from([0, 60, 290]))},
         "player": {
             "phase": draw(st.integers(0, 5)), "has_update": draw(flags), "invited": draw(flags), "late": draw(flags),
             "has_answer": draw(flags), "slot": draw(st.integers(0, 1)), "next_update_tick": draw(counts),
@@ -207,10 +220,7 @@ def any_scan(draw: st.DrawFn) -> dict[str, dict[str, Any]]:
 
 
 measured = st.tuples(
-    st.lists(readings, min_size=22, max_size=22),
-    st.booleans(),
-    st.sampled_from([375.0, 385.0, 1e9, math.nan]),
-    st.booleans(),
+    st.lists(readings, min_size=22, max_size=22), st.booleans(), st.sampled_from([375.0, 385.0, 1e9, math.nan])
 )
 
 
@@ -227,11 +237,10 @@ def test_a_scan_is_the_same_compiled(
         for name, value in values.items():
             setattr(getattr(program.scan, part), name, value)
     records, constants = scan_records(program.scan), as_arrays(program.scan_constants)
-    u = (43.0, 75.0, 36.0)
-    for tick, (read, again, load, cooling) in enumerate(measurements, start=300):
+    rows = np.full((2, 310, 3), (43.0, 75.0, 36.0)) + 0.1 * np.sin(np.arange(310))[:, None]
+    for tick, (read, again, load) in enumerate(measurements, start=300):
         y, x = program.sensors.before[:] if again else read, program.sensors.x[:]
-        told = plain_tick(program, tick, y, x, load, u, cooling=cooling)
-        arrays = np.array(y), np.array(x), load, np.array(u)
-        assert told == compiled_tick(constants, records, tick, *arrays, cooling)
+        told = do_tick(program.scan_constants, program.scan, tick, rows.tolist(), y, x, load)
+        assert told == compiled_tick(constants, records, tick, rows, np.array(y), np.array(x), load)
         for part, record in zip(program.scan, records, strict=True):
             assert repr(record_of(part)[0]) == repr(record[0])

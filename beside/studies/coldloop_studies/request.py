@@ -28,7 +28,7 @@ from coldloop.service.start import main as start_service
 from coldloop.text_file import file_digest
 from coldloop_optimizer_plc.solvers import make_solver
 from coldloop_plant.kinds import GROUP
-from coldloop_rig.cosim.linear_plant import LinearRig
+from coldloop_rig.cosim.ideal_loop import LinearRig
 from coldloop_rig.cosim.local_services import run_on_localhost
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
@@ -63,7 +63,7 @@ class Procedure(StrEnum):
     HARSH_PROBLEMS = "harsh problems"
     """Paired problems, of which only those with a guess far from the optimum count; all solvers begin at that guess."""
     LINEAR_PLANT = "linear plant"
-    """The optimiser and the control PLC with the linear model for a plant (`coldloop_rig.cosim.linear_plant`)."""
+    """The optimiser and the control PLC with the linear model for a plant (`coldloop_rig.cosim.ideal_loop`)."""
 
 
 @dataclass(frozen=True)

@@ -1,16 +1,14 @@
-"""A loop without a PLC's limits: at each instant the exact optimum of the state that is there, applied at once.
-
-It is the loop of an infinitely fast PLC, with the problems that certified iterations are sampled from. Its
-horizon is finite and its model linear, and with the rate limit in full at each instant a loop may be faster than is
-good for its plant.
-"""
+"""Loops that show what a part of the real one costs: one without a PLC's limits, one with a plant that is its model."""
 
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from coldloop.errors import ConfigurationError
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load
+from coldloop.process.lti_model import load as load_model
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import SequenceRow, control_map
 from coldloop.registers.plant import PlantSample
@@ -20,7 +18,11 @@ from coldloop_optimizer_plc.estimator import begin_prediction, correct, estimato
 from coldloop_optimizer_plc.qp.prediction import prediction_of
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 from coldloop_optimizer_plc.solvers.outside_libraries import DaqpSolver
-from coldloop_plant.kinds import own_header, plant_maker
+from coldloop_plant.kinds import NO_MISMATCH, noise_of, own_header, plant_maker
+from coldloop_plant.own_plants import LinearPlant
+from coldloop_plant.program import PlantProgram
+from coldloop_plant.settings import PlantKind
+from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.results.recording import Recorder
 from coldloop_rig.settings import Settings
@@ -81,3 +83,20 @@ def run_ideal_loop(
         plant.apply(applied)
         recorder.sample(PlantSample(tick, watts, applied, y, x))
         plant.advance()
+
+
+class LinearRig(OneProcessRig):
+    """Control PLC and optimiser PLC with a linear plant; its loop is not compiled.
+
+    Raises:
+        ConfigurationError: The plant is to differ from its model.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        if settings.plant.kind is not PlantKind.COLD_BOX or settings.plant.mismatch != NO_MISMATCH:
+            raise ConfigurationError("plant: the linear plant is a cold box without mismatch")
+        super().__init__(settings, compiled=False)
+        self._model = load_model(settings.model.file)
+
+    def _plant(self, load: LoadProfile, seed: int) -> PlantProgram:
+        return LinearPlant(self._model, load, noise_of(self._settings.plant.sensors, seed))

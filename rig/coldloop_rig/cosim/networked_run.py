@@ -17,10 +17,9 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.settings import Endpoint
 from coldloop.registers.configuration import ConfigurationDigest, ConfigurationLine, configuration_of, lines_of
 from coldloop.service.start import run_event_loop
+from coldloop_rig.cosim import session
 from coldloop_rig.cosim.local_services import run_on_localhost
-from coldloop_rig.cosim.saved_session import restore_session, save_session
 from coldloop_rig.cosim.scenario import Job, Scenario, StopRequest, with_copied_load
-from coldloop_rig.cosim.session import SessionClient, SessionUnderWay, find_session, record_session
 from coldloop_rig.cosim.wiring import RigEndpoints, answered_in_time
 from coldloop_rig.results.recording import Recorder, Way
 from coldloop_rig.settings import Settings
@@ -93,7 +92,7 @@ async def running_configuration(endpoints: RigEndpoints, settings: Settings, pat
         UsageError: Two services run different limits.
     """
     running: dict[str, Any] = {}
-    with closing(SessionClient(endpoints, settings)) as client:
+    with closing(session.SessionClient(endpoints, settings)) as client:
         await client.connect(patience_s)
         for service, one in client.clients.items():
             shown = await read_configuration(one, SHOWN[service])
@@ -157,20 +156,20 @@ def as_attached(effective: Configuration[Settings], endpoints: Sequence[Endpoint
     return attached(effective, running)
 
 
-def session_under_way(effective: Configuration[Settings], endpoints: Sequence[Endpoint]) -> SessionUnderWay:
+def session_under_way(effective: Configuration[Settings], endpoints: Sequence[Endpoint]) -> session.SessionUnderWay:
     """Return the session of a rig that is up.
 
     Raises:
         UsageError: It has none.
         LinkError: A service does not answer, or runs another model.
     """
-    found: list[SessionUnderWay] = []
+    found: list[session.SessionUnderWay] = []
 
     async def read() -> int:
-        with closing(SessionClient(RigEndpoints(*endpoints), effective.settings)) as rig:
+        with closing(session.SessionClient(RigEndpoints(*endpoints), effective.settings)) as rig:
             async with answered_in_time("to read what the rig does"):
                 await rig.connect(ATTACH_PATIENCE_S)
-                found.append(await find_session(rig))
+                found.append(await session.find_session(rig))
         return 0
 
     run_event_loop(read)
@@ -216,20 +215,20 @@ async def _stoppable(run: Awaitable[None], stop: StopRequest) -> int:
 
 
 async def _looked_at(endpoints: RigEndpoints, settings: Settings, scenario: Scenario, recorder: Recorder) -> None:
-    with closing(SessionClient(endpoints, settings, tolerant=True)) as rig:
+    with closing(session.SessionClient(endpoints, settings, tolerant=True)) as rig:
         await rig.connect(ATTACH_PATIENCE_S)
-        await record_session(rig, scenario, recorder)
+        await session.record_session(rig, scenario, recorder)
 
 
 async def _attached(endpoints: RigEndpoints, settings: Settings, scenario: Scenario, recorder: Recorder) -> None:
-    with closing(SessionClient(endpoints, settings)) as rig:
+    with closing(session.SessionClient(endpoints, settings)) as rig:
         await rig.connect(ATTACH_PATIENCE_S)
         async with answered_in_time("to read what the rig does"):
-            saved = await save_session(rig)
+            saved = await session.save_session(rig)
         try:
             await rig.run(scenario, recorder)
         finally:
-            await _to_its_end(restore_session(rig, saved, rig.session))
+            await _to_its_end(session.restore_session(rig, saved, rig.session))
 
 
 async def _to_its_end(work: Coroutine[Any, Any, None]) -> None:

@@ -6,6 +6,7 @@
 
 import asyncio
 import contextlib
+import logging
 import time
 from collections.abc import Awaitable, Iterable, Mapping, Sequence
 from functools import partial
@@ -14,15 +15,26 @@ from typing import Final, NamedTuple, TypeVar
 
 from coldloop.errors import LinkError, ModelFileError, PeerUnreachableError, UsageError
 from coldloop.modbus.client import RegisterClient
-from coldloop.operating.execution import LoadStream, write_table
+from coldloop.operating.execution import LoadStream, lead_ticks, write_pace, write_table
 from coldloop.operating.observer import BATCH, JournalReader, SampleReader, Subscriber, UpdateReader, last_update
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.audit import Event, EventKind, JournalPage
+from coldloop.registers.codec import sealed
 from coldloop.registers.common import Identity, SessionPace
-from coldloop.registers.control_plc import ControlSession, Grant, LadderStatus, Mode, Status
+from coldloop.registers.control_plc import ControlSession, Grant, LadderStatus, Mode, Operator, OperatorMode, Status
 from coldloop.registers.maps import maps_of
 from coldloop.registers.optimizer_plc import Optimization, OptimizerSession
-from coldloop.registers.plant import HISTORY_ROWS, STATION_ROWS, LoadStatus, PlantSample, PlantSession, StationSample
+from coldloop.registers.plant import (
+    HISTORY_ROWS,
+    LOAD_ROWS,
+    STATION_ROWS,
+    LiveLoad,
+    LoadStatus,
+    LoadStep,
+    PlantSample,
+    PlantSession,
+    StationSample,
+)
 from coldloop_plant.kinds import own_header
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.cosim.wiring import QUIET_S, SERVICES, RigEndpoints
@@ -490,3 +502,69 @@ class Lateness:
 
 def _gained(before: int, now: int) -> int:
     return now - before if now >= before else now
+
+
+log = logging.getLogger("coldloop.rig")
+
+
+class SavedSession(NamedTuple):
+    """State of a rig when the client attached."""
+
+    pace: SessionPace
+    operator: Operator
+    load: LoadProfile
+    """Load from that tick on, W."""
+
+
+async def save_session(rig: SessionClient) -> SavedSession | None:
+    """Return the session of a rig if it runs in real time.
+
+    Raises:
+        LinkError: A service does not answer.
+    """
+    identity, pace = await rig.plant.read(Identity), await rig.plant.read(SessionPace)
+    if not identity.session or not pace.realtime:
+        return None
+    return SavedSession(pace, await rig.control.read(Operator), await _load_from(rig, identity.tick))
+
+
+async def _load_from(rig: SessionClient, now: int) -> LoadProfile:
+    """Return the load from now on: of the session's table, unless another client has written one since."""
+    status, asked = await rig.plant.read(LoadStatus), await rig.plant.read(PlantSession)
+    steps: list[LoadStep] = []
+    if status.upcoming:
+        steps = await rig.plant.read_rows(LoadStep, 0, min(asked.load_steps, LOAD_ROWS))
+    if not steps or steps[-1].tick != status.last_tick:
+        steps = []
+    coming = [step for step in steps if step.tick > now]
+    try:
+        return LoadProfile((0, *(step.tick - now for step in coming)), (status.watts, *(step.watts for step in coming)))
+    except ValueError as error:
+        raise LinkError(f"{rig.plant.peer}: its load is invalid: {error}") from None
+
+
+async def restore_session(rig: SessionClient, saved: SavedSession | None, session: int) -> None:
+    """Restore real time, factor, load and operating mode of the rig in the session of our run.
+
+    Nothing is done where the rig was in lock-step, or where another client has begun another session. A failure
+    is logged: the run is recorded all the same.
+    """
+    if saved is None:
+        return
+    try:
+        identity = await rig.plant.read(Identity)
+        if identity.session != session:
+            return
+        await write_pace(rig.clients, saved.pace._replace(session=0))
+        if saved.operator.mode != OperatorMode.AUTO:
+            await rig.control.write(saved.operator)
+        tick = (await rig.plant.read(Identity)).tick
+        await rig.plant.write(sealed(LiveLoad(0, saved.load.watts[0]), rig.plant.map))
+        coming = LoadProfile(saved.load.times, saved.load.watts)
+        await LoadStream(
+            rig.plant, session, coming, begin=tick + lead_ticks(saved.pace, rig.plant.process.tick_s)
+        ).feed(tick)
+    except LinkError as error:
+        log.warning("the rig was not restored: %s", error)
+    else:
+        log.info("restored at %g s", tick * rig.plant.process.tick_s)

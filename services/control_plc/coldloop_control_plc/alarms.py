@@ -487,8 +487,8 @@ OPTIMIZER_DRIVES: Final = (Mode.MPC, Mode.REST)
 class ScanSummary(NamedTuple):
     """Conditions of one scan that its alarms depend on, beside those of bands."""
 
-    mode: Mode
-    cause: Cause
+    mode: int
+    cause: int
     late: bool
     """The rest of a sequence is being played."""
     optimizer: bool
@@ -534,13 +534,13 @@ class ProcessAlarms:
             return
         self.reported, report = scan, self._panel.report
         mode, cause = scan.mode, scan.cause
-        fallen = mode is not Mode.MPC and cause not in (Cause.SESSION_STARTED, Cause.OPERATOR, Cause.COOL_DOWN)
+        fallen = mode != Mode.MPC and cause not in (Cause.SESSION_STARTED, Cause.OPERATOR, Cause.COOL_DOWN)
         report(AlarmKind.MODE, condition=fallen, cause=cause)
-        exhausted = mode is not Mode.MPC and cause in (Cause.SEQUENCE_EXHAUSTED, Cause.HOLD_EXPIRED)
+        exhausted = mode != Mode.MPC and cause in (Cause.SEQUENCE_EXHAUSTED, Cause.HOLD_EXPIRED)
         report(AlarmKind.SEQUENCE_EXHAUSTED, condition=exhausted)
         report(AlarmKind.SEQUENCE_LATE, condition=scan.late)
         report(AlarmKind.OPTIMIZER_LOST, condition=not scan.optimizer)
-        short = CapacityCause.of(shortage if mode is Mode.MPC else 0.0)
+        short = CapacityCause.of(shortage if mode == Mode.MPC else 0.0)
         report(AlarmKind.CAPACITY, condition=bool(short), cause=short, value=abs(shortage))
         self._watch_sensors(tick, AlarmKind.SENSOR_BAD, scan.bad)
         suspects = scan.suspects if mode in OPTIMIZER_DRIVES else 0

@@ -100,6 +100,10 @@ class GuardState:
     """Place of the oldest of the last changes, which the next one takes."""
     out_of_bounds: bool = False
     """The outputs applied when the guard began are outside the bounds."""
+    newest: int = 0
+    """The latest tick, ..."""
+    lag: int = 0
+    """... and by how much the guard's time is behind it."""
 
 
 def beginning(limits: Limits, applied: Numbers) -> GuardState:
@@ -180,6 +184,12 @@ def admit(state: GuardState, limits: Limits, tick: int, wanted: Numbers, update:
     change(state, limits, tick, wanted)
     if state.out_of_bounds:
         state.out_of_bounds = not in_range(limits, applied)
+
+
+def admit_now(state: GuardState, limits: Limits, tick: int, wanted: Numbers, update: bool) -> None:  # noqa: FBT001
+    """Apply `wanted` (inputs,) at a tick of the rack, which the guard's time may be behind."""
+    state.newest = max(state.newest, tick)
+    admit(state, limits, state.newest - state.lag, wanted, update)
 
 
 def change(state: GuardState, limits: Limits, tick: int, wanted: Numbers) -> None:
@@ -295,28 +305,27 @@ class OutputGuard:
         self.limits = plain(limits)
         self.state = beginning(self.limits, list(map(_inside, applied, limits.low, limits.high)))
         self._twin = beginning(self.limits, applied)
-        self.applied = tuple(self.state.applied)
-        self._newest = self._lag = 0
-        """The latest tick, and by how much our time is behind it."""
+
+    @property
+    def applied(self) -> Inputs:
+        """Outputs applied."""
+        return tuple(self.state.applied)
 
     def begin_at(self, tick: int, applied: Inputs, passed: int | None = None) -> None:
         """Restart at `tick` from the outputs applied there (`output_limits.resume`).
 
         `passed`: ticks since the last scan by another clock, None without one.
         """
-        leap = tick - self._newest
+        state, leap = self.state, tick - self.state.newest
         if -self.limits.ticks_per_sample <= leap < 0:
             leap = 0
-        self._lag += leap - max(0, leap if passed is None else min(leap, passed))
-        self._newest += leap
-        resume(self.state, self.limits, self._newest - self._lag, applied)
-        self.applied = tuple(self.state.applied)
+        state.lag += leap - max(0, leap if passed is None else min(leap, passed))
+        state.newest += leap
+        resume(state, self.limits, state.newest - state.lag, applied)
 
     def admit(self, tick: int, wanted: Inputs, *, update: bool) -> Inputs:
         """Return what may be applied at `tick`, and remember it as applied."""
-        self._newest = max(self._newest, tick)
-        admit(self.state, self.limits, self._newest - self._lag, wanted, update)
-        self.applied = tuple(self.state.applied)
+        admit_now(self.state, self.limits, tick, wanted, update)
         return self.applied
 
     def judge(self, rows: Sequence[Inputs], first_tick: int, meanwhile: Sequence[Inputs | None]) -> Verdict:
@@ -329,7 +338,7 @@ class OutputGuard:
         """
         played = [row for row in meanwhile if row is not None]
         waiting = next((k for k, row in enumerate(meanwhile) if row is not None), 0)
-        first_tick -= self._lag
+        first_tick -= self.state.lag
         tick = first_tick - len(meanwhile)
         passes = judge(
             self.state, self._twin, self.limits, tick, played, waiting, len(played), first_tick, rows, len(rows)

@@ -77,13 +77,6 @@ def has_row(p: PlayerState, tick: int) -> bool:
     return 0 <= tick - p.first_ticks[p.slot] < p.lengths[p.slot]
 
 
-def plays_in_time(p: PlayerState, tick: int) -> bool:
-    """Return whether a row will be played at this tick, the next one, and not of a sequence that is late."""
-    if p.has_answer and p.first_ticks[1 - p.slot] <= tick:
-        return p.first_ticks[1 - p.slot] == tick
-    return has_row(p, tick) and not p.late and p.invited and (tick < p.next_update_tick or p.phase == ANSWERED)
-
-
 def awaits_sequence(p: PlayerState, tick: int) -> bool:
     """Return whether an updating instant has come without its sequence; one that a load may cut off is due at once."""
     is_due = tick == p.next_update_tick and tick > 0
@@ -172,14 +165,9 @@ class SequencePlayer(PlayerState):
         return self.invited and self.phase == LATCHED
 
     @property
-    def answering(self) -> bool:
-        """The optimiser has planned the current update: a sequence is expected."""
-        return self.phase in (PLANNED, ANSWERED)
-
-    @property
-    def given_up(self) -> bool:
-        """No sequence is expected for the last update: it was abandoned, or its sequence rejected."""
-        return self.phase in (NONE, REFUSED, ABANDONED)
+    def rows(self) -> list[Sequence[Inputs]]:
+        """Rows of the sequences, by slot."""
+        return [() if each is None else each.rows for each in self.sequences]
 
     def row(self, tick: int) -> Inputs | None:
         """Return the row to be played at this tick, if any."""
@@ -227,10 +215,6 @@ class SequencePlayer(PlayerState):
         self.lengths[self.slot] = 0
         self.has_answer = self.has_update = False
         self.update = None
-
-    def drop(self) -> None:
-        """Drop the sequence that has been played to its end: another mode moves the inputs now."""
-        self.lengths[self.slot] = 0
 
     def resume(self, sequence: InputSequence | None, tick: int) -> None:
         """Resume the rest of the sequence after a restart, and latch an update at the next scan."""

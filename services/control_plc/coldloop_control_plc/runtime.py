@@ -3,7 +3,7 @@
 A scan makes one exchange (FC23) with the rack, and only while the link is synchronised (`plant_link.py`); otherwise
 the rack is read until it is. In lock-step the next scan waits for what it needs: the operator's grant, the optimiser's
 plan, and at an updating instant its sequence, while an optimiser is connected. In real time it waits for the clock
-only, which follows that of the rack (`rack_clock.py`).
+only, which follows that of the rack (`rack.py`).
 """
 
 import asyncio
@@ -33,15 +33,11 @@ from coldloop.service.metrics import MetricsServer
 from coldloop.service.start import SERVING, dropped
 from coldloop.service.telemetry import Telemetry
 from coldloop.session import TimeBase
-from coldloop_control_plc.client_requests import Clients
+from coldloop_control_plc.clients import Clients, ControlPublication
 from coldloop_control_plc.plant_link import FROZEN_S, FROZEN_TICKS, PlantLink
 from coldloop_control_plc.program import ControlProgram, make_program
-from coldloop_control_plc.publication import ControlPublication
-from coldloop_control_plc.rack_clock import PHASE, RackClock
-from coldloop_control_plc.rack_finder import RackFinder
-from coldloop_control_plc.retained_state import ControlStateStore
-from coldloop_control_plc.scan_cycle import ScanCycle
-from coldloop_control_plc.sessions import Sessions
+from coldloop_control_plc.rack import PHASE, RackClock, RackFinder, ScanCycle
+from coldloop_control_plc.sessions import ControlStateStore, Sessions
 from coldloop_control_plc.settings import SHOWN, ControlSettings
 
 log = logging.getLogger("coldloop.control_plc")

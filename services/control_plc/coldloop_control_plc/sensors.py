@@ -107,6 +107,12 @@ class SensorConstants(NamedTuple):
     behind: int
     least_load: float
     largest_load: float
+    bridged_ticks: int
+    """A controlled output that has been bad for longer is missing to its loop, ..."""
+    estimated_ticks: int
+    """... and one that has been for longer to MPC, ..."""
+    estimated_most: int
+    """... as long as no more outputs are bad."""
 
 
 @dataclass(slots=True)
@@ -293,6 +299,20 @@ def is_old_image(
     return (s.image_count if s.image_moved else 0) >= c.frozen_ticks
 
 
+def is_missing(s: SensorState, output: int, ticks: int) -> bool:
+    """Return whether an output has been bad for longer than so many ticks."""
+    return s.bad_since[output] != NONE and s.now - s.bad_since[output] + 1 > ticks
+
+
+def lacks_output(c: SensorConstants, s: SensorState, ticks: int) -> bool:
+    """Return whether a controlled output has been bad for longer than so many ticks."""
+    lacks: float = False
+    if s.bad_count > 0:
+        for output in range(len(c.controlled)):
+            lacks = lacks or (c.controlled[output] and is_missing(s, output, ticks))
+    return bool(lacks)
+
+
 class SensorMonitor(SensorState):
     """Looks at every measurement. Scans can be missed.
 
@@ -316,12 +336,9 @@ class SensorMonitor(SensorState):
         self.constants = SensorConstants(
             low, high, [frozen_ticks if each else resting_ticks for each in controlled], controlled, Kinds(*kinds),
             moves, settings.may_rest, settings.may_rest and not process.moves_as_one, frozen_ticks,
-            *turbine, *process.load.stored_span,
+            *turbine, *process.load.stored_span, round(settings.bridged_s / process.tick_s),
+            round(settings.estimated_s / process.tick_s), settings.estimated_most,
         )  # fmt: skip
-        self._controlled = process.controlled
-        self._bridged_ticks = round(settings.bridged_s / process.tick_s)
-        self._estimated_ticks = round(settings.estimated_s / process.tick_s)
-        self._estimated_most = settings.estimated_most
         super().__init__(
             tick=NONE, now=0, good=list(initial), before=list(initial), unchanged=[0] * count,
             rests=[0 if each else -MOVES for each in controlled], inputs=[[0.0] * len(moves) for _ in initial],
@@ -341,20 +358,6 @@ class SensorMonitor(SensorState):
     def bad(self) -> list[int]:
         """Outputs that are substituted."""
         return [output for output, since in enumerate(self.bad_since) if since != NONE] if self.bad_count else []
-
-    @property
-    def unusable(self) -> list[int]:
-        """Controlled outputs that have been bad for longer than they are bridged: their loops are left."""
-        return self._bad_for(self._bridged_ticks)
-
-    @property
-    def unestimated(self) -> list[int]:
-        """Controlled outputs that have been bad for longer than an estimate of them is believed: MPC is left."""
-        return self._bad_for(self._bridged_ticks if self.bad_count > self._estimated_most else self._estimated_ticks)
-
-    def _bad_for(self, ticks: int) -> list[int]:
-        bad = (output for output in self._controlled if self.bad_count and self.bad_since[output] != NONE)
-        return [output for output in bad if self.now - self.bad_since[output] + 1 > ticks]
 
     @property
     def mask(self) -> int:

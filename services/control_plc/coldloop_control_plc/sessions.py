@@ -1,19 +1,186 @@
 """Session and time base of the control PLC.
 
 It is the one requested by an operator, the one retained over a restart, or with `session.autostart` that of the rack.
+The state of the control PLC is retained over a restart in a file.
 """
 
+import base64
 import logging
+import secrets
+import struct
 import time
-from typing import Final
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Final, Self
 
-from coldloop.registers.control_plc import ControlSession
+from pydantic import AfterValidator, Field, ValidationError, model_validator
+
+from coldloop.process.declaration import LAST_NUMBER, LAST_TICK, Process
+from coldloop.process.settings import ProcessSettings, settings_of, settings_process
+from coldloop.registers.codec import check_record
+from coldloop.registers.common import SessionPace
+from coldloop.registers.control_plc import (
+    SEQUENCE_ROWS,
+    ControlSession,
+    CoolDownStep,
+    Operator,
+    SequenceHeader,
+    control_map,
+)
 from coldloop.registers.plant import Measurement
+from coldloop.registers.safety import Alarm, alarms_of
+from coldloop.safety.retained import RetainedFile, RetainedStateError, RetainedStateWriter
+from coldloop.safety.writers import InputSequence, checksum
 from coldloop.session import SessionSettings, TimeBase, TimeMode
 from coldloop_control_plc.program import ControlProgram
-from coldloop_control_plc.retained_state import RetainedControlState
 
 log = logging.getLogger("coldloop.control_plc")
+
+OWNER: Final = "control_plc/6"
+"""Who retained states belong to, and the version of what they hold."""
+OF_THE_SESSION: Final = ("session", "tick", "pace", "updates", "playing", "cool_down")
+"""Keys of the retained state that belong to a session."""
+
+Count = Annotated[int, Field(ge=0, lt=2**32)]
+
+
+def _row(process: Process) -> struct.Struct:
+    return struct.Struct(f">{len(process.inputs)}f")
+
+
+def _not_longer(text: str) -> str:
+    if len(text) > 2 * SEQUENCE_ROWS * _row(settings_process()).size:
+        raise ValueError("a sequence longer than the longest")
+    return text
+
+
+class RetainedControlState(ProcessSettings):
+    """The session, how far it has got, what is being played, what operators have said, the alarms, and who we are."""
+
+    boot: Annotated[int, Field(ge=1, lt=2**16)]
+    """Number of the start that wrote it."""
+    holder: Annotated[int, Field(ge=1, lt=2**32)]
+    """Number by which the rack knows this control PLC."""
+    events: Annotated[int, Field(ge=0, lt=2**31)]
+    """Number of the last event."""
+    session: Count
+    tick: Annotated[int, Field(ge=0, le=LAST_TICK)]
+    pace: TimeBase
+    updates: Annotated[int, Field(ge=0, le=LAST_NUMBER)]
+    """Number of the next update."""
+    playing: tuple[SequenceHeader, Annotated[str, AfterValidator(_not_longer)]] | None
+    """Header and rows (base64 of single precision, high byte first) of the sequence being played."""
+    cool_down: CoolDownStep
+    operator: Operator
+    watchdog: Annotated[int, Field(ge=0, lt=2**16)]
+    """Time-out of the optimiser's watchdog, in ticks."""
+    alarms: list[Alarm]
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if len(self.alarms) != len(alarms_of(self.process)):
+            raise ValueError(f"{len(self.alarms)} alarms of {len(alarms_of(self.process))}")
+        registers = control_map(self.process)
+        for record in (SessionPace.shown(self.session, self.pace), self.operator, *self.alarms):
+            check_record(record, registers)
+        if self.playing is not None:
+            check_record(self.playing[0], registers)
+        return self
+
+    @classmethod
+    def parsed(cls, content: Mapping[str, object], process: Process) -> Self:
+        """Return the state of a control PLC of this process that a file holds.
+
+        Raises:
+            RetainedStateError: It holds something else.
+        """
+        try:
+            with settings_of(process):
+                return cls.model_validate(content)
+        except ValidationError as error:
+            raise RetainedStateError(f"the retained state is not used: {error.errors()[0]['msg']}") from None
+
+    @property
+    def sequence(self) -> InputSequence | None:
+        """The sequence being played, where it is whole."""
+        if self.playing is None:
+            return None
+        header, text = self.playing
+        try:
+            rows = list(_row(self.process).iter_unpack(base64.b64decode(text)))
+        except (ValueError, struct.error):
+            return None
+        return InputSequence(header, rows) if checksum(header, rows) == header.crc else None
+
+
+class ControlStateStore:
+    """Keeps the state in a file, if one is configured; what cannot be trusted or written is logged once.
+
+    Writing is done by a thread: a scan never waits for a disk.
+    """
+
+    def __init__(self, file: Path | None, model_digest: int, process: Process) -> None:
+        self._process, self._row = process, _row(process)
+        self._file = RetainedFile(file, OWNER, model_digest) if file else None
+        self._writer = RetainedStateWriter(self._file) if self._file else None
+        self._packed: tuple[InputSequence, tuple[SequenceHeader, str]] | None = None
+        self.refused = False
+        """A previous state exists and is not used."""
+        self.boot = 1
+        self.holder = secrets.randbelow(2**32 - 1) + 1
+
+    def recall(self) -> RetainedControlState | None:
+        """Return the previous state, if any; boot and holder continue from it."""
+        if self._file is None:
+            return None
+        try:
+            content = self._file.load()
+            state = None if content is None else RetainedControlState.parsed(content, self._process)
+        except RetainedStateError as error:
+            self.refused = True
+            log.warning("retained state refused", extra={"reason": str(error), "file": self._file.set_aside()})
+            return None
+        if state is not None:
+            self.boot, self.holder = state.boot % 0xFFFF + 1, state.holder
+        return state
+
+    @property
+    def failure(self) -> str | None:
+        """Why the state cannot be written at present."""
+        return self._writer.failed if self._writer else None
+
+    def keep(self, program: ControlProgram, pace: TimeBase, pending: RetainedControlState | None = None) -> None:
+        """Keep the state of now; of a `pending` session, which is still to be resumed, what was retained of it."""
+        if self._writer is None:
+            return
+        content = self.content(program, pace)
+        if pending is not None:
+            content |= {name: getattr(pending, name) for name in OF_THE_SESSION}
+        self._writer.keep(content)
+
+    def content(self, program: ControlProgram, pace: TimeBase) -> dict[str, Any]:
+        """Return the state of a program, as a file holds it; nothing in it changes later."""
+        return {
+            "boot": self.boot, "holder": self.holder, "events": program.journal.count, "session": program.session,
+            "tick": program.tick, "pace": pace, "updates": program.player.updates,
+            "playing": self._playing(program.player.sequence), "cool_down": program.cool_down,
+            "operator": program.operator, "watchdog": program.watchdog.time,
+            "alarms": tuple(program.alarms.rows),
+        }  # fmt: skip
+
+    def _playing(self, sequence: InputSequence | None) -> tuple[SequenceHeader, str] | None:
+        if sequence is None:
+            return None
+        if self._packed is None or self._packed[0] is not sequence:
+            rows = b"".join(self._row.pack(*row) for row in sequence.rows)
+            self._packed = sequence, (sequence.header, base64.b64encode(rows).decode())
+        return self._packed[1]
+
+    def close(self) -> None:
+        """Let the last state be written."""
+        if self._writer is not None:
+            self._writer.close()
+
 
 ADOPT_AFTER_S: Final = 1.0
 """An operator who begins a session writes to one PLC after the other: one that the rack has begun is ours by

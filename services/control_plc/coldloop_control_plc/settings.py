@@ -2,19 +2,20 @@
 
 import math
 from enum import StrEnum
-from typing import Annotated, Final
+from typing import Annotated, Final, Self
 
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
 
 from coldloop.modbus.settings import CONTROL_PORT, PLANT_PORT, Endpoint, ServerSettings
+from coldloop.process.cold_box import LEVEL_LOOP, T5_LOOP
+from coldloop.process.sections import Band, Loop
 from coldloop.process.settings import InputLimits, ProcessSettings, RootSettings, declared, stretched, within
+from coldloop.process.updating_periods import whole_ticks
 from coldloop.registers.codec import WordOrder
 from coldloop.safety.retained import RetainSettings
 from coldloop.service.settings import MetricsSettings, TelemetrySettings
 from coldloop.session import SessionSettings
 from coldloop_control_plc.alarms import AlarmSettings
-from coldloop_control_plc.classical import ClassicalSettings
-from coldloop_control_plc.cool_down import CoolDownSettings
 from coldloop_control_plc.sensors import SensorCheckSettings
 
 SHOWN: Final = (
@@ -45,6 +46,80 @@ class ControlStrategy(StrEnum):
     """The optimiser's sequences."""
     CLASSICAL = "classical"
     """The classical loops; no update is latched, and the optimiser idles."""
+
+
+class PiSettings(BaseModel):
+    """One PI loop, u = gain (e + 1/T_i integral of e) with e = setpoint - y: the gain has the sign of the process."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    gain: FiniteFloat
+    """K, in the unit of the input per unit of the output."""
+    integral_time_s: PositiveFloat
+    """T_i, s."""
+    setpoint_offset: FiniteFloat = 0.0
+    """Setpoint less the output at the operating point of the model file, in the unit of the output."""
+
+
+def _declared(loop: Loop, band: Band) -> PiSettings:
+    return PiSettings(gain=loop.gain, integral_time_s=loop.integral_time_s, setpoint_offset=band.setpoint_offset)
+
+
+class TemperatureLoop(PiSettings):
+    """T5 (K) by CV156 (%): gain in % per K."""
+
+    gain: FiniteFloat = T5_LOOP.gain
+    integral_time_s: PositiveFloat = T5_LOOP.integral_time_s
+
+
+class LevelLoop(PiSettings):
+    """L1 (%) by NCR22_A (W): gain in W per %."""
+
+    gain: FiniteFloat = LEVEL_LOOP.gain
+    integral_time_s: PositiveFloat = LEVEL_LOOP.integral_time_s
+
+
+class ClassicalSettings(ProcessSettings):
+    """The tuning of loops by the quantity of their output, as the cold box declares it; of others it is declared."""
+
+    temperature: TemperatureLoop = TemperatureLoop()
+    level: LevelLoop = LevelLoop()
+    period_s: Annotated[float, within(lambda process: (process.tick_s, process.sampling_period_s))] = declared(
+        lambda process: process.sampling_period_s
+    )
+    """How often the loops are executed: a whole number of ticks, and no longer than the window of the rate limits."""
+
+    @property
+    def pairs(self) -> "tuple[tuple[str, str, PiSettings], ...]":
+        """Output, input and tuning of each loop."""
+        return tuple(
+            (output.name, loop.input, getattr(self, output.quantity) if output.quantity else _declared(loop, band))
+            for output, band in zip(self.process.banded, self.process.bands, strict=True)
+            if (loop := band.loop) is not None
+        )
+
+    @property
+    def period_ticks(self) -> int:
+        """The period, in ticks."""
+        return round(self.period_s / self.process.tick_s)
+
+    @model_validator(mode="after")
+    def _whole_ticks(self) -> Self:
+        if whole_ticks(self.period_s, self.process.tick_s) is None:
+            raise ValueError(f"period_s must be a multiple of the tick, {self.process.tick_s} s")
+        return self
+
+
+class CoolDownSettings(BaseModel, frozen=True, extra="forbid"):
+    """Settings of the cool-down: when it begins, and when its steps end."""
+
+    warm_k: Annotated[float, Field(ge=5, le=300)] = 20.0
+    """Its temperature at the beginning of a session, or after a restart, above which a bath without liquid is cooled
+    down."""
+    liquid_pct: Annotated[float, Field(gt=0, lt=50)] = 1.0
+    """Level from which on there is liquid, and the bath is filled."""
+    settled_s: Annotated[float, Field(ge=0, le=36_000)] = 600.0
+    """How long level and turbine's outlet have to stay in their bands until the optimiser is invited, plant time."""
 
 
 class LadderSettings(ProcessSettings):

@@ -36,12 +36,7 @@ class Watchdog:
 
     def check(self, tick: int) -> bool:
         """Return whether it expires at `tick`; once for each time that it does."""
-        if not expires(self, tick):
-            return False
-        self.expired = True
-        self.lowest = 0
-        self.trips += 1
-        return True
+        return expire(self, tick)
 
     def registers(self, tick: int) -> safety.WatchdogStatus:
         """Return what its registers show at `tick`."""
@@ -56,9 +51,13 @@ def remaining(watchdog: Watchdog, tick: int) -> int:
     return min(watchdog.time, max(0, watchdog.time - (tick - watchdog.triggered)))
 
 
-def expires(watchdog: Watchdog, tick: int) -> bool:
-    """Return whether it expires at a tick."""
-    return watchdog.time > 0 and not watchdog.expired and remaining(watchdog, tick) <= 0
+def expire(watchdog: Watchdog, tick: int) -> bool:
+    """Return whether it expires at a tick, and let it; once for each time that it does."""
+    if watchdog.time == 0 or watchdog.expired or remaining(watchdog, tick) > 0:
+        return False
+    watchdog.expired, watchdog.lowest = True, 0
+    watchdog.trips += 1
+    return True
 
 
 def trigger(watchdog: Watchdog, tick: int) -> None:

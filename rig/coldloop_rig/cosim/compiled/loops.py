@@ -1,8 +1,8 @@
 """Ticks and updates of the three programs as one compiled loop, which runs until something has to be reported.
 
 A tick is: outputs, the plant's step, the measurement observed. The control PLC's part is its own functions, which take
-records in the place of its objects. The loop ends with a tick that `observe` has found something in, which the program
-concludes, and before one that does not play a row in time. Values that would cross the link are rounded as the link
+records in the place of its objects. The loop ends with a tick that `decide` or `observe` has found something in, which
+the program concludes. Values that would cross the link are rounded as the link
 rounds them, through the rows of the trace.
 """
 
@@ -14,19 +14,10 @@ from numpy.typing import NDArray
 import coldloop_rig.cosim.compiled.portable  # noqa: F401 it lets kernels call what is plain Python
 from coldloop.kernels.compiled import inlined, kernel
 from coldloop.kernels.intrinsics import borrowed
-from coldloop.safety.watchdog import expires, trigger
-from coldloop_control_plc.output_limits import admit, in_range, judge
-from coldloop_control_plc.player import (
-    accept,
-    awaits_sequence,
-    begin_sequence,
-    has_row,
-    latch,
-    latches,
-    plays_in_time,
-    promise,
-)
-from coldloop_control_plc.program import Scan, observe
+from coldloop.safety.watchdog import trigger
+from coldloop_control_plc.output_limits import in_range, judge
+from coldloop_control_plc.player import accept, awaits_sequence, has_row, latch, latches, promise
+from coldloop_control_plc.scan import Scan, decide, observe
 from coldloop_optimizer_plc import scheme
 from coldloop_optimizer_plc.decisions import Latched, note_answer, take_update
 from coldloop_optimizer_plc.scheme import OptimizerState
@@ -48,16 +39,12 @@ from coldloop_rig.cosim.compiled.records import (
 Counts = NDArray[np.int64]
 
 DONE: Final = 0
-UNUSUAL: Final = 1
-"""The next tick is none for the loop."""
 OBSERVED: Final = 2
 """The last tick is still to be concluded."""
 AWAITED: Final = 3
 """The next tick awaits a sequence."""
 LATCHED: Final = 4
 """An update was latched in the last tick, and awaits its plan."""
-COOLING: Final = False
-"""Whether the plant is being cooled down: then the classical loops drive, and not this one."""
 LATE: Final = False
 """Whether answers come late."""
 
@@ -76,33 +63,30 @@ def go_on(
     w: World, parts: Records, rows: Array, plant: PlantState, trace: Trace, counts: Counts, until: int
 ) -> int:  # fmt: skip
     """Do what `play` does. `rows` (2, 240, inputs) are those of a slot."""
-    guard, player, watchdog = parts.guard[0], parts.player[0], parts.watchdog[0]
-    s = Scan(guard, player, parts.sensors[0], parts.alarms[0], watchdog)
-    limits, tick = w.scan.limits, counts[TICK]
+    guard, player = parts.guard[0], parts.player[0]
+    s = Scan(guard, parts.ladder[0], player, parts.sensors[0], parts.alarms[0], parts.watchdog[0])
+    tick = counts[TICK]
     while tick < until:
         if awaits_sequence(player, tick):
             return AWAITED
-        if not plays_in_time(player, tick) or expires(watchdog, tick):
-            return UNUSUAL
         row = tick - counts[FIRST]
         while counts[LOAD] + 1 < w.load_ticks.shape[0] and w.load_ticks[counts[LOAD] + 1] <= tick:
             counts[LOAD] += 1
         load = w.load_watts[counts[LOAD]]
         trace.load[row], trace.y[row], trace.x[row], trace.station[row] = load, plant.y, plant.x, plant.station
-        begins = begin_sequence(player, tick)
-        admit(guard, limits, tick, rows[player.slot, tick - player.first_ticks[player.slot]], begins)
+        changed = decide(w.scan, s, tick, rows)  # type: ignore[arg-type]
         u, y, x = guard.applied, trace.y[row], trace.x[row]
         trace.u[row] = u
         advance_plant(w.plant, plant, u, load, row)
         if plant.noise.shape[0]:
             for i in range(plant.y.shape[0]):
                 plant.y[i] = plant.y[i] + w.biases[i] + w.deviations[i] * plant.noise[row, i]
-        told = observe(w.scan, s, tick, y, x, trace.load[row], u, COOLING)
+        told = observe(w.scan, s, tick, y, x, trace.load[row])
         counts[TICK] = tick + 1
-        if told:
+        if told or changed:
             return OBSERVED
         if latches(player, tick, trace.load[row]):
-            latch(player, tick, trace.load[row], limits.ticks_per_sample)
+            latch(player, tick, trace.load[row], w.scan.limits.ticks_per_sample)
             return LATCHED
         tick += 1
     return DONE

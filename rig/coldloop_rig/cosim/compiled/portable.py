@@ -12,14 +12,13 @@ from numba.extending import overload, register_jitable
 
 from coldloop.kernels import single_precision
 from coldloop.safety import watchdog
-from coldloop_control_plc import alarms, output_limits, player, program, sensors
+from coldloop_control_plc import alarms, output_limits, player, scan, sensors
 
 PORTABLE: Final[tuple[Callable[..., Any], ...]] = (
     single_precision.neighbour,
-    program.observe,
     *(
         function
-        for module in (alarms, output_limits, player, sensors, watchdog)
+        for module in (alarms, output_limits, player, scan, sensors, watchdog)
         for name, function in vars(module).items()
         if isfunction(function) and function.__module__ == module.__name__ and not name.startswith("_")
     ),

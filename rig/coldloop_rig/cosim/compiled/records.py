@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from coldloop.process.declaration import Process
 from coldloop_control_plc.output_limits import Limits
-from coldloop_control_plc.program import Scan, ScanConstants
+from coldloop_control_plc.scan import Scan, ScanConstants
 from coldloop_optimizer_plc.decisions import Latched, Starts
 from coldloop_optimizer_plc.rules import UpdatingRule
 from coldloop_optimizer_plc.scheme import Constants, OptimizerState
@@ -77,7 +77,7 @@ def as_arrays(constants: Any) -> Any:  # noqa: ANN401 named tuples
         return constants
     if hasattr(constants, "_fields"):
         return type(constants)(*map(as_arrays, constants))
-    return np.array(constants)
+    return np.array(constants) if len(constants) else np.empty(0, np.int64)
 
 
 PlantState = Any

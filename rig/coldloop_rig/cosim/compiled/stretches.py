@@ -15,22 +15,8 @@ from coldloop_optimizer_plc.decisions import Latched, Starts
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.solvers import KernelSolver
 from coldloop_plant.program import PlantProgram
-from coldloop_rig.cosim.compiled import loops
+from coldloop_rig.cosim.compiled import loops, records
 from coldloop_rig.cosim.compiled.plants import CompiledPlant
-from coldloop_rig.cosim.compiled.records import (
-    BLOCK_TICKS,
-    SOLVED,
-    TICK,
-    Optimizer,
-    Reports,
-    World,
-    as_arrays,
-    empty_reports,
-    empty_trace,
-    restore,
-    scan_records,
-    write,
-)
 from coldloop_rig.results.recording import NO_STATION, STATION_COLUMNS, SampleBlock
 
 SHORTEST: Final = 6
@@ -73,18 +59,19 @@ class CompiledStretches:
         self._updates_too = _is_compiled(optimizer_plc)
         self._may_compile = may_compile
         self._is_there: dict[Callable[..., int], bool] = {}
-        self._trace, self._reports = empty_trace(process, STATION_COLUMNS if plant.station else 0), empty_reports()
+        self._trace = records.empty_trace(process, STATION_COLUMNS if plant.station else 0)
+        self._reports = records.empty_reports()
         self._rows = np.zeros((2, SEQUENCE_ROWS, len(process.inputs)))
-        self._scans = scan_records(control_plc.scan)
+        self._scans = records.scan_records(control_plc.scan)
         self._pause_until = 0
         real = optimizer_plc.state.u.dtype
         u_before, u, y, x, ahead = (
             np.zeros(len(part), real) for part in (process.inputs, process.inputs, process.outputs, process.states, ())
         )
         self._latched = Latched(0, 0, 0, real.type(0.0), u_before, u, y, x, ahead)
-        self._world = World(
+        self._world = records.World(
             compiled.constants, plant.biases, plant.deviations, np.array(load.times), np.array(load.watts),
-            as_arrays(control_plc.scan_constants),
+            records.as_arrays(control_plc.scan_constants),
         )  # fmt: skip
 
     def ahead(self, until: int) -> Stretch | None:
@@ -95,32 +82,32 @@ class CompiledStretches:
             return None
         if not self._updates_too and (program.awaiting_sequence or instant - first < SHORTEST):
             return None
-        until = int(min(until, (first // BLOCK_TICKS + 1) * BLOCK_TICKS, program.alarms.next_report))
+        until = int(min(until, (first // records.BLOCK_TICKS + 1) * records.BLOCK_TICKS, program.alarms.next_report))
         for slot, sequence in enumerate(program.player.sequences):
             if sequence is not None:
                 self._rows[slot, : len(sequence.rows)] = sequence.rows
         scans, counts = self._scans, np.array([first, first, 0, 0])
-        for part, records in zip(program.scan, scans, strict=True):
-            write(part, records)
+        for part, kept in zip(program.scan, scans, strict=True):
+            records.write(part, kept)
         with self._plant.noise(until - first) as noise:
             plant = self._compiled.state(noise, until - first)
             loop: Callable[..., int] = loops.play
             further: tuple[Any, ...] = (scans, self._rows, plant, self._trace)
             if self._updates_too:
                 starts = Starts(o.rule.first, o.rule.after_interruption())
-                parts = Optimizer(o.constants, o.method, o.rule, starts, o.state, self._latched)
+                parts = records.Optimizer(o.constants, o.method, o.rule, starts, o.state, self._latched)
                 loop, further = loops.run_block, (parts, scans, self._rows, plant, self._trace, self._reports)
             outcome = self._run(loop, self._world, *further, counts, until)
-            ticks = int(counts[TICK]) - first
+            ticks = int(counts[records.TICK]) - first
             if ticks:
-                self._compiled.restore(plant, int(counts[TICK]), scans.guard[0]["applied"])
+                self._compiled.restore(plant, int(counts[records.TICK]), scans.guard[0]["applied"])
         if not ticks:  # the programs run alone to the next updating instant
             self._pause_until = instant
             return None
         latched = self._give_back(first, ticks, outcome)
         load, u, y, x, station = (part[:ticks].copy() for part in self._trace)
         block = SampleBlock(first, load, u, y, x, station if station.size else NO_STATION)
-        return Stretch(block, _optimizations(self._reports, int(counts[SOLVED])), latched)
+        return Stretch(block, _optimizations(self._reports, int(counts[records.SOLVED])), latched)
 
     def _run(self, loop: Callable[..., int], *arguments: Any) -> int:  # noqa: ANN401 arguments differ by loop
         """Run a loop and return how it ended; it may have to be compiled: whether it is there is asked once."""
@@ -128,15 +115,15 @@ class CompiledStretches:
             if loop not in self._is_there:
                 self._is_there[loop] = is_compiled(loop, *arguments)
             if not self._is_there[loop]:
-                return loops.UNUSUAL
+                return loops.DONE
         return loop(*arguments)
 
     def _give_back(self, first: int, ticks: int, outcome: int) -> Update | None:
         """Let the control PLC continue behind the ticks of a loop; return an update that awaits its plan."""
         program, player, u = self._control, self._control.player, self._trace.u[:ticks].tolist()
         befores = [program.applied, *map(tuple, u)]
-        for part, records in zip(program.scan, self._scans, strict=True):
-            restore(part, records)
+        for part, kept in zip(program.scan, self._scans, strict=True):
+            records.restore(part, kept)
         place, update = player.update_tick - first, None
         if place >= 0:
             m = self._measurement(first, place)
@@ -161,7 +148,7 @@ def _is_compiled(program: OptimizerProgram) -> bool:
     return isinstance(program.solver, KernelSolver) and not (program.plans_by_steps or program.process.forecasts)
 
 
-def _optimizations(reports: Reports, solved: int) -> list[Optimization]:
+def _optimizations(reports: records.Reports, solved: int) -> list[Optimization]:
     """Return what was reported, as the recorder takes it."""
     counts, values = reports.counts[:solved].tolist(), reports.values[:solved].tolist()
     rows = ([*row, int(Verdict.ACCEPTED), *of_row] for row, of_row in zip(counts, values, strict=True))

@@ -1,33 +1,173 @@
-"""Requests of optimisers and operators to the control PLC, and their effects."""
+"""Registers, log and telemetry made from the program's state, and what optimisers and operators write there."""
 
 import asyncio
-from collections.abc import Awaitable
+import logging
+import math
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Final
 
 from coldloop.process.settings import InputLimits
+from coldloop.registers import control_plc as registers
 from coldloop.registers.audit import EventKind, JournalQuery
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
-from coldloop.registers.common import SessionPace, pace_subject
-from coldloop.registers.control_plc import (
-    AwaitUpdate,
-    ControlSession,
-    Grant,
-    Heartbeat,
-    LatchedUpdate,
-    Operator,
-    Plan,
-    SequenceHeader,
-    SequenceRow,
-    Update,
-    Verdict,
-)
+from coldloop.registers.common import Identity, ServiceState, SessionPace, pace_subject
 from coldloop.registers.declaration import Block, Role
-from coldloop.registers.safety import AlarmCommand, AlarmKind, LeaseEvent, WatchdogTime
+from coldloop.registers.safety import AlarmCommand, AlarmKind, AlarmState, LeaseEvent, WatchdogTime
 from coldloop.safety.writers import InputSequence, WriterLease
+from coldloop.service.journal import JournalPublication, alarm_word, log_event
 from coldloop.session import TimeBase
+from coldloop.session.clock import LatenessRecord
+from coldloop_control_plc.plant_link import PlantLink
 from coldloop_control_plc.program import ControlProgram
-from coldloop_control_plc.publication import ControlPublication
+from coldloop_control_plc.rack import Skew
 from coldloop_control_plc.sessions import Sessions
+
+log = logging.getLogger("coldloop.control_plc")
+
+
+class ControlPublication:
+    """Shows the program's state in the registers: what changes in each scan when it is read, the rest with its events.
+
+    `keep` is called with new events, so that no number of an event is given out twice, and what an operator has said
+    is retained also while no scans are made.
+    """
+
+    def __init__(
+        self,
+        program: ControlProgram,
+        sessions: Sessions,
+        link: PlantLink,
+        bank: RegisterBank,
+        model_digest: int,
+        keep: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._program = program
+        self._sessions = sessions
+        self._link = link
+        self._bank = bank
+        self._model_digest = model_digest
+        self._keep = keep
+        self.journal = JournalPublication(program.journal, bank)
+        self._told_alarms = -1
+        self.overruns = 0
+        """Scans that began too late."""
+        self.lateness = LatenessRecord()
+        """Lateness of all scans of this session in real time."""
+        self.skew = Skew(0.0, math.inf)
+        """How much faster the rack's clock is than ours, and its phase error."""
+        self.offset_ms = 0.0
+        self.lease: WriterLease | None = None
+        """Lease of the optimiser."""
+        bank.keep_fresh(Identity, self._identity)
+        bank.keep_fresh(registers.ProcessNow, lambda: program.process)
+        bank.keep_fresh(registers.Status, self._status)
+
+    def begin(self) -> None:
+        """Reset the counters: a session begins."""
+        self.overruns = 0
+        self.lateness = LatenessRecord()
+        self.skew, self.offset_ms = Skew(0.0, math.inf), 0.0
+
+    def _identity(self) -> Identity:
+        program = self._program
+        return Identity(
+            map_digest=self._bank.map.digest,
+            map_version=self._bank.map.version,
+            state=ServiceState.RUNNING if self._sessions.running else ServiceState.READY,
+            model_digest=self._model_digest,
+            session=program.session,
+            tick=program.tick,
+            heartbeat=program.tick & 0xFFFF,
+        )
+
+    def _status(self) -> registers.Status:
+        program, lateness = self._program, self.lateness
+        player = program.player
+        return registers.Status(
+            mode=program.mode,
+            update=player.update.update if player.update else 0,
+            next_update_tick=player.next_update_tick,
+            playing=player.playing,
+            remaining=program.remaining,
+            accepted=player.accepted & 0xFFFFFFFF,
+            rejected=player.rejected & 0xFFFFFFFF,
+            deadline_misses=player.deadline_misses & 0xFFFFFFFF,
+            overruns=self.overruns & 0xFFFFFFFF,
+            lateness_max=lateness.maximum_s * 1000,
+            lateness_p99=lateness.percentile_s(0.99) * 1000,
+        )
+
+    def _ladder(self) -> registers.LadderStatus:
+        program = self._program
+        return registers.LadderStatus(
+            mode=program.mode,
+            cause=program.ladder.cause,
+            since=program.ladder.since,
+            optimizer=int(program.optimizer_present),
+            bad_sensors=program.bad_sensors,
+            events=program.journal.count,
+        )
+
+    @property
+    def is_behind(self) -> bool:
+        """There are events that have not been shown."""
+        return self.journal.is_behind
+
+    def safety(self) -> None:
+        """Show ladder, watchdog, links, alarms and events, which agree with each other, and log the events."""
+        program = self._program
+        if self.lease is not None:
+            self.lease.note_end()
+        events = self.journal.show()
+        for event in events:
+            log_event(log, event, self._bank.map.process)
+        if events:
+            self._keep()
+        if program.alarms.changes != self._told_alarms:
+            self._told_alarms = program.alarms.changes
+            for row, alarm in enumerate(program.alarms.rows):
+                self._bank.put(alarm, row)
+        for shown in (self._ladder(), program.watchdog.registers(program.tick), self._plant_link()):
+            self._bank.put(shown)
+        if self.lease is not None:
+            self._bank.put(self.lease.registers())
+
+    def _plant_link(self) -> registers.PlantLinkStatus:
+        link = self._link
+        return registers.PlantLinkStatus(
+            state=link.state,
+            cause=link.cause,
+            since=link.since,
+            breaks=link.breaks & 0xFFFFFFFF,
+            holder=link.holder,
+            generation=link.generation,
+            plant_session=link.session,
+            plant_tick=link.tick,
+            offset=self.offset_ms,
+            skew=self.skew.ppm,
+            skew_error=self.skew.error_ppm,
+        )
+
+    def snapshot(self) -> Mapping[str, object]:
+        """Return what telemetry publishes."""
+        status, process = self._bank.get(registers.Status), self._bank.get(registers.ProcessNow)
+        alarms = {
+            alarm_word(kind, self._bank.map.process).replace(" ", "_"): AlarmState(alarm.state).name.lower()
+            for kind, alarm in enumerate(self._program.alarms.rows)
+            if alarm.state != AlarmState.NORMAL
+        }
+        return {
+            "session": self._program.session,
+            "tick": process.tick,
+            **status._asdict(),
+            "mode": self._program.mode.name.lower(),
+            "cause": registers.Cause(self._program.ladder.cause).name.lower(),
+            "alarms": alarms,
+            "load_w": process.load,
+            "inputs": dict(zip(self._bank.map.process.input_names, process.u, strict=True)),
+            "outputs": dict(zip(self._bank.map.process.output_names, process.y, strict=True)),
+        }
+
 
 LONGEST_WAIT_S: Final = 1.0
 """Longest time that a read of the latch waits for an update; the optimiser then asks again."""
@@ -71,15 +211,16 @@ class Clients:
         self.changed = asyncio.Event()
         self.granted = 0
         """Lock-step scans every tick before this one."""
-        self.asked: ControlSession | None = None
+        self.asked: registers.ControlSession | None = None
         """A session that is to begin."""
         self.pending_time_base: TimeBase | None = None
         """A time base that the session under way is to have."""
         publication.lease = self.lease
-        bank.judged_by(self._judge_optimizer, AwaitUpdate, Plan, Heartbeat, SequenceHeader)
-        bank.judged_by(self._judge_optimizer, SequenceRow, every_row=False)
-        bank.judged_by(self._judge_operator, Operator)
-        bank.put_sealed(Plan(0, 0))
+        for record in (registers.AwaitUpdate, registers.Plan, registers.Heartbeat, registers.SequenceHeader):
+            bank.judged_by(self._judge_optimizer, record)
+        bank.judged_by(self._judge_optimizer, registers.SequenceRow, every_row=False)
+        bank.judged_by(self._judge_operator, registers.Operator)
+        bank.put_sealed(registers.Plan(0, 0))
         bank.judged_by(self._judge_pace, SessionPace)
 
     # -- judged before anything is stored ------------------------------------------------------------------------------
@@ -93,14 +234,14 @@ class Clients:
 
     def _judge_optimizer(self, record: tuple[object, ...], _row: int, caller: Caller) -> None:
         try:
-            self.lease.check(caller, record.holder if isinstance(record, Heartbeat) else None)
+            self.lease.check(caller, record.holder if isinstance(record, registers.Heartbeat) else None)
         except BusyError:
             self._program.alarms.pulse(AlarmKind.SECOND_WRITER, SECOND_OPTIMIZER)
             raise
-        if isinstance(record, Plan) and not record.crc:
+        if isinstance(record, registers.Plan) and not record.crc:
             raise IllegalValueError("a plan needs a CRC: it decides when inputs change")
 
-    def _judge_operator(self, record: Operator, _row: int, _caller: Caller) -> None:
+    def _judge_operator(self, record: registers.Operator, _row: int, _caller: Caller) -> None:
         names = self._limits.process.input_names
         for name, value, low, high in zip(names, record.u, self._limits.low, self._limits.high, strict=True):
             if not low <= value <= high:
@@ -119,8 +260,8 @@ class Clients:
     def begin(self) -> None:
         """Show nothing of the session before: a session begins."""
         self._begun += 1
-        self._bank.put_sealed(self._bank.get(Update)._replace(session=0))
-        self._bank.put_sealed(LatchedUpdate())
+        self._bank.put_sealed(self._bank.get(registers.Update)._replace(session=0))
+        self._bank.put_sealed(registers.LatchedUpdate())
         self._bank.put_sealed(self._program.player.acknowledgement)
         self._bank.put(self._program.operator)
 
@@ -129,10 +270,10 @@ class Clients:
         """An optimiser waits for an update: its silence is no failure."""
         return bool(self._waiting)
 
-    def tell(self, update: Update) -> None:
+    def tell(self, update: registers.Update) -> None:
         """Show a new update, and answer who waits for it."""
         self._bank.put_sealed(update)
-        self._bank.put_sealed(LatchedUpdate(update.session, update.update, update.tick))
+        self._bank.put_sealed(registers.LatchedUpdate(update.session, update.update, update.tick))
         for answer, (wanted, begun) in self._waiting.items():
             # one of a session that has begun since, which counts from 0 again, will do
             if not answer.done() and (update.update >= wanted or begun != self._begun):
@@ -153,17 +294,17 @@ class Clients:
     def _take(self, block: Block, caller: Caller) -> Awaitable[None] | None:
         """Take what the optimiser has written."""
         record, program = block.record, self._program
-        beat = self._bank.get(Heartbeat) if record is Heartbeat else None
+        beat = self._bank.get(registers.Heartbeat) if record is registers.Heartbeat else None
         self.lease.take(caller, beat.holder if beat else None)
-        if record is SequenceRow:
+        if record is registers.SequenceRow:
             return None
         self.changed.set()
-        if record is AwaitUpdate:
-            return self._await_update(self._bank.get(AwaitUpdate))
-        if record is Plan:
-            program.accept_plan(self._bank.get(Plan))
-        elif record is SequenceHeader:
-            self._offer(self._bank.get(SequenceHeader))
+        if record is registers.AwaitUpdate:
+            return self._await_update(self._bank.get(registers.AwaitUpdate))
+        if record is registers.Plan:
+            program.accept_plan(self._bank.get(registers.Plan))
+        elif record is registers.SequenceHeader:
+            self._offer(self._bank.get(registers.SequenceHeader))
         elif beat is not None:
             program.heartbeat(beat)
         return None
@@ -171,17 +312,17 @@ class Clients:
     def _command(self, block: Block, caller: Caller) -> None:
         """Do what an operator has written, and note who it was."""
         record, program = block.record, self._program
-        if record is Grant:
-            self.granted = self._bank.get(Grant).until_tick
-        elif record is ControlSession:
-            self.asked = asked = self._bank.get(ControlSession)
+        if record is registers.Grant:
+            self.granted = self._bank.get(registers.Grant).until_tick
+        elif record is registers.ControlSession:
+            self.asked = asked = self._bank.get(registers.ControlSession)
             self.pending_time_base = None
             self.granted = 0
             self._note(EventKind.SESSION, asked.realtime, caller.name, value=asked.factor)
         elif record is SessionPace:
             self._ask_for_pace(caller.name)
-        elif record is Operator:
-            self._operate(self._bank.get(Operator), caller.name)
+        elif record is registers.Operator:
+            self._operate(self._bank.get(registers.Operator), caller.name)
         elif record is AlarmCommand:
             program.alarms.command(self._bank.get(AlarmCommand), caller.name)
         elif record is WatchdogTime:
@@ -190,7 +331,7 @@ class Clients:
             self._publication.journal.answer(self._bank.get(JournalQuery))
             return
         self.changed.set()
-        if record is not Grant:
+        if record is not registers.Grant:
             self._publication.safety()
 
     def _ask_for_pace(self, who: str) -> None:
@@ -206,7 +347,7 @@ class Clients:
             self._note(EventKind.WATCHDOG_TIME, time, who, cause=watchdog.time)
             watchdog.set(time, self._program.tick)
 
-    def _operate(self, operator: Operator, who: str) -> None:
+    def _operate(self, operator: registers.Operator, who: str) -> None:
         before = self._program.operator
         if operator.mode != before.mode:
             self._note(EventKind.OPERATOR_MODE, operator.mode, who)
@@ -222,14 +363,14 @@ class Clients:
         now = max(self._program.tick, self._program.alarms.now)
         self._program.journal.note(now, kind, subject, cause, value=value, who=who)
 
-    def _offer(self, header: SequenceHeader) -> None:
-        rows = [row.u for row in self._bank.get_rows(SequenceRow, header.length)]
+    def _offer(self, header: registers.SequenceHeader) -> None:
+        rows = [row.u for row in self._bank.get_rows(registers.SequenceRow, header.length)]
         answer = self._program.offer(InputSequence(header, rows))
         self._bank.put_sealed(answer)
-        if answer.verdict != Verdict.ACCEPTED:
+        if answer.verdict != registers.Verdict.ACCEPTED:
             self._publication.safety()
 
-    def _await_update(self, asked: AwaitUpdate) -> Awaitable[None] | None:
+    def _await_update(self, asked: registers.AwaitUpdate) -> Awaitable[None] | None:
         """Let the answer wait for the update asked for; one who asks out of session gets the next fresh one."""
         program = self._program
         program.optimizer_seen()
