@@ -43,7 +43,7 @@ def reference() -> Rest:
 
 @pytest.fixture(scope="module")
 def efficient() -> Rest:
-    return refrigerator_operating_point(EFFICIENT, HELIUM, LqWeights()).rest
+    return refrigerator_operating_point(EFFICIENT, HELIUM, LqWeights())[0]
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ def execute_exergy(options: argparse.Namespace) -> int:
     settings = configuration(options).settings
     file = read_refrigerator(options.plant, settings.limits)
     try:
-        rest = refrigerator_operating_point(file, load_helium(), settings.plant.station.weights).rest
+        rest, _ = refrigerator_operating_point(file, load_helium(), settings.plant.station.weights)
     except NoEquilibriumError as error:
         raise UsageError(f"{options.plant or 'the reference refrigerator'}: {error}") from None
     sys.stdout.write("\n".join(lines_of(exergy_balance(rest, file.refrigerator, load_helium()))) + "\n")

@@ -13,15 +13,8 @@ import numpy as np
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop_plant.cold_box.physics import OUTPUTS
-from coldloop_plant.helium.properties import (
-    HIGHEST_SATURATION,
-    WARM_CP,
-    Helium,
-    entropy_before_expansion,
-    saturation,
-    supply_enthalpy_and_density,
-    vapour_enthalpy_and_cp,
-)
+from coldloop_plant.helium import properties
+from coldloop_plant.helium.properties import WARM_CP, Helium, saturation, supply_enthalpy_and_density
 from coldloop_refrigerator.model import AMBIENT, Rest
 from coldloop_refrigerator.physics import SIGNALS, Crossing, Refrigerator, evaluate_refrigerator
 
@@ -36,15 +29,15 @@ def entropy(P: float, h: float, helium: Helium) -> float:
     Up to 2.25 bar for all h from that of the saturated liquid on, within 0.2 J/(kg K) (wet or 0.3 K above saturation:
     0.02); from there to 19 bar for h of 7e3 or more, within 0.1 J/(kg K). Up to 350 K.
     """
-    if P <= HIGHEST_SATURATION:
+    if P <= properties.HIGHEST_SATURATION:
         sat = saturation(P, helium)
         if h <= sat.h_v:
             return sat.s_v + (h - sat.h_v) / sat.T
     if h > HIGHEST_ENTHALPY:
         excess = WARM_EXCESS + WARM_EXCESS_BY_P * P
         warmer = (h - excess) / (HIGHEST_ENTHALPY - excess)
-        return entropy_before_expansion(P, HIGHEST_ENTHALPY, helium) + WARM_CP * float(np.log(warmer))
-    return entropy_before_expansion(P, h, helium)
+        return properties.entropy_before_expansion(P, HIGHEST_ENTHALPY, helium) + WARM_CP * float(np.log(warmer))
+    return properties.entropy_before_expansion(P, h, helium)
 
 
 def supply_entropy(P: float, T: float, helium: Helium) -> float:
@@ -162,7 +155,7 @@ def _exergies(
     h_1 = h_top + s.m_jt / s.m_v * (middle[0] - lower[0])
     h_mixed = (s.m_v * h_1 + s.m_t * s.exhaust.h_out) / (s.m_v + s.m_t)
     h_2 = h_mixed + s.m_jt / (s.m_v + s.m_t) * (upper[0] - middle[0])
-    h_suction, _ = vapour_enthalpy_and_cp(P_LP, AMBIENT, saturation(P_LP, helium).T, helium.vapour)
+    h_suction, _ = properties.vapour_enthalpy_and_cp(P_LP, AMBIENT, saturation(P_LP, helium).T, helium.vapour)
     h_6 = crossing.cooling.warm_end.h
     return SimpleNamespace(
         compressed=hot[1], before_nef5=supply(signals["T13"])[1], before_nef34=inlet[1], before_nef2=upper[1],

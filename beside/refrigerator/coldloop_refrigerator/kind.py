@@ -1,7 +1,7 @@
 """The refrigerator as the plant service and the command line ask for it: an entry point of `coldloop.plant_kinds`."""
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 from coldloop.errors import ConfigurationError, ModelFileError
@@ -12,26 +12,11 @@ from coldloop.process.settings import InputLimits
 from coldloop_plant.cold_box.model import AtRest
 from coldloop_plant.cold_box.physics import ColdBox
 from coldloop_plant.cold_box.plant_file import REFERENCE, PlantFile
-from coldloop_plant.helium.properties import load_helium
 from coldloop_plant.kinds import box_of, parameters_in
 from coldloop_plant.program import HeatLoad, MakePlant, MeasurementNoise, PlantProgram
 from coldloop_plant.settings import PlantSection, RefrigeratorStart, StationControlKind, StationSettings
+from coldloop_refrigerator import plant_file, program
 from coldloop_refrigerator.physics import Refrigerator
-from coldloop_refrigerator.plant_file import (
-    REFERENCE_REFRIGERATOR,
-    RefrigeratorParameters,
-    RefrigeratorPlantFile,
-    read_plant_file,
-)
-from coldloop_refrigerator.program import (
-    SHIPPED,
-    EventSchedule,
-    RefrigeratorFile,
-    RefrigeratorProgram,
-    read_refrigerator_file,
-    refrigerator_digest,
-    rest_in,
-)
 
 
 class RefrigeratorKind:
@@ -43,7 +28,7 @@ class RefrigeratorKind:
 
     def digest_of(self, model: ModelHeader, where: str) -> str:
         """Return the digest of that refrigerator's parameters."""
-        return _digest(_refrigerator_in(model, where))
+        return program.refrigerator_digest(_refrigerator_in(model, where))
 
     def maker_of(
         self, header: ModelHeader, section: PlantSection, noise_of_seed: Callable[[int], MeasurementNoise | None]
@@ -56,13 +41,13 @@ class RefrigeratorKind:
         """
         if header.plant == COLD_BOX and box_of(header) != REFERENCE:
             raise ModelFileError("model.file: of another cold box than the refrigerator's; set plant.kind to cold-box")
-        plant, named = REFERENCE_REFRIGERATOR, section.refrigerator.file
+        plant, named = plant_file.REFERENCE_REFRIGERATOR, section.refrigerator.file
         if header.plant != COLD_BOX:
             plant = _refrigerator_in(header, "model.file")
         if named is None and header.plant_rest:
-            file = rest_in(header.plant_rest, plant, "model.file: plant_rest")
+            file = program.rest_in(header.plant_rest, plant, "model.file: plant_rest")
         else:
-            file = read_refrigerator_file(named or SHIPPED, plant)
+            file = program.read_refrigerator_file(named or program.SHIPPED, plant)
         if section.station.control is StationControlKind.LQ and section.station.weights != file.weights:
             raise ConfigurationError(
                 "plant.station.weights: the gains of this refrigerator belong to other weights; make a file with"
@@ -73,37 +58,32 @@ class RefrigeratorKind:
 
     def read_plant_file(self, path: Path | None, limits: InputLimits, *, whole: bool) -> PlantFile:
         """Return what a plant file says: of a refrigerator if it has one of its sections, or if `whole` is set."""
-        return read_plant_file(path, limits, whole=whole)
+        return plant_file.read_plant_file(path, limits, whole=whole)
 
     def at_rest(self, file: PlantFile, control: StationSettings) -> AtRest:
         """Return the refrigerator of a plant file at rest, and its model with the gains of the controller's weights."""
         from coldloop_refrigerator.model import described_at_rest  # noqa: PLC0415 it needs SciPy, the service does not
 
-        return described_at_rest(RefrigeratorPlantFile.model_validate(file), control)
+        return described_at_rest(plant_file.RefrigeratorPlantFile.model_validate(file), control)
 
 
 def _refrigerator_in(model: ModelHeader | LtiModel, where: str) -> Refrigerator:
-    return parameters_in(model, RefrigeratorParameters, where).refrigerator
-
-
-@cache
-def _digest(plant: Refrigerator) -> str:
-    return refrigerator_digest(plant, load_helium())
+    return parameters_in(model, plant_file.RefrigeratorParameters, where).refrigerator
 
 
 def _made(
-    header: ModelHeader, section: PlantSection, plant: Refrigerator, file: RefrigeratorFile,
+    header: ModelHeader, section: PlantSection, plant: Refrigerator, file: program.RefrigeratorFile,
     noise_of_seed: Callable[[int], MeasurementNoise | None], load: HeatLoad, seed: int,
 ) -> PlantProgram:  # fmt: skip
     happening = section.refrigerator
     with kernels_of("the refrigerator", about_s=20):
-        return RefrigeratorProgram(
+        return program.RefrigeratorProgram(
             plant=plant,
             file=file,
             u0=header.u0,
             load=load,
             station=section.station,
-            events=EventSchedule(happening.events, happening.ambient_k, happening.daily_swing_k),
+            events=program.EventSchedule(happening.events, happening.ambient_k, happening.daily_swing_k),
             noise=noise_of_seed(seed),
             seed=seed,
             warm=happening.start is RefrigeratorStart.WARM,

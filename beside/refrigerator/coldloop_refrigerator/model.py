@@ -21,43 +21,18 @@ from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
 from coldloop.service.command_line import add_configuration_options
 from coldloop.service.start import SECTIONS
 from coldloop_plant.cold_box import model as cold_box
-from coldloop_plant.cold_box.model import (
-    AtRest,
-    Equilibrium,
-    find_equilibrium,
-    obstacles,
-    operating_point,
-    part_of,
-    state_scales,
-)
+from coldloop_plant.cold_box.model import Equilibrium
 from coldloop_plant.cold_box.physics import streams
 from coldloop_plant.cold_box.plant_file import OPERATING_INPUTS, OPERATING_LEVEL
 from coldloop_plant.equilibrium import Linear, Modes, NoEquilibriumError, complex_step, model_of, newton
 from coldloop_plant.helium.properties import Helium, load_helium
 from coldloop_plant.numeric import PA_PER_BAR, Array, RealArray
 from coldloop_plant.settings import LqWeights, PlantSettings, StationSettings
-from coldloop_refrigerator.physics import (
-    BOX_STATES,
-    COIL,
-    COMMAND_NAMES,
-    DISTURBANCE_NAMES,
-    SIGNAL_NAMES,
-    STATE_NAMES,
-    STATE_UNITS,
-    Refrigerator,
-    advance_refrigerator,
-    high_pressure_mass,
-    rates,
-    read,
-)
+from coldloop_refrigerator import physics
+from coldloop_refrigerator.physics import COMMAND_NAMES, STATE_NAMES, Refrigerator
 from coldloop_refrigerator.plant_file import KIND, REFERENCE_REFRIGERATOR, RefrigeratorPlantFile
 from coldloop_refrigerator.precooler import LIQUID_DENSITY
-from coldloop_refrigerator.program import (
-    SHIPPED,
-    RefrigeratorFile,
-    read_refrigerator_file,
-    refrigerator_digest,
-)
+from coldloop_refrigerator.program import SHIPPED, RefrigeratorFile, read_refrigerator_file, refrigerator_digest
 from coldloop_refrigerator.station import GasVolume, compress, gas_mass
 
 AMBIENT: Final = 300.0
@@ -65,13 +40,15 @@ V_L, M_HP, M_LP, M_BUFFER, M_LOST, M_N2, CV956, CV167 = (
     STATE_NAMES.index(name) for name in ("V_l", "M_HP", "M_LP", "M_buffer", "M_lost", "M_N2", "CV956", "CV167")
 )
 LINES: Final = (M_HP, M_LP)
-PRESSURE_ROWS: Final = tuple(len(STATE_NAMES) + len(OUTPUT_NAMES) + SIGNAL_NAMES.index(name) for name in ("P12", "P11"))
+PRESSURE_ROWS: Final = tuple(
+    len(STATE_NAMES) + len(OUTPUT_NAMES) + physics.SIGNAL_NAMES.index(name) for name in ("P12", "P11")
+)
 """Rows of the refrigerator's Jacobian that are those of the pressures of both lines."""
 
 
 def rate_scales(plant: Refrigerator) -> RealArray:
     """Return the size of an ordinary deviation of each state: as in the cold box; 10 g of helium, 1 % of opening."""
-    return state_scales(plant.box, STATE_UNITS)
+    return cold_box.state_scales(plant.box, physics.STATE_UNITS)
 
 
 def jacobian(x: RealArray, u: RealArray, v: RealArray, d: RealArray, plant: Refrigerator, helium: Helium) -> RealArray:
@@ -80,7 +57,8 @@ def jacobian(x: RealArray, u: RealArray, v: RealArray, d: RealArray, plant: Refr
 
     def evaluate(z: Array) -> Array:
         xz, uz, vz, dz = np.split(z, cuts)
-        return np.concatenate([rates(xz, uz, vz, dz, plant, helium), *read(xz, uz, vz, dz, plant, helium)])
+        shown = physics.read(xz, uz, vz, dz, plant, helium)
+        return np.concatenate([physics.rates(xz, uz, vz, dz, plant, helium), *shown])
 
     at = np.concatenate([x, u, v, d])
     return complex_step(evaluate, at, np.ones(at.size))
@@ -149,23 +127,23 @@ def find_refrigerator_equilibrium(
         moved *= min(1.0, 10.0 / float(np.max(np.abs(moved[warm]))))  # 10 K at most
         z = z.copy()
         z[[*free, -1, n, n + 3]] += moved
-        z[M_HP] = high_pressure_mass(z[:n], plant.box.P_HP, AMBIENT, plant, helium)
+        z[M_HP] = physics.high_pressure_mass(z[:n], plant.box.P_HP, AMBIENT, plant, helium)
         return z
 
     z, residual = newton(
-        np.array([*x, *v, cold.w]), lambda z: rates(*apart(z), plant, helium) / scales, step, 60,
+        np.array([*x, *v, cold.w]), lambda z: physics.rates(*apart(z), plant, helium) / scales, step, 60,
         "the refrigerator has no equilibrium",
     )  # fmt: skip
-    return Rest(*apart(z), *read(*apart(z), plant, helium), residual)
+    return Rest(*apart(z), *physics.read(*apart(z), plant, helium), residual)
 
 
 def _balancing_bypass(
     x: RealArray, u: RealArray, v: RealArray, d: RealArray, plant: Refrigerator, helium: Helium
 ) -> float:
     """Return the opening (%) with which the high-pressure side keeps its mass; else it works on the passes."""
-    _, signals = read(x, u, v, d, plant, helium)
-    surplus = 1e3 * rates(x, u, v, d, plant, helium)[M_HP]
-    return max(0.0, float(x[CV956] * (1.0 + surplus / signals[SIGNAL_NAMES.index("M_CV956")])))
+    _, signals = physics.read(x, u, v, d, plant, helium)
+    surplus = 1e3 * physics.rates(x, u, v, d, plant, helium)[M_HP]
+    return max(0.0, float(x[CV956] * (1.0 + surplus / signals[physics.SIGNAL_NAMES.index("M_CV956")])))
 
 
 def _relaxed(x: RealArray, u: RealArray, v: RealArray, d: RealArray, plant: Refrigerator, helium: Helium) -> RealArray:
@@ -178,14 +156,14 @@ def _relaxed(x: RealArray, u: RealArray, v: RealArray, d: RealArray, plant: Refr
     large = plant._replace(station=plant.station._replace(hp=large_line, lp=large_line))
     held = [*GIVEN, M_HP]
     in_low_pressure_line = x[M_LP]
-    x[M_HP] = high_pressure_mass(x, plant.box.P_HP, AMBIENT, large, helium)
+    x[M_HP] = physics.high_pressure_mass(x, plant.box.P_HP, AMBIENT, large, helium)
     x[M_LP] = gas_mass(large_line, plant.box.P_LP, AMBIENT)
     given = x[held]
     for _ in range(20_000):
-        x = advance_refrigerator(x, u, v, d, TICK_S, large, helium)
+        x = physics.advance_refrigerator(x, u, v, d, TICK_S, large, helium)
         x[held] = given
     x[M_LP] = in_low_pressure_line
-    x[M_HP] = high_pressure_mass(x, plant.box.P_HP, AMBIENT, plant, helium)
+    x[M_HP] = physics.high_pressure_mass(x, plant.box.P_HP, AMBIENT, plant, helium)
     return x
 
 
@@ -197,7 +175,7 @@ def first_guess(cold: Equilibrium, plant: Refrigerator, helium: Helium, P_buffer
     masses = [0.0, gas_mass(station.lp, plant.box.P_LP, AMBIENT), gas_mass(station.buffer, P_buffer, AMBIENT)]
     exchanger = np.linspace(hot - 25.0, 84.0, precooler.nef6.cells)
     x = np.concatenate([cold.x, exchanger, [80.0, nitrogen, 30.0], masses, [0.0, 1.0, 1.0, 25.0, 0.0, 0.0]])
-    x[M_HP] = high_pressure_mass(x, plant.box.P_HP, AMBIENT, plant, helium)
+    x[M_HP] = physics.high_pressure_mass(x, plant.box.P_HP, AMBIENT, plant, helium)
     return x
 
 
@@ -239,12 +217,12 @@ def make_refrigerator_file(
     """
     helium, weights = load_helium(), weights or LqWeights()
     if rest is None:
-        cold = find_equilibrium(np.array(OPERATING_INPUTS), OPERATING_LEVEL, plant.box, helium)
+        cold = cold_box.find_equilibrium(np.array(OPERATING_INPUTS), OPERATING_LEVEL, plant.box, helium)
         rest = find_refrigerator_equilibrium(cold, plant, helium)
     J = jacobian(rest.x, rest.u, rest.v, rest.d, plant, helium)
     first, second = lq_gains(J, plant.station.actuator.lag, weights).tolist()
     return RefrigeratorFile(
-        parameters_digest=refrigerator_digest(plant, helium), w0=float(rest.d[0]), x0=tuple(rest.x.tolist()),
+        parameters_digest=refrigerator_digest(plant), w0=float(rest.d[0]), x0=tuple(rest.x.tolist()),
         u0=tuple(rest.u.tolist()), v0=tuple(rest.v.tolist()), gains=(tuple(first), tuple(second)), weights=weights,
     )  # fmt: skip
 
@@ -273,9 +251,9 @@ def prediction_model(
     helium = load_helium()
     point = np.array(file.x0), np.array(file.u0), np.array(file.v0), _disturbances(file.w0)
     J = jacobian(*point, plant, helium)
-    y0, _ = read(*point, plant, helium)
+    y0, _ = physics.read(*point, plant, helium)
     n, extra = len(STATE_NAMES), len(LOOP_STATES)
-    inputs, load = slice(n, n + 3), n + 7 + DISTURBANCE_NAMES.index("NCR22_HL")
+    inputs, load = slice(n, n + 3), n + 7 + physics.DISTURBANCE_NAMES.index("NCR22_HL")
     outputs, rows = slice(n, n + len(y0)), list(KEPT)
     linear = Linear(
         A=_closed(J, np.array(file.gains), plant.station.actuator.lag),
@@ -285,7 +263,7 @@ def prediction_model(
     )  # fmt: skip
     return model_of(
         linear, np.concatenate([point[0][rows], np.zeros(extra)]), point[1], file.w0, y0, COLD_BOX,
-        {STATE_NAMES[i]: STATE_UNITS[i] for i in rows} | LOOP_STATES, refrigerator_digest(plant, helium), plant=KIND,
+        {STATE_NAMES[i]: physics.STATE_UNITS[i] for i in rows} | LOOP_STATES, refrigerator_digest(plant), plant=KIND,
         plant_parameters=dict(parameters or {}), plant_rest=dict(rest or {}),
     )  # fmt: skip
 
@@ -308,23 +286,19 @@ def _closed(J: RealArray, K: RealArray, lag_s: float) -> RealArray:
     return A
 
 
-class Found(NamedTuple):
-    """A refrigerator at rest, with what goes with it."""
+def refrigerator_operating_point(
+    file: RefrigeratorPlantFile, helium: Helium, weights: LqWeights
+) -> tuple[Rest, LtiModel]:
+    """Return the state at which the refrigerator of a plant file rests, and its model with its pressure loop closed.
 
-    rest: Rest
-    model: LtiModel
-    """Model of the refrigerator with its pressure loop closed; it carries the plant, its rest and its gains."""
-
-
-def refrigerator_operating_point(file: RefrigeratorPlantFile, helium: Helium, weights: LqWeights) -> Found:
-    """Return the state at which the refrigerator of a plant file rests, the gains of these weights, and the model.
+    The model carries the plant, its rest and the gains of these weights.
 
     Raises:
         NoEquilibriumError: There is none that the model holds for; one line that names the part, and what would help.
     """
     for obstacle in _wrong_pressures(file):
         raise NoEquilibriumError(obstacle)
-    cold = operating_point(file, helium)
+    cold = cold_box.operating_point(file, helium)
     for obstacle in _wrong_flows(cold, file, helium):
         raise NoEquilibriumError(obstacle)
     plant = file.refrigerator
@@ -333,7 +307,8 @@ def refrigerator_operating_point(file: RefrigeratorPlantFile, helium: Helium, we
             rest = find_refrigerator_equilibrium(cold, plant, helium, file.station.buffer_bar * PA_PER_BAR)
         except NoEquilibriumError:
             raise NoEquilibriumError(_why_restless(cold, file, helium)) from None
-        for obstacle in chain(_too_narrow(rest.v), obstacles(cold_part(rest), cooled_file(file, rest), helium)):
+        of_the_box = cold_box.obstacles(cold_part(rest), cooled_file(file, rest), helium)
+        for obstacle in chain(_too_narrow(rest.v), of_the_box):
             raise NoEquilibriumError(obstacle)
         try:
             own = make_refrigerator_file(plant, weights, rest)
@@ -345,7 +320,7 @@ def refrigerator_operating_point(file: RefrigeratorPlantFile, helium: Helium, we
         modes = _modes(model.A, model.state_names, model.state_units, plant)
         for obstacle in (*modes.growing(", with its pressures controlled"), *modes.too_fast(slower)):
             raise NoEquilibriumError(obstacle)
-    return Found(rest, model)
+    return rest, model
 
 
 def _wrong_pressures(file: RefrigeratorPlantFile) -> Iterator[str]:
@@ -390,7 +365,7 @@ def _why_restless(cold: Equilibrium, file: RefrigeratorPlantFile, helium: Helium
     plant, P_buffer = file.refrigerator, file.station.buffer_bar * PA_PER_BAR
     x, n = first_guess(cold, plant, helium, P_buffer), len(STATE_NAMES)
     A = jacobian(x, cold.u, np.zeros(len(COMMAND_NAMES)), _disturbances(cold.w), plant, helium)[:n, :n]
-    for obstacle in _modes(A, STATE_NAMES, STATE_UNITS, plant).too_fast(slower):
+    for obstacle in _modes(A, STATE_NAMES, physics.STATE_UNITS, plant).too_fast(slower):
         return obstacle
     for section, key in (("nef5", "cv167_area_mm2"), ("station", "cv956_area_mm2")):
         part = getattr(file, section)
@@ -427,23 +402,23 @@ def _too_narrow(v: RealArray) -> Iterator[str]:
 
 def cold_part(rest: Rest) -> Equilibrium:
     """Return the rest of the cold box within that of the refrigerator."""
-    return Equilibrium(rest.x[:BOX_STATES], rest.u, float(rest.d[0]), rest.y, rest.residual)
+    return Equilibrium(rest.x[: physics.BOX_STATES], rest.u, float(rest.d[0]), rest.y, rest.residual)
 
 
 def cooled_file(file: RefrigeratorPlantFile, rest: Rest) -> RefrigeratorPlantFile:
     """Return the file with the temperature after the pre-cooler that it has at rest."""
-    given = file.boundaries.model_copy(update={"t_in_k": float(rest.x[COIL])})
+    given = file.boundaries.model_copy(update={"t_in_k": float(rest.x[physics.COIL])})
     return file.model_copy(update={"boundaries": given})
 
 
-def described_at_rest(file: RefrigeratorPlantFile, control: StationSettings) -> AtRest:
+def described_at_rest(file: RefrigeratorPlantFile, control: StationSettings) -> cold_box.AtRest:
     """Return the refrigerator of a plant file at rest, with its controller's setpoints and weights.
 
     Raises:
         NoEquilibriumError: As `refrigerator_operating_point`.
     """
     rest, model = refrigerator_operating_point(file, load_helium(), control.weights)
-    return AtRest(
+    return cold_box.AtRest(
         cold_part(rest), cooled_file(file, rest).box, model, [*_station_lines(rest), *_set_point_line(file, control)]
     )
 
@@ -469,7 +444,7 @@ def _set_point_line(plant: RefrigeratorPlantFile, control: StationSettings) -> l
 
 
 def _modes(A: RealArray, names: Sequence[str], units: Sequence[str], plant: Refrigerator) -> Modes:
-    return Modes.of(A, state_scales(plant.box, units), list(map(part_of, names)))
+    return Modes.of(A, cold_box.state_scales(plant.box, units), list(map(cold_box.part_of, names)))
 
 
 def slower(part: str) -> str:

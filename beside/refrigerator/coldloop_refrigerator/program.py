@@ -7,6 +7,7 @@ starts warm, before its cool-down.
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from functools import cache
 from math import pi, sin
 from operator import itemgetter
 from pathlib import Path
@@ -29,35 +30,12 @@ from coldloop_plant.helium.properties import Helium, load_helium, saturation, va
 from coldloop_plant.numeric import RealArray
 from coldloop_plant.program import HeatLoad, MeasurementNoise
 from coldloop_plant.settings import MEASURED, LqWeights, RefrigeratorEvent, StationSettings
-from coldloop_refrigerator.physics import (
-    BOX_STATES,
-    COIL,
-    COMMAND_NAMES,
-    STATE_NAMES,
-    STATION,
-    Refrigerator,
-    high_pressure_mass,
-    inventory,
-    read,
-)
+from coldloop_refrigerator import physics, tick
+from coldloop_refrigerator.physics import BOX_STATES, COMMAND_NAMES, STATE_NAMES, Refrigerator
 from coldloop_refrigerator.plant_file import KIND, REFERENCE_REFRIGERATOR
 from coldloop_refrigerator.station import gas_mass
 from coldloop_refrigerator.station_control import Commands, station_law
-from coldloop_refrigerator.tick import (
-    ACTING,
-    ALARMS,
-    DEVIATING,
-    GIVEN_NAMES,
-    HP,
-    LP,
-    MODE,
-    RefrigeratorMemory,
-    advance_program_tick,
-    begin_memory,
-    control_tick,
-    resting_equipment,
-    standing_equipment,
-)
+from coldloop_refrigerator.tick import RefrigeratorMemory
 
 SHIPPED = Path(__file__).with_name("refrigerator.json")
 if TYPE_CHECKING:
@@ -122,13 +100,15 @@ def rest_in(document: dict[str, Any], plant: Refrigerator, path: str) -> Refrige
     names, sizes = (file.state_names, file.command_names), list(map(len, (file.x0, file.u0, file.v0, *file.gains)))
     if names != (STATE_NAMES, COMMAND_NAMES) or sizes != [len(STATE_NAMES), 3, len(COMMAND_NAMES), 6, 6]:
         raise ModelFileError(f"{path}: made for a refrigerator with other states; {REMEDY}")
-    if file.parameters_digest != refrigerator_digest(plant, load_helium()):
+    if file.parameters_digest != refrigerator_digest(plant):
         raise ModelFileError(f"{path}: made for a refrigerator with other parameters; {REMEDY}")
     return file
 
 
-def refrigerator_digest(plant: Refrigerator, helium: Helium) -> str:
+@cache
+def refrigerator_digest(plant: Refrigerator) -> str:
     """Return the SHA-256 over all parameters, tables and what the states mean, in hexadecimal."""
+    helium = load_helium()
     digest = hashlib.sha256(parameters_digest(plant.box, helium).encode())
     digest.update(helium.departure.nodes.astype("<f8").tobytes())
     digest.update(repr((plant.precooler, plant.station)).encode())
@@ -149,19 +129,19 @@ def warm_state(
     line, which has that of the cooler's gas; low-pressure line and bath have the pressure `low_pressure` (Pa).
     """
     station, bath = plant.station, plant.box.separator
-    total = inventory(np.array(rest), plant, helium)
+    total = physics.inventory(np.array(rest), plant, helium)
     saturated = saturation(low_pressure, helium)
     h, _ = vapour_enthalpy_and_cp(low_pressure, ambient, saturated.T, helium.vapour)
     x = np.zeros(len(STATE_NAMES))
     x[0], x[1] = low_pressure, (saturated.h_v - h) / SUPERHEAT * bath.volume
-    x[STATE_NAMES.index("T_nef1_1") : BOX_STATES] = x[BOX_STATES : COIL + 1] = ambient
+    x[STATE_NAMES.index("T_nef1_1") : BOX_STATES] = x[BOX_STATES : physics.COIL + 1] = ambient
     lp_line = gas_mass(station.lp, low_pressure, ambient)
     elsewhere = total - lp_line - content(bath, x[0], x[1], helium).mass
     pressure = low_pressure
     for _ in range(20):  # masses are nearly in proportion to the pressure
-        high = high_pressure_mass(x, pressure, ambient, plant, helium)
+        high = physics.high_pressure_mass(x, pressure, ambient, plant, helium)
         pressure *= elsewhere / (high + gas_mass(station.buffer, pressure, ambient))
-    x[STATION : STATION + 3] = high, lp_line, elsewhere - high
+    x[physics.STATION : physics.STATION + 3] = high, lp_line, elsewhere - high
     return x
 
 
@@ -203,7 +183,7 @@ class EventSchedule:
         return self.at(tick).ambient + swing
 
 
-AMBIENT: Final = GIVEN_NAMES.index("T_ambient")
+AMBIENT: Final = tick.GIVEN_NAMES.index("T_ambient")
 RETAINED: Final = ("x", "y", "signals", "commands", "integrals", "equipment")
 """Fields of the memory that are retained; the rest follows from them."""
 
@@ -240,12 +220,12 @@ class RefrigeratorProgram(ColdBoxProgram):
         self._gauge_deviation, self._seed = station.noise_bar, seed
         x, v = np.array(file.x0, dtype=np.float64), np.array(file.v0, dtype=np.float64)
         d = self._disturbances(0, load.value(0))
-        equipment = standing_equipment(np.array(u0)) if warm else resting_equipment(np.array(u0))
+        equipment = tick.standing_equipment(np.array(u0)) if warm else tick.resting_equipment(np.array(u0))
         if warm:
             x = warm_state(file.x0, plant, load_helium(), ambient=d[AMBIENT], low_pressure=1e5 * station.lp_bar)
-        self._memory = m = begin_memory(x, v, equipment)
-        m.y[:], m.signals[:] = read(x, equipment[ACTING:DEVIATING], v, d, plant, load_helium())
-        control_tick(self._memory, d, self.law)
+        self._memory = m = tick.begin_memory(x, v, equipment)
+        m.y[:], m.signals[:] = physics.read(x, equipment[tick.ACTING : tick.DEVIATING], v, d, plant, load_helium())
+        tick.control_tick(self._memory, d, self.law)
         super().__init__(box=plant.box, x0=x[:BOX_STATES].tolist(), u0=u0, load=load, noise=noise)
 
     def _read(self, w: float) -> RealArray:  # noqa: ARG002 what was read with the memory
@@ -253,20 +233,20 @@ class RefrigeratorProgram(ColdBoxProgram):
 
     def _warm_up(self) -> None:
         d = self._disturbances(0, self.load)
-        advance_program_tick(self.memory, self._u, d, d, self._plant, self._tables, self._law)
+        tick.advance_program_tick(self.memory, self._u, d, d, self._plant, self._tables, self._law)
 
     @property
     def station(self) -> StationSample:
         """Compression station and nitrogen at the current tick, with mode and alarms of its controller."""
         m = self._memory
-        mode, alarms = StationMode(int(m.status[MODE])), StationAlarm(int(m.status[ALARMS]))
+        mode, alarms = StationMode(int(m.status[tick.MODE])), StationAlarm(int(m.status[tick.ALARMS]))
         return StationSample(self.tick, tuple(m.signals.tolist()), mode, alarms)
 
     @property
     def model_range(self) -> int:
         """Parts outside the property tables at the current tick, bits of `ModelRange`."""
         signals = self._memory.signals
-        return present_model_range(self._x, float(signals[HP]), float(signals[LP]))
+        return present_model_range(self._x, float(signals[tick.HP]), float(signals[tick.LP]))
 
     @property
     def station_status(self) -> StationStatus:
@@ -291,12 +271,12 @@ class RefrigeratorProgram(ColdBoxProgram):
     @property
     def acting(self) -> tuple[float, ...]:
         """The inputs that acted on the cold box up to the current tick: CV155 %, NCR22_A W, CV156 %."""
-        return tuple(self._memory.equipment[ACTING:DEVIATING].tolist())
+        return tuple(self._memory.equipment[tick.ACTING : tick.DEVIATING].tolist())
 
     def advance(self) -> None:
         """Go one tick forward."""
         d, ahead = self._disturbances(self.tick, self.load), self._disturbances(self.tick + 1, 0.0)
-        advance_program_tick(self._memory, self._u, d, ahead, self._plant, self._tables, self._law)
+        tick.advance_program_tick(self._memory, self._u, d, ahead, self._plant, self._tables, self._law)
         self._x = self._memory.x[:BOX_STATES]
         self.tick += 1
         self._measured = self._sample(self._memory.y)
