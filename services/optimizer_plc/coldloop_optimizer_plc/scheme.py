@@ -221,42 +221,29 @@ class Constants(NamedTuple):
 
 
 def constants_of(
-    estimator: Estimator,
-    problem: PredictiveProblem,
-    target: TargetSearch,
-    alpha: float,
-    settings: ProgramSettings,
-    budget: PlcBudget,
-    rest: Array,
+    estimator: Estimator, problem: PredictiveProblem, target: TargetSearch, alpha: float, settings: ProgramSettings,
+    budget: PlcBudget, rest: Array,
 ) -> Constants:  # fmt: skip
     """Return the constants of a session with adaptive periods."""
     real, process, every = problem.Phi.dtype.type, settings.process, range(budget.longest_ticks + 1)
-    bath, level, temperature, feed_temperature = process.bath, 0, 0, 0
+    bath, level, temperature, feed_temperature, end = process.bath, 0, 0, 0, settings.cold_end
     if bath is not None:
         named = bath.level, bath.temperature, bath.feed_temperature
         level, temperature, feed_temperature = map(process.output_names.index, named)
     return Constants(
-        estimator=estimator, target=target,
-        Phi=problem.Phi, Gamma=problem.Gamma, maps=problem.maps, shifts=problem.shifts,
-        knots=problem.knots, rest=rest,
-        predicted=problem.predicted,
+        estimator=estimator, target=target, Phi=problem.Phi, Gamma=problem.Gamma, maps=problem.maps,
+        shifts=problem.shifts, knots=problem.knots, rest=rest, predicted=problem.predicted,
         weights=problem.knots_to_samples, input_scale=problem.input_scale, rate=problem.rate,
-        scaled_rate=problem.scaled_rate,
+        scaled_rate=problem.scaled_rate, n_inputs=problem.n_inputs, alpha=real(alpha),
         rate_shares=np.array([problem.limits.rate_share(ticks) for ticks in every], real),
-        n_inputs=problem.n_inputs,
-        alpha=real(alpha), floor=real(settings.adaptive.cost_floor),
-        least_load=real(settings.holdable_load_w[0] - estimator.w0),
-        largest_load=real(settings.holdable_load_w[1] - estimator.w0),
-        reserve=real(settings.capacity_reserve_w),
-        least_load_error=real(bath.least_load_error if bath else 0.0),
-        approach=real(settings.cold_end.approach_k or np.inf), following_s=real(settings.cold_end.following_s),
-        level=level, temperature=temperature, feed_temperature=feed_temperature,
-        opening_per_k=real(settings.cold_end.opening_per_k),
-        opening_from=real(settings.cold_end.opening_from - estimator.u0[target.feed]),
-        turbine=turbine_watch(process, estimator.y0, real),
-        load_step=real(settings.interrupting_load_step_w), sequence_ticks=shortest_sequence(settings, budget),
-        fixed_ticks=0, most=len(budget.ladder), periods=np.array([0, *budget.ladder]),
-        fitting=np.array([budget.iterations(ticks) for ticks in every]),
+        floor=real(settings.adaptive.cost_floor), least_load=real(settings.holdable_load_w[0] - estimator.w0),
+        largest_load=real(settings.holdable_load_w[1] - estimator.w0), reserve=real(settings.capacity_reserve_w),
+        least_load_error=real(bath.least_load_error if bath else 0.0), approach=real(end.approach_k or np.inf),
+        following_s=real(end.following_s), level=level, temperature=temperature, feed_temperature=feed_temperature,
+        opening_per_k=real(end.opening_per_k), opening_from=real(end.opening_from - estimator.u0[target.feed]),
+        turbine=turbine_watch(process, estimator.y0, real), load_step=real(settings.interrupting_load_step_w),
+        sequence_ticks=shortest_sequence(settings, budget), fixed_ticks=0, most=len(budget.ladder),
+        periods=np.array([0, *budget.ladder]), fitting=np.array([budget.iterations(ticks) for ticks in every]),
     )  # fmt: skip
 
 

@@ -205,22 +205,15 @@ def presets_of(process: Process) -> Mapping[Preset, Mapping[str, Mapping[str, An
         or {"estimator": {"disturbances": ("outputs",)}},
         Preset.PAPER: {},
         Preset.AS_PRINTED: {
-            "penalties": {
-                "output_rows": 1.0,
-                "rate_rows": tuple(one.scale**2 for one in process.inputs),
-                "box": 1.0,
-                "first_knot_in_box": False,
-            },
+            "penalties": {"output_rows": 1.0, "rate_rows": tuple(one.scale**2 for one in process.inputs),
+                          "box": 1.0, "first_knot_in_box": False},
             "ode": {"cost_scale": 1e-8, "look_ahead_rows": False, "hold_at_bounds": False},
         },
-    }
+    }  # fmt: skip
 
 
 OF_PRESETS: Final = tuple(
-    f"{section}.{key}"
-    for preset in presets_of(COLD_BOX).values()
-    for section, values in preset.items()
-    for key in values
+    f"{name}.{key}" for preset in presets_of(COLD_BOX).values() for name, values in preset.items() for key in values
 )
 """Keys of `optimizer_plc.program` that a preset decides: the cold box's has all."""
 OF_ALPHA: Final = ("penalties.output_rows", "design.violation_weight")
