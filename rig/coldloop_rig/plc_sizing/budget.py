@@ -1,6 +1,6 @@
 """Budget of a PLC in an updating period, and whether its memory holds the problem, as tables and in a sentence."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from math import floor
 from typing import NamedTuple
 
@@ -298,13 +298,10 @@ def _operations(problem: PredictiveProblem, prediction: PredictionModel, apart: 
     return aligned(rows, numbers=True)
 
 
-def solver_table(
-    program: ProgramSettings, problem: PredictiveProblem, periods_s: Sequence[float]
-) -> list[tuple[str, ...]]:  # fmt: skip
-    """Return, solver by solver, times of an iteration at P = 1, periods of the ladder, iterations in some, and memory.
-
-    The first row is the header.
-    """
+def _iterations(program: ProgramSettings, problem: PredictiveProblem, period_s: float | None) -> str:
+    """Return times of an iteration, periods of the ladder, iterations in some, and memory, solver by solver."""
+    longest_s = program.process.sampling_period_s
+    periods_s = [share * longest_s for share in (0.2, 0.5, 1.0)] if period_s is None else [period_s]
     sizes, speed = counted_sizes(problem), reference_curve().flops_per_s(problem.size)
     memory = workspaces(problem.size, len(problem.Gamma))
     columns = ("solver", "paper s", "dense s", "without zeros s", "tau_1_s", "default follows")
@@ -318,14 +315,7 @@ def solver_table(
             str(len(plc.ladder)), *(str(plc.iterations(round(period / plc.times.tick_s))) for period in periods_s),
             f"{memory[name] / 1e3:.1f}",
         ))  # fmt: skip
-    return rows
-
-
-def _iterations(program: ProgramSettings, problem: PredictiveProblem, period_s: float | None) -> str:
-    longest_s = program.process.sampling_period_s
-    periods_s = [share * longest_s for share in (0.2, 0.5, 1.0)] if period_s is None else [period_s]
-    table = solver_table(program, problem, periods_s)
-    return f"seconds at P = 1, iterations done at P = {program.budget.power:.3g}\n{aligned(table, numbers=True)}"
+    return f"seconds at P = 1, iterations done at P = {program.budget.power:.3g}\n{aligned(rows, numbers=True)}"
 
 
 def _memory(

@@ -132,9 +132,11 @@ def condense(prediction: PredictionModel, design: ControlDesign, weights: Array)
     C, D, G = (matrix[list(prediction.constrained)] for matrix in (prediction.C, prediction.D, prediction.G))
     Phi, cross, constant = np.zeros((n, n)), np.zeros((nx + 1, n)), np.zeros((nx + 1, nx + 1))
     rho, of_slacks = np.repeat(design.violation_weight, 2), np.zeros((n, n))
+    no_slacks = np.zeros((design.n_inputs, design.n_slacks * weights.shape[1]))
     outputs_z, outputs_s = [], []
     for sample, of_knots in enumerate(weights, 1):
-        u_of_z, slack_of_z = input_map(of_knots, design), slack_map(of_knots, design)
+        u_of_z = np.hstack([np.kron(of_knots, np.diag(design.input_scale)), no_slacks])
+        slack_of_z = slack_map(of_knots, design)
         ahead = [one for one in prediction.ahead if one.first <= sample <= one.last]
         to_z = multiply(A, to_z) + multiply(B, u_of_z)
         to_s = multiply(A, to_s)
@@ -153,12 +155,6 @@ def condense(prediction: PredictionModel, design: ControlDesign, weights: Array)
             through_w[:, one.place] += one.outputs[list(prediction.constrained)]
         outputs_s.append(through_w)
     return Condensed(np.ascontiguousarray(Phi + of_slacks), cross, constant, np.array(outputs_z), np.array(outputs_s))
-
-
-def input_map(of_knots: Array, design: ControlDesign) -> Array:
-    """Return the matrix (inputs, n) from z to the input deviation at a sample with these knot weights (knots,)."""
-    slacks = np.zeros((design.n_inputs, design.n_slacks * len(of_knots)))
-    return np.hstack([np.kron(of_knots, np.diag(design.input_scale)), slacks])
 
 
 def slack_map(of_knots: Array, design: ControlDesign) -> Array:

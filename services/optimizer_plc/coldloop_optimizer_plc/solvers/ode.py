@@ -83,18 +83,12 @@ def velocity(
     `excess` (m,) is Gamma z - gamma.
     """
     costs.gradient(constant, qp, z, excess, flow.alpha, result, active)
-    if flow.box > z.dtype.type(0.0):
-        add_box_gradient(qp, z, flow.box, result)
+    zero, two = z.dtype.type(0.0), z.dtype.type(2.0)
+    if flow.box > zero:  # the gradient of box sum max(z - high, low - z, 0)^2
+        for i in range(z.shape[0]):
+            result[i] += two * flow.box * (max(z[i] - qp.high[i], zero) - max(qp.low[i] - z[i], zero))
     for i in range(z.shape[0]):
         result[i] *= -flow.cost_scale
-
-
-@kernel
-def add_box_gradient(qp: QuadraticProblem, z: Array, weight: float, result: Array) -> None:
-    """Add the gradient of weight sum max(z - high, low - z, 0)^2 to `result` (n,)."""
-    zero, two = z.dtype.type(0.0), z.dtype.type(2.0)
-    for i in range(z.shape[0]):
-        result[i] += two * weight * (max(z[i] - qp.high[i], zero) - max(qp.low[i] - z[i], zero))
 
 
 @kernel
