@@ -120,7 +120,6 @@ class OptimizerProgram:
         )  # fmt: skip
 
     def _ahead(self, tick: int) -> Array:
-        """Return what is forecast from a tick on."""
         return self._forecasts.changes(tick).astype(self._real) if len(self._forecasts) else self._nothing_ahead
 
     @property

@@ -391,7 +391,6 @@ class ProgramSettings(ProcessSettings, validate_default=True):
     @pydantic.field_validator(*WITH_ALPHA, mode="before")
     @classmethod
     def _with_alpha(cls, section: Any, others: ValidationInfo) -> Any:  # noqa: ANN401 whatever is given
-        """Take alpha from the penalties where it was not set."""
         if not {"penalties", "design"} <= others.data.keys():
             return section  # one of them is refused
         return filled(section, {"alpha": alpha_of(others.data["penalties"], others.data["design"])})
@@ -424,24 +423,12 @@ class ProgramSettings(ProcessSettings, validate_default=True):
                                  "design.violation_weight if it is not set")  # fmt: skip
         return self
 
-    @pydantic.model_validator(mode="after")
-    def _load_steps_are_seen(self) -> Self:
-        if self.interrupting_load_step_w and not self.estimator.load_known:
-            raise ValueError("interrupting_load_step_w needs a load that is measured, estimator.load_known = true")
-        return self
-
     @pydantic.field_validator("holdable_load_w")
     @classmethod
     def _least_first(cls, value: tuple[float, float]) -> tuple[float, float]:
         if value[0] >= value[1]:
             raise ValueError("give the least load that can be held, then the largest")
         return value
-
-    @pydantic.model_validator(mode="after")
-    def _one_cost(self) -> Self:
-        if self.solver is SolverName.HYBRID and self.ode.alpha != self.interior_point.alpha:
-            raise ValueError("hybrid needs one cost for both of its solvers: set ode.alpha = interior_point.alpha")
-        return self
 
     @property
     def solver_name(self) -> str:
@@ -462,7 +449,11 @@ class ProgramSettings(ProcessSettings, validate_default=True):
         return float(getattr(self, solver.replace("-", "_")).tau_1_s)
 
     @pydantic.model_validator(mode="after")
-    def _own_arithmetic(self) -> Self:
+    def _parts_fit(self) -> Self:
+        if self.interrupting_load_step_w and not self.estimator.load_known:
+            raise ValueError("interrupting_load_step_w needs a load that is measured, estimator.load_known = true")
+        if self.solver is SolverName.HYBRID and self.ode.alpha != self.interior_point.alpha:
+            raise ValueError("hybrid needs one cost for both of its solvers: set ode.alpha = interior_point.alpha")
         if self.arithmetic is Arithmetic.FLOAT32 and self.outside.names:
             raise ValueError(f"{', '.join(self.outside.names)}: what is not ours computes in double precision")
         if self.arithmetic is Arithmetic.FLOAT32 and self.solver not in SINGLE_PRECISION_SOLVERS:

@@ -443,7 +443,6 @@ class PredictiveProblem:
         self._u0 = self._rounded(u0)
 
     def _rounded(self, values: Array) -> Array:
-        """Return an array in the type of the on-line arithmetic."""
         return values.astype(self._real, copy=False)
 
     def _maps(
@@ -480,7 +479,6 @@ class PredictiveProblem:
         return QuadraticProblem(self.Phi, phi, self.Gamma, gamma, low, high, self._real(constant))
 
     def _share(self, parameters: QpParameters) -> float:
-        """Return the share of the rate limit that an update may use."""
         share: float = self._real(self.limits.rate_share(parameters.elapsed_ticks))
         return share
 
