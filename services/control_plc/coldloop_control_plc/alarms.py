@@ -309,6 +309,7 @@ class AlarmPanel(AlarmConditions):
         """Last reported cause and value of alarms that are about to follow their condition, without those of bands."""
         self._causes: dict[int, set[int]] = {}
         """Causes for which an active alarm has been raised since its last acknowledgement."""
+        self._may_be_shelved = True
         self._now = 0
         self.rows = [Alarm(priority=rule.priority) for rule in self._rules]
         """Alarms as the registers show them, by number of the alarm."""
@@ -379,7 +380,8 @@ class AlarmPanel(AlarmConditions):
 
     def returned(self, kind: int) -> None:
         """Report that the condition of an alarm has ended."""
-        self.report(kind, condition=False)
+        if self.active[kind] or self.since[kind] != NOT:
+            self.report(kind, condition=False)
 
     def pulse(self, kind: int, cause: int = 0) -> None:
         """Report an instantaneous condition: the alarm returns an off-delay after the last one.
@@ -446,6 +448,7 @@ class AlarmPanel(AlarmConditions):
         self._causes = {kind: {row.cause} for kind, row in enumerate(rows) if row.active}
         # An instantaneous alarm has no end.
         self.active[:] = [bool(row.active) for row in rows]
+        self._may_be_shelved = True
         self.reports = {kind: (0, 0.0) for kind in PASSING if self.active[kind]}
         self.since[:] = [self.now if kind in self.reports else NOT for kind in range(len(self.rows))]
         self.changes += 1
@@ -472,10 +475,15 @@ class AlarmPanel(AlarmConditions):
     def _store(self, kind: int, **fields: int) -> None:
         row = self.rows[kind] = self.rows[kind]._replace(**fields)
         self.active[kind] = bool(row.active)
+        self._may_be_shelved = self._may_be_shelved or row.state == AlarmState.SHELVED
         self.changes += 1
 
     def _shelved(self) -> list[int]:
-        return [i for i, row in enumerate(self.rows) if row.state == AlarmState.SHELVED]
+        if not self._may_be_shelved:
+            return []
+        found = [i for i, row in enumerate(self.rows) if row.state == AlarmState.SHELVED]
+        self._may_be_shelved = bool(found)
+        return found
 
 
 SENSORS: Final = {AlarmKind.SENSOR_BAD: 1, AlarmKind.SENSOR_SUSPECT: 2}

@@ -209,10 +209,10 @@ def change(state: GuardState, limits: Limits, tick: int, wanted: Numbers) -> Non
 
 def same(one: Numbers, other: Numbers) -> bool:
     """Return whether two rows of outputs are the same."""
-    found = True
-    for i in range(len(one)):
-        found = found and one[i] == other[i]
-    return found
+    for i in range(len(one)):  # noqa: SIM110 compiled
+        if one[i] != other[i]:
+            return False
+    return True
 
 
 def nearest(state: GuardState, limits: Limits, tick: int, wanted: float, i: int) -> float:
@@ -287,6 +287,9 @@ def judge(
 def admits(state: GuardState, limits: Limits, first_tick: int, rows: Rows, length: int) -> bool:
     """Return whether a sequence of `length` rows, one per tick, would be applied unchanged; `state` advances."""
     for k in range(length):
+        within = k > 0 and first_tick + k - state.start < limits.ticks_per_sample
+        if within and not state.out_of_bounds and same(rows[k], state.applied):
+            continue  # it was admitted before
         admit(state, limits, first_tick + k, rows[k], k == 0)
         for i in range(len(limits.low)):
             if abs(state.applied[i] - rows[k][i]) > limits.slack[i]:

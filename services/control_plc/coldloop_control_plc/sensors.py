@@ -167,15 +167,20 @@ def check(c: SensorConstants, s: SensorState, tick: int, y: Numbers, x: Numbers,
         note_moves(c, s, inputs, tick)
     is_old = is_old_image(c, s, has_moved, x, load, inputs, elapsed)
     suspicious = is_old or s.bad_count > 0
+    low, high, least, unchanged, bad_since = c.low, c.high, c.least, s.unchanged, s.bad_since
     for output in range(len(y)):
-        if not c.low[output] <= y[output] <= c.high[output] or s.unchanged[output] >= c.least[output]:
+        if not low[output] <= y[output] <= high[output] or unchanged[output] >= least[output]:
             suspicious = True
     if not suspicious:
         s.good[:] = y
         return False
     told = s.bad_count > 0
     for output in range(len(y)):
-        judge(c, s, output, y, is_old or is_stuck(c, s, output, y, tick))
+        value, moves = y[output], unchanged[output] < least[output] and not is_old
+        if moves and bad_since[output] == NONE and low[output] <= value <= high[output]:
+            s.good[output] = value
+        else:
+            judge(c, s, output, y, is_old or is_stuck(c, s, output, y, tick))
     return told or s.bad_count > 0
 
 
@@ -209,15 +214,18 @@ def count_unchanged(c: SensorConstants, s: SensorState, y: Numbers, elapsed: int
     count = temperatures + pressures + (moved(s.before, y, 0, first) if end > 0 else 0)
     most = 2 * count > len(y) - few
     most_of_each = (end == 0 or 2 * temperatures > end - first) and 2 * pressures > len(y) - end - few
+    unchanged, rests, before = s.unchanged, s.rests, s.before
     for output in range(len(y)):
-        if y[output] == s.before[output]:
-            s.unchanged[output] += elapsed * (most if c.controlled[output] else most_of_each)
+        if y[output] == before[output]:
+            unchanged[output] += elapsed * (most if c.controlled[output] else most_of_each)
             continue
-        if s.rests[output] < 0:
-            s.rests[output] += bool(abs(y[output] - s.before[output]) > 0.0)  # from or to no number is no move
-        elif not c.controlled[output] and not is_frozen(s.unchanged[output], s.rests[output], c.least[output]):
-            s.rests[output] = max(s.unchanged[output], s.rests[output])
-        s.unchanged[output] = 0
+        if rests[output] < 0:
+            rests[output] += bool(abs(y[output] - before[output]) > 0.0)  # from or to no number is no move
+        elif unchanged[output] > rests[output] and not (
+            c.controlled[output] or is_frozen(unchanged[output], rests[output], c.least[output])
+        ):
+            rests[output] = unchanged[output]
+        unchanged[output] = 0
     s.before[:] = y
     return count > 0
 
@@ -285,9 +293,11 @@ def is_old_image(
             same = same and x[i] == s.x[i]
     s.x[:] = x
     s.load = load
-    s.is_unknown = not c.least_load <= load <= c.largest_load
-    for i in range(len(x)):
-        s.is_unknown = s.is_unknown or not abs(x[i]) <= MAX_STATE
+    unknown = not c.least_load <= load <= c.largest_load
+    for value in x:
+        if not abs(value) <= MAX_STATE:
+            unknown = True
+    s.is_unknown = unknown
     if not same:
         for i in range(len(c.moves)):
             s.image_inputs[i] = inputs[i]
@@ -362,4 +372,4 @@ class SensorMonitor(SensorState):
     @property
     def mask(self) -> int:
         """Bit i is set when output i is substituted."""
-        return sum(1 << output for output in self.bad)
+        return sum(1 << output for output in self.bad) if self.bad_count else 0

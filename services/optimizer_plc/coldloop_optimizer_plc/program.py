@@ -5,11 +5,13 @@ played from its end on. Decisions are those of `decisions.py`, the arithmetic is
 of the session. Pure: no sockets, no clock, no sleeping.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
 from coldloop.errors import ConfigurationError
+from coldloop.kernels.compiled import entry_of
 from coldloop.kernels.first_use import kernels_of
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel
@@ -91,6 +93,8 @@ class OptimizerProgram:
         fixed_ticks = round(updating_period_s / self.process.tick_s)
         self.constants = self.constants._replace(fixed_ticks=fixed_ticks)
         self.rule = rule or make_rule(self.settings, self.budget, fixed_ticks, self._real)
+        self._entries: dict[Any, Callable[..., Any]] = {}
+        """Compiled code of kernels whose arguments have the same types in the whole session."""
         outside = self.settings.outside.estimator
         self._estimator = OutsideEstimator(outside, self._prediction, self.settings.estimator) if outside else None
         self.solver.reset()
@@ -99,6 +103,13 @@ class OptimizerProgram:
         for array in (*self.state.playing[1:], *self.state.sent[1:], self.state.u, self.state.target, self.state.rule):
             array[:] = 0
         decisions.begin_session(self.constants, self.state)
+
+    def _run(self, kernel: Callable[..., Any], *arguments: Any) -> Any:  # noqa: ANN401
+        """Call a kernel whose arguments have the same types in the whole session."""
+        entry = self._entries.get(kernel)
+        if entry is None:
+            entry = self._entries[kernel] = entry_of(kernel, *arguments)
+        return entry(*arguments)
 
     # -- steps (4), (5) and (2): at an updating instant ---------------------------------------------------------------
 
@@ -112,7 +123,7 @@ class OptimizerProgram:
             load_step = self._plan_by_steps(latched)
         else:
             starts = Starts(self.rule.first, self.rule.after_interruption())
-            load_step = decisions.take_update(c, self.rule, starts, m, latched)
+            load_step = self._run(decisions.take_update, c, self.rule, starts, m, latched)
         now = self.state.numbers[0]
         return Plan(
             update.update, update.tick + int(now["ticks"]), float(load_step), float(now["shortage"]),
@@ -167,7 +178,7 @@ class OptimizerProgram:
         if ahead := len(self._forecasts):
             self.state.belief.x[-ahead:] = self._ahead(int(now["tick"]) + int(now["ticks"]))
         if isinstance(self.solver, KernelSolver):
-            scheme.solve(self.constants, self.method, self.state)
+            self._run(scheme.solve, self.constants, self.method, self.state)
         else:
             qp, guess = scheme.pose(self.constants, self.state)
             with in_its_name(Part.SOLVER, self.settings.outside.solver or self.settings.solver):
@@ -184,24 +195,31 @@ class OptimizerProgram:
 
     def answered(self, *, late: bool) -> None:
         """Note how an answer came."""
-        decisions.note_answer(self.state, late)
+        self._run(decisions.note_answer, self.state, late)
 
     # -- diagnostics --------------------------------------------------------------------------------------------------
 
-    def prediction(self) -> registers.Prediction:
-        """Return what the last profile is expected to lead to."""
+    def predictor(self) -> Callable[[], registers.Prediction]:
+        """Return what computes the expected result of the last profile, also after later updates."""
         header, sent = self.state.sent.numbers[0], self.state.sent
         if not header["length"]:
             raise RuntimeError("call solve before prediction")
-        horizon = self.problem.design.horizon
-        outputs = self.problem.outputs(sent.z, QpParameters(sent.x, header["w"], sent.u_before))
-        inputs = self.problem.inputs(sent.z, horizon)
-        shown = outputs[[min(sample, horizon) - 1 for sample in registers.PREDICTED_SAMPLES]]
-        planned = inputs[[min(sample, horizon) - 1 for sample in registers.INPUT_SAMPLES]]
-        return registers.Prediction(
-            int(self.state.numbers[0]["update"]), int(header["first_tick"]), tuple(shown.T.ravel().tolist()),
-            tuple(planned.ravel().tolist()),
-        )  # fmt: skip
+        update, first_tick, z = int(self.state.numbers[0]["update"]), int(header["first_tick"]), sent.z.copy()
+        at = QpParameters(sent.x.copy(), header["w"], sent.u_before.copy())
+
+        def predict() -> registers.Prediction:
+            horizon = self.problem.design.horizon
+            outputs, inputs = self.problem.outputs(z, at), self.problem.inputs(z, horizon)
+            shown = outputs[[min(sample, horizon) - 1 for sample in registers.PREDICTED_SAMPLES]]
+            planned = inputs[[min(sample, horizon) - 1 for sample in registers.INPUT_SAMPLES]]
+            y, u = tuple(shown.T.ravel().tolist()), tuple(planned.ravel().tolist())
+            return registers.Prediction(update, first_tick, y, u)
+
+        return predict
+
+    def prediction(self) -> registers.Prediction:
+        """Return what the last profile is expected to lead to."""
+        return self.predictor()()
 
     def model_deviation(self) -> registers.ModelDeviation:
         """Return how the plant differs from the model, as the filter has estimated it at the last update."""
@@ -229,15 +247,16 @@ class OptimizerProgram:
         """Return what was done with the last update, once the control PLC has answered."""
         if not (self.state.sent.numbers[0]["length"] or self.state.numbers[0]["solved"]):
             raise RuntimeError("call solve before report")
-        now, sent = self.state.numbers[0], self.state.sent.numbers[0]
+        records = self.state.numbers[0], self.state.sent.numbers[0]
+        now, sent = (dict(zip(record.dtype.names or (), record.item(), strict=True)) for record in records)
         of_sent, of_now = ("j_dev", "j_cst", "violation"), ("efficiency", "mismatch", "contraction", "gamma")
         numbers = [self.state.belief.numbers[0]["mismatch"], now["effective"], sent["hot_start"], sent["delivered"]]
         mismatch, effective, hot_start, delivered, *others = _single(
             [*numbers, *(sent[name] for name in of_sent), *(now[name] for name in of_now)]
         )
         return registers.Optimization(
-            update=int(now["update"]), tick=int(now["tick"]), tau_u=int(now["ticks"]), q=int(now["q"]),
-            iterations=int(sent["iterations"]), verdict=verdict,
+            update=now["update"], tick=now["tick"], tau_u=now["ticks"], q=now["q"],
+            iterations=sent["iterations"], verdict=verdict,
             load_mismatch=mismatch, j_effective=effective, j_hot_start=hot_start, j_delivered=delivered,
             **dict(zip((*of_sent, *of_now), others, strict=True)),
         )  # fmt: skip

@@ -1,6 +1,6 @@
 """Registers of the optimiser PLC: what it shows, and what operators write."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Final
 
 from coldloop.process.updating_periods import SHORTEST_TICKS
@@ -56,11 +56,14 @@ class OptimizerPublication:
         self._asked_by = ""
         self._last: Optimization | None = None
         self._session = self._tick = 0
+        self._predict: Callable[[], Prediction] | None = None
+        """Computes the prediction that is to be shown; None when the registers have it."""
         self._journal.note(0, EventKind.BOOT)
         self._shown.show()
         self.link = ControlLink(holder, self._journal, self._shown.show)
         self.bank.keep_fresh(ControlLinkStatus, self.link.registers)
         self.bank.keep_fresh(Identity, self._identity)
+        self.bank.keep_fresh(Prediction, self._prediction)
 
     # -- what operators write ------------------------------------------------------------------------------------------
 
@@ -116,6 +119,7 @@ class OptimizerPublication:
         self.pace = pace
         self.bank.put(SessionPace.shown(session, pace))
         self.bank.put(rule)
+        self._predict = None
         self.bank.put_sealed(blank(Prediction, self.bank.map))
         self._shown.show()
 
@@ -124,9 +128,13 @@ class OptimizerPublication:
         self._tick, self._last = tick, done
         self.bank.put(done, done.update % HISTORY_ROWS)
 
-    def predicted(self, prediction: Prediction) -> None:
-        """Show what a delivered sequence is expected to lead to."""
-        self.bank.put_sealed(prediction)
+    def predicted(self, predict: Callable[[], Prediction]) -> None:
+        """Show what a delivered sequence is expected to lead to: it is computed when it is read."""
+        self._predict = predict
+
+    def _prediction(self) -> Prediction | None:
+        predict, self._predict = self._predict, None
+        return None if predict is None else predict()
 
     def _identity(self) -> Identity:
         return Identity(

@@ -235,7 +235,7 @@ class OptimizerPlc:
             log.warning("sequence rejected", extra={"update": update.update, "verdict": verdict.name.lower()})
         self.publication.optimised(update.tick, self._program.report(verdict))
         if verdict is Verdict.ACCEPTED:
-            self.publication.predicted(self._program.prediction())
+            self.publication.predicted(self._program.predictor())
         # a plan that came too late: this update leads to no other, unless a load step has led to one
         unplanned = verdict is Verdict.WRONG_UPDATE and not await self._is_superseded(update)
         # late once is late for ever with updates that have been waiting: begin again with a fresh one

@@ -201,6 +201,17 @@ def is_compiled(kernel: Callable[..., Any], *arguments: Any) -> bool:  # noqa: A
     return cache_folder.has(of_numba._cache.file_name(signature, codegen))  # noqa: SLF001
 
 
+def entry_of(kernel: Callable[P, R], *arguments: Any) -> Callable[P, R]:  # noqa: ANN401
+    """Return the compiled code of a kernel for arguments of these types: the caller passes no others.
+
+    It saves what numba takes to recognise them, 30 to 80 us a call for records of many arrays.
+    """
+    of_numba: Any = kernel
+    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+        return kernel
+    return cast("Callable[P, R]", of_numba.compile(tuple(map(numba.typeof, arguments))))
+
+
 def _text(kind: Any) -> str:  # noqa: ANN401 a type of numba
     """Return a type as text that is the same in every process."""
     if isinstance(kind, types.Dispatcher):

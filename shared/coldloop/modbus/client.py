@@ -422,7 +422,7 @@ class RegisterClient:
     def _writing(self, records: Sequence[tuple[Any, ...]], start: int = 0) -> bytes:
         """Return the PDU that writes rows of one block."""
         block, codec = self._places[type(records[0])]
-        data = b"".join([_encoded(block, codec, record) for record in records])
+        data = _encoded(block, codec, *records)
         address = block.address + start * codec.size // 2
         return _WRITE.pack(WRITE_MULTIPLE_REGISTERS, address, len(data) // 2, len(data)) + data
 
@@ -450,7 +450,9 @@ class RegisterClient:
         """
         block, codec = self._places[type(record)]
         answer_block, answer_codec = self._places[answer]
-        data = _encoded(block, codec, record) + b"".join([_encoded(*self._places[type(row)], row) for row in rows])
+        data = _encoded(block, codec, record)
+        if rows:
+            data += _encoded(*self._places[type(rows[0])], *rows)
         head = _READ_WRITE.pack(
             READ_WRITE_REGISTERS, answer_block.address, answer_codec.size // 2, block.address, len(data) // 2, len(data)
         )
@@ -549,8 +551,8 @@ def _secured(tls: TlsSettings, name: str) -> ssl.SSLContext:
     return client_context(tls, name)
 
 
-def _encoded(block: Block, codec: RecordCodec, record: tuple[Any, ...]) -> bytes:
+def _encoded(block: Block, codec: RecordCodec, *records: tuple[Any, ...]) -> bytes:
     try:
-        return sealed_bytes(codec, record) if block.sealed else codec.encode(record)
+        return b"".join([sealed_bytes(codec, one) for one in records]) if block.sealed else codec.encode_rows(records)
     except (struct.error, OverflowError) as error:
         raise UnfitValueError(f"block '{block.name}' cannot hold the values to be written: {error}") from None

@@ -137,9 +137,7 @@ class RegisterBank:
     def get_rows(self, record: type[R], count: int) -> list[R]:
         """Return the first rows of the block that holds `record`."""
         block, codec = self._places[record]
-        start = 2 * block.address
-        places = range(start, start + count * codec.size, codec.size)
-        return [cast("R", codec.decode(self._memory, place)) for place in places]
+        return cast("list[R]", codec.decode_rows(self._memory, 2 * block.address, count))
 
     def put(self, record: tuple[Any, ...], row: int = 0) -> None:
         """Store a row of the block that holds this type of record."""

@@ -8,7 +8,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from enum import Enum, StrEnum
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from itertools import accumulate, chain
 from operator import itemgetter
 from typing import Any, Final, NamedTuple, TypeVar, cast
@@ -55,8 +55,10 @@ class Domain:
         """
         if math.isfinite(sum(values)):  # one pass instead of a look at each
             for start, end, low, high in self._runs:
-                run = values[start:end]
-                if min(run) < low or max(run) > high:
+                if end == start + 1:
+                    if not low <= values[start] <= high:
+                        break
+                elif min(run := values[start:end]) < low or max(run) > high:
                     break
             else:
                 return
@@ -143,8 +145,8 @@ class ValueCodec:
 
     def canonical(self, data: bytes | bytearray | memoryview, offset: int = 0) -> bytes:
         """Return the bytes of the values that stand in `data` at `offset`, with the high words first, bit for bit."""
-        raw = bytes(data[offset : offset + self.size])
-        return raw if self._swaps is None else self._reordered(raw)
+        raw = data if len(data) == self.size else data[offset : offset + self.size]
+        return bytes(raw) if self._swaps is None else self._reordered(raw)
 
     def _reordered(self, raw: bytes | bytearray | memoryview) -> bytes:
         words = self._words.unpack(raw)
@@ -156,8 +158,10 @@ class RecordCodec:
 
     def __init__(self, block: Block, order: WordOrder) -> None:
         self._values = ValueCodec(block.letters, order)
+        self._of_rows = lru_cache(maxsize=64)(lambda rows: ValueCodec(rows * block.letters, order))
         self._domain = domain_of(block)
         self._parts, self._fields = _places_of([len(field.elements) for field in block.fields.values()])
+        self._length = len(block.letters)
         self._make: _Places = partial(tuple.__new__, block.record)
         self.size = self._values.size
         self.canonical = self._values.canonical
@@ -169,6 +173,17 @@ class RecordCodec:
             struct.error, OverflowError: A value does not fit its register.
         """
         return self._values.pack(record if self._parts is None else chain.from_iterable(self._parts(record)))
+
+    def encode_rows(self, records: Sequence[tuple[Any, ...]]) -> bytes:
+        """Return the bytes of rows one after the other, as `encode` does of one."""
+        parts = records if self._parts is None else chain.from_iterable(map(self._parts, records))
+        return self._of_rows(len(records)).pack(chain.from_iterable(parts))
+
+    def decode_rows(self, data: bytes | bytearray | memoryview, offset: int, rows: int) -> list[tuple[Any, ...]]:
+        """Return the records of rows that follow each other in `data` from `offset` (bytes) on."""
+        values, each = self._of_rows(rows).unpack(data, offset), self._length
+        found = [values[start : start + each] for start in range(0, rows * each, each)]
+        return list(map(self._make, found if self._fields is None else map(self._fields, found)))
 
     def decode(self, data: bytes | bytearray | memoryview, offset: int = 0) -> tuple[Any, ...]:
         """Return the record in `data` at `offset` (bytes)."""
@@ -255,7 +270,8 @@ def blank(record: type[R], of: RegisterMap) -> R:
     return cast("R", codec_of(block).decode(bytes(2 * block.row_words)))
 
 
-CRC_BYTES = 4
+CRC_BYTES: Final = 4
+_ABSENT: Final = bytes(CRC_BYTES)
 
 
 class Seal(Enum):
@@ -275,8 +291,8 @@ class Seal(Enum):
 def seal_of(codec: RecordCodec, data: bytes | bytearray | memoryview, offset: int = 0) -> Seal:
     """Return what the seal says of the record in `data` at `offset`."""
     raw = codec.canonical(data, offset)
-    crc = int.from_bytes(raw[-CRC_BYTES:], "big")
-    if not crc:
+    crc = raw[-CRC_BYTES:]
+    if crc == _ABSENT:
         return Seal.ABSENT
     return Seal.INTACT if crc == _checksum(raw) else Seal.BROKEN
 
@@ -284,14 +300,14 @@ def seal_of(codec: RecordCodec, data: bytes | bytearray | memoryview, offset: in
 def sealed(record: R, of: RegisterMap) -> R:
     """Return a record of a map with its field `crc`, the last one, filled in."""
     crc = _checksum(codec_of(of.block_of(type(record))).encode(record))
-    return cast("R", record._replace(crc=crc))  # type: ignore[attr-defined] # a NamedTuple
+    return cast("R", record._replace(crc=int.from_bytes(crc, "big")))  # type: ignore[attr-defined] # a NamedTuple
 
 
 def sealed_bytes(codec: RecordCodec, record: tuple[Any, ...]) -> bytes:
     """Return the bytes of `sealed`, which is encoded once only."""
     raw = codec.canonical(codec.encode(record))
-    return codec.canonical(raw[:-CRC_BYTES] + _checksum(raw).to_bytes(CRC_BYTES, "big"))  # words back in order
+    return codec.canonical(raw[:-CRC_BYTES] + _checksum(raw))  # words back in order
 
 
-def _checksum(raw: bytes) -> int:
-    return zlib.crc32(raw[:-CRC_BYTES]) or 1
+def _checksum(raw: bytes) -> bytes:
+    return (zlib.crc32(raw[:-CRC_BYTES]) or 1).to_bytes(CRC_BYTES, "big")

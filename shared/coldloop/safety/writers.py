@@ -107,6 +107,9 @@ class WriterLease:
     def take(self, caller: Caller, holder: int | None = None) -> bool:
         """Give the lease to a client that `check` has let pass, or renew it; return whether it has a new holder."""
         held, state = self._caller, self.state
+        if held is caller and state is LeaseState.HELD and holder in (None, self._holder):
+            self._heard_at = self._now()
+            return False
         same = held is not None and caller.connection in {held.connection, *self._others}
         number = self._holder if holder is None and same else holder or SIMPLE_CLIENT
         new = held is None or state is LeaseState.FREE or not (same or number == self._holder != SIMPLE_CLIENT)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from coldloop.kernels.compiled import entry_of
 from coldloop.kernels.intrinsics import plain_tuples
 from coldloop.process.cold_box import L1, TICK_S
 from coldloop.process.model_range import present_model_range
@@ -28,6 +29,8 @@ class ColdBoxProgram(PlantProgram):
         self.box = box
         self._box, self._helium = plain_tuples(box), plain_tuples(load_helium())
         self._slope = np.empty(len(x0))
+        kinds = self._slope, self._slope, False, np.empty(3), 0.0, TICK_S, self._box, self._helium
+        self._advance = entry_of(advance_and_read, *kinds)
         self._held: tuple[float, ...] = (nan,) * 4
         """Inputs and load that the slope of the state was computed with."""
         super().__init__(x0=x0, **arguments)
@@ -62,7 +65,7 @@ class ColdBoxProgram(PlantProgram):
 
     def _step(self, w: float) -> tuple[RealArray, RealArray]:
         held = (*self._u.tolist(), w) == self._held
-        return advance_and_read(self._x, self._slope, held, self._u, w, TICK_S, self._box, self._helium)
+        return self._advance(self._x, self._slope, held, self._u, w, TICK_S, self._box, self._helium)
 
 
 class MismatchedPlant(ColdBoxProgram):
