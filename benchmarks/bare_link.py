@@ -12,6 +12,7 @@ from collections.abc import Awaitable, Callable
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
 from coldloop.process.cold_box import COLD_BOX
+from coldloop.registers import maps_of
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.codec import blank
 from coldloop.registers.common import Identity
@@ -26,7 +27,6 @@ from coldloop.registers.control_plc import (
     Verdict,
 )
 from coldloop.registers.declaration import Block, RegisterMap
-from coldloop.registers.maps import maps_of
 from coldloop.registers.plant import HISTORY_ROWS, Actuators, Measurement, PlantSample
 from coldloop.service.start import run_event_loop
 

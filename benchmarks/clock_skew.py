@@ -10,8 +10,8 @@ from typing import NamedTuple
 from coldloop.config import load_configuration
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.cold_box import COLD_BOX, TICK_S
+from coldloop.registers import maps_of
 from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus, Status
-from coldloop.registers.maps import maps_of
 from coldloop.service.start import run_event_loop
 from coldloop_plant.kinds import own_header
 from coldloop_plant.load import find_load

@@ -28,9 +28,9 @@ from coldloop.config import load_configuration
 from coldloop.modbus.settings import TlsSettings
 from coldloop.modbus.tls import client_context
 from coldloop.process.cold_box import COLD_BOX
+from coldloop.registers import maps_of
 from coldloop.registers.common import STATISTICS_BLOCK
 from coldloop.registers.declaration import RegisterMap
-from coldloop.registers.maps import maps_of
 from coldloop_chaos.sequencer import resident_mb
 from coldloop_rig import cli
 from coldloop_rig.cli.certificates import CLIENTS

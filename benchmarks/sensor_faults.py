@@ -14,9 +14,9 @@ from typing import NamedTuple, cast
 
 from coldloop.process.cold_box import COLD_BOX, L1, OUTPUT_NAMES, OUTPUT_UNITS, T5, TICK_S
 from coldloop.process.load_profile import LoadProfile
-from coldloop.registers.audit import Event, EventKind
+from coldloop.registers import maps_of
+from coldloop.registers.common import Event, EventKind
 from coldloop.registers.control_plc import Mode
-from coldloop.registers.maps import maps_of
 from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.load import find_load

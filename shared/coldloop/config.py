@@ -110,16 +110,10 @@ class _Layers:
 
 
 def load_configuration(
-    model: type[M],
-    *,
-    file: Path | None = None,
-    environment: Mapping[str, str] | None = None,
-    assignments: Iterable[str] = (),
-    options: Mapping[str, tuple[object, str]] | None = None,
-    others: Iterable[str] = (),
-    option: str = "--config",
-    listing: str = LISTING,
-) -> Configuration[M]:
+    model: type[M], *, file: Path | None = None, environment: Mapping[str, str] | None = None,
+    assignments: Iterable[str] = (), options: Mapping[str, tuple[object, str]] | None = None,
+    others: Iterable[str] = (), option: str = "--config", listing: str = LISTING,
+) -> Configuration[M]:  # fmt: skip
     """Return the validated configuration.
 
     Args:

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, EventKind, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.text import from_words
+from coldloop.registers.codec import from_words
+from coldloop.registers.common import EVENT_ROWS, QUERY_ROWS, Event, EventKind, JournalAnswer, JournalPage, JournalQuery
 from coldloop.service.journal import ANY_SUBJECT, KEPT, LOOKED_AT, Journal, JournalPublication
 from tests.harness.records import CONTROL_MAP
 

@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coldloop.registers.audit import WHO_WORDS
 from coldloop.registers.bank import BusyError, Caller
+from coldloop.registers.codec import to_words
+from coldloop.registers.common import WHO_WORDS
 from coldloop.registers.declaration import Role
 from coldloop.registers.safety import LeaseState, LeaseStatus
-from coldloop.registers.text import to_words
 from coldloop.safety.writers import LINGER_S, SIMPLE_CLIENT, WriterLease
 
 SILENCE_S = 5.0

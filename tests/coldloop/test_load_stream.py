@@ -9,7 +9,7 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.operating.execution import LoadStream
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import LoadProfile
-from coldloop.registers.maps import maps_of
+from coldloop.registers import maps_of
 from coldloop.registers.plant import LoadAhead, LoadStatus
 from coldloop_plant.load import MOST_UPCOMING, LoadSchedule
 

@@ -9,7 +9,7 @@ import pytest
 
 from coldloop.process.cold_box import INPUT_NAMES, L1, OUTPUT_NAMES, T5
 from coldloop.process.settings import InputLimits
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Cause, Heartbeat, Mode, Operator, OperatorMode, Update, Verdict
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import AlarmAction, AlarmCommand, AlarmKind, AlarmState

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from coldloop.errors import DamagedAnswerError, LinkError, PeerUnreachableError, RequestRefusedError
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import LinkCause, PlantLinkState
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import AlarmKind

@@ -14,9 +14,8 @@ from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
 from coldloop.process.cold_box import L1, T1, T5
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop.registers.audit import EVENT_ROWS, Event
 from coldloop.registers.bank import ANYBODY, Caller, RegisterBank
-from coldloop.registers.common import Identity
+from coldloop.registers.common import EVENT_ROWS, Event, Identity
 from coldloop.registers.control_plc import (
     Cause,
     ControlSession,

@@ -11,7 +11,7 @@ from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invar
 from coldloop.process.cold_box import COLD_BOX, L1, T5
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits, RateReference
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import (
     Cause,
     Heartbeat,

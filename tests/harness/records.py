@@ -4,9 +4,8 @@ from typing import Any, Final, NamedTuple, TypeVar, cast
 
 from coldloop.kernels.single_precision import single
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.registers import codec
+from coldloop.registers import codec, maps_of
 from coldloop.registers.declaration import RegisterMap
-from coldloop.registers.maps import maps_of
 
 R = TypeVar("R", bound=tuple[Any, ...])
 PLANT_MAP, CONTROL_MAP, OPTIMIZER_MAP = maps_of(COLD_BOX)

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES
-from coldloop.registers.audit import Event, EventKind
+from coldloop.registers.common import Event, EventKind
 from coldloop_hmi.explanation import Branch
 from coldloop_hmi.process_image import JournalEntry, Model
 from coldloop_hmi.runtime import Replay

@@ -14,9 +14,8 @@ from coldloop.errors import LinkError
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
-from coldloop.registers.audit import EVENT_ROWS, Event, EventKind
 from coldloop.registers.codec import WordOrder, codec_of
-from coldloop.registers.common import Identity
+from coldloop.registers.common import EVENT_ROWS, Event, EventKind, Identity
 from coldloop.registers.control_plc import ControlSession, Operator, OperatorMode, PlantLinkState, PlantLinkStatus
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.plant import HISTORY_ROWS, LoadStep, Measurement, PlantSample, PlantSession

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.registers.audit import EventKind
-from coldloop.registers.common import Identity
+from coldloop.registers.common import EventKind, Identity
 from coldloop.registers.control_plc import LinkCause
 from coldloop_chaos.faults import Direction
 

@@ -9,7 +9,7 @@ import pytest
 
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Cause, CoolDownStep, LadderStatus, LinkCause, Mode, PlantLinkState
 from coldloop.registers.plant import Actuators
 from coldloop.registers.safety import AlarmKind, WatchdogTime

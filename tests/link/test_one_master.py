@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coldloop.modbus.client import RegisterClient
-from coldloop.registers.audit import EventKind
-from coldloop.registers.common import ServerStatistics
+from coldloop.registers.common import EventKind, ServerStatistics
 from coldloop.registers.control_plc import LinkCause, PlantLinkState, PlantLinkStatus, Status
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
 from coldloop.registers.safety import AlarmKind, LeaseState, LeaseStatus

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import LinkCause
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import AlarmKind

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 from pydantic import ValidationError
 
-from coldloop.modbus.access import caller_at
+from coldloop.modbus.connection import caller_at
 from coldloop.modbus.settings import AccessSettings
 from coldloop.registers.codec import codec_of
 from coldloop.registers.control_plc import Grant, Operator, Plan, SequenceHeader, SequenceRow

@@ -9,8 +9,8 @@ import pytest
 from cryptography.hazmat.primitives.serialization import BestAvailableEncryption, Encoding, PrivateFormat
 
 from coldloop.errors import ConfigurationError, PeerUnreachableError, RequestRefusedError, UntrustedPeerError
-from coldloop.modbus.access import decoded_role, encoded_role
 from coldloop.modbus.client import RegisterClient
+from coldloop.modbus.connection import decoded_role, encoded_role
 from coldloop.modbus.settings import Endpoint, TlsSettings
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import AwaitUpdate, Grant, SequenceRow

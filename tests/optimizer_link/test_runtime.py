@@ -9,9 +9,8 @@ import pytest
 from coldloop.errors import ModelFileError
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.lti_model import LtiModel
-from coldloop.registers.audit import EVENT_ROWS, Event, EventKind
 from coldloop.registers.bank import Caller
-from coldloop.registers.common import Identity
+from coldloop.registers.common import EVENT_ROWS, Event, EventKind, Identity
 from coldloop.registers.control_plc import AwaitUpdate, Verdict
 from coldloop.registers.optimizer_plc import ControlLinkState, Optimization, OptimizerSession
 from coldloop_optimizer_plc.runtime import SHORTEST_WAIT_S

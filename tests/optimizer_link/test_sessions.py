@@ -11,13 +11,11 @@ from hypothesis import strategies as st
 
 from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
-from coldloop.registers.audit import Event, EventKind, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.bank import Caller, IllegalValueError, RefusedAccessError
-from coldloop.registers.codec import WordOrder, blank
-from coldloop.registers.common import SessionPace
+from coldloop.registers.codec import WordOrder, blank, from_words
+from coldloop.registers.common import Event, EventKind, JournalAnswer, JournalPage, JournalQuery, SessionPace
 from coldloop.registers.declaration import Role
 from coldloop.registers.optimizer_plc import OperatingLimits, OptimizerSession
-from coldloop.registers.text import from_words
 from coldloop_optimizer_plc.computing_settings import BudgetSettings, PlcBudget
 from coldloop_optimizer_plc.publication import OptimizerPublication
 from tests.harness.records import OPTIMIZER_MAP

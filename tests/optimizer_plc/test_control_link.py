@@ -14,7 +14,7 @@ from coldloop.errors import (
     RequestRefusedError,
     UntrustedPeerError,
 )
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
 from coldloop.service.journal import Journal

@@ -11,9 +11,9 @@ from coldloop.modbus.requests import DeviceIdentity, RequestHandler, Written
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop.registers.audit import EVENT_ROWS, Event, EventKind
 from coldloop.registers.bank import ALL_ROLES, Caller, RefusedAccessError
 from coldloop.registers.codec import Seal, codec_of, seal_of
+from coldloop.registers.common import EVENT_ROWS, Event, EventKind
 from coldloop.registers.declaration import Role
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop_plant.cold_box.physics import ColdBox, advance, derivative, outputs

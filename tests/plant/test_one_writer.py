@@ -4,10 +4,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.registers.audit import EventKind
+from coldloop.registers.codec import from_words
+from coldloop.registers.common import EventKind
 from coldloop.registers.plant import OutputVerdict
 from coldloop.registers.safety import LeaseEvent, LeaseState, LeaseStatus, WatchdogTime
-from coldloop.registers.text import from_words
 
 if TYPE_CHECKING:
     from tests.plant.conftest import RackOnTheBus

@@ -7,8 +7,7 @@ import pytest
 
 from coldloop.process.cold_box import L1, T5
 from coldloop.process.declaration import LAST_TICK
-from coldloop.registers.audit import EventKind
-from coldloop.registers.common import SessionPace
+from coldloop.registers.common import EventKind, SessionPace
 from coldloop.registers.plant import (
     Actuators,
     LiveLoad,

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.registers.audit import EventKind, JournalAnswer, JournalPage, JournalQuery
+from coldloop.registers.codec import from_words
+from coldloop.registers.common import EventKind, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.plant import (
     LOAD_ROWS,
     LoadStep,
@@ -17,7 +18,6 @@ from coldloop.registers.plant import (
     SensorFault,
     SensorFaultKind,
 )
-from coldloop.registers.text import from_words
 from coldloop.service.journal import ANY_SUBJECT
 
 if TYPE_CHECKING:

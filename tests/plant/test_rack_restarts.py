@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.plant import OutputVerdict, PlantSession
 from coldloop.safety.retained import RetainedFile
 from coldloop_plant.runtime import OWNER

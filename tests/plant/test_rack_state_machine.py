@@ -16,7 +16,7 @@ from hypothesis.stateful import (
 )
 
 from coldloop.process.settings import InputLimits
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict, PlantSession
 from coldloop.registers.safety import LeaseState, LeaseStatus, WatchdogStatus, WatchdogTime
 

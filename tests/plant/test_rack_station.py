@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.plant import (
     STATION_ROWS,
     PlantSession,

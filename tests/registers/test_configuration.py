@@ -7,7 +7,7 @@ import pytest
 from coldloop.config import selected
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.codec import WordOrder
-from coldloop.registers.configuration import (
+from coldloop.registers.common import (
     LINE_CHARACTERS,
     LINES,
     ConfigurationDigest,

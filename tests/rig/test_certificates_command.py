@@ -10,7 +10,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from coldloop.config import load_configuration
-from coldloop.modbus.access import Caller, caller_with
+from coldloop.modbus.connection import Caller, caller_with
 from coldloop.modbus.tls import client_context, server_context
 from coldloop_rig.settings import Settings
 

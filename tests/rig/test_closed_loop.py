@@ -11,7 +11,7 @@ from coldloop.process.cold_box import L1, T5, TICKS_PER_SAMPLE
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import InputLimits, RateReference
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Cause, Verdict
 from coldloop_optimizer_plc.settings import ControlDesign, OptimizerSection, ProgramSettings
 from coldloop_plant.kinds import make_program

@@ -15,7 +15,7 @@ from coldloop.kernels.single_precision import neighbour, single
 from coldloop.process.declaration import LAST_NUMBER
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.settings import InputLimits, RateReference
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Cause, CoolDownStep, Mode, OperatorMode
 from coldloop_control_plc.output_limits import admit, beginning, plain
 from coldloop_control_plc.player import latch, latches

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coldloop.process.cold_box import COLD_BOX, L1, OUTPUT_NAMES
-from coldloop.registers.audit import Event, EventKind
+from coldloop.registers.common import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.plant import SensorFaultKind
 from coldloop_rig.results.file_sinks import DrivingHistory

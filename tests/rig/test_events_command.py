@@ -17,9 +17,8 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
 from coldloop.modbus.settings import AccessSettings, TlsSettings
 from coldloop.operating.observer import JournalReader
-from coldloop.registers.audit import Event, EventKind, JournalQuery
 from coldloop.registers.bank import Caller, RegisterBank
-from coldloop.registers.common import Identity
+from coldloop.registers.common import Event, EventKind, Identity, JournalQuery
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.declaration import Block, RegisterMap
 from coldloop.registers.safety import AlarmKind

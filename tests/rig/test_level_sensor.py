@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from coldloop.process.cold_box import COLD_BOX, L1, OUTPUT_UNITS
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_plant.load import find_load
 from coldloop_plant.program import PlantProgram

@@ -12,8 +12,7 @@ import pytest
 from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.operating.observer import JournalReader
-from coldloop.registers.audit import Event, EventKind
-from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.common import Event, EventKind, Identity, SessionPace
 from coldloop.registers.control_plc import ControlSession, LadderStatus, Mode, PlantLinkState, PlantLinkStatus
 from coldloop.registers.optimizer_plc import OptimizerSession
 from coldloop.registers.plant import LiveLoad, LoadAhead, LoadStatus, LoadStep, PlantSession

@@ -17,19 +17,22 @@ import coldloop_optimizer_plc.settings
 import coldloop_plant.settings
 from coldloop.config import selected
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
-from coldloop.registers.audit import JournalAnswer, JournalPage
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.common import MAGIC, Identity, SessionPace
-from coldloop.registers.configuration import (
+from coldloop.registers.codec import to_words
+from coldloop.registers.common import (
     LINE_CHARACTERS,
     LINE_WORDS,
+    MAGIC,
     ConfigurationDigest,
     ConfigurationLine,
+    Identity,
+    JournalAnswer,
+    JournalPage,
+    SessionPace,
     publish_configuration,
 )
 from coldloop.registers.control_plc import LadderStatus, Operator
 from coldloop.registers.plant import LoadStatus
-from coldloop.registers.text import to_words
 from coldloop_plant.kinds import own_header
 from coldloop_rig.cosim.wiring import SERVICES
 from coldloop_rig.settings import Settings

@@ -7,8 +7,7 @@ import pytest
 from coldloop.modbus.client import RegisterClient
 from coldloop.operating.observer import UpdateReader
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.registers.audit import Event, EventKind
-from coldloop.registers.common import Identity
+from coldloop.registers.common import Event, EventKind, Identity
 from coldloop.registers.control_plc import Status
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, Optimization
 from coldloop.registers.safety import AlarmState

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coldloop.process.station import STATION_SIGNAL_NAMES
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind
 from coldloop_studies.reference_plc import SLOW_DOWN, SPEED

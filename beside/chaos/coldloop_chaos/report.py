@@ -20,7 +20,7 @@ from coldloop.number_text import ends_text
 from coldloop.parsing import parsed_json
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import load as load_model
-from coldloop.registers.audit import Event, EventKind
+from coldloop.registers.common import Event, EventKind
 from coldloop.registers.control_plc import LadderStatus, Mode
 from coldloop.registers.safety import AlarmState, alarm_key, alarms_of
 from coldloop.service.journal import alarm_word

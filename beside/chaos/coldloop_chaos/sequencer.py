@@ -20,8 +20,7 @@ from coldloop.process.cold_box import L1, TICK_S
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import discretise, load
 from coldloop.process.settings import settings_of
-from coldloop.registers.audit import Event, EventKind
-from coldloop.registers.common import Identity
+from coldloop.registers.common import Event, EventKind, Identity
 from coldloop.registers.control_plc import LadderStatus
 from coldloop.registers.plant import PlantSample, SensorFault, SensorFaultKind, Surroundings
 from coldloop.registers.safety import Alarm, alarms_of

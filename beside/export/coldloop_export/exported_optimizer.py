@@ -26,9 +26,9 @@ from coldloop.parsing import parsed_json
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.settings import InputLimits
+from coldloop.registers import maps_of
 from coldloop.registers.codec import blank
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, Update, Verdict
-from coldloop.registers.maps import maps_of
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, Prediction
 from coldloop.safety.writers import InputSequence, with_checksum
 from coldloop.service.start import in_one_line, main

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.process.cold_box import COLD_BOX, TICK_S
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.plant import StationAlarm, StationMode
 from coldloop.service.journal import alarm_word

@@ -15,7 +15,7 @@ from coldloop.config import MOST_SHOWN, Configuration, flattened, load_configura
 from coldloop.errors import LinkError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.settings import Endpoint
-from coldloop.registers.configuration import ConfigurationDigest, ConfigurationLine, configuration_of, lines_of
+from coldloop.registers.common import ConfigurationDigest, ConfigurationLine, configuration_of, lines_of
 from coldloop.service.start import run_event_loop
 from coldloop_rig.cosim import session
 from coldloop_rig.cosim.local_services import run_on_localhost

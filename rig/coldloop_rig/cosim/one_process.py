@@ -8,9 +8,9 @@ from coldloop.kernels.first_use import kernels_of
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
+from coldloop.registers import Maps, maps_of
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Update, Verdict
-from coldloop.registers.maps import Maps, maps_of
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import LoadStep, Measurement, PlantSample, StationSample, plant_map
 from coldloop_control_plc.program import ControlProgram

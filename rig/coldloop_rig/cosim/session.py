@@ -18,11 +18,10 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.operating.execution import LoadStream, lead_ticks, write_pace, write_table
 from coldloop.operating.observer import BATCH, JournalReader, SampleReader, Subscriber, UpdateReader, last_update
 from coldloop.process.load_profile import LoadProfile
-from coldloop.registers.audit import Event, EventKind, JournalPage
+from coldloop.registers import maps_of
 from coldloop.registers.codec import sealed
-from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.common import Event, EventKind, Identity, JournalPage, SessionPace
 from coldloop.registers.control_plc import ControlSession, Grant, LadderStatus, Mode, Operator, OperatorMode, Status
-from coldloop.registers.maps import maps_of
 from coldloop.registers.optimizer_plc import Optimization, OptimizerSession
 from coldloop.registers.plant import (
     HISTORY_ROWS,

@@ -13,7 +13,7 @@ from coldloop.config import load_configuration
 from coldloop.process.declaration import Process
 from coldloop.process.settings import settings_of
 from coldloop.process.station import STATION_SIGNAL_NAMES
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Cause, Mode, ProcessNow
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization
 from coldloop.registers.plant import SensorFaultKind, StationSample

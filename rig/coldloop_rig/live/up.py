@@ -22,9 +22,9 @@ from coldloop.config import to_environment
 from coldloop.errors import ColdloopError, LinkError, PeerUnreachableError, UsageError
 from coldloop.modbus.settings import TlsSettings
 from coldloop.process.cold_box import COLD_BOX
+from coldloop.registers import maps_of
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus
-from coldloop.registers.maps import maps_of
 from coldloop.registers.plant import Measurement
 from coldloop_hmi.settings import HmiSection, HmiSettings
 from coldloop_hmi.users import PageRole, write_user

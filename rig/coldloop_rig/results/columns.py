@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from coldloop.process.declaration import Process
 from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS
-from coldloop.registers.audit import Event
+from coldloop.registers import Maps, maps_of
+from coldloop.registers.common import Event
 from coldloop.registers.control_plc import Verdict
-from coldloop.registers.maps import Maps, maps_of
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import ModelRangeStatus, PlantSample, StationMode, StationSample
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from coldloop.errors import ResultsError, UsageError
 from coldloop.process.declaration import Process
 from coldloop.process.model_range import recorded_model_range
-from coldloop.registers.audit import Event, EventKind
+from coldloop.registers.common import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import SensorFaultKind

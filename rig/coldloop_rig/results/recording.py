@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ColdloopError, LinkError
 from coldloop.process.station import STATION_SIGNAL_NAMES
-from coldloop.registers.audit import Event
+from coldloop.registers.common import Event
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample, StationSample
 

@@ -25,7 +25,7 @@ from coldloop.errors import UsageError
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.updating_periods import duration, whole_ticks
-from coldloop.registers.audit import Event
+from coldloop.registers.common import Event
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.figures import plot
 from coldloop_rig.results.file_sinks import DrivingHistory, events_table, station_table, trace_table, updates_table

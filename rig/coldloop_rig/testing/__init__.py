@@ -23,9 +23,9 @@ from typing import Any, Final, Literal, NamedTuple, TypeVar
 from coldloop.errors import LinkError, PeerUnreachableError, UnfitValueError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.settings import Endpoint
+from coldloop.registers import maps_of
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap
-from coldloop.registers.maps import maps_of
 from coldloop_rig.cosim import wiring
 from coldloop_rig.cosim.local_services import LocalServices
 from coldloop_rig.cosim.session import SessionClient

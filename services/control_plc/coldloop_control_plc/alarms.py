@@ -20,7 +20,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, FiniteFl
 from coldloop.process.declaration import Process
 from coldloop.process.sections import Range
 from coldloop.process.settings import ProcessSettings, declared, settings_process, stretched, within
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.safety import (
     ALL_ALARMS,

@@ -8,9 +8,8 @@ from typing import Final
 
 from coldloop.process.settings import InputLimits
 from coldloop.registers import control_plc as registers
-from coldloop.registers.audit import EventKind, JournalQuery
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
-from coldloop.registers.common import Identity, ServiceState, SessionPace, pace_subject
+from coldloop.registers.common import EventKind, Identity, JournalQuery, ServiceState, SessionPace, pace_subject
 from coldloop.registers.declaration import Block, Role
 from coldloop.registers.safety import AlarmCommand, AlarmKind, AlarmState, LeaseEvent, WatchdogTime
 from coldloop.safety.writers import InputSequence, WriterLease

@@ -19,7 +19,7 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import LinkCause, PlantLinkState
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import AlarmKind

@@ -14,7 +14,7 @@ from coldloop.errors import ConfigurationError
 from coldloop.process.model_file import ModelHeader
 from coldloop.process.settings import InputLimits
 from coldloop.registers import control_plc as registers
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Cause, CoolDownStep, Mode, Operator, OperatorMode, ProcessNow, Update
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.registers.safety import Alarm, AlarmKind

@@ -21,12 +21,10 @@ from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.modbus.settings import TlsSettings
 from coldloop.process.declaration import LAST_TICK
 from coldloop.process.model_file import read_header
-from coldloop.registers.audit import EventKind
+from coldloop.registers import maps_of
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.common import SessionPace
-from coldloop.registers.configuration import publish_configuration
+from coldloop.registers.common import EventKind, SessionPace, publish_configuration
 from coldloop.registers.control_plc import ControlSession
-from coldloop.registers.maps import maps_of
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import AlarmKind, WatchdogTime
 from coldloop.service.metrics import MetricsServer

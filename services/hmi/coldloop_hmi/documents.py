@@ -13,8 +13,8 @@ from prometheus_client.core import Metric
 from coldloop import __version__
 from coldloop.process.declaration import Process
 from coldloop.registers import optimizer_plc
-from coldloop.registers.audit import EventKind
 from coldloop.registers.codec import blank
+from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, Prediction
 from coldloop.registers.plant import StationAlarm, StationMode, StationStatus

@@ -16,7 +16,7 @@ from aiohttp.log import server_logger
 
 from coldloop.errors import ConfigurationError, PortInUseError
 from coldloop.modbus.connection import RefusalLog
-from coldloop.modbus.tls_listener import TlsListener
+from coldloop.modbus.tls import TlsListener
 from coldloop.service.metrics import CONTENT_TYPE, exposition
 from coldloop_hmi import documents
 from coldloop_hmi import guard as guards

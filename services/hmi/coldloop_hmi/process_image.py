@@ -14,11 +14,10 @@ from typing import Any, Final, NamedTuple, TypeVar, cast
 
 from coldloop.process.declaration import Process
 from coldloop.process.station import STATION_SIGNAL_NAMES
-from coldloop.registers.audit import Event
+from coldloop.registers import maps_of
 from coldloop.registers.codec import blank
-from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.common import Event, Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Mode, Plan, ProcessNow
-from coldloop.registers.maps import maps_of
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Prediction, UpdatingRuleStatus
 from coldloop.registers.plant import StationStatus
 from coldloop.registers.safety import Alarm

@@ -22,11 +22,17 @@ from coldloop.modbus.settings import Endpoint
 from coldloop.operating.observer import JournalReader, UpdateReader, read_alarms
 from coldloop.process.declaration import Process
 from coldloop.process.station import STATION_VALVE_NAMES
-from coldloop.registers.audit import JournalPage
-from coldloop.registers.common import Identity, SessionPace
-from coldloop.registers.configuration import ConfigurationDigest, ConfigurationLine, configuration_of, lines_of
+from coldloop.registers import Maps
+from coldloop.registers.common import (
+    ConfigurationDigest,
+    ConfigurationLine,
+    Identity,
+    JournalPage,
+    SessionPace,
+    configuration_of,
+    lines_of,
+)
 from coldloop.registers.control_plc import LadderStatus, Operator, PlantLinkStatus, ProcessNow, Status
-from coldloop.registers.maps import Maps
 from coldloop.registers.optimizer_plc import (
     ControlLinkStatus,
     OperatingLimits,

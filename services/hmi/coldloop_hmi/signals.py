@@ -11,8 +11,8 @@ from typing import Any, Final, NamedTuple
 
 from coldloop.process.declaration import Process
 from coldloop.process.sections import Output, Range
+from coldloop.registers.codec import from_words
 from coldloop.registers.declaration import Block, Kind, RegisterMap
-from coldloop.registers.text import from_words
 
 BESIDE_BAND: Final = 1.5
 """Margin of a bar beside a band, on each side, over the width of the band."""

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import Final
 
 from coldloop.errors import BUSY, ColdloopError, DamagedAnswerError, ModelFileError, RequestRefusedError
-from coldloop.registers.audit import EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
 from coldloop.service.journal import Journal

@@ -4,10 +4,9 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from coldloop.process.updating_periods import SHORTEST_TICKS
-from coldloop.registers.audit import EventKind, JournalQuery
 from coldloop.registers.bank import Caller, IllegalValueError, RegisterBank
 from coldloop.registers.codec import WordOrder, blank
-from coldloop.registers.common import Identity, ServiceState, SessionPace, pace_subject
+from coldloop.registers.common import EventKind, Identity, JournalQuery, ServiceState, SessionPace, pace_subject
 from coldloop.registers.declaration import Block, RegisterMap
 from coldloop.registers.optimizer_plc import (
     HISTORY_ROWS,

@@ -24,9 +24,9 @@ from coldloop.errors import (
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.settings import InputLimits
-from coldloop.registers.configuration import publish_configuration
+from coldloop.registers import maps_of
+from coldloop.registers.common import publish_configuration
 from coldloop.registers.control_plc import AwaitUpdate, Plan, Update, Verdict
-from coldloop.registers.maps import maps_of
 from coldloop.registers.optimizer_plc import ControlLinkState, ModelDeviation
 from coldloop.safety.writers import InputSequence
 from coldloop.service.metrics import MetricsServer

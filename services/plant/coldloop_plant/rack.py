@@ -17,9 +17,8 @@ from coldloop.process.declaration import LAST_TICK, Process
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.station import STATION_SIGNAL_NAMES, ModelRange
 from coldloop.registers import plant as registers
-from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import Caller
-from coldloop.registers.common import pace_subject
+from coldloop.registers.common import EventKind, pace_subject
 from coldloop.registers.plant import Actuators, OutputVerdict, SensorFault, SensorFaultKind
 from coldloop.safety.watchdog import Watchdog
 from coldloop.safety.writers import SIMPLE_CLIENT

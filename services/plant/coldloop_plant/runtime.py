@@ -22,11 +22,16 @@ from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import ModelHeader
 from coldloop.registers import plant as registers
-from coldloop.registers.audit import EventKind, JournalQuery
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, Judge, RegisterBank
 from coldloop.registers.codec import DomainError, check_record
-from coldloop.registers.common import Identity, ServiceState, SessionPace
-from coldloop.registers.configuration import publish_configuration
+from coldloop.registers.common import (
+    EventKind,
+    Identity,
+    JournalQuery,
+    ServiceState,
+    SessionPace,
+    publish_configuration,
+)
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import Actuators, LiveLoad, LoadAhead, LoadStep, PlantSession, Surroundings
 from coldloop.registers.safety import LeaseEvent, LeaseStatus, WatchdogStatus, WatchdogTime

@@ -293,15 +293,9 @@ class RegisterClient:
     """
 
     def __init__(
-        self,
-        register_map: RegisterMap,
-        *,
-        host: str,
-        port: int,
-        timeout_s: float,
-        order: WordOrder = WordOrder.HIGH_FIRST,
-        tls: TlsSettings | None = None,
-    ) -> None:
+        self, register_map: RegisterMap, *, host: str, port: int, timeout_s: float,
+        order: WordOrder = WordOrder.HIGH_FIRST, tls: TlsSettings | None = None,
+    ) -> None:  # fmt: skip
         self.map = register_map
         self._order = order
         self._timeout_s = timeout_s
@@ -321,13 +315,9 @@ class RegisterClient:
             ConfigurationError: The files for TLS cannot be used.
         """
         return cls(
-            register_map,
-            host=endpoint.host,
-            port=endpoint.port,
-            timeout_s=endpoint.timeout_s,
-            order=endpoint.word_order,
-            tls=endpoint.tls,
-        )
+            register_map, host=endpoint.host, port=endpoint.port, timeout_s=endpoint.timeout_s,
+            order=endpoint.word_order, tls=endpoint.tls,
+        )  # fmt: skip
 
     @property
     def process(self) -> Process:
@@ -431,14 +421,9 @@ class RegisterClient:
             raise self._nonsense(block)
 
     async def exchange(
-        self,
-        record: tuple[Any, ...],
-        answer: type[R],
-        *,
-        rows: Sequence[tuple[Any, ...]] = (),
-        before: tuple[Any, ...] | None = None,
-        patience_s: float | None = None,
-    ) -> R:
+        self, record: tuple[Any, ...], answer: type[R], *, rows: Sequence[tuple[Any, ...]] = (),
+        before: tuple[Any, ...] | None = None, patience_s: float | None = None,
+    ) -> R:  # fmt: skip
         """Write `record`, then read `answer`, in one request.
 
         Args:

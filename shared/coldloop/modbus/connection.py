@@ -3,32 +3,27 @@
 Everything runs in the callbacks of the event loop. A request costs no task and no await unless `on_write` asks for a
 wait; then requests that arrive behind it stay in the buffer until its answer is written. A request that comes alone is
 answered at once; many are answered a few at a time (`Turns`).
+
+A client is known by its address, or with TLS by the role in its certificate, in the X.509v3 extension of the Modbus/TCP
+Security Protocol Specification (v21, section 8.2, "Role extension"): a UTF8String. One without a role, or with a role
+that we do not know, may only read.
 """
 
 import asyncio
+import json
 import logging
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, fields
 from functools import partial
+from ipaddress import IPv4Address, IPv6Address, ip_address
 from itertools import count
 from time import monotonic
 from typing import Final, Protocol, cast
 
-from coldloop.modbus.access import caller_at, caller_with
-from coldloop.modbus.requests import (
-    NO_SUCH_UNIT,
-    SERVER_FAILURE,
-    Frame,
-    MalformedFrameError,
-    RequestHandler,
-    Written,
-    exception_answer,
-    framed,
-    next_frame,
-)
-from coldloop.modbus.settings import ServerSettings
+from coldloop.modbus import requests
+from coldloop.modbus.settings import AccessSettings, Networks, ServerSettings
 from coldloop.registers.bank import ANYBODY, Caller, ForbiddenWriteError, RefusedAccessError
 from coldloop.registers.declaration import Block, Role
 
@@ -198,19 +193,13 @@ class Connection(asyncio.Protocol):
     `opened` reports the connection to the server and returns whether it may stay; `lost` reports its end.
     """
 
-    _handle: Callable[[bytes], bytes | Written]
+    _handle: Callable[[bytes], bytes | requests.Written]
 
     def __init__(
-        self,
-        *,
-        handler_for: Callable[[Caller], RequestHandler],
-        settings: ServerSettings,
-        on_write: OnWrite,
-        refusals: RefusalLog,
-        turns: Turns,
-        opened: Callable[["Connection"], bool],
+        self, *, handler_for: Callable[[Caller], requests.RequestHandler], settings: ServerSettings, on_write: OnWrite,
+        refusals: RefusalLog, turns: Turns, opened: Callable[["Connection"], bool],
         lost: Callable[["Connection"], None],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._handler_for = handler_for
         self._settings = settings
         self._on_write = on_write
@@ -354,14 +343,14 @@ class Connection(asyncio.Protocol):
         more = False
         try:
             while self._wait is None and not more and position < len(self._buffer):
-                frame = next_frame(self._buffer, position)
+                frame = requests.next_frame(self._buffer, position)
                 if frame is None or (self._rate is not None and self._too_fast(self._rate)):
                     break
                 position = frame.end
                 answers += self._answer(frame)
                 self.last_request = monotonic()
                 more = self.requests >= last or len(answers) >= OUTPUT_CHUNK or self.last_request >= until
-        except MalformedFrameError as error:
+        except requests.MalformedFrameError as error:
             if answers:  # they are sent first, and the next call comes here again
                 more = True
             else:
@@ -385,28 +374,32 @@ class Connection(asyncio.Protocol):
         self._held = None
         self._serve()
 
-    def _answer(self, frame: Frame) -> bytes:
+    def _answer(self, frame: requests.Frame) -> bytes:
         """Carry a request out; return its answer, or nothing when it waits or is to be ignored."""
         self.requests += 1
         if frame.unit not in self._settings.unit_ids:
             self._refusals.note("unknown_unit", self.peer, f"unit id {frame.unit} is not served")
             if self._settings.unknown_unit == "silence":
                 return b""
-            return framed(frame.transaction, frame.unit, exception_answer(frame.pdu[0], NO_SUCH_UNIT))
+            return requests.framed(
+                frame.transaction, frame.unit, requests.exception_answer(frame.pdu[0], requests.NO_SUCH_UNIT)
+            )
         try:
             outcome = self._handle(frame.pdu)
         except RefusedAccessError as refusal:
             kind = _KINDS[refusal.exception_code] if not isinstance(refusal, ForbiddenWriteError) else "access_refused"
             self._refusals.note(kind, self.peer, f"function {frame.pdu[0]}: {refusal}")
-            return framed(frame.transaction, frame.unit, exception_answer(frame.pdu[0], refusal.exception_code))
+            return requests.framed(
+                frame.transaction, frame.unit, requests.exception_answer(frame.pdu[0], refusal.exception_code)
+            )
         except Exception as error:  # noqa: BLE001 - whatever goes wrong in here, the client gets an answer
             return self._failure(frame, error)
-        if isinstance(outcome, Written):
+        if isinstance(outcome, requests.Written):
             self.written_as.update([block.writer for block in outcome.blocks])
             return self._answer_written(frame, outcome, iter(outcome.blocks))
-        return framed(frame.transaction, frame.unit, outcome)
+        return requests.framed(frame.transaction, frame.unit, outcome)
 
-    def _answer_written(self, frame: Frame, written: Written, blocks: Iterator[Block]) -> bytes:
+    def _answer_written(self, frame: requests.Frame, written: requests.Written, blocks: Iterator[Block]) -> bytes:
         """Report the written blocks to the program; return the answer, or nothing if the program delays it."""
         try:
             for block in blocks:
@@ -417,9 +410,11 @@ class Connection(asyncio.Protocol):
                     return b""
         except Exception as error:  # noqa: BLE001 - whatever the program does wrong, the client gets an answer
             return self._failure(frame, error)
-        return framed(frame.transaction, frame.unit, written.answer())
+        return requests.framed(frame.transaction, frame.unit, written.answer())
 
-    def _go_on(self, frame: Frame, written: Written, blocks: Iterator[Block], wait: asyncio.Future[None]) -> None:
+    def _go_on(
+        self, frame: requests.Frame, written: requests.Written, blocks: Iterator[Block], wait: asyncio.Future[None]
+    ) -> None:
         self._wait = None
         error = asyncio.CancelledError("wait cancelled") if wait.cancelled() else wait.exception()
         if self._transport.is_closing():
@@ -430,9 +425,11 @@ class Connection(asyncio.Protocol):
             self._transport.write(answer)
         self._serve()
 
-    def _failure(self, frame: Frame, error: BaseException) -> bytes:
+    def _failure(self, frame: requests.Frame, error: BaseException) -> bytes:
         self._refusals.note("server_failure", self.peer, f"function {frame.pdu[0]}: {error!r}")
-        return framed(frame.transaction, frame.unit, exception_answer(frame.pdu[0], SERVER_FAILURE))
+        return requests.framed(
+            frame.transaction, frame.unit, requests.exception_answer(frame.pdu[0], requests.SERVER_FAILURE)
+        )
 
     def _check_idle(self) -> None:
         now = monotonic()
@@ -444,3 +441,68 @@ class Connection(asyncio.Protocol):
             return
         self._refusals.note("idle_timeout", self.peer, f"no complete request for {self._settings.idle_timeout_s:g} s")
         self._transport.abort()
+
+
+ROLE_EXTENSION: Final = "1.3.6.1.4.1.50316.802.1"
+UTF8_STRING: Final = 0x0C
+"""Tag of a UTF8String in DER."""
+MAX_LENGTH: Final = 127
+"""Longest role, in bytes: what DER says the length of in one byte."""
+
+
+def caller_at(host: str, name: str, access: AccessSettings) -> Caller | None:
+    """Return the caller at an address, or None if the address is not allowed."""
+    address = _plain_address(host)
+    places = {Role.CONTROL: access.control, Role.OPTIMIZER: access.optimizer, Role.OPERATOR: access.operator}
+    roles = frozenset(role for role, networks in places.items() if _within(address, networks))
+    if not roles and not _within(address, access.readers):
+        return None
+    return Caller(name, roles)
+
+
+def caller_with(certificate: bytes, name: str) -> Caller:
+    """Return the caller with a verified certificate (DER)."""
+    subject, role = _subject_and_role(certificate)
+    known = {each.value: each for each in Role}
+    described = " ".join(f"{key}={json.dumps(text)}" for key, text in (("certificate", subject), ("role", role)))
+    return Caller(f"{name} {described}", frozenset({known[role]} if role in known else ()))
+
+
+def _plain_address(host: str) -> IPv4Address | IPv6Address:
+    """Return an address; an IPv4 client of a dual-stack socket is returned as IPv4."""
+    address = ip_address(host)
+    return getattr(address, "ipv4_mapped", None) or address
+
+
+def _within(address: IPv4Address | IPv6Address, networks: Networks) -> bool:
+    return any(address in network for network in networks)
+
+
+def _subject_and_role(der: bytes) -> tuple[str, str]:
+    """Return both as they stand in a certificate; empty where it is too odd to be read, though OpenSSL took it."""
+    from cryptography import x509  # noqa: PLC0415 a service without TLS starts without it
+
+    odd = (x509.DuplicateExtension, x509.UnsupportedGeneralNameType, x509.InvalidVersion)
+    subject = ""
+    try:
+        certificate = x509.load_der_x509_certificate(der)
+        subject = certificate.subject.rfc4514_string()
+        extension = certificate.extensions.get_extension_for_oid(x509.ObjectIdentifier(ROLE_EXTENSION)).value
+    except (x509.ExtensionNotFound, ValueError, *odd):
+        return subject, ""
+    return subject, decoded_role(extension.public_bytes())
+
+
+def encoded_role(text: str) -> bytes:
+    """Return a role as the extension's DER."""
+    raw = text.encode()
+    if len(raw) > MAX_LENGTH:
+        raise ValueError(f"a role of more than {MAX_LENGTH} bytes")
+    return bytes((UTF8_STRING, len(raw))) + raw
+
+
+def decoded_role(der: bytes) -> str:
+    """Return the role in an extension's DER, empty when it is not one."""
+    if len(der) < 2 or der[0] != UTF8_STRING or der[1] > MAX_LENGTH or der[1] != len(der) - 2:
+        return ""
+    return der[2:].decode(errors="replace")

@@ -7,16 +7,18 @@ from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from time import monotonic
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import PortInUseError
 from coldloop.modbus.connection import Connection, ErrorCounters, OnWrite, RefusalLog, Turns
 from coldloop.modbus.requests import DeviceIdentity, RequestHandler
 from coldloop.modbus.settings import ServerSettings
-from coldloop.modbus.tls_listener import TlsListener
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import ServerStatistics
 from coldloop.registers.declaration import Role
+
+if TYPE_CHECKING:
+    from coldloop.modbus.tls import TlsListener
 
 __all__ = ["DeviceIdentity", "ErrorCounters", "ModbusServer", "OnWrite", "ServerSettings"]
 
@@ -50,16 +52,10 @@ class ModbusServer:
     """
 
     def __init__(
-        self,
-        bank: RegisterBank,
-        *,
-        settings: ServerSettings,
-        on_write: OnWrite,
-        identity: DeviceIdentity,
-        on_departure: Callable[[Role], None] | None = None,
-        on_close: Callable[[Caller], None] | None = None,
+        self, bank: RegisterBank, *, settings: ServerSettings, on_write: OnWrite, identity: DeviceIdentity,
+        on_departure: Callable[[Role], None] | None = None, on_close: Callable[[Caller], None] | None = None,
         on_refusal: Callable[[str], None] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._settings = settings
         self._on_write = on_write
         self._service = bank.map.service
@@ -92,11 +88,9 @@ class ModbusServer:
         requests = self._past_requests + sum(connection.requests for connection in self._connections)
         errors = {kind: count & 0xFFFFFFFF for kind, count in asdict(self.counters).items()}
         return ServerStatistics(
-            connections=min(self.connections, 0xFFFF),
-            accepted=self._accepted & 0xFFFFFFFF,
-            requests=requests & 0xFFFFFFFF,
-            **errors,
-        )
+            connections=min(self.connections, 0xFFFF), accepted=self._accepted & 0xFFFFFFFF,
+            requests=requests & 0xFFFFFFFF, **errors,
+        )  # fmt: skip
 
     @property
     def port(self) -> int:
@@ -119,20 +113,16 @@ class ModbusServer:
             reason = _REMEDIES.get(error.errno or 0, f"{error.strerror}; choose another host or port")
             raise PortInUseError(f"{self._service} cannot listen on {host}:{port}: {reason}") from error
 
-    async def _listen(self, host: str, port: int) -> asyncio.Server | TlsListener:
+    async def _listen(self, host: str, port: int) -> "asyncio.Server | TlsListener":
         tls = self._settings.tls
         if tls is None:
             return await asyncio.get_running_loop().create_server(self._new_connection, host, port)
-        from coldloop.modbus.tls import server_context  # noqa: PLC0415 without TLS, nothing needs cryptography
+        from coldloop.modbus.tls import TlsListener, server_context  # noqa: PLC0415 without TLS, nothing needs cryptography
 
         return await TlsListener.at(
-            host,
-            port,
-            server_context(tls, f"{self._service}.server.tls"),
-            make_protocol=self._new_connection,
-            limit=self._settings.connection_limit,
-            refusals=self._refusals,
-        )
+            host, port, server_context(tls, f"{self._service}.server.tls"), make_protocol=self._new_connection,
+            limit=self._settings.connection_limit, refusals=self._refusals,
+        )  # fmt: skip
 
     async def close(self) -> None:
         """Stop listening and close all connections; waits of `on_write` are cancelled."""
@@ -150,14 +140,9 @@ class ModbusServer:
 
     def _new_connection(self) -> Connection:
         return Connection(
-            handler_for=self._handler_for,
-            settings=self._settings,
-            on_write=self._on_write,
-            refusals=self._refusals,
-            turns=self._turns,
-            opened=self._admit,
-            lost=self._forget,
-        )
+            handler_for=self._handler_for, settings=self._settings, on_write=self._on_write, refusals=self._refusals,
+            turns=self._turns, opened=self._admit, lost=self._forget,
+        )  # fmt: skip
 
     def _admit(self, newcomer: Connection) -> bool:
         """Take a connection in, where need be in the place of an idle one; return whether it may stay."""

@@ -16,10 +16,10 @@ from coldloop.operating.commands import Command, TreatAlarm, clock_text
 from coldloop.operating.observer import read_alarms
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
+from coldloop.registers import Maps, maps_of
 from coldloop.registers.codec import sealed
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
-from coldloop.registers.maps import Maps, maps_of
 from coldloop.registers.plant import (
     AHEAD_STEPS,
     LOAD_ROWS,

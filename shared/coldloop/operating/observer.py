@@ -11,8 +11,7 @@ from typing import Final, Protocol, TypeVar
 
 from coldloop.errors import LinkError, RequestRefusedError
 from coldloop.modbus.client import REQUESTS_AT_ONCE, RegisterClient
-from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
-from coldloop.registers.common import Identity
+from coldloop.registers.common import EVENT_ROWS, QUERY_ROWS, Event, Identity, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.optimizer_plc import HISTORY_ROWS as UPDATE_ROWS
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import HISTORY_ROWS, STATION_ROWS, PlantSample, StationSample

@@ -1,4 +1,4 @@
-"""Records to register words and back: their ranges, their values in words, their seals.
+"""Records to register words and back: their ranges, their values in words, their seals, their texts.
 
 Servers check writes by the declared ranges, clients what they read, and programs the records of a file.
 """
@@ -311,3 +311,20 @@ def sealed_bytes(codec: RecordCodec, record: tuple[Any, ...]) -> bytes:
 
 def _checksum(raw: bytes) -> bytes:
     return (zlib.crc32(raw[:-CRC_BYTES]) or 1).to_bytes(CRC_BYTES, "big")
+
+
+@lru_cache(maxsize=256)
+def to_words(text: str, words: int) -> tuple[int, ...]:
+    """Return a text as `words` register values; what is too long is cut off."""
+    raw = _printable(text).encode("ascii")[: 2 * words].ljust(2 * words, b"\0")
+    return tuple(int.from_bytes(raw[place : place + 2], "big") for place in range(0, 2 * words, 2))
+
+
+def from_words(words: tuple[int, ...]) -> str:
+    """Return the text that register values hold."""
+    raw = b"".join(word.to_bytes(2, "big") for word in words).rstrip(b"\0")
+    return _printable(raw.decode("ascii", errors="replace"))
+
+
+def _printable(text: str) -> str:
+    return "".join(character if " " <= character <= "~" else "?" for character in text)

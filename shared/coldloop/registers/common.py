@@ -1,8 +1,19 @@
-"""The corner below address 100 that is the same in every map."""
+"""Records that every map has: identity and statistics below address 100, the journal and the configuration at its end.
 
-from typing import Annotated, Final, NamedTuple
+The configuration is what decides results, as a JSON text with its digest: an object of values by dotted key, as
+`coldloop config` lists them. Addresses, certificates, files and other things that concern one machine alone are not in
+it.
+"""
 
-from coldloop.registers.declaration import Block, Worded, f32, in_ticks, u16, u32
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, Final, NamedTuple
+
+from coldloop.parsing import parsed_json
+from coldloop.registers.bank import RegisterBank
+from coldloop.registers.codec import from_words, to_words
+from coldloop.registers.declaration import Block, Role, Worded, f32, in_ticks, text, u16, u32
 from coldloop.session import TimeBase
 
 MAGIC: Final = 123.456
@@ -103,3 +114,173 @@ class ServerStatistics(NamedTuple):
 
 IDENTITY_BLOCK: Final = Block("identity", 0, Identity, "Identity and heartbeat of the service")
 STATISTICS_BLOCK: Final = Block("statistics", 60, ServerStatistics, "Requests served and refused")
+
+
+EVENT_ROWS: Final = 256
+QUERY_ROWS: Final = 3
+"""Events in one answer to a query: what one request can read."""
+WHO_WORDS: Final = 24
+NOBODY: Final = (0,) * WHO_WORDS
+
+
+class EventKind(Worded):
+    """Kind of an event: `subject`, `cause` and `value` depend on it."""
+
+    NONE = 0
+    MODE = 1
+    """The mode of the ladder changed: subject the new mode, cause why."""
+    ALARM_RAISED = 2
+    """Subject is the alarm, cause its cause; so for all alarm events. Value is the shortage of CAPACITY, W."""
+    ALARM_RETURNED = 3
+    ALARM_ACKNOWLEDGED = 4
+    ALARM_SHELVED = 5
+    """Value is the time, s."""
+    ALARM_UNSHELVED = 6
+    ALARM_OUT_OF_SERVICE = 7
+    ALARM_IN_SERVICE = 8
+    BOOT = 9
+    """The service started: subject 1 when it resumes a retained state, cause 1 when one was set aside."""
+    SESSION = 10
+    """A session was started: subject 0 lock-step, 1 real time; value the factor."""
+    OPERATOR_MODE = 11
+    """Subject is the operator's mode."""
+    SETPOINT = 12
+    """Subject is the input, value the setpoint."""
+    WATCHDOG_TIME = 13
+    """Subject is the new time-out in ticks, 0 off; cause the old one."""
+    WATCHDOG_EXPIRED = 14
+    PLANT_LINK = 15
+    """Subject is the new state of the plant link, cause why."""
+    LEASE = 16
+    """Subject 0 ended, 1 granted, 2 a second writer was refused."""
+    SENSOR_FAULT = 17
+    """A fault was put into a sensor: subject the output, cause the kind."""
+    LOAD = 18
+    """The load table was written: subject the last row that the request wrote, its value in W."""
+    CERTIFICATE = 19
+    """Subject 1 expires soon, 2 expired; value days left."""
+    LOST = 20
+    """Events or log lines were lost: value how many."""
+    CONTROL_LINK = 21
+    """Subject is the new state of the optimiser's link to the control PLC; 2 is up."""
+    SENSOR = 22
+    """Subject is the output, cause 1 bad: it is substituted, 2 suspect: the optimiser does without it, 0 good again."""
+    PACE = 23
+    """The time base of a session was changed: subject 0 lock-step, 1 real time, 2 paused; value the factor."""
+    LIVE_LOAD = 24
+    """The load of the session under way was written: subject 0 from now on, 1 steps ahead; value its first one, W."""
+    STATION_ALARM = 25
+    """An alarm of the compression station: subject its number from 0, cause 1 raised, 0 returned."""
+    STATION_MODE = 26
+    """The mode of the station's controller changed: subject the new one."""
+    SURROUNDINGS = 27
+    """Something was changed that a refrigerator is given: subject what, value its new value."""
+    MODEL_RANGE = 28
+    """The simulation left its property tables: subject what, its number from 0, cause 1 left, 0 returned."""
+    COOL_DOWN = 29
+    """The cool-down has come further: subject its step."""
+
+
+class Event(NamedTuple):
+    """One line of the journal. The row of event n is n modulo the number of rows; the first is number 1."""
+
+    number: Annotated[int, u32("Number of the event, rising over restarts; 0 is none yet")] = 0
+    boot: Annotated[int, u16("Number of the start of the service")] = 0
+    tick: Annotated[int, u32("Tick of plant time")] = 0
+    utc: Annotated[int, u32("UTC, seconds since 1970", unit="s")] = 0
+    milliseconds: Annotated[int, u16("Milliseconds of that time", unit="ms", high=999)] = 0
+    kind: Annotated[int, u16("{}", values=EventKind)] = 0
+    subject: Annotated[int, u16("The mode, the alarm, ...: depends on the kind")] = 0
+    cause: Annotated[int, u16("Why: depends on the kind")] = 0
+    value: Annotated[float, f32("A value: depends on the kind")] = 0.0
+    who: Annotated[tuple[int, ...], text("Client of the request: address, role, certificate", WHO_WORDS)] = NOBODY
+
+
+class JournalQuery(NamedTuple):
+    """Selects events when written; the answer is in the block behind it."""
+
+    first: Annotated[int, u32("Number of the first event to search")]
+    kind: Annotated[int, u16("Only events of this kind; 0 is any")]
+    subject: Annotated[int, u16("Only events with this subject; 65535 is any")]
+
+
+class JournalPage(NamedTuple):
+    """State of the journal, and where the next query continues."""
+
+    oldest: Annotated[int, u32("Number of the oldest event kept")] = 0
+    newest: Annotated[int, u32("Number of the newest event")] = 0
+    found: Annotated[int, u16("Events in the answer")] = 0
+    next_first: Annotated[int, u32("First number for the next query; 0 at the end")] = 0
+
+
+class JournalAnswer(Event):
+    """An event that a query has found."""
+
+
+LINE_WORDS: Final = 16
+LINE_CHARACTERS: Final = 2 * LINE_WORDS
+LINES: Final = 512
+"""16,384 characters; the optimiser PLC, which has the longest, takes 3,000 by default."""
+DIGEST_WORDS: Final = 32
+
+
+class ConfigurationDigest(NamedTuple):
+    """How long the text of the configuration is, and its digest."""
+
+    length: Annotated[int, u16("Characters of the text; it is cut off if this is more than the lines hold")]
+    sha256: Annotated[tuple[int, ...], text("SHA-256 of the text, in hexadecimal", DIGEST_WORDS)]
+
+
+class ConfigurationLine(NamedTuple):
+    """A part of the text."""
+
+    text: Annotated[tuple[int, ...], text("Part of a JSON object: values by dotted key", LINE_WORDS)]
+
+
+LAST_BLOCKS: Final = (
+    Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
+    Block("journal page", 45010, JournalPage, "State of the journal"),
+    Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
+    Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
+    Block("configuration", 55000, ConfigurationDigest, "Digest of the running configuration"),
+    Block("configuration text", 55040, ConfigurationLine, "The running configuration", rows=LINES),
+)
+"""The end of every map: the service's journal and its configuration."""
+
+
+def publish_configuration(bank: RegisterBank, values: Mapping[str, Any]) -> None:
+    """Show values by dotted key in the registers of a service."""
+    document = json.dumps(values, sort_keys=True, separators=(",", ":"))
+    bank.put(ConfigurationDigest(min(len(document), 0xFFFF), to_words(_digest(document), DIGEST_WORDS)))
+    for row, line in enumerate(_lines(document)):
+        bank.put(ConfigurationLine(to_words(line, LINE_WORDS)), row)
+
+
+def lines_of(digest: ConfigurationDigest) -> int:
+    """Return the number of lines that the text takes."""
+    return min(LINES, -(-digest.length // LINE_CHARACTERS))
+
+
+def configuration_of(digest: ConfigurationDigest, lines: Sequence[ConfigurationLine]) -> dict[str, Any]:
+    """Return the values by dotted key.
+
+    Raises:
+        ValueError: The text is not the one of the digest: it was cut off, or has arrived damaged; or it is no object of
+            values.
+    """
+    document = "".join(from_words(line.text) for line in lines)
+    if _digest(document) != from_words(digest.sha256):
+        raise ValueError("the text is not the one of its digest")
+    try:
+        return {**parsed_json(document)}
+    except TypeError:
+        raise ValueError("the text is not an object") from None
+
+
+def _lines(document: str) -> Iterator[str]:
+    for start in range(0, min(len(document), LINES * LINE_CHARACTERS), LINE_CHARACTERS):
+        yield document[start : start + LINE_CHARACTERS]
+
+
+def _digest(document: str) -> str:
+    return hashlib.sha256(document.encode()).hexdigest()

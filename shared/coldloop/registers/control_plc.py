@@ -4,24 +4,9 @@ from functools import cache
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.process.declaration import LAST_NUMBER, LAST_TICK, Process
-from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace, TimeBaseKind
-from coldloop.registers.configuration import LAST_BLOCKS
-from coldloop.registers.declaration import (
-    Block,
-    RegisterMap,
-    Role,
-    Worded,
-    each_input,
-    f32,
-    in_ticks,
-    of_inputs,
-    of_load,
-    of_outputs,
-    of_states,
-    placed,
-    u16,
-    u32,
-)
+from coldloop.registers import declaration as reg
+from coldloop.registers.common import IDENTITY_BLOCK, LAST_BLOCKS, STATISTICS_BLOCK, SessionPace, TimeBaseKind
+from coldloop.registers.declaration import Block, RegisterMap, Role, Worded
 from coldloop.registers.plant import MAX_STATE
 from coldloop.registers.safety import Alarm, AlarmCommand, LeaseStatus, WatchdogStatus, WatchdogTime, alarms_of
 
@@ -157,127 +142,126 @@ class LinkCause(Worded):
 class ProcessNow(NamedTuple):
     """The process at the last scan."""
 
-    tick: Annotated[int, u32("Tick of the scan")]
-    load: Annotated[float, of_load("{noun} {name}", finite=False)]
-    u: Annotated[tuple[float, ...], of_inputs("Input being applied")]
-    y: Annotated[tuple[float, ...], of_outputs("Measured output")]
+    tick: Annotated[int, reg.u32("Tick of the scan")]
+    load: Annotated[float, reg.of_load("{noun} {name}", finite=False)]
+    u: Annotated[tuple[float, ...], reg.of_inputs("Input being applied")]
+    y: Annotated[tuple[float, ...], reg.of_outputs("Measured output")]
 
 
 class Status(NamedTuple):
     """State of the sequence player and of the scan cycle."""
 
-    mode: Annotated[int, u16("{}", values=Mode)]
-    update: Annotated[int, u32("Last update latched")]
+    mode: Annotated[int, reg.u16("{}", values=Mode)]
+    update: Annotated[int, reg.u32("Last update latched")]
     next_update_tick: Annotated[
-        int, u32("Tick of the next updating instant; the latest possible one until it is planned")
+        int, reg.u32("Tick of the next updating instant; the latest possible one until it is planned")
     ]
-    playing: Annotated[int, u32("Number of the sequence being played; 0 is none")]
-    remaining: Annotated[int, u16("Ticks of that sequence still to be played")]
-    accepted: Annotated[int, u32("Sequences accepted")]
-    rejected: Annotated[int, u32("Sequences rejected")]
-    deadline_misses: Annotated[int, u32("Updating instants at which no sequence had arrived")]
-    overruns: Annotated[int, u32("Scans that began more than the tolerance late")]
-    lateness_max: Annotated[float, f32("Largest lateness of a scan in real time", unit="ms")]
-    lateness_p99: Annotated[float, f32("99th percentile of the lateness of a scan in real time", unit="ms")]
+    playing: Annotated[int, reg.u32("Number of the sequence being played; 0 is none")]
+    remaining: Annotated[int, reg.u16("Ticks of that sequence still to be played")]
+    accepted: Annotated[int, reg.u32("Sequences accepted")]
+    rejected: Annotated[int, reg.u32("Sequences rejected")]
+    deadline_misses: Annotated[int, reg.u32("Updating instants at which no sequence had arrived")]
+    overruns: Annotated[int, reg.u32("Scans that began more than the tolerance late")]
+    lateness_max: Annotated[float, reg.f32("Largest lateness of a scan in real time", unit="ms")]
+    lateness_p99: Annotated[float, reg.f32("99th percentile of the lateness of a scan in real time", unit="ms")]
 
 
 class LadderStatus(NamedTuple):
     """Step of the fail-safe ladder, and the state of its inputs."""
 
-    mode: Annotated[int, u16("{}", values=Mode)]
-    cause: Annotated[int, u16("{}", values=Cause)]
-    since: Annotated[int, u32("Tick at which this mode began")]
-    optimizer: Annotated[int, u16("1 while the optimiser is alive", high=1)]
-    bad_sensors: Annotated[int, u32("Outputs whose measurement is substituted: bit i is output i")]
-    events: Annotated[int, u32("Number of the last event")]
+    mode: Annotated[int, reg.u16("{}", values=Mode)]
+    cause: Annotated[int, reg.u16("{}", values=Cause)]
+    since: Annotated[int, reg.u32("Tick at which this mode began")]
+    optimizer: Annotated[int, reg.u16("1 while the optimiser is alive", high=1)]
+    bad_sensors: Annotated[int, reg.u32("Outputs whose measurement is substituted: bit i is output i")]
+    events: Annotated[int, reg.u32("Number of the last event")]
 
 
 class Update(NamedTuple):
     """Record for the optimiser, latched at an updating instant."""
 
-    session: Annotated[int, u32("Session")]
-    update: Annotated[int, u32("Number of the update; 0 is the one at tick 0", high=LAST_NUMBER)]
-    tick: Annotated[int, u32("Tick of the updating instant t_i", high=LAST_TICK)]
+    session: Annotated[int, reg.u32("Session")]
+    update: Annotated[int, reg.u32("Number of the update; 0 is the one at tick 0", high=LAST_NUMBER)]
+    tick: Annotated[int, reg.u32("Tick of the updating instant t_i", high=LAST_TICK)]
     playing: Annotated[
-        int, u32("Number of the sequence being played from this instant on; 0 is none", high=LAST_NUMBER)
+        int, reg.u32("Number of the sequence being played from this instant on; 0 is none", high=LAST_NUMBER)
     ]
-    load: Annotated[float, of_load("{noun} {name}", in_span=True)]
-    u_before: Annotated[tuple[float, ...], of_inputs("Input applied until this instant", in_span=True)]
-    u: Annotated[tuple[float, ...], of_inputs("Input applied from this instant on", in_span=True)]
+    load: Annotated[float, reg.of_load("{noun} {name}", in_span=True)]
+    u_before: Annotated[tuple[float, ...], reg.of_inputs("Input applied until this instant", in_span=True)]
+    u: Annotated[tuple[float, ...], reg.of_inputs("Input applied from this instant on", in_span=True)]
     y: Annotated[
         tuple[float, ...],
-        of_outputs(
+        reg.of_outputs(
             "Output measured at this instant; not a number where the measurement is bad",
             low=-MAX_STATE,
             high=MAX_STATE,
             finite=False,
         ),
     ]
-    x: Annotated[tuple[float, ...], of_states("Simulated state, not measured", low=-MAX_STATE, high=MAX_STATE)]
-    crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none")] = 0
+    x: Annotated[tuple[float, ...], reg.of_states("Simulated state, not measured", low=-MAX_STATE, high=MAX_STATE)]
+    crc: Annotated[int, reg.u32("CRC-32 of the registers before; 0 is none")] = 0
 
 
 class AwaitUpdate(NamedTuple):
     """Written together with a read of the latch, makes the answer wait for the update named."""
 
-    session: Annotated[int, u32("Session of the update before the awaited one")]
-    update: Annotated[int, u32("Number of the awaited update")]
-    crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
+    session: Annotated[int, reg.u32("Session of the update before the awaited one")]
+    update: Annotated[int, reg.u32("Number of the awaited update")]
+    crc: Annotated[int, reg.u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
 
 class Plan(NamedTuple):
     """The updating period that the optimiser has decided for an update."""
 
-    update: Annotated[int, u32("Update that is planned")]
-    next_update_tick: Annotated[int, u32("Tick of the next updating instant t_{i+1}")]
+    update: Annotated[int, reg.u32("Update that is planned")]
+    next_update_tick: Annotated[int, reg.u32("Tick of the next updating instant t_{i+1}")]
     load_step: Annotated[
-        float,
-        of_load("An update is latched at once when the load has moved by more than this; 0 is never", low=0),
+        float, reg.of_load("An update is latched at once when the load has moved by more than this; 0 is never", low=0)
     ] = 0.0
     shortage: Annotated[
-        float, of_load("Estimated load above what can be held; negative: below what is needed; 0 is neither")
+        float, reg.of_load("Estimated load above what can be held; negative: below what is needed; 0 is neither")
     ] = 0.0
     suspects: Annotated[
         int,
-        u32(
+        reg.u32(
             "Outputs whose reading is not used, as prediction and other readings contradict it: bit i is output i; "
             "after these bits, inputs that are left where they are, as they have no effect"
         ),
     ] = 0
-    crc: Annotated[int, u32("CRC-32 of the registers before; none, or a wrong one, is refused")] = 0
+    crc: Annotated[int, reg.u32("CRC-32 of the registers before; none, or a wrong one, is refused")] = 0
 
 
 class Acknowledgement(NamedTuple):
     """Answer to the last sequence committed."""
 
-    number: Annotated[int, u32("Number of the sequence")]
-    verdict: Annotated[int, u16("{}", values=Verdict)]
-    crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
+    number: Annotated[int, reg.u32("Number of the sequence")]
+    verdict: Annotated[int, reg.u16("{}", values=Verdict)]
+    crc: Annotated[int, reg.u32("CRC-32 of the registers before")] = 0
 
 
 class Heartbeat(NamedTuple):
     """Sign of life of the optimiser, besides its other requests."""
 
-    beat: Annotated[int, u16("Any number; the write itself triggers the watchdog")]
-    model_digest: Annotated[int, u32("First 32 bits of the digest of the optimiser's prediction model")]
-    holder: Annotated[int, u32("Number chosen by the optimiser; 0 is a simple client")] = 0
-    crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
+    beat: Annotated[int, reg.u16("Any number; the write itself triggers the watchdog")]
+    model_digest: Annotated[int, reg.u32("First 32 bits of the digest of the optimiser's prediction model")]
+    holder: Annotated[int, reg.u32("Number chosen by the optimiser; 0 is a simple client")] = 0
+    crc: Annotated[int, reg.u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
 
 class LatchedUpdate(NamedTuple):
     """Number and tick of the newest update, read by an optimiser while it computes."""
 
-    session: Annotated[int, u32("Session")] = 0
-    update: Annotated[int, u32("Number of the newest update", high=LAST_NUMBER)] = 0
-    tick: Annotated[int, u32("Tick of its updating instant", high=LAST_TICK)] = 0
-    crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
+    session: Annotated[int, reg.u32("Session")] = 0
+    update: Annotated[int, reg.u32("Number of the newest update", high=LAST_NUMBER)] = 0
+    tick: Annotated[int, reg.u32("Tick of its updating instant", high=LAST_TICK)] = 0
+    crc: Annotated[int, reg.u32("CRC-32 of the registers before")] = 0
 
 
 class Operator(NamedTuple):
     """Request of an operator: mode and setpoints. Setpoints count in manual mode; they are clamped and rate-limited."""
 
-    mode: Annotated[int, u16("{}", values=OperatorMode)]
-    u: Annotated[tuple[float, ...], each_input("Setpoint: {}")]
+    mode: Annotated[int, reg.u16("{}", values=OperatorMode)]
+    u: Annotated[tuple[float, ...], reg.each_input("Setpoint: {}")]
 
 
 class SequenceHeader(NamedTuple):
@@ -286,59 +270,57 @@ class SequenceHeader(NamedTuple):
     It is right before the buffer: header and rows of a short sequence fit into one request.
     """
 
-    number: Annotated[int, u32("Number of the sequence, rising", high=LAST_NUMBER)]
-    update: Annotated[int, u32("Update that the sequence answers")]
-    first_tick: Annotated[int, u32("First tick at which it is valid, t_{i+1}")]
-    length: Annotated[int, u16("Rows in use", high=SEQUENCE_ROWS)]
-    tau_u: Annotated[int, in_ticks(u16("Updating period t_{i+1} - t_i that it was computed in"))]
-    model_digest: Annotated[int, u32("First 32 bits of the digest of the prediction model")]
-    crc: Annotated[int, u32("CRC-32 of the header before this field and of the rows in use, as big-endian words")]
+    number: Annotated[int, reg.u32("Number of the sequence, rising", high=LAST_NUMBER)]
+    update: Annotated[int, reg.u32("Update that the sequence answers")]
+    first_tick: Annotated[int, reg.u32("First tick at which it is valid, t_{i+1}")]
+    length: Annotated[int, reg.u16("Rows in use", high=SEQUENCE_ROWS)]
+    tau_u: Annotated[int, reg.in_ticks(reg.u16("Updating period t_{i+1} - t_i that it was computed in"))]
+    model_digest: Annotated[int, reg.u32("First 32 bits of the digest of the prediction model")]
+    crc: Annotated[int, reg.u32("CRC-32 of the header before this field and of the rows in use, as big-endian words")]
 
 
 class SequenceRow(NamedTuple):
     """Inputs of one tick."""
 
-    u: Annotated[tuple[float, ...], each_input("{}", in_span=False)]
+    u: Annotated[tuple[float, ...], reg.each_input("{}", in_span=False)]
 
 
 class PlantLinkStatus(NamedTuple):
     """The link to the rack: whether outputs are written, and how far the clocks agree."""
 
-    state: Annotated[int, u16("{}", values=PlantLinkState)] = PlantLinkState.IDLE
-    cause: Annotated[int, u16("{}", values=LinkCause)] = LinkCause.NONE
-    since: Annotated[int, u32("Tick at which this state began")] = 0
-    breaks: Annotated[int, u32("Times that the link has lost synchronisation")] = 0
-    holder: Annotated[int, u32("Number chosen by this control PLC")] = 0
-    generation: Annotated[int, u32("Generation of the rack's outputs that was read back")] = 0
-    plant_session: Annotated[int, u32("Session of the rack when it last answered")] = 0
-    plant_tick: Annotated[int, u32("Tick of the rack when it last answered")] = 0
-    offset: Annotated[float, f32("Phase error of the rack's clock against ours", unit="ms")] = 0.0
-    skew: Annotated[float, f32("Skew of the rack's clock; positive: faster than ours", unit="ppm")] = 0.0
-    skew_error: Annotated[float, f32("Standard error of that", unit="ppm", finite=False)] = 0.0
+    state: Annotated[int, reg.u16("{}", values=PlantLinkState)] = PlantLinkState.IDLE
+    cause: Annotated[int, reg.u16("{}", values=LinkCause)] = LinkCause.NONE
+    since: Annotated[int, reg.u32("Tick at which this state began")] = 0
+    breaks: Annotated[int, reg.u32("Times that the link has lost synchronisation")] = 0
+    holder: Annotated[int, reg.u32("Number chosen by this control PLC")] = 0
+    generation: Annotated[int, reg.u32("Generation of the rack's outputs that was read back")] = 0
+    plant_session: Annotated[int, reg.u32("Session of the rack when it last answered")] = 0
+    plant_tick: Annotated[int, reg.u32("Tick of the rack when it last answered")] = 0
+    offset: Annotated[float, reg.f32("Phase error of the rack's clock against ours", unit="ms")] = 0.0
+    skew: Annotated[float, reg.f32("Skew of the rack's clock; positive: faster than ours", unit="ppm")] = 0.0
+    skew_error: Annotated[float, reg.f32("Standard error of that", unit="ppm", finite=False)] = 0.0
 
 
 class ControlSession(NamedTuple):
     """Starts a session when written."""
 
-    session: Annotated[int, u32("Number of the session; the control PLC restarts from tick 0", low=1)]
-    realtime: Annotated[int, u16("{}", high=1, values=TimeBaseKind)]
-    factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
+    session: Annotated[int, reg.u32("Number of the session; the control PLC restarts from tick 0", low=1)]
+    realtime: Annotated[int, reg.u16("{}", high=1, values=TimeBaseKind)]
+    factor: Annotated[float, reg.f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
 
 
 class Grant(NamedTuple):
     """How far the control PLC may go in lock-step."""
 
-    until_tick: Annotated[int, in_ticks(u32("The control PLC scans every tick before this one"))]
+    until_tick: Annotated[int, reg.in_ticks(reg.u32("The control PLC scans every tick before this one"))]
 
 
 @cache
 def control_map(process: Process) -> RegisterMap:
     """Return the map of the control PLC of a process."""
     blocks = (
-        IDENTITY_BLOCK,
-        Block("status", 30, Status, "Sequence player and scan cycle"),
-        Block("ladder", 50, LadderStatus, "The fail-safe ladder"),
-        STATISTICS_BLOCK,
+        IDENTITY_BLOCK, Block("status", 30, Status, "Sequence player and scan cycle"),
+        Block("ladder", 50, LadderStatus, "The fail-safe ladder"), STATISTICS_BLOCK,
         Block("process", 100, ProcessNow, "The process at the last scan"),
         Block("update", 200, Update, "Latched at the last updating instant", sealed=True),
         Block("plant link", 330, PlantLinkStatus, "Link to the rack, and the clocks of both"),
@@ -357,7 +339,6 @@ def control_map(process: Process) -> RegisterMap:
         Block("sequence header", 488, SequenceHeader, "Commits the sequence in the buffer", Role.OPTIMIZER),
         Block("sequence", 500, SequenceRow, "Spare buffer for a sequence", Role.OPTIMIZER, SEQUENCE_ROWS),
         Block("pace", 1950, SessionPace, "Time base of the present session", Role.OPERATOR),
-        Block("alarms", 2000, Alarm, "One row for each alarm", rows=len(alarms_of(process))),
-        *LAST_BLOCKS,
-    )
-    return RegisterMap(service="control_plc", version=4, blocks=placed(process, blocks))
+        Block("alarms", 2000, Alarm, "One row for each alarm", rows=len(alarms_of(process))), *LAST_BLOCKS,
+    )  # fmt: skip
+    return RegisterMap(service="control_plc", version=4, blocks=reg.placed(process, blocks))

@@ -89,7 +89,7 @@ class Field:
     values: type[Worded] | None = None
     """Meaning of the numbers of an enumeration."""
     is_text: bool = False
-    """The elements are the words of a text (`registers.text`)."""
+    """The elements are the words of a text (`registers.codec`)."""
     finite: bool = True
     """No NaN and no infinity; where they are allowed, the user of the value checks it."""
     each: tuple["Field", ...] = ()
@@ -111,13 +111,9 @@ class Field:
 
 
 def u16(
-    description: str,
-    *,
-    unit: str = "",
-    low: int | None = None,
-    high: int | None = None,
+    description: str, *, unit: str = "", low: int | None = None, high: int | None = None,
     values: type[Worded] | None = None,
-) -> Field:
+) -> Field:  # fmt: skip
     """Declare an unsigned 16-bit register.
 
     `values` gives an enumeration's numbers their meaning, and their range; `{}` in the description lists them.
@@ -140,7 +136,7 @@ def u16_array(description: str, elements: tuple[str, ...], *, unit: str = "") ->
 
 
 def text(description: str, words: int) -> Field:
-    """Declare a text of two ASCII characters a word, padded with zeros; `registers.text` converts it."""
+    """Declare a text of two ASCII characters a word, padded with zeros; `registers.codec` converts it."""
     return Field(Kind.U16, description, elements=tuple(f"{word}" for word in range(words)), is_text=True)
 
 
@@ -152,14 +148,9 @@ def f32(
 
 
 def f32_array(
-    description: str,
-    elements: tuple[str, ...],
-    units: tuple[str, ...],
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    finite: bool = True,
-) -> Field:
+    description: str, elements: tuple[str, ...], units: tuple[str, ...], *, low: float | None = None,
+    high: float | None = None, finite: bool = True,
+) -> Field:  # fmt: skip
     """Declare one single-precision register pair for each element, all with the same range."""
     return Field(Kind.F32, description, "", low, high, elements, units, finite=finite)
 
@@ -214,13 +205,9 @@ def each_input(description: str, *, in_span: bool = True) -> Declared:
 
 
 def of_outputs(
-    description: str,
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    finite: bool = True,
+    description: str, *, low: float | None = None, high: float | None = None, finite: bool = True,
     unit: str | None = None,
-) -> Declared:
+) -> Declared:  # fmt: skip
     """Declare a value for each output, in its unit or in this one."""
     return lambda process: f32_array(
         description, process.output_names,

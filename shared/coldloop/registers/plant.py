@@ -8,27 +8,9 @@ from typing import Annotated, Final, NamedTuple
 
 from coldloop.process.declaration import LAST_TICK, Process
 from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, STATION_VALVE_NAMES
-from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace, TimeBaseKind
-from coldloop.registers.configuration import LAST_BLOCKS
-from coldloop.registers.declaration import (
-    Block,
-    Field,
-    RegisterMap,
-    Role,
-    Worded,
-    each_input,
-    f32,
-    f32_array,
-    in_ticks,
-    of_inputs,
-    of_load,
-    of_outputs,
-    of_states,
-    placed,
-    u16,
-    u16_array,
-    u32,
-)
+from coldloop.registers import declaration as reg
+from coldloop.registers.common import IDENTITY_BLOCK, LAST_BLOCKS, STATISTICS_BLOCK, SessionPace, TimeBaseKind
+from coldloop.registers.declaration import Block, RegisterMap, Role, Worded
 from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 
 HISTORY_ROWS: Final = 256
@@ -65,12 +47,14 @@ class Actuators(NamedTuple):
     The rack judges them whole; its next measurement shows whether they were accepted.
     """
 
-    tick: Annotated[int, u32("Tick of these outputs; in lock-step the present one advances the plant", high=LAST_TICK)]
-    u: Annotated[tuple[float, ...], each_input("{}")]
-    session: Annotated[int, u32("Session of these outputs")]
-    holder: Annotated[int, u32("Number chosen by the writer; 0 is a simple client")] = 0
-    generation: Annotated[int, u32("Generation that was read back; 0 does not compare")] = 0
-    crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
+    tick: Annotated[
+        int, reg.u32("Tick of these outputs; in lock-step the present one advances the plant", high=LAST_TICK)
+    ]
+    u: Annotated[tuple[float, ...], reg.each_input("{}")]
+    session: Annotated[int, reg.u32("Session of these outputs")]
+    holder: Annotated[int, reg.u32("Number chosen by the writer; 0 is a simple client")] = 0
+    generation: Annotated[int, reg.u32("Generation that was read back; 0 does not compare")] = 0
+    crc: Annotated[int, reg.u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
 
 class Measurement(NamedTuple):
@@ -79,26 +63,22 @@ class Measurement(NamedTuple):
     Load, outputs and states may be any number, or NaN: sensors fail, and the control PLC works without them.
     """
 
-    tick: Annotated[int, u32("Tick at which these values were read", high=LAST_TICK)]
-    load: Annotated[float, of_load("{noun} {name}, which is known", finite=False)]
-    y: Annotated[tuple[float, ...], of_outputs("Measured output", finite=False)]
-    x: Annotated[tuple[float, ...], of_states("Simulated state, not measured", finite=False)]
-    session: Annotated[int, u32("Session")]
-    u: Annotated[tuple[float, ...], of_inputs("Input being applied", in_span=True)]
-    holder: Annotated[int, u32("Holder of these outputs; 0 is a simple client, safe or initial state")] = 0
+    tick: Annotated[int, reg.u32("Tick at which these values were read", high=LAST_TICK)]
+    load: Annotated[float, reg.of_load("{noun} {name}, which is known", finite=False)]
+    y: Annotated[tuple[float, ...], reg.of_outputs("Measured output", finite=False)]
+    x: Annotated[tuple[float, ...], reg.of_states("Simulated state, not measured", finite=False)]
+    session: Annotated[int, reg.u32("Session")]
+    u: Annotated[tuple[float, ...], reg.of_inputs("Input being applied", in_span=True)]
+    holder: Annotated[int, reg.u32("Holder of these outputs; 0 is a simple client, safe or initial state")] = 0
     generation: Annotated[
-        int,
-        u32("Rises when outputs change other than by their writer: safe state, session, new writer", low=1),
+        int, reg.u32("Rises when outputs change other than by their writer: safe state, session, new writer", low=1)
     ] = 1
-    verdict: Annotated[
-        int,
-        u16("Outputs sent last: {}", values=OutputVerdict),
-    ] = OutputVerdict.NONE
-    refused: Annotated[int, u16("Writes of others that were refused so far; wraps")] = 0
+    verdict: Annotated[int, reg.u16("Outputs sent last: {}", values=OutputVerdict)] = OutputVerdict.NONE
+    refused: Annotated[int, reg.u16("Writes of others that were refused so far; wraps")] = 0
     age: Annotated[
-        float, f32("Time since this tick began, by the rack's clock, in ticks; 0 in lock-step", low=0, high=MAX_AGE)
+        float, reg.f32("Time since this tick began, by the rack's clock, in ticks; 0 in lock-step", low=0, high=MAX_AGE)
     ] = 0.0
-    crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
+    crc: Annotated[int, reg.u32("CRC-32 of the registers before")] = 0
 
 
 class SensorFaultKind(Worded):
@@ -113,63 +93,67 @@ class SensorFaultKind(Worded):
 class SensorFault(NamedTuple):
     """A fault put into one output of the simulation. Row i is output i; the history keeps the true value."""
 
-    kind: Annotated[int, u16("{}", values=SensorFaultKind)]
-    value: Annotated[float, f32("Value that the sensor shows with fault 3")]
+    kind: Annotated[int, reg.u16("{}", values=SensorFaultKind)]
+    value: Annotated[float, reg.f32("Value that the sensor shows with fault 3")]
 
 
 class PlantSession(NamedTuple):
     """Starts a simulation session when written."""
 
-    session: Annotated[int, u32("Number of the session; the simulation restarts from tick 0", low=1)]
-    realtime: Annotated[int, u16("{}", high=1, values=TimeBaseKind)]
-    factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
-    seed: Annotated[int, u32("Seed of the sensor noise")]
-    load_steps: Annotated[int, u16("Rows of the load table that are in use", low=1, high=LOAD_ROWS)]
+    session: Annotated[int, reg.u32("Number of the session; the simulation restarts from tick 0", low=1)]
+    realtime: Annotated[int, reg.u16("{}", high=1, values=TimeBaseKind)]
+    factor: Annotated[float, reg.f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
+    seed: Annotated[int, reg.u32("Seed of the sensor noise")]
+    load_steps: Annotated[int, reg.u16("Rows of the load table that are in use", low=1, high=LOAD_ROWS)]
 
 
 class LoadStep(NamedTuple):
     """One step of the load table, held until the next one."""
 
-    tick: Annotated[int, in_ticks(u32("First tick of the step", high=LAST_TICK))]
-    watts: Annotated[float, of_load("{noun}", in_span=True)]
+    tick: Annotated[int, reg.in_ticks(reg.u32("First tick of the step", high=LAST_TICK))]
+    watts: Annotated[float, reg.of_load("{noun}", in_span=True)]
 
 
 class LoadStatus(NamedTuple):
     """The heat load, and what is known of it."""
 
-    watts: Annotated[float, of_load("{noun} now")] = 0.0
-    next_tick: Annotated[int, in_ticks(u32("Tick of the next step that is known; 0 is none"))] = 0
-    next_watts: Annotated[float, of_load("{noun} from then on")] = 0.0
-    last_tick: Annotated[int, in_ticks(u32("Tick of the last step that is known; it is held from there on"))] = 0
-    upcoming: Annotated[int, u16("Known future steps")] = 0
-    free: Annotated[int, u16("Further steps that can be accepted now")] = 0
+    watts: Annotated[float, reg.of_load("{noun} now")] = 0.0
+    next_tick: Annotated[int, reg.in_ticks(reg.u32("Tick of the next step that is known; 0 is none"))] = 0
+    next_watts: Annotated[float, reg.of_load("{noun} from then on")] = 0.0
+    last_tick: Annotated[
+        int, reg.in_ticks(reg.u32("Tick of the last step that is known; it is held from there on"))
+    ] = 0
+    upcoming: Annotated[int, reg.u16("Known future steps")] = 0
+    free: Annotated[int, reg.u16("Further steps that can be accepted now")] = 0
 
 
 class LiveLoad(NamedTuple):
     """Changes the heat load of the session under way; what was known of later ticks is dropped."""
 
-    tick: Annotated[int, in_ticks(u32("First tick, in the future; 0 is the next tick", high=LAST_TICK))] = 0
-    watts: Annotated[float, of_load("{noun}", in_span=True)] = 0.0
-    crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
+    tick: Annotated[int, reg.in_ticks(reg.u32("First tick, in the future; 0 is the next tick", high=LAST_TICK))] = 0
+    watts: Annotated[float, reg.of_load("{noun}", in_span=True)] = 0.0
+    crc: Annotated[int, reg.u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
 
 class LoadAhead(NamedTuple):
     """Steps of the heat load that are to come, for loads of any length; what was known from the first on is dropped."""
 
-    session: Annotated[int, u32("Session of these steps")] = 0
-    tick: Annotated[int, in_ticks(u32("Tick of the first step, in the future", high=LAST_TICK))] = 0
-    length: Annotated[int, u16("Steps in use", low=1, high=AHEAD_STEPS)] = 1
+    session: Annotated[int, reg.u32("Session of these steps")] = 0
+    tick: Annotated[int, reg.in_ticks(reg.u32("Tick of the first step, in the future", high=LAST_TICK))] = 0
+    length: Annotated[int, reg.u16("Steps in use", low=1, high=AHEAD_STEPS)] = 1
     watts: Annotated[
         tuple[float, ...],
-        lambda process: f32_array(
+        lambda process: reg.f32_array(
             f"{process.load.noun} of step", tuple(map(str, range(AHEAD_STEPS))), (process.load.unit,) * AHEAD_STEPS
         ),
     ] = (0.0,) * AHEAD_STEPS
     ticks: Annotated[
         tuple[int, ...],
-        u16_array("Ticks from this step to the next one; of the last one unused", tuple(map(str, range(AHEAD_STEPS)))),
+        reg.u16_array(
+            "Ticks from this step to the next one; of the last one unused", tuple(map(str, range(AHEAD_STEPS)))
+        ),
     ] = (0,) * AHEAD_STEPS
-    crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
+    crc: Annotated[int, reg.u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
     @classmethod
     def first_of(cls, session: int, ticks: Sequence[int], watts: Sequence[float]) -> "LoadAhead":
@@ -209,11 +193,11 @@ class LoadAhead(NamedTuple):
 class PlantSample(NamedTuple):
     """One row of the history: everything physical at one tick. The row of tick n is n modulo the number of rows."""
 
-    tick: Annotated[int, u32("Tick of the row")]
-    load: Annotated[float, of_load("{noun}")]
-    u: Annotated[tuple[float, ...], of_inputs("Input applied from this tick on")]
-    y: Annotated[tuple[float, ...], of_outputs("Measured output", finite=False)]
-    x: Annotated[tuple[float, ...], of_states("Simulated state", finite=False)]
+    tick: Annotated[int, reg.u32("Tick of the row")]
+    load: Annotated[float, reg.of_load("{noun}")]
+    u: Annotated[tuple[float, ...], reg.of_inputs("Input applied from this tick on")]
+    y: Annotated[tuple[float, ...], reg.of_outputs("Measured output", finite=False)]
+    x: Annotated[tuple[float, ...], reg.of_states("Simulated state", finite=False)]
 
 
 class StationMode(Worded):
@@ -261,17 +245,14 @@ class StationAlarm(IntFlag):
 class StationSample(NamedTuple):
     """Compression station and nitrogen pre-cooler at one tick; all 0 where the plant is a cold box alone."""
 
-    tick: Annotated[int, u32("Tick of the row")]
+    tick: Annotated[int, reg.u32("Tick of the row")]
     signals: Annotated[
-        tuple[float, ...], f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, finite=False)
+        tuple[float, ...], reg.f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, finite=False)
     ]
-    mode: Annotated[
-        int,
-        u16("Pressure control: {}", high=0xFFFF, values=StationMode),
-    ] = StationMode.AUTOMATIC
+    mode: Annotated[int, reg.u16("Pressure control: {}", high=0xFFFF, values=StationMode)] = StationMode.AUTOMATIC
     alarms: Annotated[
         int,
-        u16(
+        reg.u16(
             "Bits: 1 HP high, 2 HP low, 4 LP high, 8 LP low, 16 NC1, 32 NC2 tripped, 64 nitrogen low, 128 helium lost, "
             "256 total trip, 512 relief of the bath, 1024 turbine tripped, "
             "2048 by overspeed, 4096 an actuator not as asked, 8192 a compressor tripped by low suction pressure"
@@ -282,16 +263,16 @@ class StationSample(NamedTuple):
 class StationStatus(NamedTuple):
     """Compression station and nitrogen pre-cooler now; all 0 where the plant is a cold box alone."""
 
-    tick: Annotated[int, u32("Tick at which these values were read")] = 0
-    mode: Annotated[int, u16("As in the station history")] = StationMode.AUTOMATIC
-    alarms: Annotated[int, u16("As in the station history")] = 0
+    tick: Annotated[int, reg.u32("Tick at which these values were read")] = 0
+    mode: Annotated[int, reg.u16("As in the station history")] = StationMode.AUTOMATIC
+    alarms: Annotated[int, reg.u16("As in the station history")] = 0
     signals: Annotated[
-        tuple[float, ...], f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, finite=False)
+        tuple[float, ...], reg.f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, finite=False)
     ] = (0.0,) * len(STATION_SIGNAL_NAMES)
-    commands: Annotated[tuple[float, ...], f32_array("Requested opening of valve", STATION_VALVE_NAMES, ("%",) * 4)] = (
-        0.0,
-    ) * len(STATION_VALVE_NAMES)
-    acting: Annotated[tuple[float, ...], of_inputs("Acting on the cold box, whatever is asked")] = (0.0,) * 3
+    commands: Annotated[
+        tuple[float, ...], reg.f32_array("Requested opening of valve", STATION_VALVE_NAMES, ("%",) * 4)
+    ] = (0.0,) * len(STATION_VALVE_NAMES)
+    acting: Annotated[tuple[float, ...], reg.of_inputs("Acting on the cold box, whatever is asked")] = (0.0,) * 3
 
 
 class ModelRangeStatus(NamedTuple):
@@ -299,31 +280,33 @@ class ModelRangeStatus(NamedTuple):
 
     outside: Annotated[
         int,
-        u16(
+        reg.u16(
             "Bits: 1 bath, 2 supply, 4 return pressure, 8 a cell too cold, 16 a cell too warm, "
             "32 a dry bath too warm; 0 is within"
         ),
     ] = 0
-    since: Annotated[int, u32("Tick at which this last changed")] = 0
+    since: Annotated[int, reg.u32("Tick at which this last changed")] = 0
 
 
-def _blocking(exchanger: str) -> Field:
+def _blocking(exchanger: str) -> reg.Field:
     """Declare how fast an exchanger blocks up."""
-    return f32(f"Share of {exchanger} that blocks up in an hour; below 0 it is cleaned", unit="1/h", low=-10, high=10)
+    return reg.f32(
+        f"Share of {exchanger} that blocks up in an hour; below 0 it is cleaned", unit="1/h", low=-10, high=10
+    )
 
 
 class Surroundings(NamedTuple):
     """Boundary conditions of a refrigerator, from the next tick on; refused by a cold box alone."""
 
-    nc1: Annotated[int, u16("1: compressor NC1 runs, 0: it has tripped", high=1)] = 1
-    nc2: Annotated[int, u16("1: compressor NC2 runs, 0: it has tripped", high=1)] = 1
-    nitrogen: Annotated[int, u16("1: nitrogen in the tank, 0: none", high=1)] = 1
-    leak: Annotated[float, f32("Leak of the high-pressure line, as at 16 bar", unit="g/s", low=0, high=50)] = 0.0
-    ambient: Annotated[float, f32("Temperature of the surroundings", unit="K", low=270, high=320)] = 300.0
-    turbine: Annotated[int, u16("1: the turbine may run, 0: it is tripped", high=1)] = 1
-    cv155: Annotated[int, u16("1: CV155 follows what is asked, 0: it is stuck", high=1)] = 1
-    cv156: Annotated[int, u16("1: CV156 follows what is asked, 0: it is stuck", high=1)] = 1
-    heater: Annotated[int, u16("1: the heater follows what is asked, 0: it is off, 2: fully on, 150 W", high=2)] = 1
+    nc1: Annotated[int, reg.u16("1: compressor NC1 runs, 0: it has tripped", high=1)] = 1
+    nc2: Annotated[int, reg.u16("1: compressor NC2 runs, 0: it has tripped", high=1)] = 1
+    nitrogen: Annotated[int, reg.u16("1: nitrogen in the tank, 0: none", high=1)] = 1
+    leak: Annotated[float, reg.f32("Leak of the high-pressure line, as at 16 bar", unit="g/s", low=0, high=50)] = 0.0
+    ambient: Annotated[float, reg.f32("Temperature of the surroundings", unit="K", low=270, high=320)] = 300.0
+    turbine: Annotated[int, reg.u16("1: the turbine may run, 0: it is tripped", high=1)] = 1
+    cv155: Annotated[int, reg.u16("1: CV155 follows what is asked, 0: it is stuck", high=1)] = 1
+    cv156: Annotated[int, reg.u16("1: CV156 follows what is asked, 0: it is stuck", high=1)] = 1
+    heater: Annotated[int, reg.u16("1: the heater follows what is asked, 0: it is off, 2: fully on, 150 W", high=2)] = 1
     blocked_nef1: Annotated[float, _blocking("NEF1")] = 0.0
     blocked_nef2: Annotated[float, _blocking("NEF2")] = 0.0
     blocked_nef34: Annotated[float, _blocking("NEF34")] = 0.0
@@ -374,4 +357,4 @@ def plant_map(process: Process) -> RegisterMap:
         *LAST_BLOCKS,
     )
     unused = () if process.has_station else OF_A_REFRIGERATOR
-    return RegisterMap(service="plant", version=4, blocks=placed(process, blocks), unused=unused)
+    return RegisterMap(service="plant", version=4, blocks=reg.placed(process, blocks), unused=unused)

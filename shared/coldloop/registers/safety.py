@@ -3,7 +3,7 @@
 from typing import Annotated, Final, NamedTuple, Self
 
 from coldloop.process.declaration import Process
-from coldloop.registers.audit import NOBODY, WHO_WORDS
+from coldloop.registers.common import NOBODY, WHO_WORDS
 from coldloop.registers.declaration import Worded, in_ticks, text, u16, u32
 
 

@@ -3,7 +3,7 @@
 Events are numbered without gaps, over restarts too where the service retains its count. They are kept in memory, are
 shown in registers (the last ones, and those that a query selects) and are written to the log.
 
-What `subject`, `cause` and `value` of an event mean depends on its kind (`registers.audit.EventKind`); the tables here
+What `subject`, `cause` and `value` of an event mean depends on its kind (`registers.common.EventKind`); the tables here
 say it in words. A number without a word stays a number: a newer peer may have more of them.
 """
 
@@ -19,14 +19,13 @@ from typing import Final, NamedTuple
 
 from coldloop.process.declaration import Process
 from coldloop.process.station import ModelRange
-from coldloop.registers import audit, control_plc
-from coldloop.registers.audit import Event, EventKind
+from coldloop.registers import common, control_plc
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.common import TimeBaseKind
+from coldloop.registers.codec import from_words, to_words
+from coldloop.registers.common import Event, EventKind, TimeBaseKind
 from coldloop.registers.declaration import Worded
 from coldloop.registers.plant import SensorFaultKind, StationAlarm, StationMode, Surroundings
 from coldloop.registers.safety import AlarmKind, CapacityCause, LeaseEvent, band_alarms
-from coldloop.registers.text import from_words, to_words
 
 KEPT: Final = 10_000
 """Events kept in memory."""
@@ -80,7 +79,7 @@ class Journal:
         self._events.append(
             Event(
                 self.count, self.boot & 0xFFFF, tick & 0xFFFFFFFF, milliseconds // 1000 & 0xFFFFFFFF,
-                milliseconds % 1000, kind, subject & 0xFFFF, cause & 0xFFFF, value, to_words(who, audit.WHO_WORDS),
+                milliseconds % 1000, kind, subject & 0xFFFF, cause & 0xFFFF, value, to_words(who, common.WHO_WORDS),
             )
         )  # fmt: skip
 
@@ -93,22 +92,22 @@ class Journal:
         newest_first = islice(reversed(self._events), max(0, events))
         return list(newest_first)[::-1]
 
-    def select(self, query: audit.JournalQuery) -> tuple[audit.JournalPage, list[audit.JournalAnswer]]:
+    def select(self, query: common.JournalQuery) -> tuple[common.JournalPage, list[common.JournalAnswer]]:
         """Return the first events that a query selects, and where the next query continues.
 
         At most `LOOKED_AT` events are looked at: a page may have fewer events than fit, even none, and `next_first`
         still says that there is more.
         """
         place = max(0, query.first - self.oldest)
-        found: list[audit.JournalAnswer] = []
+        found: list[common.JournalAnswer] = []
         for event in islice(self._events, place, place + LOOKED_AT):
             place += 1
             if query.kind in (0, event.kind) and query.subject in (ANY_SUBJECT, event.subject):
-                found.append(audit.JournalAnswer(*event))
-                if len(found) == audit.QUERY_ROWS:
+                found.append(common.JournalAnswer(*event))
+                if len(found) == common.QUERY_ROWS:
                     break
         next_first = self.oldest + place if place < len(self._events) else 0
-        return audit.JournalPage(self.oldest, self.count, len(found), next_first), found
+        return common.JournalPage(self.oldest, self.count, len(found), next_first), found
 
 
 class JournalPublication:
@@ -137,21 +136,21 @@ class JournalPublication:
         new = shown = journal.last(journal.noted - self._shown)
         if self._renumbered:
             shown = journal.last(journal.noted)
-            for row in range(audit.EVENT_ROWS):
+            for row in range(common.EVENT_ROWS):
                 self._bank.put(Event(), row)
-        for event in shown[-audit.EVENT_ROWS :]:
-            self._bank.put(event, event.number % audit.EVENT_ROWS)
+        for event in shown[-common.EVENT_ROWS :]:
+            self._bank.put(event, event.number % common.EVENT_ROWS)
         self._shown, self._start = journal.noted, (journal.boot, journal.before)
-        page = self._bank.get(audit.JournalPage)  # what the last query found may still have to be read
+        page = self._bank.get(common.JournalPage)  # what the last query found may still have to be read
         self._bank.put(page._replace(oldest=journal.oldest, newest=journal.count))
         return new
 
-    def answer(self, query: audit.JournalQuery) -> None:
+    def answer(self, query: common.JournalQuery) -> None:
         """Put what a query selects into the registers."""
         page, found = self._journal.select(query)
         self._bank.put(page)
-        for row in range(audit.QUERY_ROWS):
-            self._bank.put(found[row] if row < len(found) else audit.JournalAnswer(), row)
+        for row in range(common.QUERY_ROWS):
+            self._bank.put(found[row] if row < len(found) else common.JournalAnswer(), row)
 
 
 Words = Callable[[int], str]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from coldloop.modbus.settings import Endpoint
     from coldloop.operating.observer import JournalReader
     from coldloop.process.declaration import Process
-    from coldloop.registers.audit import Event
+    from coldloop.registers.common import Event
 
 
 COLUMNS: Final = ("number", "boot", "utc", "tick", "plant_time_s", "kind", "subject", "cause", "value", "who")
@@ -50,7 +50,7 @@ class Since(NamedTuple):
 
 
 def _kinds(text: str) -> tuple[int, ...]:
-    from coldloop.registers.audit import EventKind
+    from coldloop.registers.common import EventKind
 
     known = {kind.name.lower().replace("_", "-"): kind for kind in EventKind if kind}
     try:
@@ -82,7 +82,7 @@ def execute_events(options: argparse.Namespace) -> int:
 async def _show_journal(options: argparse.Namespace) -> None:
     from coldloop.modbus.client import RegisterClient
     from coldloop.operating.observer import JournalReader
-    from coldloop.registers.maps import maps_of
+    from coldloop.registers import maps_of
 
     settings = common.operator_settings(options)
     process = settings.process
@@ -235,7 +235,7 @@ def _declare_registers(parser: argparse.ArgumentParser) -> None:
 def execute_registers(options: argparse.Namespace) -> int:
     """The register maps, as a table, Markdown, CSV or JSON, or as files of other programs."""
     from coldloop.process.settings import settings_process
-    from coldloop.registers.maps import maps_of
+    from coldloop.registers import maps_of
     from coldloop_rig.cli.registers import EXPORTS, FORMATS
 
     every = maps_of(settings_process()).by_service
