@@ -7,18 +7,8 @@ from coldloop.errors import BUSY, DamagedAnswerError, LinkError, ModelFileError,
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.requests import MAX_READ_WRITE_WORDS
 from coldloop.modbus.settings import Endpoint
+from coldloop.registers import control_plc as registers
 from coldloop.registers.common import Identity, SessionPace
-from coldloop.registers.control_plc import (
-    Acknowledgement,
-    AwaitUpdate,
-    Heartbeat,
-    LatchedUpdate,
-    Plan,
-    SequenceHeader,
-    SequenceRow,
-    Update,
-    Verdict,
-)
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.optimizer_plc import ControlLinkState
 from coldloop.safety.writers import InputSequence
@@ -30,7 +20,7 @@ T = TypeVar("T")
 ATTEMPTS: Final = 3
 """Attempts of a request whose data arrive damaged: on the way there (exception 03, bad CRC), or back."""
 ILLEGAL_VALUE: Final = 3
-DAMAGED_THERE: Final = (Verdict.BAD_CRC, Verdict.WRONG_LENGTH)
+DAMAGED_THERE: Final = (registers.Verdict.BAD_CRC, registers.Verdict.WRONG_LENGTH)
 """Verdicts on a sequence that is not as it was sent; its number may not be either."""
 LONGEST_WAIT_S: Final = 1.0
 """The control PLC answers a request that waits for an update after this real time at the latest."""
@@ -57,7 +47,9 @@ class ControlClient:
         self, register_map: RegisterMap, endpoint: Endpoint, link: ControlLink, model_digest: int, model_name: str
     ) -> None:
         self._map = register_map
-        header, row = (register_map.block_of(record).row_words for record in (SequenceHeader, SequenceRow))
+        header, row = (
+            register_map.block_of(record).row_words for record in (registers.SequenceHeader, registers.SequenceRow)
+        )
         self._rows_with_header = (MAX_READ_WRITE_WORDS - header) // row
         """Rows that fit into one request with the header that commits them: 18 of three inputs."""
         self._endpoint = endpoint
@@ -108,9 +100,9 @@ class ControlClient:
             f"({self._model_name}): give both PLCs the same model.file"
         )
 
-    def _heartbeat(self) -> Heartbeat:
+    def _heartbeat(self) -> registers.Heartbeat:
         self._beats = (self._beats + 1) & 0xFFFF
-        return Heartbeat(self._beats, self._model_digest, self._link.holder)
+        return registers.Heartbeat(self._beats, self._model_digest, self._link.holder)
 
     async def pace(self, session: int) -> TimeBase | None:
         """Return the time base of a session; None where the control PLC is in another, or shows none that can be."""
@@ -129,30 +121,30 @@ class ControlClient:
 
     # -- updates -------------------------------------------------------------------------------------------------------
 
-    async def next_update(self, wanted: AwaitUpdate) -> Update:
+    async def next_update(self, wanted: registers.AwaitUpdate) -> registers.Update:
         """Wait for an update; after `LONGEST_WAIT_S` return the last one there was, or an empty one."""
         patience_s = self._endpoint.timeout_s + LONGEST_WAIT_S
 
-        async def waiting() -> Update:
+        async def waiting() -> registers.Update:
             try:
-                return await self._client.exchange(wanted, Update, patience_s=patience_s)
+                return await self._client.exchange(wanted, registers.Update, patience_s=patience_s)
             except DamagedAnswerError:
                 self._link.damaged()
-                return await self._client.read(Update)  # it is latched: asking to wait again could give it up
+                return await self._client.read(registers.Update)  # it is latched: asking to wait again could give it up
 
         return await self._again(waiting)
 
-    async def plan(self, plan: Plan) -> None:
+    async def plan(self, plan: registers.Plan) -> None:
         """Send the updating period."""
         await self._again(lambda: self._client.write(plan))
 
-    async def newest(self) -> LatchedUpdate:
+    async def newest(self) -> registers.LatchedUpdate:
         """Give a sign of life; return which update is the newest."""
-        return await self._again(lambda: self._client.exchange(self._heartbeat(), LatchedUpdate))
+        return await self._again(lambda: self._client.exchange(self._heartbeat(), registers.LatchedUpdate))
 
     # -- sequences -----------------------------------------------------------------------------------------------------
 
-    async def deliver(self, sequence: InputSequence, plan: Plan | None = None) -> Verdict:
+    async def deliver(self, sequence: InputSequence, plan: registers.Plan | None = None) -> registers.Verdict:
         """Send a sequence, the header that commits it last; return the verdict of the control PLC.
 
         Args:
@@ -163,29 +155,29 @@ class ControlClient:
             answer = await self._again(lambda: self._commit(sequence, plan))
             if answer.verdict not in DAMAGED_THERE or attempt == ATTEMPTS:
                 break
-        if answer.number != sequence.header.number or answer.verdict not in Verdict.__members__.values():
+        if answer.number != sequence.header.number or answer.verdict not in registers.Verdict.__members__.values():
             raise LinkError(
                 f"{self._client.peer} acknowledges sequence {answer.number} with verdict {answer.verdict} after "
                 f"sequence {sequence.header.number}: look for a second optimiser"
             )
-        return Verdict(answer.verdict)
+        return registers.Verdict(answer.verdict)
 
-    async def _commit(self, sequence: InputSequence, plan: Plan | None) -> Acknowledgement:
-        header, rows = sequence.header, list(map(SequenceRow, sequence.rows))
+    async def _commit(self, sequence: InputSequence, plan: registers.Plan | None) -> registers.Acknowledgement:
+        header, rows = sequence.header, list(map(registers.SequenceRow, sequence.rows))
         await self._client.write_rows(rows[self._rows_with_header :], start=self._rows_with_header)
         try:
             return await self._client.exchange(
-                header, Acknowledgement, rows=rows[: self._rows_with_header], before=plan
+                header, registers.Acknowledgement, rows=rows[: self._rows_with_header], before=plan
             )
         except DamagedAnswerError:  # the sequence has been judged, and may have been accepted
             self._link.damaged()
-            return await self._again(lambda: self._client.read(Acknowledgement))
+            return await self._again(lambda: self._client.read(registers.Acknowledgement))
 
-    async def verdict_on(self, sequence: InputSequence) -> Verdict | None:
+    async def verdict_on(self, sequence: InputSequence) -> registers.Verdict | None:
         """Return the verdict on a sequence whose acknowledgement was lost; None when it has not arrived."""
-        answer = await self._again(lambda: self._client.read(Acknowledgement))
-        known = answer.number == sequence.header.number and answer.verdict in Verdict.__members__.values()
-        return Verdict(answer.verdict) if known else None
+        answer = await self._again(lambda: self._client.read(registers.Acknowledgement))
+        known = answer.number == sequence.header.number and answer.verdict in registers.Verdict.__members__.values()
+        return registers.Verdict(answer.verdict) if known else None
 
     # -- again ---------------------------------------------------------------------------------------------------------
 

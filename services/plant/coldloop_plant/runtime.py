@@ -112,16 +112,10 @@ class RackRegisters:
     """
 
     def __init__(
-        self,
-        settings: PlantSettings,
-        header: ModelHeader,
-        make_plant: MakePlant,
-        *,
-        first_generation: int | None = None,
-        age: Callable[[], float] = lambda: 0.0,
-        now: Callable[[], float] = time.monotonic,
-        utc: Callable[[], float] = time.time,
-    ) -> None:
+        self, settings: PlantSettings, header: ModelHeader, make_plant: MakePlant, *,
+        first_generation: int | None = None, age: Callable[[], float] = lambda: 0.0,
+        now: Callable[[], float] = time.monotonic, utc: Callable[[], float] = time.time,
+    ) -> None:  # fmt: skip
         self._model_digest, process = header.short_digest, header.declared
         self._age = age
         self.bank = RegisterBank(registers.plant_map(process), settings.plant.word_order)
@@ -155,13 +149,9 @@ class RackRegisters:
         self._finish()
 
     def _switched_on(
-        self,
-        settings: PlantSettings,
-        header: ModelHeader,
-        make_plant: MakePlant,
-        utc: Callable[[], float],
+        self, settings: PlantSettings, header: ModelHeader, make_plant: MakePlant, utc: Callable[[], float],
         first_generation: int,
-    ) -> tuple[Rack, bool]:
+    ) -> tuple[Rack, bool]:  # fmt: skip
         """Return the rack at the beginning of the configured session, or, and True, where it was when it ended."""
         section, configured = settings.plant, settings.session
         pace = TimeBase(configured.mode is TimeMode.REALTIME, configured.factor)
@@ -330,14 +320,10 @@ class RackRegisters:
     def _identity(self) -> Identity:
         rack = self.rack
         return Identity(
-            map_digest=self.bank.map.digest,
-            map_version=self.bank.map.version,
-            state=ServiceState.RUNNING if rack.session.number else ServiceState.READY,
-            model_digest=self._model_digest,
-            session=rack.session.number,
-            tick=rack.tick,
-            heartbeat=rack.tick & 0xFFFF,
-        )
+            map_digest=self.bank.map.digest, map_version=self.bank.map.version,
+            state=ServiceState.RUNNING if rack.session.number else ServiceState.READY, model_digest=self._model_digest,
+            session=rack.session.number, tick=rack.tick, heartbeat=rack.tick & 0xFFFF,
+        )  # fmt: skip
 
     def _show_applied(self) -> None:
         """Put what is applied into the registers of the outputs; the seal keeps others from completing it by a part."""
