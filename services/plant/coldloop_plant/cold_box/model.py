@@ -17,9 +17,9 @@ from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, STATE_NAMES, STATE
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.model_range import COLDEST_CELLS_K, SATURATION_BAR, WARMEST_CELL_K, model_range
 from coldloop.process.station import ModelRange
-from coldloop_plant.cold_box.physics import ColdBox, advance, derivative, outputs, streams
+from coldloop_plant.cold_box import ColdBox, advance, derivative, outputs, streams
 from coldloop_plant.cold_box.plant_file import OPERATING_INPUTS, OPERATING_LEVEL, REFERENCE, PlantFile
-from coldloop_plant.components.valve import CRITICAL_RATIO
+from coldloop_plant.components.expansion import CRITICAL_RATIO
 from coldloop_plant.equilibrium import (
     Linear,
     Modes,
@@ -29,7 +29,7 @@ from coldloop_plant.equilibrium import (
     model_of,
     newton,
 )
-from coldloop_plant.helium.properties import ISOBAR_PRESSURE, Helium, load_helium, saturation
+from coldloop_plant.helium import ISOBAR_PRESSURE, Helium, load_helium, saturation
 from coldloop_plant.numeric import PA_PER_BAR, Array, RealArray
 
 SIZES: Final = {
