@@ -39,11 +39,6 @@ Key = tuple[int, bool]
 # -- what is ours -----------------------------------------------------------------------------------------------------
 
 
-PROJECT: Final = frozenset({
-    "coldloop", "coldloop_plant", "coldloop_control_plc", "coldloop_optimizer_plc", "coldloop_hmi", "coldloop_rig",
-    "coldloop_chaos", "coldloop_export", "coldloop_refrigerator", "coldloop_studies", "tests",
-})  # fmt: skip
-"""Packages that are ours wherever they are installed; what is not part of an installed distribution is ours, too."""
 NOT_DECISIVE: Final = frozenset({
     "coldloop.kernels.cache_folder", "coldloop.kernels.compiled", "coldloop.kernels.first_use",
     "coldloop.kernels.reach", "coldloop.service.start",
@@ -61,9 +56,9 @@ def label(value: Any) -> str:  # noqa: ANN401 anything
 
 @functools.cache
 def is_own(module: str | None) -> bool:
-    """Return whether a module is ours: neither Python's nor that of an installed distribution."""
+    """Return whether a module is ours: one of the project, or neither Python's nor of an installed distribution."""
     package = (module or "").partition(".")[0]
-    if package in PROJECT:
+    if package == "tests" or package.partition("_")[0] == "coldloop":
         return True
     if not package or package in sys.builtin_module_names or package in sys.stdlib_module_names - {"__main__"}:
         return False
