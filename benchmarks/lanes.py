@@ -18,9 +18,9 @@ from coldloop.kernels.compiled import kernel
 from coldloop.process.cold_box import TICK_S
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop_plant.cold_box.physics import ColdBox, advance
+from coldloop_plant.cold_box import ColdBox, advance
 from coldloop_plant.cold_box.plant_file import REFERENCE
-from coldloop_plant.helium.properties import Helium, load_helium, saturation
+from coldloop_plant.helium import Helium, load_helium, saturation
 
 Array = NDArray[np.float64]
 

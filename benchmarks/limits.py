@@ -17,9 +17,9 @@ from coldloop.process.lti_model import load
 from coldloop_optimizer_plc.computing_settings import OdeSettings
 from coldloop_optimizer_plc.qp.costs import matrices_of
 from coldloop_optimizer_plc.solvers.ode import descend, flow_in, warm_start
-from coldloop_plant.cold_box.physics import advance_along, evaluate
+from coldloop_plant.cold_box import advance_along, evaluate
 from coldloop_plant.cold_box.plant_file import REFERENCE
-from coldloop_plant.helium.properties import load_helium
+from coldloop_plant.helium import load_helium
 from coldloop_plant.load import find_load
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario

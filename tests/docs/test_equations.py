@@ -14,7 +14,7 @@ from coldloop_refrigerator.physics import COMMAND_NAMES, DISTURBANCE_NAMES, STAT
 from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR
 
 PAGE = (Path(__file__).parents[2] / "docs" / "equations.md").read_text(encoding="utf-8")
-PACKAGES = ("coldloop_plant.components", "coldloop_plant.helium", "coldloop_refrigerator")
+PACKAGES = ("coldloop_plant", "coldloop_plant.components", "coldloop_refrigerator")
 
 
 def rows(text: str) -> list[list[str]]:

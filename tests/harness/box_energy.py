@@ -6,10 +6,10 @@ Stored are the bath's internal energy and, in each cell, that of gas and wall at
 import numpy as np
 
 from coldloop.kernels.compiled import kernel
-from coldloop_plant.cold_box.physics import ColdBox, evaluate
+from coldloop_plant.cold_box import ColdBox, evaluate
 from coldloop_plant.components.heat_exchanger import HeatExchanger, heat_capacity
 from coldloop_plant.components.phase_separator import content, outflow
-from coldloop_plant.helium.properties import Helium, saturation, supply_cell
+from coldloop_plant.helium import Helium, saturation, supply_cell
 from coldloop_plant.numeric import Array, RealArray, at_least
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(32)

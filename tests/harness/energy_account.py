@@ -8,7 +8,7 @@ from coldloop.kernels.compiled import kernel
 from coldloop.kernels.intrinsics import borrowed, named
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop_plant.components.phase_separator import start_account
-from coldloop_plant.helium.properties import Helium, supply_cell
+from coldloop_plant.helium import Helium, supply_cell
 from coldloop_plant.numeric import RealArray
 from coldloop_refrigerator.high_pressure import FIRST, MASS
 from coldloop_refrigerator.physics import (

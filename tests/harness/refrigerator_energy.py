@@ -7,7 +7,7 @@ is isothermal.
 from coldloop.kernels.compiled import kernel
 from coldloop_plant.components.heat_exchanger import TRICKLE
 from coldloop_plant.components.phase_separator import content, outflow
-from coldloop_plant.helium.properties import WARM_CP, Helium, saturation, supply_cell
+from coldloop_plant.helium import WARM_CP, Helium, saturation, supply_cell
 from coldloop_plant.numeric import RealArray, at_least
 from coldloop_refrigerator.high_pressure import (
     CAPACITY,

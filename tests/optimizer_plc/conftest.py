@@ -23,8 +23,8 @@ from coldloop_optimizer_plc.qp.prediction import PredictionModel
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 from coldloop_optimizer_plc.settings import ControlDesign, Preset, ProgramSettings
 from coldloop_optimizer_plc.solvers import Answer, Solver, make_solver
+from coldloop_plant.cold_box import ColdBoxProgram
 from coldloop_plant.cold_box.plant_file import REFERENCE
-from coldloop_plant.cold_box.program import ColdBoxProgram
 from coldloop_plant.load import find_load
 from tests.harness.records import as_transmitted
 from tests.harness.reference_qp import solved_by_daqp

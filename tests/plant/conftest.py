@@ -16,9 +16,9 @@ from coldloop.registers.codec import Seal, codec_of, seal_of
 from coldloop.registers.common import EVENT_ROWS, Event, EventKind
 from coldloop.registers.declaration import Role
 from coldloop.registers.plant import Actuators, Measurement
-from coldloop_plant.cold_box.physics import ColdBox, advance, derivative, outputs
+from coldloop_plant.cold_box import ColdBox, advance, derivative, outputs
 from coldloop_plant.cold_box.plant_file import REFERENCE
-from coldloop_plant.helium.properties import Helium, load_helium
+from coldloop_plant.helium import Helium, load_helium
 from coldloop_plant.kinds import plant_maker
 from coldloop_plant.numeric import RealArray
 from coldloop_plant.runtime import RackRegisters

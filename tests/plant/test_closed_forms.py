@@ -7,12 +7,11 @@ from hypothesis import strategies as st
 
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop_plant.cold_box.physics import OUTPUTS, evaluate
+from coldloop_plant.cold_box import OUTPUTS, evaluate
 from coldloop_plant.cold_box.plant_file import REFERENCE
+from coldloop_plant.components.expansion import CHOKED, Valve, cold_valve_flow, expand, gas_valve_flow
 from coldloop_plant.components.phase_separator import content, separate
-from coldloop_plant.components.turbine import expand
-from coldloop_plant.components.valve import CHOKED, Valve, cold_valve_flow, gas_valve_flow
-from coldloop_plant.helium.properties import (
+from coldloop_plant.helium import (
     GAS_CONSTANT,
     WARM_CP,
     load_helium,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 import pytest
 
+from coldloop_plant.cold_box import streams
 from coldloop_plant.cold_box.model import (
     build_model,
     find_equilibrium,
@@ -14,11 +15,10 @@ from coldloop_plant.cold_box.model import (
     parameters_digest,
     state_scales,
 )
-from coldloop_plant.cold_box.physics import streams
 from coldloop_plant.cold_box.plant_file import REFERENCE
 from coldloop_plant.components.heat_exchanger import HeatExchanger
 from coldloop_plant.equilibrium import NoEquilibriumError
-from coldloop_plant.helium.properties import (
+from coldloop_plant.helium import (
     saturation,
     supply_enthalpy_and_density,
     vapour_enthalpy_and_cp,

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop_plant.cold_box.plant_file import REFERENCE
+from coldloop_plant.components.expansion import CRITICAL_RATIO, expand, return_flow, turbine_flow, valve_mass_flow
 from coldloop_plant.components.heat_exchanger import (
     HighPressureFlow,
     LowPressureFlow,
@@ -14,9 +15,7 @@ from coldloop_plant.components.heat_exchanger import (
     take_up,
 )
 from coldloop_plant.components.phase_separator import content, level, separate
-from coldloop_plant.components.turbine import expand, return_flow, turbine_flow
-from coldloop_plant.components.valve import CRITICAL_RATIO, valve_mass_flow
-from coldloop_plant.helium.properties import (
+from coldloop_plant.helium import (
     load_helium,
     saturation,
     supply_cell,

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop_plant.helium import properties as helium_at
-from coldloop_plant.helium.properties import Helium, load_helium
+from coldloop_plant import helium as helium_at
+from coldloop_plant.helium import Helium, load_helium
 
 HELIUM: Helium = load_helium()
 bath_pressures = st.floats(0.9e5, 1.9e5)

@@ -17,7 +17,7 @@ from coldloop.process.model_file import read_document, read_header, write_docume
 from coldloop.process.settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS, InputLimits
 from coldloop_plant.cold_box.model import build_model, model_at, operating_point, parameters_digest
 from coldloop_plant.cold_box.plant_file import REFERENCE, BoxParameters, PlantFile
-from coldloop_plant.helium.properties import load_helium
+from coldloop_plant.helium import load_helium
 from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.load import find_load
 from coldloop_plant.settings import MismatchSettings, PlantSection

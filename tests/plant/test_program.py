@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import LtiModel
+from coldloop_plant.cold_box import ColdBoxProgram
 from coldloop_plant.cold_box.plant_file import REFERENCE
-from coldloop_plant.cold_box.program import ColdBoxProgram
 from coldloop_plant.program import MeasurementNoise, PlantProgram
 
 LEVEL_AND_T5 = tuple(0.01 if name in ("L1", "T5") else 0.0 for name in OUTPUT_NAMES)

@@ -11,11 +11,11 @@ from coldloop.process.model_range import SATURATION_BAR, WARMEST_BATH_M3, WARMES
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.process.station import STATION_SIGNAL_NAMES, ModelRange
 from coldloop.registers.plant import StationAlarm, StationMode
-from coldloop_plant.cold_box.physics import ColdBox, streams
+from coldloop_plant.cold_box import ColdBox, streams
 from coldloop_plant.cold_box.plant_file import REFERENCE
+from coldloop_plant.components.expansion import LAMINAR, ReturnLine, return_flow
 from coldloop_plant.components.phase_separator import SUPERHEAT, content, holding, outflow, separate, thinness
-from coldloop_plant.components.turbine import LAMINAR, ReturnLine, return_flow
-from coldloop_plant.helium.properties import (
+from coldloop_plant.helium import (
     HIGHEST_SATURATION,
     LOWEST_SATURATION,
     WARM_CP,

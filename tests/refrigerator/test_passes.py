@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coldloop_plant.cold_box.physics import OUTPUTS
+from coldloop_plant.cold_box import OUTPUTS
 from coldloop_plant.components.heat_exchanger import HeatExchanger
-from coldloop_plant.helium.properties import load_helium, supply_cell, supply_enthalpy_and_density
+from coldloop_plant.helium import load_helium, supply_cell, supply_enthalpy_and_density
 from coldloop_plant.numeric import Array, RealArray
 from coldloop_refrigerator.high_pressure import (
     CAPACITY,

@@ -12,10 +12,10 @@ from coldloop.kernels.intrinsics import borrowed, named, plain_tuples
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.model_range import model_range
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop_plant.cold_box.physics import OUTPUTS, ColdBox, advance, derivative
+from coldloop_plant.cold_box import OUTPUTS, ColdBox, advance, derivative
 from coldloop_plant.cold_box.plant_file import REFERENCE
 from coldloop_plant.components.phase_separator import content
-from coldloop_plant.helium.properties import Helium, load_helium, supply_enthalpy_and_density
+from coldloop_plant.helium import Helium, load_helium, supply_enthalpy_and_density
 from coldloop_plant.kinds import own_header
 from coldloop_plant.numeric import RealArray
 from coldloop_plant.settings import StationSettings

@@ -9,9 +9,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from coldloop.process.cold_box import OUTPUT_NAMES
+from coldloop_plant.cold_box import advance
 from coldloop_plant.cold_box.model import Equilibrium, build_model
-from coldloop_plant.cold_box.physics import advance
-from coldloop_plant.helium.properties import WARM_CP, load_helium
+from coldloop_plant.helium import WARM_CP, load_helium
 from coldloop_plant.numeric import RealArray
 from coldloop_refrigerator.model import Rest, find_refrigerator_equilibrium, jacobian, lq_gains, rate_scales
 from coldloop_refrigerator.physics import (

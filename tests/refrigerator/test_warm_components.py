@@ -6,9 +6,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from coldloop_plant.components.expansion import (
+    CHOKED,
+    CRITICAL_RATIO,
+    Actuator,
+    gas_valve_flow,
+    opening_rate,
+    relief_flow,
+)
 from coldloop_plant.components.heat_exchanger import STILL, LowPressureFlow
-from coldloop_plant.components.valve import CHOKED, CRITICAL_RATIO, Actuator, gas_valve_flow, opening_rate, relief_flow
-from coldloop_plant.helium.properties import (
+from coldloop_plant.helium import (
     WARM_CP,
     load_helium,
     saturation,

@@ -8,7 +8,7 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.plant import StationMode
-from coldloop_plant.helium.properties import load_helium
+from coldloop_plant.helium import load_helium
 from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.settings import PlantSettings
 from coldloop_refrigerator.physics import inventory

@@ -9,10 +9,10 @@ import pytest
 from coldloop.process.cold_box import LEVEL_BAND, T5_BAND
 from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_plant.cold_box import derivative
 from coldloop_plant.cold_box.model import LOOP_MARGIN, held_loads
-from coldloop_plant.cold_box.physics import derivative
 from coldloop_plant.cold_box.plant_file import REFERENCE
-from coldloop_plant.helium.properties import load_helium
+from coldloop_plant.helium import load_helium
 from coldloop_rig import Simulation, simulate
 
 pytestmark = pytest.mark.usefixtures("compiles")

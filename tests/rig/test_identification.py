@@ -19,7 +19,7 @@ from coldloop.process.model_file import read_header
 from coldloop.process.settings import SHIPPED_MODELS
 from coldloop_plant.cold_box.model import build_model
 from coldloop_plant.cold_box.plant_file import REFERENCE
-from coldloop_plant.components.valve import Valve
+from coldloop_plant.components.expansion import Valve
 from coldloop_rig import cli
 from coldloop_rig.results.run_folder import RunFolder
 from coldloop_rig.runs.identification import (

@@ -119,7 +119,7 @@ def test_the_digest_is_the_same_elsewhere_and_whatever_was_imported_or_done_befo
     [
         ("beside/refrigerator/coldloop_refrigerator/compiled.py", "station[SIGNALS + 1]", "station[SIGNALS + 0]"),
         ("shared/coldloop/registers/plant.py", "MAX_STATE: Final = 1e9", "MAX_STATE: Final = 1e8"),
-        ("services/plant/coldloop_plant/helium/properties.py", "COLDEST = 1.0", "COLDEST = 1.5"),
+        ("services/plant/coldloop_plant/helium/__init__.py", "COLDEST = 1.0", "COLDEST = 1.5"),
     ],
 )
 def test_an_edit_of_what_a_run_uses_is_another_digest(copy: Path, file: str, old: str, new: str) -> None:
@@ -136,7 +136,7 @@ def test_an_edit_of_what_a_run_uses_is_another_digest(copy: Path, file: str, old
 def test_the_edit_of_a_docstring_a_comment_or_the_page_is_not(copy: Path) -> None:
     for file, old, new in (
         ("services/optimizer_plc/coldloop_optimizer_plc/settings.py", '"""Configuration', '"""The configuration'),
-        ("services/plant/coldloop_plant/helium/properties.py", "# K, below the table", "# K, somewhat below the table"),
+        ("services/plant/coldloop_plant/helium/__init__.py", "# K, below the table", "# K, somewhat below the table"),
         ("services/hmi/coldloop_hmi/process_image.py", "import math\n", "import math\n\nEXTRA = 1\n"),
     ):
         text = (copy / file).read_text()

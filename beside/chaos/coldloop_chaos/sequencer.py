@@ -27,7 +27,7 @@ from coldloop.registers.safety import Alarm, alarms_of
 from coldloop_chaos import faults
 from coldloop_chaos.proxy import LinkProxies
 from coldloop_plant.cold_box.model import find_equilibrium, linearise
-from coldloop_plant.helium.properties import load_helium
+from coldloop_plant.helium import load_helium
 from coldloop_plant.kinds import box_of
 from coldloop_rig.cosim.local_services import LocalServices
 from coldloop_rig.cosim.scenario import Scenario, with_copied_load

@@ -24,7 +24,7 @@ def execute_exergy(options: argparse.Namespace) -> int:
     """Specific power of a refrigerator at rest, and where the exergy that it is given is lost."""
     from coldloop.errors import UsageError
     from coldloop_plant.equilibrium import NoEquilibriumError
-    from coldloop_plant.helium.properties import load_helium
+    from coldloop_plant.helium import load_helium
     from coldloop_refrigerator.exergy import exergy_balance
     from coldloop_refrigerator.model import refrigerator_operating_point
     from coldloop_refrigerator.plant_file import read_refrigerator

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import kernel
-from coldloop_plant.helium.properties import Helium, load_helium
+from coldloop_plant.helium import Helium, load_helium
 from coldloop_plant.numeric import RealArray as Array
 from coldloop_refrigerator.physics import BOX_STATES, SIGNALS, Refrigerator
 from coldloop_refrigerator.program import RefrigeratorProgram

@@ -12,9 +12,9 @@ import numpy as np
 
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.station import STATION_SIGNAL_NAMES
-from coldloop_plant.cold_box.physics import OUTPUTS
-from coldloop_plant.helium import properties
-from coldloop_plant.helium.properties import WARM_CP, Helium, saturation, supply_enthalpy_and_density
+from coldloop_plant import helium as properties
+from coldloop_plant.cold_box import OUTPUTS
+from coldloop_plant.helium import WARM_CP, Helium, saturation, supply_enthalpy_and_density
 from coldloop_refrigerator.model import AMBIENT, Rest
 from coldloop_refrigerator.physics import SIGNALS, Crossing, Refrigerator, evaluate_refrigerator
 

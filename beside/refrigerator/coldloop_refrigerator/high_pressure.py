@@ -24,9 +24,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import inlined, kernel
-from coldloop_plant.cold_box.physics import ColdBox, Streams
+from coldloop_plant.cold_box import ColdBox, Streams
 from coldloop_plant.components.heat_exchanger import HeatExchanger, LowPressureFlow
-from coldloop_plant.helium.properties import (
+from coldloop_plant.helium import (
     GAS_CONSTANT,
     HIGHEST_DEPARTURE,
     HIGHEST_SUPPLY,

@@ -9,8 +9,8 @@ from coldloop.kernels.first_use import kernels_of
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.model_file import COLD_BOX, ModelHeader
 from coldloop.process.settings import InputLimits
+from coldloop_plant.cold_box import ColdBox
 from coldloop_plant.cold_box.model import AtRest
-from coldloop_plant.cold_box.physics import ColdBox
 from coldloop_plant.cold_box.plant_file import REFERENCE, PlantFile
 from coldloop_plant.kinds import box_of, parameters_in
 from coldloop_plant.program import HeatLoad, MakePlant, MeasurementNoise, PlantProgram

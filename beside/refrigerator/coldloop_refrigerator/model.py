@@ -21,11 +21,11 @@ from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
 from coldloop.service.command_line import add_configuration_options
 from coldloop.service.start import SECTIONS
 from coldloop_plant.cold_box import model as cold_box
+from coldloop_plant.cold_box import streams
 from coldloop_plant.cold_box.model import Equilibrium
-from coldloop_plant.cold_box.physics import streams
 from coldloop_plant.cold_box.plant_file import OPERATING_INPUTS, OPERATING_LEVEL
 from coldloop_plant.equilibrium import Linear, Modes, NoEquilibriumError, complex_step, model_of, newton
-from coldloop_plant.helium.properties import Helium, load_helium
+from coldloop_plant.helium import Helium, load_helium
 from coldloop_plant.numeric import PA_PER_BAR, Array, RealArray
 from coldloop_plant.settings import LqWeights, PlantSettings, StationSettings
 from coldloop_refrigerator import physics

@@ -20,11 +20,11 @@ import numpy as np
 
 from coldloop.kernels.compiled import kernel
 from coldloop.process import cold_box, station
-from coldloop_plant.cold_box.physics import OUTPUTS, ColdBox, Streams, evaluate
+from coldloop_plant.cold_box import OUTPUTS, ColdBox, Streams, evaluate
+from coldloop_plant.components.expansion import opening_rate
 from coldloop_plant.components.heat_exchanger import WILD, HighPressureFlow, LowPressureFlow, widest_move
 from coldloop_plant.components.phase_separator import Content, add_to_account, content, settle_account, start_account
-from coldloop_plant.components.valve import opening_rate
-from coldloop_plant.helium.properties import Helium
+from coldloop_plant.helium import Helium
 from coldloop_plant.numeric import PA_PER_BAR, Array, RealArray
 from coldloop_refrigerator.high_pressure import (
     COARSE_CELL,

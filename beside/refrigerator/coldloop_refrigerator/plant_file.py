@@ -20,7 +20,7 @@ from coldloop_plant.cold_box.plant_file import (
     Section,
     within,
 )
-from coldloop_plant.components.valve import Actuator, ReliefValve, Valve
+from coldloop_plant.components.expansion import Actuator, ReliefValve, Valve
 from coldloop_refrigerator.physics import Refrigerator
 from coldloop_refrigerator.precooler import NEF6_CELLS, NitrogenBath, Precooler
 from coldloop_refrigerator.station import CompressionStation, GasVolume, ScrewCompressor

@@ -18,9 +18,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import kernel
+from coldloop_plant.components.expansion import Actuator, Valve, effective_area
 from coldloop_plant.components.heat_exchanger import STILL, TRICKLE, HeatExchanger, LowPressureFlow
-from coldloop_plant.components.valve import Actuator, Valve, effective_area
-from coldloop_plant.helium.properties import WARM_CP
+from coldloop_plant.helium import WARM_CP
 from coldloop_plant.numeric import Array, at_least, at_most
 
 BOILING_POINT = 77.66  # K

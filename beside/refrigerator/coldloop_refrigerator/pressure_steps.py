@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from coldloop.process.cold_box import INPUT_NAMES, TICK_S
-from coldloop_plant.helium.properties import load_helium
+from coldloop_plant.helium import load_helium
 from coldloop_plant.numeric import RealArray
 from coldloop_plant.settings import StationControlKind, StationSettings
 from coldloop_refrigerator.physics import COMMAND_NAMES, SIGNAL_NAMES, STATE_NAMES, advance_refrigerator, read

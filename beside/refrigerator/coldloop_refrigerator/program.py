@@ -23,10 +23,10 @@ from coldloop.process.cold_box import TICK_S
 from coldloop.process.model_file import FORMAT, read_document, write_document
 from coldloop.process.model_range import present_model_range
 from coldloop.registers.plant import StationAlarm, StationMode, StationSample, StationStatus, Surroundings
+from coldloop_plant.cold_box import ColdBoxProgram
 from coldloop_plant.cold_box.model import parameters_digest
-from coldloop_plant.cold_box.program import ColdBoxProgram
 from coldloop_plant.components.phase_separator import SUPERHEAT, content
-from coldloop_plant.helium.properties import Helium, load_helium, saturation, vapour_enthalpy_and_cp
+from coldloop_plant.helium import Helium, load_helium, saturation, vapour_enthalpy_and_cp
 from coldloop_plant.numeric import RealArray
 from coldloop_plant.program import HeatLoad, MeasurementNoise
 from coldloop_plant.settings import MEASURED, LqWeights, RefrigeratorEvent, StationSettings

@@ -16,8 +16,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import kernel
-from coldloop_plant.components.valve import Actuator, ReliefValve, Valve, gas_valve_flow, relief_flow
-from coldloop_plant.helium.properties import GAS_CONSTANT, WARM_CP
+from coldloop_plant.components.expansion import Actuator, ReliefValve, Valve, gas_valve_flow, relief_flow
+from coldloop_plant.helium import GAS_CONSTANT, WARM_CP
 from coldloop_plant.numeric import Array, at_least
 
 SECOND_VIRIAL = 2.953e-3  # m3/kg, of helium at 300 K (CoolProp; 2.963e-3 at 290 K, 2.942e-3 at 310 K)

@@ -17,8 +17,8 @@ import numpy as np
 from coldloop.kernels.compiled import kernel
 from coldloop.process.cold_box import TICK_S
 from coldloop.registers.plant import StationMode
-from coldloop_plant.components.valve import CHOKED, Valve
-from coldloop_plant.helium.properties import GAS_CONSTANT
+from coldloop_plant.components.expansion import CHOKED, Valve
+from coldloop_plant.helium import GAS_CONSTANT
 from coldloop_plant.numeric import PA_PER_BAR, RealArray
 from coldloop_plant.settings import StationControlKind, StationSettings
 from coldloop_refrigerator.station import CompressionStation

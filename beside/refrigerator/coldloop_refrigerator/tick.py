@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from coldloop.kernels.compiled import kernel
 from coldloop.kernels.intrinsics import borrowed, named
 from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, P1, TICK_S, V1
-from coldloop_plant.cold_box.physics import ColdBox
+from coldloop_plant.cold_box import ColdBox
 from coldloop_plant.components.heat_exchanger import HeatExchanger
-from coldloop_plant.helium.properties import Helium
+from coldloop_plant.helium import Helium
 from coldloop_plant.numeric import PA_PER_BAR, RealArray
 from coldloop_refrigerator.high_pressure import COLUMNS
 from coldloop_refrigerator.physics import (

@@ -12,10 +12,10 @@ from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_file import COLD_BOX
 from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.settings import ControlDesign
+from coldloop_plant.cold_box import ColdBox
 from coldloop_plant.cold_box import model as cold_box
-from coldloop_plant.cold_box.physics import ColdBox
 from coldloop_plant.cold_box.plant_file import PlantFile
-from coldloop_plant.helium.properties import load_helium
+from coldloop_plant.helium import load_helium
 from coldloop_plant.kinds import kind_named
 from coldloop_plant.settings import StationSettings
 

@@ -18,12 +18,11 @@ from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.model_file import COLD_BOX, ModelHeader, read_header
 from coldloop.process.settings import InputLimits
+from coldloop_plant.cold_box import ColdBox, ColdBoxProgram, MismatchedPlant
 from coldloop_plant.cold_box.model import AtRest, parameters_digest
-from coldloop_plant.cold_box.physics import ColdBox
 from coldloop_plant.cold_box.plant_file import LISTING, BoxParameters, PlantFile
-from coldloop_plant.cold_box.program import ColdBoxProgram, MismatchedPlant
-from coldloop_plant.components.valve import Valve
-from coldloop_plant.helium.properties import load_helium
+from coldloop_plant.components.expansion import Valve
+from coldloop_plant.helium import load_helium
 from coldloop_plant.program import HeatLoad, MakePlant, MeasurementNoise, PlantProgram
 from coldloop_plant.settings import MismatchSettings, PlantKind, PlantSection, SensorSettings, StationSettings
 

@@ -8,18 +8,10 @@ from typing import Annotated, Final
 from pydantic import Field, FiniteFloat, PositiveFloat, field_validator, model_validator
 
 from coldloop.modbus.settings import PLANT_PORT, ServerSettings
+from coldloop.process import settings as common
 from coldloop.process.cold_box import TICK_S
 from coldloop.process.sections import Section
-from coldloop.process.settings import (
-    InputLimits,
-    PerInput,
-    ProcessSettings,
-    RootSettings,
-    declared,
-    settings_process,
-    stretched,
-    within,
-)
+from coldloop.process.settings import InputLimits, PerInput, ProcessSettings, declared, stretched, within
 from coldloop.registers.codec import WordOrder
 from coldloop.safety.retained import RetainSettings
 from coldloop.service.settings import MetricsSettings, TelemetrySettings
@@ -119,7 +111,7 @@ class WatchdogSettings(ProcessSettings):
     @field_validator("safe_state")
     @classmethod
     def _within_registers(cls, values: tuple[float, ...]) -> tuple[float, ...]:
-        for one, value in zip(settings_process().inputs, values, strict=True):
+        for one, value in zip(common.settings_process().inputs, values, strict=True):
             low, high = one.span
             if not low <= value <= high:
                 raise ValueError(f"{one.name} = {value:g} is outside {low:g} to {high:g} {one.unit}".rstrip())
@@ -409,7 +401,7 @@ class PlantSection(ProcessSettings):
     retain: RetainSettings = RetainSettings()
 
 
-class PlantSettings(RootSettings):
+class PlantSettings(common.RootSettings):
     """Settings that the plant service reads of a configuration."""
 
     limits: InputLimits = Field(default_factory=InputLimits)

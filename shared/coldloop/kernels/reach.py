@@ -39,11 +39,6 @@ Key = tuple[int, bool]
 # -- what is ours -----------------------------------------------------------------------------------------------------
 
 
-PROJECT: Final = frozenset({
-    "coldloop", "coldloop_plant", "coldloop_control_plc", "coldloop_optimizer_plc", "coldloop_hmi", "coldloop_rig",
-    "coldloop_chaos", "coldloop_export", "coldloop_refrigerator", "coldloop_studies", "tests",
-})  # fmt: skip
-"""Packages that are ours wherever they are installed; what is not part of an installed distribution is ours, too."""
 NOT_DECISIVE: Final = frozenset({
     "coldloop.kernels.cache_folder", "coldloop.kernels.compiled", "coldloop.kernels.first_use",
     "coldloop.kernels.reach", "coldloop.service.start",
@@ -61,9 +56,9 @@ def label(value: Any) -> str:  # noqa: ANN401 anything
 
 @functools.cache
 def is_own(module: str | None) -> bool:
-    """Return whether a module is ours: neither Python's nor that of an installed distribution."""
+    """Return whether a module is ours: one of the project, or neither Python's nor of an installed distribution."""
     package = (module or "").partition(".")[0]
-    if package in PROJECT:
+    if package == "tests" or package.partition("_")[0] == "coldloop":
         return True
     if not package or package in sys.builtin_module_names or package in sys.stdlib_module_names - {"__main__"}:
         return False
@@ -171,7 +166,7 @@ class Describer:
             tuple(self._cell(cell) for cell in function.__closure__ or ()),
             self._globals(function.__globals__, names),
             () if self.compiled else tuple(self._imported(*each, names) for each in _imports(function.__code__)),
-            tuple(self.items([each]) for each in overloads_of(function)) if self.compiled else (),
+            tuple(self.items([each]) for each in _overloads.get(function, ())) if self.compiled else (),
         )  # fmt: skip
 
     def _code(self, code: CodeType, names: set[str]) -> Plain:
@@ -339,38 +334,18 @@ def _slots(kind: type) -> tuple[str, ...]:
 
 
 class _Node:
-    """An object that counts, and its place in Tarjan's search for those that refer to each other."""
+    """An object that counts: the digest of its description, and the objects that this refers to."""
 
-    def __init__(self, reference: Reference, number: int) -> None:
+    def __init__(self, reference: Reference) -> None:
         describer = Describer(compiled=reference.compiled)
-        description = describer.describe(reference.holder)
         self.holder = reference.holder
-        self.content = _hash(description)
+        self.content = _hash(describer.describe(reference.holder))
         self.references = describer.references
         self.finished = describer.finished
-        self.waiting = iter(self.references)
-        self.number = self.lowest = number
-        self.digest: bytes | None = None
-
-
-class _State:
-    """State of the reading of this process's modules.
-
-    Attributes:
-        finished: No node refers to a module that is being imported.
-        registered: So many implementations were there when the nodes were described.
-        read: So many entries of numba's registry have been read; overloads by the function whose place they take.
-    """
-
-    def __init__(self) -> None:
-        self.finished = True
-        self.registered = 0
-        self.read = 0
-        self.overloads: dict[FunctionType, list[tuple[Any, Any]]] = {}
 
 
 _nodes: Final[dict[Key, _Node]] = {}
-_state: Final = _State()
+"""Nodes by the identity of their objects; none refers to a module that is being imported."""
 _lock: Final = threading.RLock()
 
 
@@ -382,38 +357,44 @@ def digest(*roots: Any, compiled: bool = False) -> str:  # noqa: ANN401 function
         compiled: They are used by compiled code, for which a class is the layout of its data.
     """
     with _lock:
-        description, nodes = _described(roots, compiled=compiled)
-        return _hash((description, [node.digest for node in nodes])).hex()[:24]
+        description, references, nodes = _described(roots, compiled=compiled)
+    places = {key: place for place, key in enumerate(nodes)}
+    groups = (references, *(node.references for node in nodes.values()))
+    edges = [[places[_key(each)] for each in group] for group in groups]
+    return _hash((description, [node.content for node in nodes.values()], edges)).hex()[:24]
 
 
 def reached(*roots: Any) -> list[Any]:  # noqa: ANN401
     """Return the functions, classes and instances that the digest of `roots` is of."""
     with _lock:
-        _, waiting = _described(roots, compiled=False)
-        found: dict[int, _Node] = {}
-        while waiting:
-            node = waiting.pop()
-            if node.number not in found:
-                found[node.number] = node
-                waiting += map(_settle, node.references)
-    return [node.holder for node in found.values()]
+        return [node.holder for node in _described(roots, compiled=False)[2].values()]
 
 
-def _described(roots: Any, *, compiled: bool) -> tuple[Plain, list[_Node]]:  # noqa: ANN401
-    """Return the description of roots and the nodes that it refers to.
+def _described(roots: Any, *, compiled: bool) -> tuple[Plain, list[Reference], dict[Key, _Node]]:  # noqa: ANN401
+    """Return the description of roots, what it refers to, and all nodes that are reached from there, in an order.
 
     To describe some functions is to import what they import, which may register implementations of others that have
     been described: these are then described again.
     """
     while True:
-        if _state.registered != registrations() or not _state.finished:
+        now = registrations()
+        if now != _overloads.described:
             _nodes.clear()
-            _state.finished, _state.registered = True, registrations()
+            _overloads.described = now
         describer = Describer(compiled=compiled)
         description = describer.value(roots)
-        nodes = [_settle(each) for each in describer.references]
-        if _state.registered == registrations():
-            return description, nodes
+        found: dict[Key, _Node] = {}
+        waiting = describer.references[::-1]
+        while waiting:
+            reference = waiting.pop()
+            key = _key(reference)
+            if key not in found:
+                node = found[key] = _nodes[key] = _nodes.get(key) or _Node(reference)
+                waiting += node.references[::-1]
+        if not all(node.finished for node in found.values()):
+            _nodes.clear()
+        if registrations() == now:
+            return description, describer.references, found
 
 
 def _key(reference: Reference) -> Key:
@@ -424,86 +405,40 @@ def _hash(plain: Plain) -> bytes:
     return hashlib.sha256(repr(plain).encode()).digest()
 
 
-def _settle(root: Reference) -> _Node:
-    """Return the node of an object, with its digest."""
-    known = _nodes.get(_key(root))
-    if known is not None:
-        return known
-    path, group = [_added(root)], list[_Node]()
-    group.append(path[0])
-    while path:
-        node = path[-1]
-        for reference in node.waiting:
-            other = _nodes.get(_key(reference))
-            if other is None:
-                other = _added(reference)
-                path.append(other)
-                group.append(other)
-                break
-            if other.digest is None:
-                node.lowest = min(node.lowest, other.number)
-        else:
-            path.pop()
-            if path:
-                path[-1].lowest = min(path[-1].lowest, node.lowest)
-            if node.lowest == node.number:
-                start = group.index(node)
-                _close(group[start:])
-                del group[start:]
-    return _nodes[_key(root)]
-
-
-def _added(reference: Reference) -> _Node:
-    node = _nodes[_key(reference)] = _Node(reference, len(_nodes))
-    _state.finished = _state.finished and node.finished
-    return node
-
-
-def _close(group: list[_Node]) -> None:
-    """Give digests to objects that refer to each other, directly or through others; all others have theirs."""
-    contents = {id(node): node.content for node in group}
-    for _ in range(2 if len(group) > 1 else 1):
-        contents = {id(node): _hash((node.content, list(_parts(node, contents)))) for node in group}
-    whole = sorted(contents.values()) if len(group) > 1 else []
-    for node in group:
-        node.digest = _hash((contents[id(node)], whole))
-
-
-def _parts(node: _Node, contents: dict[int, bytes]) -> Iterator[bytes]:
-    for reference in node.references:
-        other = _nodes[_key(reference)]
-        yield other.digest or contents[id(other)]
-
-
 # -- what takes a function's place in compiled code -------------------------------------------------------------------
 
 
-def overloads_of(function: FunctionType) -> list[tuple[Any, Any]]:
-    """Return what takes a function's place in compiled code, and how it is compiled, as far as modules are imported."""
-    _read_overloads()
-    return _state.overloads.get(function, [])
+class _Overloads(dict[FunctionType, list[tuple[Any, Any]]]):
+    """Overloads of functions in compiled code, and how they are compiled, as far as modules are imported."""
+
+    read = 0
+    """Entries of numba's registry that have been read."""
+    described = 0
+    """Registrations when the nodes were described."""
+
+    def read_on(self) -> None:
+        """Read the further entries of the registry."""
+        templates = sys.modules.get("numba.core.typing.templates")
+        if templates is None:
+            return
+        registered = templates.builtin_registry.globals
+        for held, kind in registered[self.read :]:
+            if isinstance(held, FunctionType) and is_own(held.__module__):
+                found = [each for each in getattr(kind, "templates", ()) if hasattr(each, "_overload_func")]
+                self.setdefault(held, []).extend(
+                    (each._overload_func, {**each._jit_options, "strict": each._strict})  # noqa: SLF001 numba has no other way
+                    for each in found
+                )
+        self.read = len(registered)
+
+
+_overloads: Final = _Overloads()
 
 
 def registrations() -> int:
     """Return how many overloads and implementations there are."""
-    _read_overloads()
-    overloads, tables = _state.overloads.values(), Implementations.tables
-    return sum(map(len, overloads)) + sum(map(len, tables))
-
-
-def _read_overloads() -> None:
-    templates = sys.modules.get("numba.core.typing.templates")
-    if templates is None:
-        return
-    registered = templates.builtin_registry.globals
-    for held, kind in registered[_state.read :]:
-        if isinstance(held, FunctionType) and is_own(held.__module__):
-            found = [each for each in getattr(kind, "templates", ()) if hasattr(each, "_overload_func")]
-            _state.overloads.setdefault(held, []).extend(
-                (each._overload_func, {**each._jit_options, "strict": each._strict})  # noqa: SLF001 numba has no other way
-                for each in found
-            )
-    _state.read = len(registered)
+    _overloads.read_on()
+    return sum(map(len, _overloads.values())) + sum(map(len, Implementations.tables))
 
 
 # -- data -------------------------------------------------------------------------------------------------------------

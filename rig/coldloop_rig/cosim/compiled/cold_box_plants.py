@@ -6,9 +6,8 @@ import numpy as np
 
 from coldloop.kernels.compiled import kernel
 from coldloop.process.cold_box import TICK_S
-from coldloop_plant.cold_box.physics import ColdBox, advance_along, evaluate
-from coldloop_plant.cold_box.program import ColdBoxProgram
-from coldloop_plant.helium.properties import Helium, load_helium
+from coldloop_plant.cold_box import ColdBox, ColdBoxProgram, advance_along, evaluate
+from coldloop_plant.helium import Helium, load_helium
 from coldloop_plant.program import PlantProgram
 from coldloop_rig.cosim.compiled.plants import CompiledPlant, advances
 from coldloop_rig.cosim.compiled.records import Array

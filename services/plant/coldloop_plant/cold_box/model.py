@@ -17,19 +17,12 @@ from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, STATE_NAMES, STATE
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.model_range import COLDEST_CELLS_K, SATURATION_BAR, WARMEST_CELL_K, model_range
 from coldloop.process.station import ModelRange
-from coldloop_plant.cold_box.physics import ColdBox, advance, derivative, outputs, streams
+from coldloop_plant import equilibrium
+from coldloop_plant.cold_box import ColdBox, advance, derivative, outputs, streams
 from coldloop_plant.cold_box.plant_file import OPERATING_INPUTS, OPERATING_LEVEL, REFERENCE, PlantFile
-from coldloop_plant.components.valve import CRITICAL_RATIO
-from coldloop_plant.equilibrium import (
-    Linear,
-    Modes,
-    NoEquilibriumError,
-    central_differences,
-    complex_step,
-    model_of,
-    newton,
-)
-from coldloop_plant.helium.properties import ISOBAR_PRESSURE, Helium, load_helium, saturation
+from coldloop_plant.components.expansion import CRITICAL_RATIO
+from coldloop_plant.equilibrium import Linear, Modes, NoEquilibriumError
+from coldloop_plant.helium import ISOBAR_PRESSURE, Helium, load_helium, saturation
 from coldloop_plant.numeric import PA_PER_BAR, Array, RealArray
 
 SIZES: Final = {
@@ -61,7 +54,8 @@ def _equations(states: int, box: ColdBox, helium: Helium) -> Callable[[Array], A
 def linearise(x: RealArray, u: RealArray, w: float, box: ColdBox, helium: Helium) -> Linear:
     """Return the linear model of the cold box at (x, u, w)."""
     sizes = np.array([*state_scales(box), *FURTHER_SIZES])
-    linear = Linear.of(complex_step(_equations(x.size, box, helium), np.array([*x, *u, w]), sizes), x.size, u.size)
+    jacobian = equilibrium.complex_step(_equations(x.size, box, helium), np.array([*x, *u, w]), sizes)
+    linear = Linear.of(jacobian, x.size, u.size)
     return linear._replace(F=linear.F[:, 0], G=linear.G[:, 0])
 
 
@@ -73,8 +67,8 @@ def linearisation_error(x: RealArray, u: RealArray, w: float, box: ColdBox, heli
     """
     evaluate, at, rates = _equations(x.size, box, helium), np.array([*x, *u, w]), state_scales(box)
     sizes, rows = np.array([*rates, *FURTHER_SIZES]), np.array([*rates, *np.ones(len(OUTPUT_NAMES))])
-    fine, coarse = central_differences(evaluate, at, 1e-3 * sizes)
-    difference = complex_step(evaluate, at, sizes) - (4.0 * fine - coarse) / 3.0
+    fine, coarse = equilibrium.central_differences(evaluate, at, 1e-3 * sizes)
+    difference = equilibrium.complex_step(evaluate, at, sizes) - (4.0 * fine - coarse) / 3.0
     return float(np.max(np.abs(difference * sizes / rows[:, np.newaxis])))
 
 
@@ -134,7 +128,7 @@ def rest_near(x: RealArray, w: float, u: RealArray, box: ColdBox, helium: Helium
         further: RealArray = z + np.append(moved, load)
         return further
 
-    z, residual = newton(
+    z, residual = equilibrium.newton(
         np.append(x, w), lambda z: derivative(z[:-1], u, z[-1], box, helium) / scales, step, 30,
         f"no equilibrium at u = {u.tolist()}",
     )  # fmt: skip
@@ -347,7 +341,7 @@ def build_model(box: ColdBox = REFERENCE) -> LtiModel:
 
 def model_at(rest: Equilibrium, box: ColdBox, helium: Helium, parameters: Mapping[str, Any] | None = None) -> LtiModel:
     """Return the linear model of `box` at a state of rest; `parameters` are what its file says of the plant."""
-    return model_of(
+    return equilibrium.model_of(
         linearise(rest.x, rest.u, rest.w, box, helium), rest.x, rest.u, rest.w, rest.y, COLD_BOX,
         dict(zip(STATE_NAMES, STATE_UNITS, strict=True)), parameters_digest(box, helium),
         plant_parameters=dict(parameters or {}),

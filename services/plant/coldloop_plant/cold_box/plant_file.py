@@ -12,11 +12,10 @@ from pydantic.fields import FieldInfo
 from coldloop.process import sections
 from coldloop.process.model_file import COLD_BOX
 from coldloop.process.model_range import SATURATION_BAR, SUPPLY_BAR
-from coldloop_plant.cold_box.physics import CELLS, ColdBox
+from coldloop_plant.cold_box import CELLS, ColdBox
+from coldloop_plant.components.expansion import ReturnLine, Turbine, Valve
 from coldloop_plant.components.heat_exchanger import HeatExchanger
 from coldloop_plant.components.phase_separator import PhaseSeparator
-from coldloop_plant.components.turbine import ReturnLine, Turbine
-from coldloop_plant.components.valve import Valve
 
 IN_SI: Final = {
     "_g_sqrt_k_per_s_bar": (1.0, 1e8),  # kg sqrt(K)/(s Pa)

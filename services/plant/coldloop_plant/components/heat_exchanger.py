@@ -10,14 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import inlined, kernel
-from coldloop_plant.helium.properties import (
-    Helium,
-    Saturation,
-    Surface,
-    saturation,
-    supply_cell,
-    vapour_enthalpy_and_cp,
-)
+from coldloop_plant.helium import Helium, Saturation, Surface, saturation, supply_cell, vapour_enthalpy_and_cp
 from coldloop_plant.numeric import Array, RealArray, at_least, at_most
 
 LARGEST_RATIO = 8.0  # of the mean to the cold-end difference; more would be too stiff for a step of 0.25 s

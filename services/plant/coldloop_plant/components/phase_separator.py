@@ -13,22 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import inlined, kernel
-from coldloop_plant.components.valve import CHOKED
-from coldloop_plant.helium.properties import (
-    ALUMINIUM_ENTHALPY,
-    WARM_CP,
-    WARMEST_ISOBAR,
-    Helium,
-    Saturation,
-    hermite_slope_weights,
-    hermite_weights,
-    locate,
-    read_curve,
-    saturation,
-    saturation_slopes,
-    vapour_density,
-    vapour_temperature,
-)
+from coldloop_plant import helium as properties
+from coldloop_plant.components.expansion import CHOKED
+from coldloop_plant.helium import WARM_CP, Helium, Saturation, read_curve, saturation, saturation_slopes
 from coldloop_plant.numeric import Array, at_least, at_most
 
 SUPERHEAT = 5e4  # J/kg, of the vapour in a dry vessel at V_l = -V: mass and energy then bend little where it runs dry
@@ -116,13 +103,14 @@ def dry_content(separator: PhaseSeparator, P: float, V_l: float, helium: Helium)
     V, per_volume = separator.volume, SUPERHEAT / separator.volume
     excess = -per_volume * V_l
     h = sat.h_v + excess
-    rho, rho_P, rho_h = vapour_density(P, excess, sat, slope, helium)
+    rho, rho_P, rho_h = properties.vapour_density(P, excess, sat, slope, helium)
     T_wall = COLD_WALL + excess / WARM_CP
-    T = at_most(T_wall, WARMEST_ISOBAR)  # above it the wall has the heat capacity that it has there
+    T = at_most(T_wall, properties.WARMEST_ISOBAR)  # above it the wall has the heat capacity that it has there
     table = helium.isobar
-    i, t = locate(np.log(T), table.start, table.step, table.before, table.nodes.shape[0])
-    capacity = read_curve(table.nodes, i, ALUMINIUM_ENTHALPY, hermite_slope_weights(t)) / (table.step * T)
-    stored = read_curve(table.nodes, i, ALUMINIUM_ENTHALPY, hermite_weights(t)) + capacity * (T_wall - T)
+    i, t = properties.locate(np.log(T), table.start, table.step, table.before, table.nodes.shape[0])
+    values, slopes = properties.hermite_weights(t), properties.hermite_slope_weights(t)
+    capacity = read_curve(table.nodes, i, properties.ALUMINIUM_ENTHALPY, slopes) / (table.step * T)
+    stored = read_curve(table.nodes, i, properties.ALUMINIUM_ENTHALPY, values) + capacity * (T_wall - T)
     stored, wall = separator.wall * stored, separator.wall * capacity / WARM_CP
     return Content(
         V * rho,
@@ -140,7 +128,7 @@ def outflow(separator: PhaseSeparator, P: float, V_l: float, sat: Saturation, he
     if V_l.real < 0.0:
         excess = -SUPERHEAT / separator.volume * V_l
         rho = dry_content(separator, P, V_l, helium).mass / separator.volume
-        return Outflow(vapour_temperature(P, sat.h_v + excess, sat, helium), sat.h_v + excess, rho)
+        return Outflow(properties.vapour_temperature(P, sat.h_v + excess, sat, helium), sat.h_v + excess, rho)
     liquid = carried_liquid(separator, V_l)
     return Outflow(sat.T, sat.h_v - liquid * (sat.h_v - sat.h_l), sat.rho_v / mixture_thinness(liquid, sat))
 

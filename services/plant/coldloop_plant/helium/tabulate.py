@@ -22,7 +22,7 @@ from CoolProp.CoolProp import PropsSI
 from scipy.integrate import quad
 from scipy.interpolate import CubicSpline
 
-from coldloop_plant.helium.properties import EXCESS_OFFSET, GAS_CONSTANT, SUPERHEAT_OFFSET
+from coldloop_plant.helium import EXCESS_OFFSET, GAS_CONSTANT, SUPERHEAT_OFFSET
 from coldloop_plant.numeric import RealArray
 
 FLUID = "Helium"
