@@ -202,7 +202,7 @@ def test_a_full_disk_is_one_line(requests: "Requests", store: Store, monkeypatch
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     (request,) = requests(1)
-    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr(Path, "open", full)
     with pytest.raises(ResultsError, match=r"No space left on device; what was done before is kept: make room"):
         store.keep(request, perform(request))
     assert list(store.folder.iterdir()) == []

@@ -101,9 +101,9 @@ class GuardState:
     out_of_bounds: bool = False
     """The outputs applied when the guard began are outside the bounds."""
     newest: int = 0
-    """The latest tick, ..."""
+    """Latest tick of the rack."""
     lag: int = 0
-    """... and by how much the guard's time is behind it."""
+    """Ticks by which the guard's time is behind that of the rack."""
 
 
 def beginning(limits: Limits, applied: Numbers) -> GuardState:
@@ -287,9 +287,6 @@ def judge(
 def admits(state: GuardState, limits: Limits, first_tick: int, rows: Rows, length: int) -> bool:
     """Return whether a sequence of `length` rows, one per tick, would be applied unchanged; `state` advances."""
     for k in range(length):
-        within = k > 0 and first_tick + k - state.start < limits.ticks_per_sample
-        if within and not state.out_of_bounds and same(rows[k], state.applied):
-            continue  # it was admitted before
         admit(state, limits, first_tick + k, rows[k], k == 0)
         for i in range(len(limits.low)):
             if abs(state.applied[i] - rows[k][i]) > limits.slack[i]:
