@@ -7,7 +7,7 @@ import signal
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -198,10 +198,14 @@ def test_shards_asked_for_wrongly_are_one_line(
 
 
 def test_a_full_disk_is_one_line(requests: "Requests", store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
     (request,) = requests(1)
+    there = Path.open
+
+    def full(path: Path, *arguments: Any, **options: Any) -> Any:  # noqa: ANN401 in the place of `Path.open`
+        if path.parent == store.folder:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return there(path, *arguments, **options)
+
     monkeypatch.setattr(Path, "open", full)
     with pytest.raises(ResultsError, match=r"No space left on device; what was done before is kept: make room"):
         store.keep(request, perform(request))
