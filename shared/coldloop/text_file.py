@@ -143,7 +143,7 @@ def whole_text(path: Path, text: str, *, synced: bool = False) -> None:
     replace_file(path, text.encode(), synced=synced)
 
 
-def replace_file(path: Path, data: bytes, *, synced: bool = False, private: bool = False) -> None:
+def replace_file(path: Path, data: bytes, *, synced: bool = False, private: bool = False, alone: bool = False) -> None:
     """Let a file have this content, or the one that it had; whatever is there under its name is replaced.
 
     Args:
@@ -151,6 +151,7 @@ def replace_file(path: Path, data: bytes, *, synced: bool = False, private: bool
         data: Its content.
         synced: The disk has the content before the name, and the name when this returns, also if power fails.
         private: Nobody else can read it.
+        alone: No other process writes this file: the draft of one that was killed is written over.
 
     Raises:
         OSError: It cannot be written.
@@ -166,7 +167,7 @@ def replace_file(path: Path, data: bytes, *, synced: bool = False, private: bool
             if synced:
                 os.fsync(file.fileno())
 
-    _give_name(path, write)
+    _give_name(path, write, path.with_name(f".{path.name}.draft") if alone else None)
     if synced and os.name == "posix":  # only there a folder can be synced
         descriptor = os.open(path.parent, os.O_RDONLY)
         try:
@@ -175,8 +176,8 @@ def replace_file(path: Path, data: bytes, *, synced: bool = False, private: bool
             os.close(descriptor)
 
 
-def _give_name(path: Path, write: Callable[[Path], object]) -> None:
-    draft = draft_of(path)
+def _give_name(path: Path, write: Callable[[Path], object], draft: Path | None = None) -> None:
+    draft = draft or draft_of(path)
     try:
         draft.unlink(missing_ok=True)  # left by a process of the same number; a link is not followed
         write(draft)

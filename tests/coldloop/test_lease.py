@@ -10,7 +10,7 @@ from coldloop.registers.bank import BusyError, Caller
 from coldloop.registers.codec import to_words
 from coldloop.registers.common import WHO_WORDS
 from coldloop.registers.declaration import Role
-from coldloop.registers.safety import LeaseState, LeaseStatus
+from coldloop.registers.safety import LeaseEvent, LeaseState, LeaseStatus
 from coldloop.safety.writers import LINGER_S, SIMPLE_CLIENT, WriterLease
 
 SILENCE_S = 5.0
@@ -224,3 +224,18 @@ def test_another_party_writes_only_after_the_silence_or_the_departure_of_the_one
             elif last is not None and last[0] != step.connection and departed is None:
                 left.add(last[0])
             last, departed = (step.connection, clock.now), None
+
+
+def test_a_lease_ends_for_the_connection_that_wrote_last(clock: Clock) -> None:
+    ended: list[str] = []
+    lease = WriterLease(
+        "the rack", lambda: SILENCE_S, lambda event, name: ended.append(name) if event is LeaseEvent.ENDED else None,
+        now=clock, shared=True,
+    )  # fmt: skip
+    writes(lease, A, 7)
+    writes(lease, B, 7)
+    lease.closed(B)
+    writes(lease, A, 7)
+    clock.now += SILENCE_S + 1.0
+    lease.note_end()
+    assert ended == [A.name]

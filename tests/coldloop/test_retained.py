@@ -11,7 +11,6 @@ from typing import Any, Self
 import pytest
 
 from coldloop.safety.retained import RetainedFile, RetainedStateError, _description, encoded
-from coldloop.text_file import draft_of
 
 OLD = {"session": 3, "tick": 1000, "applied": [43.0, 75.0, 36.0]}
 NEW = {"session": 3, "tick": 1001, "applied": [43.1, 76.0, 36.0]}
@@ -55,7 +54,7 @@ def test_what_is_no_ordinary_file_is_neither_waited_for_nor_followed(tmp_path: P
     elsewhere = tmp_path / "elsewhere"
     kept(elsewhere).save(OLD)
     file = kept(tmp_path / "state")
-    for place in (file.path, draft_of(file.path)):
+    for place in (file.path, tmp_path / ".state.draft"):
         if kind == "fifo":
             os.mkfifo(place)
         elif kind == "link":
@@ -164,6 +163,15 @@ def test_a_disk_that_fills_leaves_the_old_state_and_no_draft(tmp_path: Path) -> 
             file.save(NEW)
     assert file.load() == OLD
     assert [path.name for path in tmp_path.iterdir()] == ["state"]
+
+
+def test_drafts_of_processes_that_were_killed_do_not_pile_up(tmp_path: Path) -> None:
+    file = kept(tmp_path / "state")
+    draft = tmp_path / ".state.draft"
+    draft.write_text("of a process that was killed, on another host or with another number")
+    file.save(NEW)
+    assert file.load() == NEW
+    assert not draft.exists()
 
 
 @pytest.mark.parametrize("wrong", ["cut", "flipped"])

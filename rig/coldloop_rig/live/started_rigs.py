@@ -127,7 +127,7 @@ def write_own(file: Path, text: str) -> None:
         OSError: It cannot be written.
     """
     try:
-        replace_file(file, text.encode(), private=True)
+        replace_file(file, text.encode(), private=True, alone=True)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(file)) from None
 

@@ -110,7 +110,7 @@ class RetainedFile:
         if _is_device(self.path):
             raise RetainedStateError(f"{self.path}: a device; name another file in retain.file")
         try:
-            replace_file(self.path, encoded(state, self._owner, self._digest), synced=synced)
+            replace_file(self.path, encoded(state, self._owner, self._digest), synced=synced, alone=True)
         except OSError as error:
             raise RetainedStateError(f"{self.path}: {error.strerror}; name another file in retain.file") from None
 

@@ -106,7 +106,7 @@ class WriterLease:
     def take(self, caller: Caller, holder: int | None = None) -> bool:
         """Give the lease to a client that `check` has let pass, or renew it; return whether it has a new holder."""
         held, state = self._caller, self.state
-        if held is caller and state is LeaseState.HELD and holder in (None, self._holder):
+        if held is caller and state is LeaseState.HELD and holder in (None, self._holder) and self._name == caller.name:
             self._heard_at = self._now()
             return False
         same = held is not None and caller.connection in {held.connection, *self._others}
