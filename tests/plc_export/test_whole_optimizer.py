@@ -87,7 +87,7 @@ def test_a_changed_bit_of_a_literal_a_matrix_or_a_golden_update_is_found(
 def test_a_changed_setting_is_found(folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     text = (folder / "constants.c").read_text()
-    changed = re.sub(r"(\.q_rest = )\d+", r"\g<1>77", text, count=1)
+    changed = re.sub(r"(\.low = )\d+", r"\g<1>77", text, count=1)
     assert changed != text
     (tmp_path / "constants.c").write_text(changed)
     assert "a constant or a literal is not what was written" in output(compiled(tmp_path, COMPILERS[0], "-O0"))[1]

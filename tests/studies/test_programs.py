@@ -135,7 +135,7 @@ def test_an_edit_of_what_a_run_uses_is_another_digest(copy: Path, file: str, old
 @pytest.mark.usefixtures("programs")
 def test_the_edit_of_a_docstring_a_comment_or_the_page_is_not(copy: Path) -> None:
     for file, old, new in (
-        ("services/optimizer_plc/coldloop_optimizer_plc/settings.py", '"""Configuration', '"""The configuration'),
+        ("services/optimizer_plc/coldloop_optimizer_plc/settings.py", '"""Settings of', '"""The settings of'),
         ("services/plant/coldloop_plant/helium/__init__.py", "# K, below the table", "# K, somewhat below the table"),
         ("services/hmi/coldloop_hmi/process_image.py", "import math\n", "import math\n\nEXTRA = 1\n"),
     ):

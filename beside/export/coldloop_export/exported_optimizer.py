@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from ctypes import CDLL, c_bool
 from functools import partial
 from pathlib import Path
@@ -126,9 +126,9 @@ class ExportedProgram(OptimizerProgram):
         numbers, reals = (part.tolist() for part in self._reported[0])
         return Optimization._make((*numbers, verdict, *reals))
 
-    def prediction(self) -> Prediction:
-        """Return no prediction."""
-        return blank(Prediction, maps_of(self.process).optimizer_plc)
+    def predictor(self) -> Callable[[], Prediction]:
+        """Return what gives no prediction."""
+        return partial(blank, Prediction, maps_of(self.process).optimizer_plc)
 
     def model_deviation(self) -> ModelDeviation:
         """Return no deviation."""

@@ -1,6 +1,5 @@
 """Wiring of a rig: endpoints of its three services, endpoints of their clients, and time limits of its answers."""
 
-import asyncio
 import socket
 import sys
 from collections.abc import AsyncIterator, Sequence
@@ -76,8 +75,10 @@ async def answered_in_time(what: str) -> AsyncIterator[None]:
     Raises:
         PeerUnreachableError: It took longer.
     """
+    from asyncio import timeout  # noqa: PLC0415 a run in one process does without asyncio
+
     try:
-        async with asyncio.timeout(ANSWER_S):
+        async with timeout(ANSWER_S):
             yield
     except TimeoutError:
         raise PeerUnreachableError(f"{what} takes longer than {ANSWER_S:g} s: the rig answers too slowly") from None
