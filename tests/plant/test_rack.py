@@ -301,6 +301,9 @@ def test_sensors_fail_on_purpose_and_the_history_keeps_the_truth(switch_on: "Swi
     true = operator.read(PlantSample, rack.tick - 1).y
     assert true[T5] != shown[T5]
     assert math.isfinite(true[L1])
+    published = list(rack.registers.rack.snapshot()["outputs"].values())  # type: ignore[attr-defined]
+    faulty = [published[output] for output in (L1, T5, 4)]
+    assert faulty == pytest.approx([y[L1], y[T5], y[4]], nan_ok=True), "telemetry has what the registers have"
     for output in (L1, T5, 4):
         operator.write(SensorFault(SensorFaultKind.NONE, 0.0), output)
     assert all(map(math.isfinite, plc.send(*U).y))

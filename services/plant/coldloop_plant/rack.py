@@ -432,7 +432,7 @@ class Rack:
         )  # fmt: skip
 
     def snapshot(self) -> Mapping[str, object]:
-        """Return what telemetry publishes."""
+        """Return what telemetry publishes: outputs as the sensors show them, the faulty ones too."""
         program, station = self.program, self.program.station
         of_the_station: dict[str, object] = {}
         if station is not None:
@@ -444,7 +444,7 @@ class Rack:
             "tick": program.tick,
             "load_w": program.load,
             "inputs": dict(zip(self.process.input_names, self.outputs.u, strict=True)),
-            "outputs": dict(zip(self.process.output_names, program.measure(), strict=True)),
+            "outputs": dict(zip(self.process.output_names, self._readings(), strict=True)),
             "model_range": [part.name.lower() for part in ModelRange(self.model_range.outside) if part.name],
             **({"station": of_the_station} if of_the_station else {}),
         }
