@@ -13,10 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coldloop.process.cold_box import OUTPUT_NAMES, TICK_S
+from coldloop.process.cold_box import OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.program import PlantProgram
 from coldloop_plant.settings import PlantSettings

@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FLOORS = {
     "shared/coldloop": [
-        ["process"], ["kernels", "session"], ["registers"], ["safety", "modbus"], ["service"], ["operating"],
+        ["process"], ["kernels"], ["registers"], ["safety", "modbus"], ["service"], ["operating"],
     ],
     "services/plant/coldloop_plant": [["helium"], ["components"], ["cold_box"]],
     "services/optimizer_plc/coldloop_optimizer_plc": [["qp"], ["solvers"]],

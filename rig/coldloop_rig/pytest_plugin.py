@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from coldloop.kernels.first_use import Kernels, announce_with, write_line
+from coldloop.kernels.cache import Kernels, announce_with, write_line
 from coldloop_rig.testing import Rigs
 
 

@@ -20,8 +20,7 @@ from typing import Any, Final, Generic, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from coldloop.errors import ConfigurationError
-from coldloop.parsing import MOST_LEVELS, TOO_DEEP, parsed_toml
-from coldloop.text_file import read_text
+from coldloop.text import MOST_LEVELS, TOO_DEEP, parsed_toml, read_text
 
 PREFIX = "COLDLOOP__"
 MODEL_FILE: Final = "COLDLOOP__MODEL__FILE"

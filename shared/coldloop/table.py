@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import UsageError
-from coldloop.text_file import decoded, not_text, read_bytes
+from coldloop.text import decoded, not_text, read_bytes
 
 TIME: Final = "time_s"
 SEPARATORS: Final = {"\t": "tabs", ";": "semicolons", ",": "commas"}

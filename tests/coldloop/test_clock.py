@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coldloop.process.cold_box import TICK_S
-from coldloop.session.clock import BIN_S, BINS, LatenessRecord, Pacer, Schedule
+from coldloop.session import BIN_S, BINS, LatenessRecord, Pacer, Schedule
 
 LONGEST_S = BINS * BIN_S
 latenesses = st.lists(st.floats(0.0, LONGEST_S - BIN_S), min_size=1, max_size=200)
@@ -31,7 +31,7 @@ class FakeClock:
 @pytest.fixture
 def fake(monkeypatch: pytest.MonkeyPatch) -> FakeClock:
     made = FakeClock(0.125)
-    monkeypatch.setattr("coldloop.session.clock.sleep", made.sleep)
+    monkeypatch.setattr("coldloop.session.sleep", made.sleep)
     return made
 
 

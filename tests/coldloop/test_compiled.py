@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from coldloop.kernels import compiled
-from coldloop.kernels.cache_folder import DAY_S, KEPT_DAYS, LOCKS, TIDIED, CacheFolder
+from coldloop.kernels.cache import DAY_S, KEPT_DAYS, LOCKS, TIDIED, CacheFolder
 from coldloop.kernels.compiled import kept
 
 if TYPE_CHECKING:

@@ -4,13 +4,13 @@ from collections.abc import Iterator
 
 import pytest
 
-from coldloop.kernels import first_use
-from coldloop.kernels.first_use import Kernels, announce_with, kernels_of, needs_compiling, write_line
+from coldloop.kernels import cache
+from coldloop.kernels.cache import Kernels, announce_with, kernels_of, needs_compiling, write_line
 
 
 @pytest.fixture
 def announced(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    monkeypatch.setattr(first_use, "_announced", set())
+    monkeypatch.setattr(cache, "_announced", set())
     owners: list[str] = []
     announce_with(lambda kernels: owners.append(kernels.owner))
     yield owners

@@ -14,7 +14,7 @@ from coldloop.errors import UsageError
 from coldloop.registers.common import IDENTITY_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, f32
 from coldloop.table import TIME, read_table
-from coldloop.text_file import held_file, read_text
+from coldloop.text import held_file, read_text
 from coldloop_export.st_printer import LONGEST, Names
 from coldloop_rig.cli.registers import exported
 

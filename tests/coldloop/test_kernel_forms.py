@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from coldloop.kernels import compiled
-from coldloop.kernels.cache_folder import CacheFolder
+from coldloop.kernels.cache import CacheFolder
 from coldloop.kernels.compiled import LARGE, is_compiled, kernel
 
 pytestmark = pytest.mark.usefixtures("compiles")

@@ -6,7 +6,7 @@ from tests.harness.processes import Processes
 def test_what_was_hidden_from_numba_can_be_imported_afterwards(processes: Processes) -> None:
     program = (
         "import sys\n"
-        "from coldloop.kernels.first_use import TAKEN_ALONG, load_numba_alone\n"
+        "from coldloop.kernels.cache import TAKEN_ALONG, load_numba_alone\n"
         "load_numba_alone()\n"
         "assert 'numba' in sys.modules and not {*TAKEN_ALONG} & sys.modules.keys()\n"
         "import scipy.linalg, cffi\n"
@@ -21,7 +21,7 @@ def test_what_was_hidden_from_numba_can_be_imported_afterwards(processes: Proces
 def test_what_was_loaded_before_stays(processes: Processes) -> None:
     program = (
         "import sys, scipy\n"
-        "from coldloop.kernels.first_use import load_numba_alone\n"
+        "from coldloop.kernels.cache import load_numba_alone\n"
         "load_numba_alone()\n"
         "assert sys.modules['scipy'] is scipy\n"
     )

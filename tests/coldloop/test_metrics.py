@@ -11,8 +11,7 @@ import pytest
 from coldloop.errors import PortInUseError
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.plant import Actuators, Measurement
-from coldloop.service.metrics import MOST_OPEN, MetricsServer, bank_families, exposition, gauge
-from coldloop.service.settings import MetricsSettings
+from coldloop.service.monitoring import MOST_OPEN, MetricsServer, MetricsSettings, bank_families, exposition, gauge
 from tests.harness.records import PLANT_MAP
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from coldloop.config import flattened, load_configuration
 from coldloop.errors import ConfigurationError, UsageError
-from coldloop.parsing import MOST_LEVELS, parsed_json, parsed_toml
+from coldloop.text import MOST_LEVELS, parsed_json, parsed_toml
 from coldloop_rig import simulate
 from coldloop_rig.settings import Settings
 

@@ -14,7 +14,7 @@ import sys
 from numba import types
 from numba.core import event
 from coldloop.kernels.compiled import kernel
-from coldloop.kernels.first_use import kernels_of
+from coldloop.kernels.cache import kernels_of
 
 @kernel
 def inner(x):

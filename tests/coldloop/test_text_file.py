@@ -9,7 +9,7 @@ from typing import Final
 import pytest
 
 from coldloop.errors import ConfigurationError
-from coldloop.text_file import held_file, read_bytes, read_text
+from coldloop.text import held_file, read_bytes, read_text
 
 MOST: Final = 100
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from coldloop.process import cold_box, station
+from coldloop.process import cold_box
 from coldloop_refrigerator.physics import COMMAND_NAMES, DISTURBANCE_NAMES, STATE_NAMES, STATE_UNITS
 from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR
 
@@ -39,7 +39,7 @@ def tags(heading: str) -> dict[str, str]:
     [
         ("Inputs and load", (*cold_box.INPUT_NAMES, "NCR22_HL"), (*cold_box.INPUT_UNITS, "W")),
         ("Outputs", cold_box.OUTPUT_NAMES, cold_box.OUTPUT_UNITS),
-        ("Signals of station and pre-cooler", station.STATION_SIGNAL_NAMES, station.STATION_SIGNAL_UNITS),
+        ("Signals of station and pre-cooler", cold_box.STATION_SIGNAL_NAMES, cold_box.STATION_SIGNAL_UNITS),
         ("States", STATE_NAMES, STATE_UNITS),
         ("Commands and disturbances", (*COMMAND_NAMES, *DISTURBANCE_NAMES), ("%",) * 4 + ("W", "K", "kg/s", *"111")),
     ],
@@ -50,7 +50,14 @@ def test_every_name_is_in_its_table_with_its_unit(heading: str, names: tuple[str
 
 def test_every_tag_has_a_place_in_the_diagram() -> None:
     diagram = PAGE.partition("## Where everything is\n")[2].partition("\n## ")[0].split("```")[1]
-    shown = {*cold_box.INPUT_NAMES, *cold_box.OUTPUT_NAMES, *station.STATION_SIGNAL_NAMES, *COMMAND_NAMES, "NC1", "NC2"}
+    shown = {
+        *cold_box.INPUT_NAMES,
+        *cold_box.OUTPUT_NAMES,
+        *cold_box.STATION_SIGNAL_NAMES,
+        *COMMAND_NAMES,
+        "NC1",
+        "NC2",
+    }
     assert shown <= set(re.findall(r"\w+", diagram))
 
 

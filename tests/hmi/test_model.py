@@ -16,13 +16,14 @@ from coldloop.registers.common import Event, EventKind, Identity, JournalPage, S
 from coldloop.registers.control_plc import LadderStatus, Mode, Plan, ProcessNow
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmPriority, AlarmState
-from coldloop.service.metrics import exposition
+from coldloop.service.monitoring import exposition
 from coldloop_hmi.documents import (
     MOST_MARKS,
     alarms_document,
     catalog,
     encoded,
     page_families,
+    signals_of,
     state_document,
     trend_document,
 )
@@ -30,7 +31,6 @@ from coldloop_hmi.guard import WAITING, Broadcast
 from coldloop_hmi.page_server import safe_cell
 from coldloop_hmi.process_image import MOST_ROWS, STALE_S, JournalEntry, Model, TrendStore, thin
 from coldloop_hmi.runtime import Poller
-from coldloop_hmi.signals import signals_of
 from coldloop_hmi.users import Party
 from coldloop_rig.process_file.making import made_from
 from tests.harness.process_files import COLUMN

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.number_text import NEAR, axis_labels, number_text
+from coldloop.text import NEAR, axis_labels, number_text
 
 STEPS = st.builds(
     lambda mantissa, power: mantissa * 10.0**power, st.sampled_from((1.0, 2.0, 2.5, 5.0)), st.integers(-9, 12)

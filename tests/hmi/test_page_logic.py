@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from coldloop.number_text import axis_labels, number_text
+from coldloop.text import axis_labels, number_text
 from coldloop_hmi.guard import STATIC
-from coldloop_hmi.signals import Quality
+from coldloop_hmi.process_image import Quality
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

@@ -9,13 +9,11 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES
-from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
+from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
 from coldloop.registers.plant import StationAlarm, StationStatus
-from coldloop_hmi.documents import plant_document
+from coldloop_hmi.documents import plant_document, signals_of
 from coldloop_hmi.guard import STATIC
 from coldloop_hmi.process_image import Model
-from coldloop_hmi.signals import signals_of
 from tests.harness.records import MAPS
 from tests.harness.waiting import eventually
 from tests.hmi.conftest import Served, Site, opened, record, write_registers

@@ -15,9 +15,8 @@ import pytest
 from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES
 from coldloop.registers.common import Event, EventKind
 from coldloop_hmi.explanation import Branch
-from coldloop_hmi.process_image import JournalEntry, Model
+from coldloop_hmi.process_image import SOUND, JournalEntry, Model, doubted
 from coldloop_hmi.runtime import Replay
-from coldloop_hmi.signals import SOUND, doubted
 from coldloop_rig.live.recorded_page import RecordedPage
 from coldloop_rig.results.run_folder import RunFolder
 from tests.conftest import Coldloop

@@ -8,7 +8,7 @@ import pytest
 from coldloop.errors import ColdloopError
 from coldloop.registers.bank import ANYBODY
 from coldloop.registers.plant import Actuators, PlantSession
-from coldloop.session.clock import Pacer
+from coldloop.session import Pacer
 from coldloop_plant.runtime import PlantRuntime, RackRegisters
 from coldloop_plant.settings import PlantSettings
 from tests.harness.records import PLANT_MAP
@@ -46,7 +46,7 @@ async def test_the_clock_is_as_fast_as_is_configured(clock_error_ppm: float, mon
     clock = SleepersClock()
     monkeypatch.setattr("coldloop_plant.runtime.time", clock)
     monkeypatch.setattr("coldloop_plant.runtime.Pacer", partial(Pacer, now=clock.monotonic))
-    monkeypatch.setattr("coldloop.session.clock.sleep", clock.sleep)
+    monkeypatch.setattr("coldloop.session.sleep", clock.sleep)
     plant = runtime("realtime", clock_error_ppm=clock_error_ppm)
 
     def position() -> tuple[float, float]:

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.process.cold_box import L1, OUTPUT_NAMES, T5
+from coldloop.process.cold_box import L1, OUTPUT_NAMES, STATION_SIGNAL_NAMES, T5
 from coldloop.process.settings import InputLimits
-from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop_plant.helium import GAS_CONSTANT, load_helium
 from coldloop_plant.settings import LqWeights
 from coldloop_refrigerator.exergy import (

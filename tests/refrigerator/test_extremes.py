@@ -5,11 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.process.cold_box import OUTPUT_NAMES, TICK_S
+from coldloop.process.cold_box import OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S, ModelRange
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_range import SATURATION_BAR, WARMEST_BATH_M3, WARMEST_CELL_K, model_range
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop.process.station import STATION_SIGNAL_NAMES, ModelRange
 from coldloop.registers.plant import StationAlarm, StationMode
 from coldloop_plant.cold_box import ColdBox, streams
 from coldloop_plant.cold_box.plant_file import REFERENCE

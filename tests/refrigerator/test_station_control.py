@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from coldloop.errors import ConfigurationError, ModelFileError
+from coldloop.process.cold_box import STATION_SIGNAL_NAMES
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
-from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.plant import StationAlarm, StationMode, Surroundings
 from coldloop_plant.kinds import plant_maker
 from coldloop_plant.settings import PlantSection, RefrigeratorEvent, StationSettings

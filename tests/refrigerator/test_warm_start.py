@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from coldloop.process.cold_box import OUTPUT_NAMES
+from coldloop.process.cold_box import OUTPUT_NAMES, STATION_SIGNAL_NAMES
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.plant import StationMode
 from coldloop_plant.helium import load_helium
 from coldloop_plant.kinds import own_header, plant_maker

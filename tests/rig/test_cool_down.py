@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from coldloop.kernels.intrinsics import plain_tuples
-from coldloop.process.cold_box import COLD_BOX, L1, STATE_NAMES, T5
+from coldloop.process.cold_box import COLD_BOX, L1, STATE_NAMES, STATION_SIGNAL_NAMES, T5
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop_plant.helium import load_helium
 from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.load import find_load

@@ -8,8 +8,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from coldloop.process.cold_box import INPUT_NAMES, L1
-from coldloop.process.station import STATION_SIGNAL_NAMES
+from coldloop.process.cold_box import INPUT_NAMES, L1, STATION_SIGNAL_NAMES
 from coldloop_rig import simulate
 
 if TYPE_CHECKING:

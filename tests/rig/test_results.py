@@ -19,7 +19,7 @@ from coldloop.process.cold_box import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OU
 from coldloop.process.lti_model import load
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
-from coldloop.text_file import whole_file
+from coldloop.text import whole_file
 from coldloop_rig import cli
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.results.columns import FILES, STATION

@@ -19,7 +19,7 @@ from coldloop.registers.declaration import Block, RegisterMap, f32
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import AlarmKind
 from coldloop.service.journal import alarm_word
-from coldloop.service.metrics import metric_name
+from coldloop.service.monitoring import metric_name
 from coldloop_rig.cli.registers import exported, runs
 from tests.conftest import Coldloop
 from tests.harness.records import CONTROL_MAP, MAPS, PLANT_MAP

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 import aiomqtt
 import pytest
 
-from coldloop.service.settings import TelemetrySettings
-from coldloop.service.telemetry import Telemetry
+from coldloop.service.monitoring import Telemetry, TelemetrySettings
 from tests.harness.waiting import until
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from coldloop.process.station import STATION_SIGNAL_NAMES
+from coldloop.process.cold_box import STATION_SIGNAL_NAMES
 from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind

@@ -14,11 +14,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from coldloop.config import Configuration
 from coldloop.errors import LoadFileError, UsageError
-from coldloop.parsing import parsed_toml
 from coldloop.process.settings import ProcessSettings, declared, one_of, settings_process, within
 from coldloop.process.updating_periods import whole_ticks
 from coldloop.session import TimeMode
-from coldloop.text_file import read_text
+from coldloop.text import parsed_toml, read_text
 from coldloop_plant.load import concatenated, find_load, named_families, telegraph
 from coldloop_plant.settings import EventTarget, PlantKind, RefrigeratorEvent
 from coldloop_rig.cosim.scenario import Scenario

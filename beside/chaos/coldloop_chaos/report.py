@@ -16,15 +16,13 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 from coldloop.config import Configuration
 from coldloop.errors import LinkError
-from coldloop.number_text import ends_text
-from coldloop.parsing import parsed_json
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import load as load_model
 from coldloop.registers.common import Event, EventKind
 from coldloop.registers.control_plc import LadderStatus, Mode
 from coldloop.registers.safety import AlarmState, alarm_key, alarms_of
 from coldloop.service.journal import alarm_word
-from coldloop.text_file import whole_file, whole_text
+from coldloop.text import ends_text, parsed_json, whole_file, whole_text
 from coldloop_chaos.faults import ChaosPlan
 from coldloop_chaos.sequencer import ChaosTrace, ShowProgress, conduct
 from coldloop_optimizer_plc.settings import ControlDesign

@@ -21,8 +21,7 @@ from pydantic import BaseModel
 from coldloop import __version__
 from coldloop.config import selected
 from coldloop.errors import UsageError
-from coldloop.kernels.cache_folder import find_cache_folder
-from coldloop.parsing import parsed_json
+from coldloop.kernels.cache import find_cache_folder
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.settings import InputLimits
@@ -32,7 +31,7 @@ from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, 
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, Prediction
 from coldloop.safety.writers import InputSequence, with_checksum
 from coldloop.service.start import in_one_line, main
-from coldloop.text_file import held_file, read_bytes
+from coldloop.text import held_file, parsed_json, read_bytes
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.rules import UpdatingRule
 from coldloop_optimizer_plc.runtime import serve

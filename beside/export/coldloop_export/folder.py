@@ -20,10 +20,10 @@ import numpy as np
 
 from coldloop import __version__
 from coldloop.errors import UsageError
-from coldloop.parsing import parsed_json
 from coldloop.process.settings import RateReference
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS, control_map
+from coldloop.text import parsed_json
 from coldloop_export import counting, golden, st_files
 from coldloop_export.c_files import GuardExport, OdeExport, OptimizerExport
 from coldloop_export.exported_optimizer import FOLDER as OPTIMIZER

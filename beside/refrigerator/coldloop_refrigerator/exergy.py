@@ -10,8 +10,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from coldloop.process.cold_box import OUTPUT_NAMES
-from coldloop.process.station import STATION_SIGNAL_NAMES
+from coldloop.process.cold_box import OUTPUT_NAMES, STATION_SIGNAL_NAMES
 from coldloop_plant import helium as properties
 from coldloop_plant.cold_box import OUTPUTS
 from coldloop_plant.helium import WARM_CP, Helium, saturation, supply_enthalpy_and_density

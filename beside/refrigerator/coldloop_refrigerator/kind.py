@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 
 from coldloop.errors import ConfigurationError, ModelFileError
-from coldloop.kernels.first_use import kernels_of
+from coldloop.kernels.cache import kernels_of
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.model_file import COLD_BOX, ModelHeader
 from coldloop.process.settings import InputLimits

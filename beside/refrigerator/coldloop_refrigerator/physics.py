@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process import cold_box, station
+from coldloop.process import cold_box
 from coldloop_plant.cold_box import OUTPUTS, ColdBox, Streams, evaluate
 from coldloop_plant.components.expansion import opening_rate
 from coldloop_plant.components.heat_exchanger import WILD, HighPressureFlow, LowPressureFlow, widest_move
@@ -65,11 +65,11 @@ COIL: Final = BOX_STATES + PRECOOLER_STATES.index("T_nef5")
 """Index of the last state of the high-pressure passes."""
 STATE_NAMES: Final = (*cold_box.STATE_NAMES, *PRECOOLER_STATES, *STATION_STATES)
 STATE_UNITS: Final = (*cold_box.STATE_UNITS, *PRECOOLER_STATE_UNITS, *STATION_STATE_UNITS)
-COMMAND_NAMES: Final = station.STATION_VALVE_NAMES
+COMMAND_NAMES: Final = cold_box.STATION_VALVE_NAMES
 DISTURBANCE_NAMES: Final = ("NCR22_HL", "T_ambient", "leak", "nitrogen", "NC1", "NC2")
 """Heat load (W), ambient temperature (K), leak at 16 bar (kg/s); 0 or 1: nitrogen in the tank, compressors to run."""
 
-SIGNAL_NAMES: Final = station.STATION_SIGNAL_NAMES
+SIGNAL_NAMES: Final = cold_box.STATION_SIGNAL_NAMES
 SIGNALS: Final = len(SIGNAL_NAMES)
 
 

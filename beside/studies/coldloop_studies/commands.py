@@ -157,7 +157,7 @@ def _declare_design(parser: argparse.ArgumentParser) -> None:
 
 def execute_design(options: argparse.Namespace) -> int:
     """Which decision and constraint instants the problem needs, by what each set costs in the loop."""
-    from coldloop.text_file import require_regular_file, whole_text
+    from coldloop.text import require_regular_file, whole_text
     from coldloop_rig.cli.commands.options import FIGURE_FORMATS
     from coldloop_rig.figures.plot import save_figure
     from coldloop_rig.progress import make_console

@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import ArrayLike, NDArray
 
-from coldloop.number_text import ends_text
 from coldloop.process.cold_box import SAMPLING_PERIOD_S, TICK_S
 from coldloop.process.settings import InputLimits
 from coldloop.registers.plant import StationMode
+from coldloop.text import ends_text
 from coldloop_rig.figures.plot import COLOURS, DASHES, INK, STYLE, draw_tau_u, label_marks, limit, styled
 from coldloop_rig.plc_sizing.intervals import Interval
 from coldloop_studies.request import Outcome

@@ -32,8 +32,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from coldloop import __version__
 from coldloop.errors import ColdloopError, ResultsError, StudyError, UsageError
-from coldloop.parsing import parsed_json
-from coldloop.text_file import whole_text
+from coldloop.text import parsed_json, whole_text
 from coldloop_optimizer_plc.computing_settings import BudgetSettings, PlcBudget
 from coldloop_optimizer_plc.solvers import make_solver
 from coldloop_rig.figures.plot import save_figure

@@ -18,8 +18,7 @@ from markdown_it import MarkdownIt
 from pydantic import BaseModel, BeforeValidator, ConfigDict, model_validator
 
 from coldloop import __version__
-from coldloop.parsing import parsed_toml
-from coldloop.text_file import whole_text
+from coldloop.text import parsed_toml, whole_text
 from coldloop_rig.plc_sizing.intervals import Interval, geometric_mean, interval_of_mean
 from coldloop_rig.plc_sizing.operations import dense_cholesky
 from coldloop_rig.plc_sizing.plc import cholesky_times

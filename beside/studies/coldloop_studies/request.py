@@ -19,13 +19,11 @@ from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
 from coldloop.kernels.reach import digest
-from coldloop.parsing import parsed_json
-from coldloop.process.cold_box import COLD_BOX, L1, T5, TICK_S
+from coldloop.process.cold_box import COLD_BOX, L1, STATION_SIGNAL_NAMES, T5, TICK_S
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.service.start import main as start_service
-from coldloop.text_file import file_digest
+from coldloop.text import file_digest, parsed_json
 from coldloop_optimizer_plc.solvers import make_solver
 from coldloop_plant.kinds import GROUP
 from coldloop_rig.cosim.ideal_loop import LinearRig

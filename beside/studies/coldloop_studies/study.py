@@ -9,11 +9,10 @@ from matplotlib.figure import Figure
 
 from coldloop.config import MOST_BYTES, as_toml, flattened, load_configuration
 from coldloop.errors import ConfigurationError, UsageError
-from coldloop.parsing import parsed_toml
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
-from coldloop.text_file import read_text
+from coldloop.text import parsed_toml, read_text
 from coldloop_plant.load import find_load, named_families
 from coldloop_rig.cosim.scenario import natural_ticks
 from coldloop_rig.settings import Settings

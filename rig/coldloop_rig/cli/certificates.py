@@ -20,7 +20,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from coldloop.errors import ResultsError, UsageError
 from coldloop.modbus.connection import ROLE_EXTENSION, encoded_role
 from coldloop.registers.declaration import Role
-from coldloop.text_file import read_bytes, replace_file, require_regular_file
+from coldloop.text import read_bytes, replace_file, require_regular_file
 from coldloop_rig.cosim.wiring import SERVICES
 from coldloop_rig.results.folders import prepare_folder, writing
 

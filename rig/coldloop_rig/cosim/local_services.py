@@ -14,9 +14,9 @@ from typing import IO, Any, Final, Self, TypeVar
 
 from coldloop.config import PREFIX, to_environment
 from coldloop.errors import LinkError
-from coldloop.kernels.first_use import Kernels, announce
-from coldloop.parsing import parsed_json
+from coldloop.kernels.cache import Kernels, announce
 from coldloop.service.start import COMPILING, SERVING
+from coldloop.text import parsed_json
 from coldloop_rig import PYTHON
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.cosim.session import SessionClient

@@ -4,7 +4,7 @@ from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from coldloop.errors import LoadFileError
-from coldloop.kernels.first_use import kernels_of
+from coldloop.kernels.cache import kernels_of
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model

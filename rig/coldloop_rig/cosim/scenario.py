@@ -11,7 +11,7 @@ from coldloop.errors import RunInterruptedError
 from coldloop.modbus.settings import Endpoint
 from coldloop.process.load_profile import LoadProfile
 from coldloop.table import TIME
-from coldloop.text_file import whole_text
+from coldloop.text import whole_text
 from coldloop_plant.load import HOUR_TICKS, named_families
 from coldloop_rig.results.recording import Recorder, Way
 from coldloop_rig.settings import Settings

@@ -19,11 +19,10 @@ from matplotlib.ticker import ScalarFormatter
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
-from coldloop.number_text import axis_labels, ends_text, number_text
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
 from coldloop.process.sections import Input, Output
-from coldloop.text_file import whole_file
+from coldloop.text import axis_labels, ends_text, number_text, whole_file
 from coldloop_rig.results.columns import STATION, excess_keys
 from coldloop_rig.results.folders import writing
 from coldloop_rig.results.recording import Way

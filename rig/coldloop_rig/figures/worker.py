@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Final, Self
 
 from coldloop.errors import ColdloopError, ResultsError, UsageError
-from coldloop.parsing import parsed_json
+from coldloop.text import parsed_json
 from coldloop_rig import PYTHON
 
 COMMAND: Final = (*PYTHON, "-m", "coldloop_rig.figures.worker")

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.config import load_configuration
+from coldloop.process.cold_box import STATION_SIGNAL_NAMES
 from coldloop.process.declaration import Process
 from coldloop.process.settings import settings_of
-from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Cause, Mode, ProcessNow
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization
@@ -20,9 +20,8 @@ from coldloop.registers.plant import SensorFaultKind, StationSample
 from coldloop.registers.safety import Alarm, AlarmState, alarms_of
 from coldloop.service.journal import EventText, alarm_cause, alarm_word
 from coldloop_control_plc.alarms import TRANSITIONS, AlarmSettings
-from coldloop_hmi.process_image import JournalEntry
+from coldloop_hmi.process_image import Doubts, JournalEntry
 from coldloop_hmi.runtime import ReplayFrame
-from coldloop_hmi.signals import Doubts
 from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.rules import make_rule
 from coldloop_optimizer_plc.settings import OptimizerSettings

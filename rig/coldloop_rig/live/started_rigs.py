@@ -26,7 +26,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from coldloop.errors import ColdloopError, UsageError
 from coldloop.modbus.settings import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
-from coldloop.text_file import replace_file
+from coldloop.text import replace_file
 from coldloop_rig import PYTHON
 from coldloop_rig.cosim.wiring import REQUIRED, RigEndpoints
 from coldloop_rig.interruption import INTERRUPTION

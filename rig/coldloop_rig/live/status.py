@@ -6,7 +6,6 @@ from contextlib import AsyncExitStack, nullcontext
 from typing import Any, Final, NamedTuple
 
 from coldloop.errors import LinkError, PeerUnreachableError, RequestRefusedError
-from coldloop.number_text import value_text
 from coldloop.operating.execution import Clients, CommandClient, clients_of, connected, reason_of
 from coldloop.operating.observer import last_update, read_alarms
 from coldloop.process.declaration import Process
@@ -16,6 +15,7 @@ from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import AlarmState
 from coldloop.service.journal import alarm_cause, alarm_word
+from coldloop.text import value_text
 from coldloop_rig.cosim.wiring import RigEndpoints, answered_in_time
 from coldloop_rig.text_tables import Colour, coloured
 

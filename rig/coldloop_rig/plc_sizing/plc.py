@@ -16,9 +16,8 @@ from scipy.optimize import nnls
 
 from coldloop.config import load_configuration
 from coldloop.errors import ConfigurationError, UsageError
-from coldloop.parsing import parsed_json
 from coldloop.table import read_table
-from coldloop.text_file import held_file, read_bytes
+from coldloop.text import held_file, parsed_json, read_bytes
 from coldloop_optimizer_plc.qp.linear_algebra import Array
 from coldloop_rig.plc_sizing.operations import dense_cholesky
 from coldloop_rig.text_tables import markdown_table

@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.number_text import ends_text, number_text
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.sections import Bath, Input, Output
+from coldloop.text import ends_text, number_text
 from coldloop_rig.plc_sizing.holding import NOTHING, digits_last_s, leaves_its_band, shortest_period_s, waiting
 from coldloop_rig.process_file.making import Made
 from coldloop_rig.process_file.step_test import LEVEL, half_widths

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError, foreign
-from coldloop.parsing import parsed_json
 from coldloop.process.declaration import Process
 from coldloop.process.sections import Lag, PlantSource
-from coldloop.text_file import MOST_BYTES, read_bytes
+from coldloop.text import MOST_BYTES, parsed_json, read_bytes
 from coldloop_plant import own_plants as plants
 from coldloop_plant.equilibrium import Linear, central_differences
 from coldloop_rig.process_file.reading import source_of

@@ -15,7 +15,7 @@ from coldloop.errors import ModelFileError, UsageError
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel, discretise
 from coldloop.process.sections import Bath, Output, State
-from coldloop.text_file import file_digest
+from coldloop.text import file_digest
 from coldloop_plant.equilibrium import Linear, central_differences, model_of
 from coldloop_plant.fmu import DOUBLE, Fmu, FmuSimulation, Wiring
 from coldloop_plant.own_plants import FMU, PYTHON

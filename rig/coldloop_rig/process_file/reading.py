@@ -15,11 +15,11 @@ from xml.etree import ElementTree as ET
 
 from coldloop.config import load_configuration
 from coldloop.errors import ColdloopError, ConfigurationError, UsageError
-from coldloop.kernels.cache_folder import find_cache_folder
+from coldloop.kernels.cache import find_cache_folder
 from coldloop.process.declaration import Process
 from coldloop.process.sections import Disturbance, Forecast, Load
 from coldloop.table import TIME, read_table
-from coldloop.text_file import read_bytes, read_text
+from coldloop.text import read_bytes, read_text
 from coldloop_rig.interruption import SIGNALS
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import ArrayLike, NDArray
 
+from coldloop.process.cold_box import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS
 from coldloop.process.declaration import Process
-from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS
 from coldloop.registers import Maps, maps_of
 from coldloop.registers.common import Event
 from coldloop.registers.control_plc import Verdict

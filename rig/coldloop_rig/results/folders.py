@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from coldloop.errors import ResultsError, UsageError
-from coldloop.text_file import whole_text
+from coldloop.text import whole_text
 
 try:
     import fcntl

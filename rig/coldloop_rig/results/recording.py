@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import ColdloopError, LinkError
-from coldloop.process.station import STATION_SIGNAL_NAMES
+from coldloop.process.cold_box import STATION_SIGNAL_NAMES
 from coldloop.registers.common import Event
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample, StationSample

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 
 from coldloop.errors import UsageError, printable
-from coldloop.parsing import parsed_json
 from coldloop.process.declaration import Process
 from coldloop.process.model_file import process_in, read_document
 from coldloop.process.updating_periods import LONGEST_TICKS
 from coldloop.registers.control_plc import Mode
-from coldloop.text_file import held_file, read_text, whole_file
+from coldloop.text import held_file, parsed_json, read_text, whole_file
 from coldloop_rig.results.columns import EVENTS, FILES, FORMAT, STATION, TRACE, files_of, numbers_of
 from coldloop_rig.results.folders import prepare_folder, writing
 

@@ -30,7 +30,7 @@ from coldloop.process.model_file import read_document
 from coldloop.process.settings import SHIPPED_MODELS
 from coldloop.registers.plant import PlantSample
 from coldloop.session import TimeMode
-from coldloop.text_file import file_digest, held_file, read_bytes
+from coldloop.text import file_digest, held_file, read_bytes
 from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.qp.linear_algebra import real_of
 from coldloop_optimizer_plc.settings import AdaptiveSettings, ProgramSettings, RuleName

@@ -14,8 +14,7 @@ from coldloop.registers.declaration import Block, Role
 from coldloop.registers.safety import AlarmCommand, AlarmKind, AlarmState, LeaseEvent, WatchdogTime
 from coldloop.safety.writers import InputSequence, WriterLease
 from coldloop.service.journal import JournalPublication, alarm_word, log_event
-from coldloop.session import TimeBase
-from coldloop.session.clock import LatenessRecord
+from coldloop.session import LatenessRecord, TimeBase
 from coldloop_control_plc.plant_link import PlantLink
 from coldloop_control_plc.program import ControlProgram
 from coldloop_control_plc.rack import Skew

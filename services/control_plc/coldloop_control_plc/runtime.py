@@ -27,9 +27,8 @@ from coldloop.registers.common import EventKind, SessionPace, publish_configurat
 from coldloop.registers.control_plc import ControlSession
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import AlarmKind, WatchdogTime
-from coldloop.service.metrics import MetricsServer
+from coldloop.service.monitoring import MetricsServer, Telemetry
 from coldloop.service.start import SERVING, dropped
-from coldloop.service.telemetry import Telemetry
 from coldloop.session import TimeBase
 from coldloop_control_plc.clients import Clients, ControlPublication
 from coldloop_control_plc.plant_link import FROZEN_S, FROZEN_TICKS, PlantLink

@@ -13,7 +13,7 @@ from coldloop.process.settings import InputLimits, ProcessSettings, RootSettings
 from coldloop.process.updating_periods import whole_ticks
 from coldloop.registers.codec import WordOrder
 from coldloop.safety.retained import RetainSettings
-from coldloop.service.settings import MetricsSettings, TelemetrySettings
+from coldloop.service.monitoring import MetricsSettings, TelemetrySettings
 from coldloop.session import SessionSettings
 from coldloop_control_plc.alarms import AlarmSettings
 from coldloop_control_plc.sensors import SensorCheckSettings

@@ -1,29 +1,35 @@
-"""Documents for the page and other programs: JSON (`docs/operator-page.md` describes every field), and metrics."""
+"""Documents for the page and other programs: JSON (`docs/operator-page.md` describes every field), and metrics.
 
-import json
+Signals are derived from the register declarations: a new one appears by itself. A signal is a register of a block with
+one row; its name is `service.block.register`, such as `plant.measurement.y.T5`.
+"""
+
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
+from functools import cache
 from itertools import islice, pairwise
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from prometheus_client.core import Metric
 
 from coldloop import __version__
 from coldloop.process.declaration import Process
+from coldloop.process.sections import Output, Range
 from coldloop.registers import optimizer_plc
 from coldloop.registers.codec import blank
 from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Mode
+from coldloop.registers.declaration import Kind, RegisterMap
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, Prediction
 from coldloop.registers.plant import StationAlarm, StationMode, StationStatus
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmPriority, AlarmState
 from coldloop.service.journal import alarm_cause, alarm_word, flag_words
-from coldloop.service.metrics import block_families, build_family, gauge
+from coldloop.service.monitoring import block_families, build_family, gauge
+from coldloop.text import finite_json
+from coldloop_hmi import process_image as image
 from coldloop_hmi.explanation import deviation, explain, sentence
-from coldloop_hmi.process_image import Gap, JournalEntry, ModeInterval, Model, rounded, thin
-from coldloop_hmi.signals import RAW, Quality, process_document, qualities, signals_of
 
 KIND: Final = "plant.kind"
 REFRIGERATOR: Final = "refrigerator"
@@ -57,7 +63,135 @@ QUANTITIES: Final[Mapping[str, Callable[[Optimization, float], float]]] = {
 }
 
 
-def plant_document(model: Model) -> dict[str, Any]:
+BESIDE_BAND: Final = 1.5
+"""Margin of a bar beside a band, on each side, over the width of the band."""
+BESIDE_BOUNDS: Final = 0.125
+"""The same of the bounds of an input."""
+READABLE: Final = 1e-3
+"""Share of a range that is worth a digit."""
+DECIMALS: Final = {
+    "%": 2, "K": 3, "bar": 3, "W": 1, "s": 3, "ms": 2, "ppm": 1, "Pa": 0, "m3": 5, "g/s": 2, "kg": 2, "kW": 1,
+}  # fmt: skip
+"""Digits after the point: of PLCs, links, states and a refrigerator's station. Those of the process come first."""
+DIGITS: Final = 7
+TICKS: Final = {"Tick": "time", "Ticks": "ticks"}
+"""Quantity that a register counts, by the first word of its description."""
+RAW = ("plant.measurement.y.", "control_plc.update.y.")  # have a bad reading as it is; elsewhere it is replaced
+STATES = ("plant.measurement.x.", "control_plc.update.x.")  # are of the simulation: no sensor measures them
+
+
+def qualities(doubts: image.Doubts, stale: Iterable[str], process: Process) -> Mapping[str, image.Quality]:
+    """Return the quality of all signals that are not good, by name; a name that ends with a dot is a beginning.
+
+    `stale` names what is not current.
+    """
+    found = [(name, image.Quality.STALE) for name in stale]
+    for name, quality in image.doubted(doubts, process).items():
+        found.append((f"control_plc.process.y.{name}", quality))
+        found += [(f"{raw}{name}", image.Quality.BAD if quality is image.Quality.HELD else quality) for raw in RAW]
+    found += [(name, image.Quality.SIMULATED) for name in STATES]
+    return dict(sorted(found, key=lambda one: list(image.Quality).index(one[1])))
+
+
+def process_document(process: Process) -> dict[str, Any]:
+    """Return the process as the page gets it: bars of signals with their ends, words and unit of the load, if any."""
+    load = process.load
+    shown = {"word": load.title, "unit": load.unit, "span": load.span, "bar": load.bar or load.span}
+    return {
+        "name": process.name,
+        "mimic": process.shipped_mimic or ("mimic.svg" if process.drawing else None),
+        "sample_s": process.sampling_period_s,
+        "inputs": [
+            {"name": one.name, "label": one.name[: len(one.tag)], "register": one.tag, "unit": one.unit,
+             "bounds": [one.low, one.high], "bar": one.bar or _widened(one.low, one.high, BESIDE_BOUNDS)}
+            for one in process.inputs
+        ],
+        "controlled": [_output(one) for one in process.banded],
+        "measured": [_output(one) for one in process.outputs if one.edges is None and not one.quantity],
+        "load": shown if process.has_load else None,
+        "disturbances": [_output(one) for one in process.measured_disturbances],
+    }  # fmt: skip
+
+
+def _output(one: Output) -> dict[str, Any]:
+    band = one.kept
+    loop = band.loop.input if band and band.loop else None
+    dead_band = band.dead_band if band else 0.0
+    bar = one.bar or one.range
+    if one.edges is not None and one.bar is None:  # about its band, within the range of its sensor
+        low, high = _widened(*one.edges, BESIDE_BAND)
+        bar = max(low, one.range[0]), min(high, one.range[1])
+    return {"name": one.name, "unit": one.unit, "bar": bar, "loop": loop, "dead_band": dead_band}
+
+
+def _widened(low: float, high: float, share: float) -> Range:
+    return low - share * (high - low), high + share * (high - low)
+
+
+def decimals_by_unit(process: Process) -> dict[str, int]:
+    """Return how many digits after the point values with the units of the process are shown with.
+
+    The last digit is the noise of an output, and a tenth of the largest move of an input in a sampling period.
+    """
+    low, high = process.load.span
+    steps = [(process.load.unit, READABLE * (high - low)), *((one.unit, one.rate / 10) for one in process.inputs)]
+    steps += [(one.unit, one.noise) for one in process.outputs]
+    found: dict[str, int] = {}
+    for unit, step in steps:
+        if unit not in process.decimals:
+            found[unit] = max(found.get(unit, 0), math.ceil(-math.log10(step)))
+    return found | dict(process.decimals)
+
+
+class Signal(NamedTuple):
+    """One value that the page can show."""
+
+    name: str
+    block: str
+    label: str
+    unit: str
+    decimals: int | None
+    """Digits after the point; None for whole numbers, and for those with `digits`."""
+    digits: int | None
+    """Significant digits of a number that has no unit, or one without a scale."""
+    counts: str
+    """`time` of a tick, `ticks` of a number of ticks: shown as plant time; empty for other signals."""
+    words: dict[int, str]
+    """Meaning of the numbers of an enumeration; empty for other signals."""
+    description: str
+    address: int
+    writer: str
+
+
+@cache
+def signals_of(register_map: RegisterMap) -> tuple[Signal, ...]:
+    """Return the signals of a service, in the order of their registers."""
+    found: list[Signal] = []
+    digits_of = DECIMALS | decimals_by_unit(register_map.process)
+    for block in image.shown_blocks(register_map):
+        texts, seen = {name for name, one in block.fields.items() if one.is_text}, set[str]()
+        for register in block.registers():
+            field = register.name.partition(".")[0]
+            label = field if field in texts else register.name
+            if label in seen:
+                continue
+            seen.add(label)
+            floating = register.kind is Kind.F32
+            has_scale = register.unit or label.startswith(("u.", "y."))  # others may be of any size
+            decimals = digits_of.get(register.unit) if floating and has_scale else None
+            found.append(
+                Signal(
+                    name=f"{register_map.service}.{block.name}.{label}", block=block.name, label=label,
+                    unit=register.unit, decimals=decimals, digits=DIGITS if floating and decimals is None else None,
+                    counts=TICKS.get(register.description.partition(" ")[0], ""),
+                    words={one.value: one.text for one in register.meanings}, description=register.description,
+                    address=register.address, writer=register.writer.value if register.writer else "",
+                )
+            )  # fmt: skip
+    return tuple(found)
+
+
+def plant_document(model: image.Model) -> dict[str, Any]:
     """Return the kind of the plant as it reports it; of a refrigerator also the state of its station."""
     kind = model.configuration.get(KIND, "")
     if kind != REFRIGERATOR:
@@ -71,7 +205,7 @@ def plant_document(model: Model) -> dict[str, Any]:
     }
 
 
-def _band(model: Model, *keys: str | None) -> list[float | None]:
+def _band(model: image.Model, *keys: str | None) -> list[float | None]:
     values = (model.configuration.get(f"{ALARMS}{key}") if key else None for key in keys)
     return [float(value) if isinstance(value, int | float) else None for value in values]
 
@@ -81,32 +215,17 @@ Document = dict[str, Any]
 
 def encoded(document: Document) -> bytes:
     """Return a document as JSON; numbers that are not finite are null."""
-    try:
-        return _json(document)
-    except ValueError:
-        return _json(_finite_parts(document))
-
-
-def _json(document: object) -> bytes:
-    return json.dumps(document, ensure_ascii=False, separators=(",", ":"), default=str, allow_nan=False).encode()
-
-
-def _finite_parts(part: object) -> object:
-    if isinstance(part, dict):
-        return {key: _finite_parts(value) for key, value in part.items()}
-    if isinstance(part, list | tuple):
-        return [_finite_parts(value) for value in part]
-    return None if isinstance(part, float) and not math.isfinite(part) else part
+    return finite_json(document).encode()
 
 
 def finite(value: float | str) -> float | int | str | None:
     """Return a value that JSON has."""
     if isinstance(value, float):
-        return rounded(value) if math.isfinite(value) else None
+        return image.rounded(value) if math.isfinite(value) else None
     return value
 
 
-def catalog(model: Model, *, training: bool, replay: bool) -> Document:
+def catalog(model: image.Model, *, training: bool, replay: bool) -> Document:
     """Return what the page is made from: signals, alarms, modes."""
     process = model.process
     return {
@@ -145,7 +264,7 @@ def alarm_document(kind: int, alarm: Alarm, process: Process) -> Document:
     }
 
 
-def alarms_document(model: Model) -> list[Document]:
+def alarms_document(model: image.Model) -> list[Document]:
     """Return all alarms: those that are active first, of these the unacknowledged ones, then by priority and age."""
     rank: dict[int, int] = {AlarmState.UNACKNOWLEDGED: 0, AlarmState.ACKNOWLEDGED: 1, AlarmState.RETURNED: 2}
     rows = sorted(
@@ -154,7 +273,7 @@ def alarms_document(model: Model) -> list[Document]:
     return [alarm_document(kind, alarm, model.process) for kind, alarm in rows]
 
 
-def event_document(entry: JournalEntry, tick_s: float) -> Document:
+def event_document(entry: image.JournalEntry, tick_s: float) -> Document:
     """Return one event in words."""
     text = entry.text
     return {
@@ -164,7 +283,7 @@ def event_document(entry: JournalEntry, tick_s: float) -> Document:
     }  # fmt: skip
 
 
-def services_document(model: Model) -> Document:
+def services_document(model: image.Model) -> Document:
     """Return whether each service is live, and the age of what is known of it."""
     found = {}
     for service, source in model.sources.items():
@@ -178,7 +297,7 @@ def services_document(model: Model) -> Document:
     return found
 
 
-def state_document(model: Model, changed: Iterable[str] | None = None) -> Document:
+def state_document(model: image.Model, changed: Iterable[str] | None = None) -> Document:
     """Return the state of everything that is shown; of signals only those that have changed, if these are named."""
     process = model.process
     names = model.values if changed is None else [name for name in changed if name in model.values]
@@ -207,7 +326,7 @@ def state_document(model: Model, changed: Iterable[str] | None = None) -> Docume
     return document
 
 
-def explanation_document(model: Model, number: int | None, at_tick: int | None = None) -> Document | None:
+def explanation_document(model: image.Model, number: int | None, at_tick: int | None = None) -> Document | None:
     """Return the explanation of the period of an update: by number, at a tick, or the last one; None without it."""
     updates = model.updates
     place = len(updates) - 1
@@ -246,14 +365,14 @@ def prediction_document(prediction: Prediction, process: Process) -> Document:
     return {
         "update": prediction.update,
         "time": [start + sample * sample_s for sample in optimizer_plc.PREDICTED_SAMPLES],
-        **{one.name: list(map(rounded, ahead)) for one, ahead in banded},
+        **{one.name: list(map(image.rounded, ahead)) for one, ahead in banded},
         "input_time": [start + sample * sample_s for sample in optimizer_plc.INPUT_SAMPLES],
-        **{name: [rounded(value) for value in one] for name, one in zip(names, inputs, strict=True)},
+        **{name: [image.rounded(value) for value in one] for name, one in zip(names, inputs, strict=True)},
     }
 
 
 def trend_document(
-    model: Model, names: Sequence[str], start: int, end: int, points: int, *, is_brief: bool = False
+    model: image.Model, names: Sequence[str], start: int, end: int, points: int, *, is_brief: bool = False
 ) -> Document:
     """Return everything that is drawn between two ticks; in brief without predictions, and of updates tau_u only."""
     process, tick_s = model.process, model.process.tick_s
@@ -284,7 +403,7 @@ def trend_document(
 
 
 def updates_document(
-    updates: Sequence[Optimization], modes: Sequence[ModeInterval], gaps: Sequence[Gap], points: int,
+    updates: Sequence[Optimization], modes: Sequence[image.ModeInterval], gaps: Sequence[image.Gap], points: int,
     quantities: Sequence[str], tick_s: float,
 ) -> Document:  # fmt: skip
     """Return times, updating periods and costs of updates as far as they were in force: while MPC was active.
@@ -308,7 +427,7 @@ def updates_document(
             if after.update != before.update + 1
             and any(before.tick < gap.end and gap.start < after.tick for gap in gaps)
         ]
-        times, thinned = thin([one.tick * tick_s for one in inside], columns, points, tick_s, lost)
+        times, thinned = image.thin([one.tick * tick_s for one in inside], columns, points, tick_s, lost)
         found["time"] += [*times, last * tick_s, (last + 1) * tick_s]
         for name, values in thinned.items():
             found[name] += [*values, values[-1] if name in PERIODS else None, None]
@@ -319,7 +438,7 @@ def _ranges(names: Sequence[str], low: Sequence[float], high: Sequence[float]) -
     return {name: list(ends) for name, *ends in zip(names, low, high, strict=True)}
 
 
-def _marks(model: Model, start: int, end: int) -> Document:
+def _marks(model: image.Model, start: int, end: int) -> Document:
     """Return the marks between two ticks, and since when they are all, s; None if there are no earlier ones."""
     tick_s = model.process.tick_s
     begun = max((e.utc for e in model.events if e.service == "plant" and e.text.kind == BEGUN), default="")
@@ -335,7 +454,7 @@ def _marks(model: Model, start: int, end: int) -> Document:
     return {"marks": marks, "marks_since_s": since_s}
 
 
-def page_families(model: Model, browsers: int) -> Iterator[Metric]:
+def page_families(model: image.Model, browsers: int) -> Iterator[Metric]:
     """Yield everything; of a service that is silent only that it is."""
     yield build_family()
     live = [service for service in model.maps if model.is_live(service)]
@@ -359,7 +478,7 @@ def page_families(model: Model, browsers: int) -> Iterator[Metric]:
             yield gauge(f"coldloop_update_{name}", f"Last update: {field.description}{unit}", value)
 
 
-def _qualities(model: Model, live: list[str]) -> Metric:
+def _qualities(model: image.Model, live: list[str]) -> Metric:
     """Return the quality of the outputs, wherever they are read, and of the last update, as page and API have them."""
     found, places = qualities(model.doubts, model.stale_prefixes(), model.process), ("control_plc.process.y.", *RAW)
     names = [
@@ -370,12 +489,12 @@ def _qualities(model: Model, live: list[str]) -> Metric:
     worst = dict.fromkeys(names, 0)
     for entry, quality in found.items():  # the worst is the last
         concerned = [name for name in names if name == entry or (entry[-1] == "." and name.startswith(entry))]
-        worst.update(dict.fromkeys(concerned, list(Quality).index(quality)))
-    description = ", ".join(f"{number} {quality}" for number, quality in enumerate(Quality))
+        worst.update(dict.fromkeys(concerned, list(image.Quality).index(quality)))
+    description = ", ".join(f"{number} {quality}" for number, quality in enumerate(image.Quality))
     return gauge("coldloop_quality", f"Quality of a value: {description}", worst, label="signal")
 
 
-def _alarms(model: Model) -> Iterator[Metric]:
+def _alarms(model: image.Model) -> Iterator[Metric]:
     rows = [(alarm_word(kind, model.process), alarm) for kind, alarm in enumerate(model.alarms)]
     for name, description, values in (
         ("coldloop_alarm_active", "1 while the condition of an alarm holds", [row.active for _, row in rows]),

@@ -10,11 +10,11 @@ from enum import StrEnum
 from functools import cache
 from typing import Final, NamedTuple
 
-from coldloop.number_text import number_text
 from coldloop.process.declaration import Process
 from coldloop.process.updating_periods import ComputingTimes
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, UpdatingRuleKind, UpdatingRuleStatus
+from coldloop.text import number_text
 
 RESOLUTION: Final = 2.0**-22
 """A change of E that is smaller is lost in the single precision of the registers."""

@@ -13,13 +13,12 @@ from aiohttp import web
 
 from coldloop.errors import LinkError, UsageError
 from coldloop.modbus.settings import Endpoint
-from coldloop.number_text import value_text
 from coldloop.operating import commands, execution
-from coldloop.parsing import parsed_json
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Mode, Operator, OperatorMode
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import AlarmAction
+from coldloop.text import parsed_json, value_text
 from coldloop_hmi.documents import encoded
 from coldloop_hmi.guard import Guard, compressed_answer, cookie_name, refusal
 from coldloop_hmi.process_image import Model

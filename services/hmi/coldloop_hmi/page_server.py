@@ -17,7 +17,7 @@ from aiohttp.log import server_logger
 from coldloop.errors import ConfigurationError, PortInUseError
 from coldloop.modbus.connection import RefusalLog
 from coldloop.modbus.tls import TlsListener
-from coldloop.service.metrics import CONTENT_TYPE, exposition
+from coldloop.service.monitoring import CONTENT_TYPE, exposition
 from coldloop_hmi import documents
 from coldloop_hmi import guard as guards
 from coldloop_hmi.documents import encoded

@@ -9,20 +9,22 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any, Final, NamedTuple, TypeVar, cast
 
+from coldloop.process.cold_box import STATION_SIGNAL_NAMES
 from coldloop.process.declaration import Process
-from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers import maps_of
-from coldloop.registers.codec import blank
+from coldloop.registers.codec import blank, from_words
 from coldloop.registers.common import Event, Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Mode, Plan, ProcessNow
+from coldloop.registers.declaration import Block, RegisterMap
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Prediction, UpdatingRuleStatus
 from coldloop.registers.plant import StationStatus
 from coldloop.registers.safety import Alarm
 from coldloop.service.journal import EventText, describe, utc_text
-from coldloop_hmi.signals import SOUND, Doubts, Quality, doubted, values_of
 
 STATION_NAMES: Final = ("P12", "P11")
 """Signals of a refrigerator's station that are kept: high and low pressure."""
@@ -37,6 +39,61 @@ STALE_S: Final = 1.5
 """A value whose source has been silent for this long is crossed out."""
 STEP_BACK: Final = 20
 """A tick that goes back by more than this many begins another stretch of time."""
+
+
+class Quality(StrEnum):
+    """Quality of a value, from the best to the worst."""
+
+    GOOD = "good"
+    SUSPECT = "suspect"
+    """The optimiser does without it: prediction and other readings contradict it."""
+    HELD = "held"
+    """The last good value in the place of a bad one."""
+    BAD = "bad"
+    """Its sensor is bad, by the fail-safe ladder."""
+    STALE = "stale"
+    """Its source is silent, or does not move."""
+    SIMULATED = "simulated"
+    """Not measured: a state of the simulation, or a fault that was put into the sensor for training."""
+
+
+class Doubts(NamedTuple):
+    """Outputs whose readings are in doubt; bit i is output i."""
+
+    suspect: int = 0
+    held: int = 0
+    bad: int = 0
+    simulated: int = 0
+
+
+SOUND = Doubts()
+
+
+@lru_cache(256)  # those of successive samples are the same
+def doubted(doubts: Doubts, process: Process) -> dict[str, Quality]:
+    """Return the outputs in doubt, and the worst quality of each."""
+    every = zip((Quality.SUSPECT, Quality.HELD, Quality.BAD, Quality.SIMULATED), doubts, strict=True)
+    return {name: quality for quality, bits in every for i, name in enumerate(process.output_names) if bits >> i & 1}
+
+
+def shown_blocks(register_map: RegisterMap) -> list[Block]:
+    """Return the blocks that the page shows value by value: those with one row that mean something."""
+    return [block for block in register_map.shown if block.rows == 1]
+
+
+def values_of(service: str, block: Block, record: tuple[Any, ...]) -> dict[str, float | int | str]:
+    """Return the values of a record by the names of their signals; texts are decoded."""
+    values: dict[str, float | int | str] = {}
+    prefix = f"{service}.{block.name}."
+    for (name, declared), value in zip(block.fields.items(), record, strict=True):
+        if declared.is_text:
+            values[prefix + name] = from_words(value)
+        elif declared.elements:
+            before = prefix if declared.each else f"{prefix}{name}."
+            values.update((before + element, one) for element, one in zip(declared.elements, value, strict=True))
+        else:
+            values[prefix + name] = value
+    return values
 
 
 class ModeInterval(NamedTuple):

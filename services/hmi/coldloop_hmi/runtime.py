@@ -20,8 +20,8 @@ from coldloop.errors import DamagedAnswerError, LinkError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.settings import Endpoint
 from coldloop.operating.observer import JournalReader, UpdateReader, read_alarms
+from coldloop.process.cold_box import STATION_VALVE_NAMES
 from coldloop.process.declaration import Process
-from coldloop.process.station import STATION_VALVE_NAMES
 from coldloop.registers import Maps
 from coldloop.registers.common import (
     ConfigurationDigest,
@@ -46,9 +46,8 @@ from coldloop_hmi.documents import KIND, REFRIGERATOR
 from coldloop_hmi.guard import refusal
 from coldloop_hmi.operator_desk import OperatorDesk
 from coldloop_hmi.page_server import PageServer, PageSite
-from coldloop_hmi.process_image import JournalEntry, Model
+from coldloop_hmi.process_image import SOUND, Doubts, JournalEntry, Model, shown_blocks
 from coldloop_hmi.settings import HmiSection, HmiSettings
-from coldloop_hmi.signals import SOUND, Doubts, shown_blocks
 
 log = logging.getLogger("coldloop.hmi")
 

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from coldloop.errors import ColdloopError, ConfigurationError, UsageError
-from coldloop.text_file import read_text
+from coldloop.text import read_text
 
 log = logging.getLogger("coldloop.hmi.audit")
 

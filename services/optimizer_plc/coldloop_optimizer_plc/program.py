@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from coldloop.errors import ConfigurationError
+from coldloop.kernels.cache import kernels_of
 from coldloop.kernels.compiled import entry_of
-from coldloop.kernels.first_use import kernels_of
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.settings import InputLimits

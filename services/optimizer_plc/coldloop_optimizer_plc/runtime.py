@@ -29,9 +29,8 @@ from coldloop.registers.common import publish_configuration
 from coldloop.registers.control_plc import AwaitUpdate, Plan, Update, Verdict
 from coldloop.registers.optimizer_plc import ControlLinkState, ModelDeviation
 from coldloop.safety.writers import InputSequence
-from coldloop.service.metrics import MetricsServer
+from coldloop.service.monitoring import MetricsServer, Telemetry
 from coldloop.service.start import SERVING
-from coldloop.service.telemetry import Telemetry
 from coldloop.session import TimeBase, TimeMode
 from coldloop_optimizer_plc.control_client import ControlClient
 from coldloop_optimizer_plc.program import OptimizerProgram

@@ -24,7 +24,7 @@ from coldloop.process.settings import InputLimits, ProcessSettings, RootSettings
 from coldloop.process.updating_periods import SHORTEST_TICKS, TOLERANCE, whole_ticks
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import SEQUENCE_ROWS
-from coldloop.service.settings import MetricsSettings, TelemetrySettings
+from coldloop.service.monitoring import MetricsSettings, TelemetrySettings
 from coldloop.session import SessionSettings
 from coldloop_optimizer_plc import computing_settings as computing
 from coldloop_optimizer_plc.computing_settings import Arithmetic, EstimatorKind

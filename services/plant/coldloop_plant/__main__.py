@@ -2,7 +2,7 @@
 
 import sys
 
-from coldloop.kernels.first_use import load_numba_alone
+from coldloop.kernels.cache import load_numba_alone
 from coldloop.service.start import in_one_line, main
 
 

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from coldloop.config import explained
 from coldloop.errors import ConfigurationError, ModelFileError
-from coldloop.kernels.first_use import kernels_of
+from coldloop.kernels.cache import kernels_of
 from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.model_file import COLD_BOX, ModelHeader, read_header

@@ -20,15 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import ColdloopError, ModelFileError, foreign
+from coldloop.kernels.cache import kernels_of
 from coldloop.kernels.compiled import inlined, kernel
-from coldloop.kernels.first_use import kernels_of
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import ModelHeader
 from coldloop.process.sections import Lag
-from coldloop.text_file import file_digest
+from coldloop.text import file_digest
 from coldloop_plant.numeric import RealArray
 from coldloop_plant.program import HeatLoad, MakePlant, MeasurementNoise, PlantProgram
 

@@ -12,10 +12,9 @@ from typing import Annotated, Any, Final, NamedTuple, Self
 from pydantic import BaseModel, Field, model_validator
 
 from coldloop.kernels.single_precision import single
-from coldloop.process.cold_box import COLD_BOX
+from coldloop.process.cold_box import COLD_BOX, STATION_SIGNAL_NAMES, ModelRange
 from coldloop.process.declaration import LAST_TICK, Process
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.station import STATION_SIGNAL_NAMES, ModelRange
 from coldloop.registers import plant as registers
 from coldloop.registers.bank import Caller
 from coldloop.registers.common import EventKind, pace_subject

@@ -38,11 +38,9 @@ from coldloop.registers.safety import LeaseEvent, LeaseStatus, WatchdogStatus, W
 from coldloop.safety.retained import RetainedFile, RetainedStateError
 from coldloop.safety.writers import WriterLease
 from coldloop.service.journal import Journal, JournalPublication, log_event
-from coldloop.service.metrics import MetricsServer
+from coldloop.service.monitoring import MetricsServer, Telemetry
 from coldloop.service.start import SERVING
-from coldloop.service.telemetry import Telemetry
-from coldloop.session import TimeBase, TimeMode
-from coldloop.session.clock import Pacer, Schedule
+from coldloop.session import Pacer, Schedule, TimeBase, TimeMode
 from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.load import find_load
 from coldloop_plant.program import MakePlant

@@ -3,7 +3,7 @@
 Kernels are compiled without fast-math and without contraction of multiply-add, loops run in the order they are
 written: the same inputs give the same bits in every process and on every processor.
 
-A compiled kernel is a file in the cache (`coldloop.kernels.cache_folder`) under a digest of all that decides its code:
+A compiled kernel is a file in the cache (`coldloop.kernels.cache`) under a digest of all that decides its code:
 the kernel, the kernels and the data that it reaches (`coldloop.kernels.reach`), the types of its arguments, the
 versions of numba, LLVM, numpy and Python, and the processor. So an edit compiles the kernels that reach what was edited
 and no others, and checkouts of the same sources share their kernels. What takes long to compute is kept there, too
@@ -30,8 +30,7 @@ from numba.core.errors import NumbaWarning
 from numba.core.serialize import dumps
 from numpy.typing import NDArray
 
-from coldloop.kernels.cache_folder import CacheFolder, find_cache_folder
-from coldloop.kernels.first_use import needs_compiling
+from coldloop.kernels.cache import CacheFolder, find_cache_folder, needs_compiling
 from coldloop.kernels.reach import digest, label
 
 P = ParamSpec("P")

@@ -40,8 +40,7 @@ Key = tuple[int, bool]
 
 
 NOT_DECISIVE: Final = frozenset({
-    "coldloop.kernels.cache_folder", "coldloop.kernels.compiled", "coldloop.kernels.first_use",
-    "coldloop.kernels.reach", "coldloop.service.start",
+    "coldloop.kernels.cache", "coldloop.kernels.compiled", "coldloop.kernels.reach", "coldloop.service.start",
 })  # fmt: skip
 """Modules that decide where results are kept and what is logged, and not what results are."""
 

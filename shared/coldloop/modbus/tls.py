@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat,
 from coldloop.errors import ConfigurationError, UsageError
 from coldloop.modbus.connection import RefusalLog
 from coldloop.modbus.settings import TlsSettings
-from coldloop.text_file import read_bytes
+from coldloop.text import read_bytes
 
 CRL_BEGIN: Final = b"-----BEGIN X509 CRL-----"
 DAY_S: Final = 86400.0

@@ -5,13 +5,13 @@ from typing import Annotated, Final, Literal
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
 
 from coldloop.errors import LoadFileError, UsageError
-from coldloop.number_text import value_text
 from coldloop.process.declaration import LAST_TICK, Process
 from coldloop.process.load_profile import LoadProfile, load_profile_of
 from coldloop.process.settings import ProcessSettings, one_of, settings_of, settings_process, within
 from coldloop.registers.plant import SensorFaultKind
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, alarms_of
 from coldloop.service.journal import alarm_word
+from coldloop.text import value_text
 
 LONGEST_FILE: Final = 1_000_000
 """Characters of a load file."""

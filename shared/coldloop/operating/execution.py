@@ -10,7 +10,6 @@ from typing import Any, Final, TypeVar
 from coldloop.errors import BUSY, LinkError, PeerUnreachableError, RequestRefusedError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.settings import Endpoint
-from coldloop.number_text import value_text
 from coldloop.operating import commands
 from coldloop.operating.commands import Command, TreatAlarm, clock_text
 from coldloop.operating.observer import read_alarms
@@ -32,6 +31,7 @@ from coldloop.registers.plant import (
 )
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmState, alarms_of
 from coldloop.service.journal import alarm_word
+from coldloop.text import value_text
 
 R = TypeVar("R")
 LAST_TICK: Final = 2**32 - 1

@@ -13,10 +13,9 @@ from typing import Any, Final
 from pydantic import ValidationError
 
 from coldloop.errors import ModelFileError
-from coldloop.parsing import parsed_json
 from coldloop.process.cold_box import COLD_BOX as THE_COLD_BOX
 from coldloop.process.declaration import Process
-from coldloop.text_file import read_bytes, whole_text
+from coldloop.text import parsed_json, read_bytes, whole_text
 
 FORMAT = 1
 REMEDY = "make a new one with `python -m coldloop_plant.cold_box.model FILE`"

@@ -8,8 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.station import STATION_SIGNAL_NAMES, ModelRange
+from coldloop.process.cold_box import COLD_BOX, STATION_SIGNAL_NAMES, ModelRange
 
 SATURATION_BAR: Final = (0.3, 2.25)
 """Pressures of bath and return, bar; helium's critical point is at 2.28 bar."""

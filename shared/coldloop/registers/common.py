@@ -10,11 +10,11 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Final, NamedTuple
 
-from coldloop.parsing import parsed_json
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.codec import from_words, to_words
 from coldloop.registers.declaration import Block, Role, Worded, f32, in_ticks, text, u16, u32
 from coldloop.session import TimeBase
+from coldloop.text import parsed_json
 
 MAGIC: Final = 123.456
 

@@ -6,8 +6,8 @@ from functools import cache
 from itertools import accumulate, pairwise
 from typing import Annotated, Final, NamedTuple
 
+from coldloop.process.cold_box import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, STATION_VALVE_NAMES
 from coldloop.process.declaration import LAST_TICK, Process
-from coldloop.process.station import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, STATION_VALVE_NAMES
 from coldloop.registers import declaration as reg
 from coldloop.registers.common import IDENTITY_BLOCK, LAST_BLOCKS, STATISTICS_BLOCK, SessionPace, TimeBaseKind
 from coldloop.registers.declaration import Block, RegisterMap, Role, Worded

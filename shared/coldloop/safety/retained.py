@@ -20,8 +20,7 @@ from typing import Any, Final
 from pydantic import BaseModel
 
 from coldloop.errors import ColdloopError
-from coldloop.parsing import parsed_json
-from coldloop.text_file import replace_file
+from coldloop.text import parsed_json, replace_file
 
 MAGIC = "coldloop-retained"
 MOST_BYTES: Final = 2**26

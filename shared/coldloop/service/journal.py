@@ -17,8 +17,8 @@ from functools import cache
 from itertools import islice
 from typing import Final, NamedTuple
 
+from coldloop.process.cold_box import ModelRange
 from coldloop.process.declaration import Process
-from coldloop.process.station import ModelRange
 from coldloop.registers import common, control_plc
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.codec import from_words, to_words

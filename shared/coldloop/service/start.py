@@ -26,7 +26,7 @@ from pydantic import BaseModel
 from coldloop import __version__
 from coldloop.config import load_configuration
 from coldloop.errors import ColdloopError
-from coldloop.kernels.first_use import announce_with
+from coldloop.kernels.cache import announce_with
 from coldloop.service.command_line import add_configuration_options
 
 CAPACITY: Final = 1000

@@ -16,11 +16,11 @@ import numpy as np
 import scipy
 
 from coldloop.config import load_configuration
+from coldloop.process.cold_box import STATION_SIGNAL_NAMES
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import read_header
-from coldloop.process.station import STATION_SIGNAL_NAMES
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop_plant.load import find_load
 from coldloop_plant.program import PlantProgram

@@ -271,8 +271,7 @@ def _refuse_two_places(options: argparse.Namespace) -> None:
 def _tls_site(folder: Path) -> dict[str, tuple[object, str]]:
     """Return the settings of a folder of `coldloop certificates`, and where they come from."""
     from coldloop.config import flattened
-    from coldloop.parsing import parsed_toml
-    from coldloop.text_file import read_text
+    from coldloop.text import parsed_toml, read_text
 
     file = folder / "tls.toml"
     remedy = f"make it with `coldloop certificates --out {folder}`"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import UsageError
 from coldloop.service.command_line import add_configuration_options
-from coldloop.text_file import require_regular_file, whole_text
+from coldloop.text import require_regular_file, whole_text
 from coldloop_rig.cli.commands.options import Command, check_load, configuration, fixed_updating_period, positive_count
 from coldloop_rig.text_tables import aligned, fitted, width
 

@@ -41,7 +41,7 @@ def execute_run(options: argparse.Namespace) -> int:
 
     with FigureProcess(options.figures) as figure:
         if options.in_process:
-            from coldloop.kernels.first_use import load_numba_alone
+            from coldloop.kernels.cache import load_numba_alone
 
             figure.start()  # a short run would wait for matplotlib
             load_numba_alone()
@@ -216,7 +216,7 @@ def _declare_report(parser: argparse.ArgumentParser) -> None:
 
 def execute_report(options: argparse.Namespace) -> int:
     """One HTML page of a recorded run, with interactive plots, alarms and settings."""
-    from coldloop.text_file import require_regular_file, whole_text
+    from coldloop.text import require_regular_file, whole_text
     from coldloop_rig.figures.plot import run_page
     from coldloop_rig.results.folders import writing
 

@@ -1,4 +1,4 @@
-// The quality of a value: one word, the worst that applies, as `coldloop_hmi/signals.py` has it; and how it is shown.
+// The quality of a value: one word, the worst that applies, as `coldloop_hmi/process_image.py` has it; and how it is shown.
 /** @type {Quality[]} */
 export const QUALITIES = ["good", "suspect", "held", "bad", "stale", "simulated"]; // the worst last
 /** @type {Record<string, string>} */

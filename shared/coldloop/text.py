@@ -1,19 +1,28 @@
-"""Text files of users, files in folders of others, and files that appear whole or not at all.
+"""Texts: files of users, and files that appear whole or not at all; JSON and TOML from outside; numbers in words.
 
 A text is UTF-8, with a byte order mark or without, or UTF-16 with one. Only a regular file is replaced.
+
+How deep a JSON or TOML text the standard library's parsers can read depends on the version of Python, and what they
+return can be too deep for code that descends into it. All that is read from a file, a peer or a user is therefore read
+here, and has at most `MOST_LEVELS` levels.
 """
 
 import codecs
 import errno
 import hashlib
+import json
+import math
 import os
 import socket
 import stat
 import threading
-from collections.abc import Callable
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, TypeVar
 
 from coldloop.errors import ColdloopError, UsageError
 
@@ -185,3 +194,126 @@ def _give_name(path: Path, write: Callable[[Path], object], draft: Path | None =
     finally:
         with suppress(OSError):  # half a draft would only fill the disk further
             draft.unlink(missing_ok=True)
+
+
+T = TypeVar("T")
+MOST_LEVELS: Final = 32
+"""Objects (tables) and arrays within one another, at most."""
+TOO_DEEP: Final = f"nested too deeply: more than {MOST_LEVELS} levels"
+TOO_MANY_DIGITS: Final = "a number has too many digits"
+
+
+def parsed_json(text: str | bytes, *, parse_constant: Callable[[str], object] | None = None) -> Any:  # noqa: ANN401
+    """Return what a JSON text holds.
+
+    Args:
+        text: The text; bytes are UTF-8, UTF-16 or UTF-32.
+        parse_constant: What `NaN`, `Infinity` and `-Infinity` are read by; floats by default.
+
+    Raises:
+        ValueError: It is not JSON, or beyond what can be read: a number of thousands of digits, too many levels.
+    """
+    try:
+        return _bounded(json.loads(text, parse_constant=parse_constant))  # noqa: TID251
+    except RecursionError:
+        raise ValueError(TOO_DEEP) from None
+
+
+def parsed_toml(text: str) -> dict[str, Any]:
+    """Return what a TOML text holds.
+
+    Raises:
+        ValueError: It is not TOML, or beyond what can be read: a number of thousands of digits, too many levels.
+    """
+    try:
+        tree = tomllib.loads(text)  # noqa: TID251
+    except tomllib.TOMLDecodeError:
+        raise
+    except ValueError:
+        raise ValueError(TOO_MANY_DIGITS) from None
+    except RecursionError:
+        raise ValueError(TOO_DEEP) from None
+    return _bounded(tree)
+
+
+def finite_json(document: object) -> str:
+    """Return a document as JSON; numbers that are not finite are null."""
+
+    def finite(part: object) -> object:
+        if isinstance(part, Mapping):
+            return {key: finite(value) for key, value in part.items()}
+        if isinstance(part, list | tuple):
+            return [finite(value) for value in part]
+        return None if isinstance(part, float) and not math.isfinite(part) else part
+
+    text = partial(json.dumps, ensure_ascii=False, separators=(",", ":"), default=str, allow_nan=False)
+    try:
+        return text(document)
+    except ValueError:
+        return text(finite(document))
+
+
+def _bounded(tree: T) -> T:
+    """Return a document that is not too deep."""
+    level: list[Any] = [[tree]]
+    for _ in range(MOST_LEVELS + 1):
+        parts = (one.values() if isinstance(one, dict) else one for one in level)
+        level = [part for each in parts for part in each if isinstance(part, dict | list)]
+        if not level:
+            return tree
+    raise ValueError(TOO_DEEP)
+
+
+PLAIN: Final = range(-4, 7)
+"""Decimal exponents of numbers that are written without one."""
+LONGEST_FRACTION: Final = 7
+"""Digits after the point of a mark; marks that need more have an exponent."""
+NEAR: Final = 1e-3
+"""Tolerance of the label of a mark, in steps of the marks."""
+
+
+def number_text(value: float, digits: int = 4) -> str:
+    """Return a number with so many significant digits, at least those before the point."""
+    if not math.isfinite(value):
+        return str(value)
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    if float(mantissa) == 0.0:
+        return "0"
+    if int(exponent) in PLAIN:
+        return _trimmed(f"{value:.{max(0, digits - 1 - int(exponent))}f}")
+    return f"{_trimmed(mantissa)}e{int(exponent)}"
+
+
+def value_text(value: float, unit: str = "") -> str:
+    """Return a value of a register, which has seven digits, with its unit."""
+    return f"{number_text(value, 7)} {unit}".rstrip()
+
+
+def ends_text(low: float, high: float) -> str:
+    """Return a range of values in words."""
+    return f"{value_text(low)} to {value_text(high)}"
+
+
+def axis_labels(marks: Sequence[float]) -> list[str]:
+    """Return labels of the marks of a linear axis: as many digits as their step needs, so that neighbours differ."""
+    known = sorted({float(mark) for mark in marks if math.isfinite(mark)})
+    step = min((after - before for before, after in pairwise(known)), default=0.0)
+    if step == 0.0:
+        return [number_text(mark, 7) for mark in marks]
+    top = max(abs(known[0]), abs(known[-1]))
+    if top < 10.0**PLAIN.stop:
+        for places in range(LONGEST_FRACTION + 1):
+            if all(abs(float(f"{mark:.{places}f}") - mark) <= NEAR * step for mark in known):
+                return [_unsigned_zero(f"{mark:.{places}f}") for mark in marks]
+    digits = 1
+    while digits < 17 and any(abs(float(f"{mark:.{digits - 1}e}") - mark) > NEAR * step for mark in known):
+        digits += 1
+    return [number_text(mark, digits) for mark in marks]
+
+
+def _trimmed(text: str) -> str:
+    return _unsigned_zero(text.rstrip("0").rstrip(".") if "." in text else text)
+
+
+def _unsigned_zero(text: str) -> str:
+    return text.removeprefix("-") if float(text) == 0.0 else text
