@@ -5,7 +5,7 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop_chaos.faults import Delay, Direction, Drop, Duplicate, Flip, FrameFault, Reorder, Truncate
+from coldloop_chaos.faults import Delay, Direction, Flip, FrameDamage, FrameFault, FrameLoss, Reorder
 from coldloop_chaos.proxy import FrameAction, Mangler, take_frames
 
 PDUS = st.binary(min_size=1, max_size=253)
@@ -34,7 +34,7 @@ def test_an_undisturbed_link_passes_everything_at_once(frames: list[bytes], seed
 
 @given(FRAMES, SEEDS, SHARES)
 def test_a_fault_of_the_answers_leaves_the_requests_alone(frames: list[bytes], seed: str, share: float) -> None:
-    fault = Drop(kind="drop", share=share, direction=Direction.ANSWERS, **COMMON)
+    fault = FrameLoss(kind="drop", share=share, direction=Direction.ANSWERS, **COMMON)
     assert data(passed(frames, fault, seed)[0]) == b"".join(frames)
 
 
@@ -46,7 +46,7 @@ def test_the_same_seed_decides_the_same(frames: list[bytes], seed: str, share: f
 
 @given(FRAMES, SEEDS, SHARES)
 def test_frames_are_lost_whole(frames: list[bytes], seed: str, share: float) -> None:
-    outcomes, _ = passed(frames, Drop(kind="drop", share=share, **COMMON), seed)
+    outcomes, _ = passed(frames, FrameLoss(kind="drop", share=share, **COMMON), seed)
     assert all(outcome.data in {b"", frame} for frame, outcome in zip(frames, outcomes, strict=True))
     if share == 1.0:
         assert not data(outcomes)
@@ -54,7 +54,7 @@ def test_frames_are_lost_whole(frames: list[bytes], seed: str, share: float) -> 
 
 @given(FRAMES, SEEDS, SHARES)
 def test_frames_arrive_once_or_twice(frames: list[bytes], seed: str, share: float) -> None:
-    outcomes, _ = passed(frames, Duplicate(kind="duplicate", share=share, **COMMON), seed)
+    outcomes, _ = passed(frames, FrameLoss(kind="duplicate", share=share, **COMMON), seed)
     assert all(outcome.data in {frame, 2 * frame} for frame, outcome in zip(frames, outcomes, strict=True))
 
 
@@ -81,7 +81,7 @@ def test_so_many_bits_are_flipped(frames: list[bytes], seed: str, share: float, 
 
 @given(FRAMES, SEEDS, SHARES)
 def test_half_a_frame_is_the_last_thing_of_a_connection(frames: list[bytes], seed: str, share: float) -> None:
-    outcomes, _ = passed(frames, Truncate(kind="truncate", share=share, **COMMON), seed)
+    outcomes, _ = passed(frames, FrameDamage(kind="truncate", share=share, **COMMON), seed)
     for frame, outcome in zip(frames, outcomes, strict=True):
         assert outcome.data == (frame[: len(frame) // 2] if outcome.close else frame)
 

@@ -12,7 +12,7 @@ from pymodbus.client import ModbusTcpClient
 from pymodbus.exceptions import ModbusException
 from pymodbus.pdu import ModbusPDU
 
-from coldloop_chaos.faults import Direction, FaultTransition, LinkPlan, find_link_plan
+from coldloop_chaos.faults import Direction, LinkPlan, find_link_plan
 from coldloop_chaos.proxy import Mangler
 from tests.harness.processes import Process, Processes
 
@@ -54,8 +54,8 @@ def test_faults_begin_and_end_in_the_order_of_time() -> None:
     )
     drop, freeze = plan.faults
     assert plan.changes() == [
-        FaultTransition(0.0, begins=True, fault=freeze), FaultTransition(2.0, begins=True, fault=drop),
-        FaultTransition(4.0, begins=False, fault=freeze), FaultTransition(5.0, begins=False, fault=drop),
+        (0.0, True, freeze), (2.0, True, drop),
+        (4.0, False, freeze), (5.0, False, drop),
     ]  # fmt: skip
 
 

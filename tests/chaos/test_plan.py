@@ -4,7 +4,17 @@ import pytest
 
 from coldloop.errors import LoadFileError, UsageError
 from coldloop.process.settings import settings_of
-from coldloop_chaos.faults import SHIPPED, SPREAD_S, ChaosPlan, Drop, Kill, Reset, find_plan, parse_plan, shipped_plans
+from coldloop_chaos.faults import (
+    SHIPPED,
+    SPREAD_S,
+    ChaosPlan,
+    FrameLoss,
+    Kill,
+    Reset,
+    find_plan,
+    parsed_plan,
+    shipped_plans,
+)
 from coldloop_rig.process_file.making import made_from
 from tests.harness.process_files import COLUMN
 
@@ -51,7 +61,7 @@ def test_the_shipped_plans_are_sound_and_have_all_kinds() -> None:
 )  # fmt: skip
 def test_what_is_wrong_is_said_in_one_line(text: str, complaint: str) -> None:
     with pytest.raises(UsageError) as error:
-        parse_plan(text, "mine.toml", {})
+        parsed_plan(ChaosPlan, text, "mine.toml", {})
     assert complaint in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -61,14 +71,14 @@ def test_a_plan_is_of_the_process_that_it_is_read_for() -> None:
     column = made_from(COLUMN).process
     text = with_fault('kind = "restart"', 'process = "plant"', "at_s = 60")
     with settings_of(column):
-        plan = parse_plan(text, "mine.toml", {"updating_period_s": 60.0})
+        plan = parsed_plan(ChaosPlan, text, "mine.toml", {"updating_period_s": 60.0})
         assert not {"sensor", "refrigerator"} & {one.name for one in shipped_plans()}
         for changes, complaint in (({"duration_s": 599.0}, "multiple of"), ({"updating_period_s": 600.0}, "less than")):
             with pytest.raises(UsageError, match=complaint):
-                parse_plan(text, "mine.toml", changes)
+                parsed_plan(ChaosPlan, text, "mine.toml", changes)
     (fault,) = plan.schedule()
     assert (plan.ticks, fault.tick, fault.end_tick) == (600 / column.tick_s, 60 / column.tick_s, 60 / column.tick_s + 1)
-    (fault,) = parse_plan(text, "mine.toml", {}).schedule()
+    (fault,) = parsed_plan(ChaosPlan, text, "mine.toml", {}).schedule()
     assert (fault.tick, fault.end_tick) == (240, 241)
 
 
@@ -83,7 +93,7 @@ def drawing(seed: int) -> ChaosPlan:
         draw=(
             Kill(kind="kill", process="optimizer", duration_s=60),
             Reset(kind="reset", link="plant", duration_s=1),
-            Drop(kind="drop", link="plant", share=0.1, duration_s=1),
+            FrameLoss(kind="drop", link="plant", share=0.1, duration_s=1),
         ),
     )  # fmt: skip
 

@@ -15,7 +15,7 @@ from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import Grant
 from coldloop.registers.declaration import Block
-from coldloop_chaos.faults import Delay, Direction, Drop, Duplicate, Freeze, Reset, Truncate
+from coldloop_chaos.faults import Delay, Direction, FrameDamage, FrameLoss, Freeze, Reset
 from coldloop_chaos.proxy import MOST_FROZEN, LinkProxy
 from tests.harness.records import CONTROL_MAP
 
@@ -111,7 +111,7 @@ async def test_what_is_sent_into_a_frozen_link_arrives_when_it_thaws() -> None:
 async def test_a_lost_answer_is_a_time_out_and_a_lost_request_is_never_served() -> None:
     async with line(timeout_s=1.0) as it:
         for direction, served in ((Direction.REQUESTS, set[int]()), (Direction.ANSWERS, {5})):
-            fault = Drop(kind="drop", share=1.0, direction=direction, **COMMON)
+            fault = FrameLoss(kind="drop", share=1.0, direction=direction, **COMMON)
             it.proxy.begin(fault)
             async with asyncio.timeout(60.0):  # the client may have given up before a busy server has come to it
                 while True:
@@ -140,7 +140,7 @@ async def test_who_tries_again_and_again_while_nothing_passes_does_not_use_up_al
 
 async def test_a_client_takes_the_answer_to_its_request_though_all_arrive_twice() -> None:
     async with line() as it:
-        it.proxy.begin(Duplicate(kind="duplicate", share=1.0, direction=Direction.ANSWERS, **COMMON))
+        it.proxy.begin(FrameLoss(kind="duplicate", share=1.0, direction=Direction.ANSWERS, **COMMON))
         for tick in range(20):
             await it.client.write(Grant(tick))
             assert await it.client.read(Grant) == Grant(tick)
@@ -148,7 +148,7 @@ async def test_a_client_takes_the_answer_to_its_request_though_all_arrive_twice(
 
 async def test_requests_that_arrive_twice_are_served_twice() -> None:
     async with line() as it:
-        it.proxy.begin(Duplicate(kind="duplicate", share=1.0, direction=Direction.REQUESTS, **COMMON))
+        it.proxy.begin(FrameLoss(kind="duplicate", share=1.0, direction=Direction.REQUESTS, **COMMON))
         await it.client.write(Grant(3))
         await it.client.read(Grant)
         assert it.grants == [3, 3]
@@ -156,7 +156,7 @@ async def test_requests_that_arrive_twice_are_served_twice() -> None:
 
 async def test_half_a_frame_ends_the_connection() -> None:
     async with line() as it:
-        it.proxy.begin(Truncate(kind="truncate", direction=Direction.ANSWERS, **COMMON))
+        it.proxy.begin(FrameDamage(kind="truncate", direction=Direction.ANSWERS, **COMMON))
         reader, writer = await raw(it.proxy)
         writer.write(READ_THREE)
         assert len(await reader.read()) == (9 + 6) // 2

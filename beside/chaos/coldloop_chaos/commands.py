@@ -3,6 +3,7 @@
 import argparse
 import math
 import sys
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Final
@@ -34,19 +35,16 @@ def _declare_chaos(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--list", action="store_true", help="list the shipped plans")
     parser.add_argument("--out", type="into", help="folder for the results (default: chaos/<plan>-<time>)")
     parser.add_argument("--force", action="store_true", help="write into a folder that is not empty")
-    parser.add_argument("--seed", type=_seed, dest="plan_seed", help="instead of the plan's")
+    seed = partial(common.number_within, least=0, most=math.inf, what="a whole number of at least 0")
+    parser.add_argument("--seed", type=seed, dest="plan_seed", help="instead of the plan's")
     parser.add_argument("--duration", type=duration, help="plant time, such as 2h or 90s, instead of the plan's")
-    parser.add_argument("--load", type="name", dest="plan_load",
-                        help="a named load or a CSV file, instead of the plan's")  # fmt: skip
-    parser.add_argument("--mode", choices=common.MODES, dest="plan_mode",
-                        help="instead of the plan's")  # fmt: skip
+    parser.add_argument(
+        "--load", type="name", dest="plan_load", help="a named load or a CSV file, instead of the plan's"
+    )
+    parser.add_argument("--mode", choices=common.MODES, dest="plan_mode", help="instead of the plan's")
     parser.add_argument("--factor", type=float, dest="plan_factor", help="instead of the plan's")
     parser.add_argument("--figures", nargs="+", choices=common.FIGURE_FORMATS, default=["png"], metavar="FORMAT",
                         help="of the run's picture: png, pdf, svg (default: png)")  # fmt: skip
-
-
-def _seed(text: str) -> int:
-    return common.number_within(text, 0, math.inf, "a whole number of at least 0")
 
 
 def execute_chaos(options: argparse.Namespace) -> int:
@@ -68,15 +66,13 @@ def execute_chaos(options: argparse.Namespace) -> int:
     with settings_of(effective.settings.process):
         plan = find_plan(options.plan, {name: value for name, value in given.items() if value is not None})
     retained = "the states are retained in the folder of the results"
-    common.refuse_ineffective(
-        effective,
-        {
-            **{key: f"the plan has its own value; change it with {option}" for key, option in OF_PLAN.items()},
-            **dict.fromkeys(common.PLACES, common.OWN_PORTS),
-            **dict.fromkeys(("plant.retain.file", "control_plc.retain.file"), retained),
-            "session.autostart": "it begins a session",
-        },
-    )
+    ineffective = {
+        **{key: f"the plan has its own value; change it with {option}" for key, option in OF_PLAN.items()},
+        **dict.fromkeys(common.PLACES, common.OWN_PORTS),
+        **dict.fromkeys(("plant.retain.file", "control_plc.retain.file"), retained),
+        "session.autostart": "it begins a session",
+    }
+    common.refuse_ineffective(effective, ineffective)
     from coldloop_chaos.report import ChaosProgress, perform, plot_chaos, summary_lines, table, write_report
     from coldloop_rig.results.folders import claim_folder, claim_folder_of_now, writing
     from coldloop_rig.runs.running import plain_arguments
@@ -84,9 +80,8 @@ def execute_chaos(options: argparse.Namespace) -> int:
     out = options.out or claim_folder_of_now(Path("chaos"), plan.name)
     claim_folder(out, force=options.force)
     with ChaosProgress(plan) as progress:
-        experiment = perform(
-            plan, effective, out, progress, arguments=plain_arguments(options), formats=options.figures
-        )
+        arguments = plain_arguments(options)
+        experiment = perform(plan, effective, out, progress, arguments=arguments, formats=options.figures)
     with writing(out, "no report was written, choose another --out"):
         write_report(out, experiment)
         plot_chaos(out / "chaos.png", experiment)
@@ -100,14 +95,14 @@ def execute_chaos(options: argparse.Namespace) -> int:
 
 def _declare_proxy(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("plan", type="read", metavar="PLAN", help="TOML file with the faults (`coldloop docs chaos`)")
-    parser.add_argument("--listen", type=_listener, required=True, metavar="[HOST:]PORT",
+
+    def listener(text: str) -> common.HostPort:
+        return common.endpoint(text if ":" in text else f"127.0.0.1:{text}")
+
+    parser.add_argument("--listen", type=listener, required=True, metavar="[HOST:]PORT",
                         help="where clients connect; at 127.0.0.1 unless an address is named")  # fmt: skip
     parser.add_argument("--to", type=common.endpoint, required=True, metavar="HOST:PORT", help="the server behind it")
     parser.add_argument("--seed", type=int, help="decides which frames are hit, instead of the plan's")
-
-
-def _listener(text: str) -> common.HostPort:
-    return common.endpoint(text if ":" in text else f"127.0.0.1:{text}")
 
 
 def execute_proxy(options: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ import random
 from enum import StrEnum
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeVar
 
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -72,6 +72,7 @@ class Fault(BaseModel):
 
     in_tables: ClassVar[str] = "{what}"
     """Template of its name in tables: `what` is its kind in words, the others are its fields."""
+    stopped: ClassVar[tuple[str, ...]] = ()
 
     @property
     def label(self) -> str:
@@ -81,12 +82,7 @@ class Fault(BaseModel):
     @property
     def processes(self) -> frozenset[str]:
         """Services whose processes it stops."""
-        return frozenset()
-
-    @property
-    def stops_time(self) -> bool:
-        """Whether it stops plant time in lock-step: plant and control PLC advance it."""
-        return bool(self.processes & {"plant", "control_plc"})
+        return frozenset(self.stopped)
 
 
 class LinkFault(Fault):
@@ -124,25 +120,29 @@ class Delay(FrameFault):
     """Largest deviation from it, either way."""
 
 
-class Drop(FrameFault):
-    """Whole frames are lost."""
+class ShareFault(FrameFault):
+    """A fault of a share of the frames, drawn one by one."""
 
-    kind: Literal["drop"]
     share: Share
 
 
-class Duplicate(FrameFault):
-    """Frames arrive twice."""
+class FrameLoss(ShareFault):
+    """Whole frames are lost, or arrive twice; or the connection is reset (RST) in the place of a frame."""
 
-    kind: Literal["duplicate"]
-    share: Share
+    kind: Literal["drop", "duplicate", "abort"]
 
 
-class Reorder(FrameFault):
+class FrameDamage(ShareFault):
+    """Half a frame passes, then the connection is closed; or frames name another unit than they should."""
+
+    kind: Literal["truncate", "wrong_unit"]
+    share: Share = 1.0
+
+
+class Reorder(ShareFault):
     """A frame is overtaken by the next one, if that comes soon enough."""
 
     kind: Literal["reorder"]
-    share: Share
     hold_ms: Milliseconds = 20.0
     """Longest wait for a frame that overtakes it, ms of real time."""
 
@@ -159,36 +159,14 @@ class Freeze(LinkFault):
     kind: Literal["freeze"]
 
 
-class Truncate(FrameFault):
-    """Half a frame passes, then the connection is closed."""
-
-    kind: Literal["truncate"]
-    share: Share = 1.0
-
-
-class Abort(FrameFault):
-    """The connection is reset (RST) in the place of a frame."""
-
-    kind: Literal["abort"]
-    share: Share
-
-
-class Flip(FrameFault):
+class Flip(ShareFault):
     """Bits of frames are flipped."""
 
     kind: Literal["flip"]
-    share: Share
     bits: Annotated[int, Field(ge=1, le=64)] = 1
 
 
-class WrongUnit(FrameFault):
-    """Frames name another unit than they should."""
-
-    kind: Literal["wrong_unit"]
-    share: Share = 1.0
-
-
-class ExceptionAnswer(FrameFault):
+class ExceptionAnswer(ShareFault):
     """An exception instead of the server's answer; the server has carried out the request."""
 
     kind: Literal["exception"]
@@ -235,12 +213,8 @@ class Clock(Fault):
     """A jump of the clock as all three processes see it: all are suspended and resumed."""
 
     in_tables = "clock +{duration_s:g} s"
+    stopped = tuple(SERVICE_OF.values())
     kind: Literal["clock"]
-
-    @property
-    def processes(self) -> frozenset[str]:
-        """Services whose processes it stops."""
-        return frozenset(SERVICE_OF.values())
 
 
 class Sensor(Fault):
@@ -283,32 +257,16 @@ class BoundaryFault(Fault):
 class WrongModel(Fault):
     """The optimiser is restarted with the model of another operating point, and with the right one at the end."""
 
+    stopped = ("optimizer_plc",)
     kind: Literal["wrong_model"]
-
-    @property
-    def processes(self) -> frozenset[str]:
-        """Services whose processes it stops."""
-        return frozenset({"optimizer_plc"})
 
 
 AnyLinkFault = Annotated[
-    Abort | Delay | Drop | Duplicate | ExceptionAnswer | Flip | Freeze | Reorder | Reset | Truncate | WrongUnit,
-    Field(discriminator="kind"),
+    Delay | ExceptionAnswer | Flip | FrameDamage | FrameLoss | Freeze | Reorder | Reset, Field(discriminator="kind")
 ]
 AnyFault = Annotated[
-    AnyLinkFault
-    | Kill | Pause | Restart | Clock | Sensor | BoundaryFault | WrongModel,
-    Field(discriminator="kind"),
-]  # fmt: skip
-
-
-class FaultTransition(NamedTuple):
-    """A fault begins or ends."""
-
-    at_s: float
-    """Real time since the proxy has started."""
-    begins: bool
-    fault: LinkFault
+    AnyLinkFault | Kill | Pause | Restart | Clock | Sensor | BoundaryFault | WrongModel, Field(discriminator="kind")
+]
 
 
 class LinkPlan(BaseModel, frozen=True, extra="forbid"):
@@ -334,11 +292,11 @@ class LinkPlan(BaseModel, frozen=True, extra="forbid"):
         usual = {"at_s": 0.0, "duration_s": 86_400.0, "link": Link.PLANT}
         return {**content, "faults": [usual | one if isinstance(one, dict) else one for one in content["faults"]]}
 
-    def changes(self) -> list[FaultTransition]:
-        """Return when faults begin and end, in the order of time."""
-        begins = [FaultTransition(fault.at_s or 0.0, begins=True, fault=fault) for fault in self.faults]
-        ends = [FaultTransition(at_s + fault.duration_s, begins=False, fault=fault) for at_s, _, fault in begins]
-        return sorted([*begins, *ends], key=lambda change: change.at_s)
+    def changes(self) -> list[tuple[float, bool, AnyLinkFault]]:
+        """Return times since the start of the proxy, s, and which fault begins (True) or ends then, in order."""
+        begins = [(fault.at_s or 0.0, True, fault) for fault in self.faults]
+        ends = [(at_s + fault.duration_s, False, fault) for at_s, _, fault in begins]
+        return sorted([*begins, *ends], key=lambda change: change[0])
 
 
 P = TypeVar("P", bound=BaseModel)
@@ -438,14 +396,11 @@ class ChaosPlan(ProcessSettings):
     def configured(self, effective: Configuration[Settings]) -> Configuration[Settings]:
         """Return a configuration with the values of the plan, as a manifest records it."""
         settings = self.with_plant(effective.settings)
-        session = settings.session
         load = self.load if isinstance(self.load, str) else ", ".join(self.load)
-        planned = settings.with_program(updating_period_s=self.updating_period_s).model_copy(
-            update={
-                "plant": settings.plant.model_copy(update={"load": load, "seed": self.seed}),
-                "session": session.model_copy(update={"mode": self.mode, "factor": self.factor}),
-            }
-        )
+        plant = settings.plant.model_copy(update={"load": load, "seed": self.seed})
+        session = settings.session.model_copy(update={"mode": self.mode, "factor": self.factor})
+        planned = settings.with_program(updating_period_s=self.updating_period_s)
+        planned = planned.model_copy(update={"plant": plant, "session": session})
         return Configuration(planned, {**effective.sources, **dict.fromkeys(OF_PLAN, f"plan {self.name}")})
 
     def scenario(self, mean_w: float) -> Scenario:
@@ -455,8 +410,7 @@ class ChaosPlan(ProcessSettings):
         else:
             families = []
             for name in self.load:
-                here = named_families(name)
-                if here is None:
+                if (here := named_families(name)) is None:
                     raise LoadFileError(f"load {name}: only named loads can follow each other; give a CSV file alone")
                 families += here
             load = concatenated([telegraph(family, mean_w) for family in families])
@@ -472,7 +426,7 @@ def shipped_plans() -> list[ChaosPlan]:
     for entry in SHIPPED.iterdir():
         if entry.name.endswith(".toml"):
             try:
-                plans.append(parse_plan(entry.read_text(encoding="utf-8"), entry.name, {}))
+                plans.append(parsed_plan(ChaosPlan, entry.read_text(encoding="utf-8"), entry.name, {}))
             except UsageError:  # its signals or its plant are another process's
                 continue
     return sorted(plans, key=lambda plan: plan.name)
@@ -486,10 +440,10 @@ def find_plan(name: str, changes: dict[str, Any]) -> ChaosPlan:
     """
     shipped = SHIPPED / f"{name}.toml"
     if "/" not in name and shipped.is_file():
-        return parse_plan(shipped.read_text(encoding="utf-8"), name, changes)
+        return parsed_plan(ChaosPlan, shipped.read_text(encoding="utf-8"), name, changes)
     if not Path(name).exists():
         raise UsageError(f"plan {name}: neither a file nor a shipped plan; `coldloop chaos --list` names them")
-    return parse_plan(read_text(Path(name), REMEDY), name, changes)
+    return parsed_plan(ChaosPlan, read_text(Path(name), REMEDY), name, changes)
 
 
 def find_link_plan(name: str, changes: dict[str, Any]) -> LinkPlan:
@@ -498,15 +452,11 @@ def find_link_plan(name: str, changes: dict[str, Any]) -> LinkPlan:
     Raises:
         UsageError: There is no such file, or something in it is wrong; one line that says what.
     """
-    return _validated(LinkPlan, read_text(Path(name), REMEDY), name, changes)
+    return parsed_plan(LinkPlan, read_text(Path(name), REMEDY), name, changes)
 
 
-def parse_plan(text: str, source: str, changes: dict[str, Any]) -> ChaosPlan:
+def parsed_plan(kind: type[P], text: str, source: str, changes: dict[str, Any]) -> P:
     """Return the plan that a TOML text holds, with some of its values changed; a shorter run has fewer faults."""
-    return _validated(ChaosPlan, text, source, changes)
-
-
-def _validated(kind: type[P], text: str, source: str, changes: dict[str, Any]) -> P:
     try:
         content = parsed_toml(text)
     except ValueError as error:

@@ -15,7 +15,6 @@ from coldloop_chaos import faults
 from coldloop_chaos.faults import LinkPlan
 from coldloop_rig.cosim.wiring import Detours, ReservedPorts, RigEndpoints
 
-Replacing = faults.Drop | faults.Duplicate | faults.ExceptionAnswer | faults.Flip | faults.WrongUnit
 UNIT: Final = 6
 """Place of the unit in a frame; the function code is the next byte."""
 
@@ -43,7 +42,7 @@ class Mangler:
         self.hold_s: float | None = None
         """While a frame is held back: how long, unless another one comes."""
 
-    def decide(self, frame: bytes, active: Iterable[faults.FrameFault]) -> FrameAction:  # noqa: C901 a branch for each kind
+    def decide(self, frame: bytes, active: Iterable[faults.FrameFault]) -> FrameAction:
         """Return how a frame is forwarded under the active faults."""
         pieces, delay_s, overtaken = [frame], 0.0, self.release()
         for fault in active:
@@ -51,19 +50,18 @@ class Mangler:
                 continue
             if isinstance(fault, faults.Delay):
                 delay_s += max(0.0, fault.delay_ms + fault.jitter_ms * self._draw.uniform(-1, 1)) / 1000
-            elif isinstance(fault, faults.Truncate):
-                if pieces and self._hit(fault.share):
-                    return FrameAction(b"".join(pieces[:-1]) + pieces[-1][: len(pieces[-1]) // 2], delay_s, close=True)
-            elif isinstance(fault, faults.Abort):
-                if pieces and self._hit(fault.share):
-                    return FrameAction(b"", delay_s, close=True, reset=True)
             elif isinstance(fault, faults.Reorder):
                 if pieces and not overtaken and self._hit(fault.share):
                     self._held, self.hold_s = pieces.pop(), fault.hold_ms / 1000
-            elif isinstance(fault, Replacing):
-                pieces = [new for piece in pieces for new in self._instead(piece, fault)]
-            else:
+            elif not isinstance(fault, faults.ShareFault):
                 raise TypeError(f"no frame is disturbed by {fault.kind}: add a branch")
+            elif fault.kind in ("abort", "truncate"):
+                if pieces and self._hit(fault.share):
+                    half = b"".join(pieces[:-1]) + pieces[-1][: len(pieces[-1]) // 2]
+                    is_abort = fault.kind == "abort"
+                    return FrameAction(b"" if is_abort else half, delay_s, close=True, reset=is_abort)
+            else:
+                pieces = [new for piece in pieces for new in self._instead(piece, fault)]
         return FrameAction(b"".join([*pieces, overtaken]), delay_s)
 
     def release(self) -> bytes:
@@ -71,12 +69,12 @@ class Mangler:
         held, self._held, self.hold_s = self._held, b"", None
         return held
 
-    def _instead(self, piece: bytes, fault: Replacing) -> list[bytes]:
+    def _instead(self, piece: bytes, fault: faults.ShareFault) -> list[bytes]:
         """Return the frames that replace `piece`."""
         if not self._hit(fault.share):
             return [piece]
-        if isinstance(fault, faults.Drop | faults.Duplicate):
-            return [] if isinstance(fault, faults.Drop) else [piece, piece]
+        if isinstance(fault, faults.FrameLoss):
+            return [] if fault.kind == "drop" else [piece, piece]
         if isinstance(fault, faults.Flip):
             damaged, bits = bytearray(piece), 8 * len(piece)
             for bit in self._draw.sample(range(bits), min(fault.bits, bits)):
@@ -85,9 +83,9 @@ class Mangler:
         if len(piece) <= UNIT + 1:
             return [piece]
         unit, function = piece[UNIT], piece[UNIT + 1]
-        if isinstance(fault, faults.WrongUnit):
-            return [piece[:UNIT] + bytes([unit + 1 & 0xFF]) + piece[UNIT + 1 :]]
-        return [piece[:4] + b"\x00\x03" + bytes([unit, function | 0x80, fault.code])]
+        if isinstance(fault, faults.ExceptionAnswer):
+            return [piece[:4] + b"\x00\x03" + bytes([unit, function | 0x80, fault.code])]
+        return [piece[:UNIT] + bytes([unit + 1 & 0xFF]) + piece[UNIT + 1 :]]
 
     def _hit(self, share: float) -> bool:
         return self._draw.random() < share
@@ -134,14 +132,10 @@ class LinkProxy:
         self, port: int, target: Endpoint, seed: str, *, host: str = HOST, tell: Callable[[str], object] | None = None
     ) -> None:
         self.port = port
-        self._target = target
-        self._host = host
-        self._tell = tell
-        self._seed = seed
+        self._target, self._host, self._tell, self._seed, self._number = target, host, tell, seed, 0
         self._faults: list[faults.LinkFault] = []
         self._flowing = asyncio.Event()
         self._flowing.set()
-        self._number = 0
         self._open: set[asyncio.StreamWriter] = set()
         self._serving: dict[asyncio.Task[None], None] = {}
         """Tasks that serve the connections, the oldest one first."""
@@ -292,10 +286,10 @@ async def disturb(plan: LinkPlan, listen: tuple[str, int], target: Endpoint, say
     try:
         say(f"{host}:{proxy.port} -> {target.host}:{target.port}")
         began = loop.time()
-        for change in plan.changes():
-            await asyncio.sleep(began + change.at_s - loop.time())
-            (proxy.begin if change.begins else proxy.end)(change.fault)
-            say(f"{change.at_s:9.1f} s  {'begin' if change.begins else 'end'} {change.fault.in_words}")
+        for at_s, begins, fault in plan.changes():
+            await asyncio.sleep(began + at_s - loop.time())
+            (proxy.begin if begins else proxy.end)(fault)
+            say(f"{at_s:9.1f} s  {'begin' if begins else 'end'} {fault.in_words}")
         await loop.create_future()
     finally:
         await proxy.close()

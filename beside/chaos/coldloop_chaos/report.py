@@ -3,6 +3,7 @@
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import cycle
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -11,20 +12,19 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 from coldloop.config import Configuration
 from coldloop.errors import LinkError
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import load as load_model
-from coldloop.registers.common import Event, EventKind
+from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import LadderStatus, Mode
 from coldloop.registers.safety import AlarmState, alarm_key, alarms_of
 from coldloop.service.journal import alarm_word
 from coldloop.text import ends_text, parsed_json, whole_file, whole_text
 from coldloop_chaos.faults import ChaosPlan
-from coldloop_chaos.sequencer import ChaosTrace, ShowProgress, conduct
+from coldloop_chaos.sequencer import ChaosTrace, Mark, ShowProgress, conduct
 from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Job
@@ -38,8 +38,8 @@ from coldloop_rig.runs.running import run_into
 from coldloop_rig.settings import Settings
 from coldloop_rig.text_tables import aligned, markdown_table
 
-PerInput = tuple[float, ...]
-PerBand = tuple[float, ...]
+Numbers = tuple[float, ...]
+"""A number for each input, or for each output with a band."""
 
 
 class RaisedAlarm(NamedTuple):
@@ -62,11 +62,11 @@ class Row(NamedTuple):
     """The mode before, and those passed until the next fault."""
     alarms: tuple[RaisedAlarm, ...]
     """Alarms raised in the window."""
-    largest_steps: PerInput
+    largest_steps: Numbers
     """Largest change of each input from a tick to the next, as a share of its limit."""
-    outside_s: PerBand
+    outside_s: Numbers
     """Time in the window that each output with a band was outside, beyond its dead band."""
-    undisturbed_s: PerBand
+    undisturbed_s: Numbers
     """Time outside in the same window of the run without faults, s."""
     back_s: float | None
     """Time from the end of the fault to mode MPC, s: 0 if MPC drove then, None if it did not return in the window."""
@@ -81,84 +81,56 @@ class Evaluation(NamedTuple):
     """A run."""
 
     rows: list[Row]
-    largest_steps: PerInput
-    outside_s: PerBand
-    undisturbed_s: PerBand
+    largest_steps: Numbers
+    outside_s: Numbers
+    undisturbed_s: Numbers
     missing_ticks: int
 
 
-def evaluate(trace: ChaosTrace, undisturbed: Recording, rate: PerInput, design: ControlDesign) -> Evaluation:
+def evaluate(trace: ChaosTrace, undisturbed: Recording, rate: Numbers, design: ControlDesign) -> Evaluation:
     """Compute the rows of all faults, and the same for the whole run; `rate` is the largest change of each input."""
     recording, tick_s = trace.recording(), trace.process.tick_s
-    outside, outside_undisturbed = _outside(recording, design), _outside(undisturbed, design)
-    steps = _steps(recording, rate)
-    rows = [_row(trace, number, steps, (outside, outside_undisturbed)) for number in range(len(trace.marks))]
-    return Evaluation(
-        rows, _largest(steps), _seconds(outside, tick_s), _seconds(outside_undisturbed, tick_s), trace.missing
-    )
+    u = recording.u.astype(float)
+    steps = np.nan_to_num(np.abs(np.diff(u, axis=0, prepend=u[:1])) / np.array(rate))  # 0 where it is not known
+    outside, was = (excess_of(one.y, design) > design.process.dead_bands for one in (recording, undisturbed))
+
+    def measured(ticks: slice) -> tuple[Numbers, Numbers, Numbers]:
+        """Return the largest steps, and the times outside with and without faults."""
+        outside_s, was_s = (tuple((one[ticks].sum(axis=0) * tick_s).tolist()) for one in (outside, was))
+        return tuple(np.max(steps[ticks], axis=0, initial=0.0).tolist()), outside_s, was_s
+
+    ends = [*((later.begin, later.first_event) for later in trace.marks[1:]), (trace.ticks, len(trace.events))]
+    rows = [
+        _row(trace, mark, last_event, measured(slice(mark.begin, end)))
+        for mark, (end, last_event) in zip(trace.marks, ends, strict=False)
+    ]
+    return Evaluation(rows, *measured(slice(None)), trace.missing)
 
 
-def _row(
-    trace: ChaosTrace, number: int, steps: NDArray[np.float64], outside: tuple[NDArray[np.bool_], NDArray[np.bool_]]
-) -> Row:
-    mark, following = trace.marks[number], trace.marks[number + 1 : number + 2]
-    end, last_event, tick_s = trace.ticks, len(trace.events), trace.process.tick_s
-    for later in following:
-        end, last_event = later.begin, later.first_event
+def _row(trace: ChaosTrace, mark: Mark, last_event: int, measured: tuple[Numbers, Numbers, Numbers]) -> Row:
+    tick_s = trace.process.tick_s
     before = [Mode(event.subject) for event in trace.modes(0, mark.first_event)[-1:]]
     changes = trace.modes(mark.first_event, last_event)
     modes = [*before, *(Mode(event.subject) for event in changes)]
-    return Row(
-        fault=mark.fault.label,
-        at_s=mark.begin * tick_s,
-        lasted_s=None if mark.end is None else (mark.end - mark.begin) * tick_s,
-        modes=tuple(mode.name for mode, previous in zip(modes, [None, *modes], strict=False) if mode is not previous),
-        alarms=tuple(
-            RaisedAlarm(
-                alarm_key(event.subject, trace.process).upper(),
-                max(0, event.tick - mark.begin) * tick_s,
-                max(0, event.tick - (mark.begin if mark.done is None else mark.done)) * tick_s,
-            )
-            for event in trace.events[mark.first_event : last_event]
-            if event.kind == EventKind.ALARM_RAISED
-        ),
-        largest_steps=_largest(steps[mark.begin : end]),
-        outside_s=_seconds(outside[0][mark.begin : end], tick_s),
-        undisturbed_s=_seconds(outside[1][mark.begin : end], tick_s),
-        back_s=_back_s(mark.end, before, changes, tick_s),
+    lasted_s = back_s = None
+    if mark.end is not None:
+        lasted_s = (mark.end - mark.begin) * tick_s
+        at_end = [*before, *(Mode(event.subject) for event in changes if event.tick <= mark.end)]
+        back = [event.tick for event in changes if event.tick > mark.end and event.subject == Mode.MPC]
+        if at_end and at_end[-1] is Mode.MPC:
+            back_s = 0.0
+        elif back:
+            back_s = (back[0] - mark.end) * tick_s
+    passed = tuple(mode.name for mode, previous in zip(modes, [None, *modes], strict=False) if mode is not previous)
+    instants = (mark.begin, mark.begin if mark.done is None else mark.done)
+    alarms = tuple(
+        RaisedAlarm(
+            alarm_key(event.subject, trace.process).upper(), *(max(0, event.tick - at) * tick_s for at in instants)
+        )
+        for event in trace.events[mark.first_event : last_event]
+        if event.kind == EventKind.ALARM_RAISED
     )
-
-
-def _back_s(end: int | None, before: Sequence[Mode], changes: Sequence[Event], tick_s: float) -> float | None:
-    """Return the time from the end of a fault until MPC drives; None when it does not."""
-    if end is None:
-        return None
-    at_end = [*before, *(Mode(event.subject) for event in changes if event.tick <= end)]
-    if at_end and at_end[-1] is Mode.MPC:
-        return 0.0
-    back = [event.tick for event in changes if event.tick > end and event.subject == Mode.MPC]
-    return (back[0] - end) * tick_s if back else None
-
-
-def _steps(recording: Recording, rate: PerInput) -> NDArray[np.float64]:
-    """Return the change of each input at each tick as a share of its limit, (N, 3); NaN where it is not known."""
-    u = recording.u.astype(float)
-    steps: NDArray[np.float64] = np.abs(np.diff(u, axis=0, prepend=u[:1])) / np.array(rate)
-    return steps
-
-
-def _largest(steps: NDArray[np.float64]) -> PerInput:
-    return tuple(np.max(np.nan_to_num(steps), axis=0, initial=0.0).tolist())
-
-
-def _outside(recording: Recording, design: ControlDesign) -> NDArray[np.bool_]:
-    """Return for each tick whether outputs are outside their bands, (N, bands); False for unknown ticks."""
-    outside: NDArray[np.bool_] = excess_of(recording.y, design) > design.process.dead_bands
-    return outside
-
-
-def _seconds(outside: NDArray[np.bool_], tick_s: float) -> PerBand:
-    return tuple((outside.sum(axis=0) * tick_s).tolist())
+    return Row(mark.fault.label, mark.begin * tick_s, lasted_s, passed, alarms, *measured, back_s)
 
 
 class Experiment(NamedTuple):
@@ -189,11 +161,7 @@ def perform(
     settings = plan.with_plant(effective.settings)
     scenario = plan.scenario(load_model(settings.model.file).w0)
     trace = ChaosTrace(scenario.ticks, settings.process)
-    failure = None
-
-    async def conducted(recorder: Recorder, results: Path) -> None:
-        await conduct(plan, scenario, settings, results, recorder, trace, progress)
-
+    failure, conducted = None, partial(conduct, plan, scenario, settings, trace, progress)
     try:
         job = Job(plan.configured(effective), scenario, Way.CHAOS, conduct=conducted)
         with FigureProcess(formats) as figure:
@@ -245,12 +213,7 @@ MANY_MODES: Final = 8
 
 def table(rows: Sequence[Row], process: Process) -> str:
     """Return all rows for a terminal."""
-    return aligned([_headings(process), *(_cells(row, process) for row in rows)])
-
-
-def _headings(process: Process) -> list[str]:
-    bands = [f"{one.name} out s (was)" for one in process.banded]
-    return ["fault", "at s", "lasted s", "modes", "alarms (s after)", "step/limit", *bands, "back to MPC s"]
+    return aligned(_cells(rows, process))
 
 
 def write_report(out: Path, experiment: Experiment) -> None:
@@ -277,12 +240,13 @@ def write_report(out: Path, experiment: Experiment) -> None:
         "trace_sha256": trace.recording().trace_sha256,
         "undisturbed_trace_sha256": undisturbed.trace_sha256,
     })  # fmt: skip
+    headings, *cells = _cells(evaluation.rows, trace.process)
     lines = [
         f"# Chaos plan {plan.name}\n",
         f"{plan.description}\n",
         f"Load {plan.load}, {plan.duration_s:g} s, seed {plan.seed}, {plan.mode}.\n",
         *([f"**The run failed:** {failure}\n"] if failure else []),
-        markdown_table(_headings(trace.process), (_cells(row, trace.process) for row in evaluation.rows)) + "\n",
+        markdown_table(headings, cells) + "\n",
         *(f"- {line}" for line in summary_lines(trace, evaluation)),
         "\n![Outputs, inputs, modes, faults](chaos.png)\n",
     ]
@@ -293,14 +257,13 @@ def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
     """Return the lines below the table."""
     process, largest = trace.process, evaluation.largest_steps
     steps = ", ".join(f"{name} {step:.3f}" for name, step in zip(process.input_names, largest, strict=True))
-    outside, was = evaluation.outside_s, evaluation.undisturbed_s
+    times = [
+        f"{one.name} {seconds:g} s ({'undisturbed ' if one is process.banded[0] else ''}{before:g} s)"
+        for one, seconds, before in zip(process.banded, evaluation.outside_s, evaluation.undisturbed_s, strict=True)
+    ]
     lines = [
         f"largest step/limit: {steps}",
-        "outside the bands: "
-        + ", ".join(
-            f"{one.name} {seconds:g} s ({'undisturbed ' if one is process.banded[0] else ''}{before:g} s)"
-            for one, seconds, before in zip(process.banded, outside, was, strict=True)
-        ),
+        f"outside the bands: {', '.join(times)}",
         f"ticks not seen: {evaluation.missing_ticks} of {trace.ticks}",
     ]
     if trace.ladder is not None:
@@ -318,29 +281,26 @@ def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
     return lines
 
 
-def _cells(row: Row, process: Process) -> list[str]:
-    modes: Sequence[str] = row.modes
-    if len(modes) > MANY_MODES:
-        modes = [*modes[: MANY_MODES - 2], f"({len(modes) - MANY_MODES} more)", *modes[-2:]]
-    return [
-        row.fault,
-        f"{row.at_s:g}",
-        "-" if row.lasted_s is None else f"{row.lasted_s:g}",
-        " > ".join(modes) or "-",
-        _alarms(row.alarms, process),
-        f"{row.largest_step:.3f}",
-        *(f"{outside:g} ({was:g})" for outside, was in zip(row.outside_s, row.undisturbed_s, strict=True)),
-        "not" if row.back_s is None else f"{row.back_s:g}",
-    ]
-
-
-def _alarms(alarms: Sequence[RaisedAlarm], process: Process) -> str:
-    """Return each alarm once: when it was first raised, and how often if more than once."""
+def _cells(rows: Sequence[Row], process: Process) -> list[list[str]]:
+    """Return the headings, and the cells of each row; each alarm once, when it was first raised and how often."""
+    bands = [f"{one.name} out s (was)" for one in process.banded]
     words = {alarm_key(alarm, process).upper(): alarm_word(alarm, process) for alarm in alarms_of(process)}
-    named = [(words[alarm.name], alarm.after_s) for alarm in alarms]
-    times, first = Counter(name for name, _ in named), dict(reversed(named))
-    cells = [f"{name} {first[name]:g}" + (f" (x{count})" if count > 1 else "") for name, count in times.items()]
-    return ", ".join(cells) or "none"
+    cells = [["fault", "at s", "lasted s", "modes", "alarms (s after)", "step/limit", *bands, "back to MPC s"]]
+    for row in rows:
+        modes: Sequence[str] = row.modes
+        if len(modes) > MANY_MODES:
+            modes = [*modes[: MANY_MODES - 2], f"({len(modes) - MANY_MODES} more)", *modes[-2:]]
+        first = {words[alarm.name]: alarm.after_s for alarm in reversed(row.alarms)}
+        times = Counter(words[alarm.name] for alarm in row.alarms)
+        alarms = [f"{name} {first[name]:g}" + (f" (x{count})" if count > 1 else "") for name, count in times.items()]
+        lasted, back = (
+            "-" if row.lasted_s is None else f"{row.lasted_s:g}",
+            "not" if row.back_s is None else f"{row.back_s:g}",
+        )
+        outside = [f"{outside:g} ({was:g})" for outside, was in zip(row.outside_s, row.undisturbed_s, strict=True)]
+        named = [" > ".join(modes) or "-", ", ".join(alarms) or "none"]
+        cells.append([row.fault, f"{row.at_s:g}", lasted, *named, f"{row.largest_step:.3f}", *outside, back])
+    return cells
 
 
 MANY: Final = 24

@@ -63,7 +63,6 @@ def save_wrong_model(right: Path, wrong: Path) -> None:
 
 T = TypeVar("T")
 
-ATTEMPTS: Final = 20
 _FAULT: Final[TypeAdapter[faults.AnyFault]] = TypeAdapter(faults.AnyFault)
 _SHOWN: Final = {"nan": SensorFaultKind.NOT_A_NUMBER, "frozen": SensorFaultKind.FROZEN, "value": SensorFaultKind.VALUE}
 
@@ -84,11 +83,10 @@ class Injector:
         Raises:
             UsageError: There is no such fault, or a parameter is missing or wrong.
         """
-        for name in ("at_s", "duration_s", "offset_ms"):
-            if name in parameters:
-                raise UsageError(
-                    f"fault '{kind}': {name} belongs to a plan; here the context decides when it begins and ends"
-                )
+        if of_plan := [name for name in ("at_s", "duration_s", "offset_ms") if name in parameters]:
+            raise UsageError(
+                f"fault '{kind}': {of_plan[0]} belongs to a plan; here the context decides when it begins and ends"
+            )
         try:
             with settings_of(self.plant.process):
                 fault = _FAULT.validate_python({"kind": kind, "duration_s": 1.0, **parameters})
@@ -162,7 +160,7 @@ class Injector:
 async def _insisted(request: Callable[[], Awaitable[T]], what: str) -> T:
     """Return the answer to a request, which is repeated for a while."""
     reason = "no answer in time"
-    for _ in range(ATTEMPTS):
+    for _ in range(20):
         try:
             async with asyncio.timeout(CONTACT_S):
                 return await request()
@@ -310,15 +308,6 @@ def resident_mb(services: LocalServices) -> dict[str, float]:
     return sizes
 
 
-def log_lines(services: LocalServices) -> dict[str, int]:
-    """Return the number of lines in each log."""
-    counts = {}
-    for service in SERVICES:
-        with services.log(service).open("rb") as log:
-            counts[service] = sum(1 for _ in log)
-    return counts
-
-
 ShowProgress = Callable[[int, LadderStatus | None, list[str]], None]
 """Takes the plant's tick, the state of the control PLC (None while it does not answer), and the faults that are on."""
 
@@ -356,16 +345,17 @@ class FaultSequencer:
             else:
                 await self._end(moment)
             self._stopped_since = time.monotonic()
-        alarms = await self.client.contact(
-            self.client.control.read_rows(Alarm, 0, len(alarms_of(self.client.control.process)))
+        control = self.client.control
+        self.trace.alarms = (
+            await self.client.contact(control.read_rows(Alarm, 0, len(alarms_of(control.process)))) or []
         )
-        self.trace.alarms = alarms or []
         await self.client.conclude()
 
     def finish(self) -> None:
         """Record the state at the end, however the run ended."""
         self.trace.seconds = self._seconds
-        self.trace.log_lines = log_lines(self.services)
+        logs = {service: self.services.log(service).read_bytes() for service in SERVICES}
+        self.trace.log_lines = {service: len(log.splitlines()) for service, log in logs.items()}
         self.trace.lost_contacts = self.client.lost_contacts
 
     @property
@@ -383,12 +373,9 @@ class FaultSequencer:
                 return moment
             if self.tick >= self.plan.ticks:
                 return None
-            await self._go_on(self._timeline.next_tick or self.plan.ticks)
+            if not self.plan.realtime:
+                await self.client.grant(min(self._timeline.next_tick or self.plan.ticks, self.plan.ticks))
             await asyncio.sleep(LOOK_S)
-
-    async def _go_on(self, until: int) -> None:
-        if not self.plan.realtime:
-            await self.client.grant(min(until, self.plan.ticks))
 
     async def _look(self) -> LadderStatus | None:
         """Record what has happened; return the state of the control PLC, None while it does not answer."""
@@ -407,10 +394,9 @@ class FaultSequencer:
         """Return the end of a fault that stops plant time. Raises LinkError if plant time stopped without a fault."""
         stopped_s = time.monotonic() - self._stopped_since
         for end in self._timeline.on:
-            fault = end.fault
             bearable = self.plan.standstill_s
-            if fault.stops_time:
-                bearable = min(bearable, fault.duration_s)
+            if end.fault.processes & {"plant", "control_plc"}:  # they advance plant time in lock-step
+                bearable = min(bearable, end.fault.duration_s)
             if not self.plan.realtime and stopped_s > bearable:
                 return self._timeline.take(end)
         tick_s = self.plan.process.tick_s
@@ -424,7 +410,8 @@ class FaultSequencer:
     async def _begin(self, moment: Moment) -> None:
         fault = moment.fault
         if isinstance(fault, faults.ProcessFault) and fault.offset_ms:
-            await self._go_on(fault.end_tick)  # the signal is to come while the rig moves on
+            if not self.plan.realtime:
+                await self.client.grant(min(fault.end_tick, self.plan.ticks))  # the rig moves on until the signal comes
             await asyncio.sleep(fault.offset_ms / 1000)
             await self._look()
         mark = Mark(fault, begin=self.tick, first_event=len(self.trace.events))
@@ -470,15 +457,17 @@ SLOWEST: Final = 20.0
 
 
 async def conduct(
-    plan: faults.ChaosPlan, scenario: Scenario, settings: Settings, folder: Path, recorder: Recorder, trace: ChaosTrace,
-    progress: ShowProgress,
+    plan: faults.ChaosPlan, scenario: Scenario, settings: Settings, trace: ChaosTrace, progress: ShowProgress,
+    recorder: Recorder, folder: Path,
 ) -> None:  # fmt: skip
     """Run a plan on three services started for it; `trace`, a sink of the recorder, has what there was.
 
     Raises:
         LinkError: A service ended by itself, plant time stopped, or the run took too long.
     """
-    if any(isinstance(fault, faults.WrongModel) for fault in plan.schedule()):  # not while the clock is running
+    schedule, speed = plan.schedule(), plan.factor / 2 if plan.realtime else SLOWEST
+    patience_s = 300.0 + plan.duration_s / speed + sum(60.0 + fault.duration_s / speed for fault in schedule)
+    if any(isinstance(fault, faults.WrongModel) for fault in schedule):  # not while the clock is running
         await asyncio.to_thread(save_wrong_model, settings.model.file, folder / WRONG_MODEL)
     copied = with_copied_load(settings, scenario.load, folder)
     async with contextlib.AsyncExitStack() as stack:
@@ -490,23 +479,16 @@ async def conduct(
         await services.during(client.connect(START_PATIENCE_S))
         await links.connect()
         await services.during(client.begin(scenario, recorder))
-        driver = FaultSequencer(
-            plan, services, client, Injector(services, links, client.plant, folder), trace, progress
-        )
+        injector = Injector(services, links, client.plant, folder)
+        driver = FaultSequencer(plan, services, client, injector, trace, progress)
         try:
-            async with asyncio.timeout(_patience_s(plan)):
+            async with asyncio.timeout(patience_s):
                 await services.during(driver.run())
         except TimeoutError:
             raise LinkError(
-                f"plan {plan.name} has taken {_patience_s(plan):.0f} s of real time and is at "
+                f"plan {plan.name} has taken {patience_s:.0f} s of real time and is at "
                 f"{driver.tick * plan.process.tick_s:g} s: see the logs in {folder / 'logs'}"
             ) from None
         finally:
             driver.finish()
             await client.last_look()
-
-
-def _patience_s(plan: faults.ChaosPlan) -> float:
-    schedule = plan.schedule()
-    speed = SLOWEST if not plan.realtime else plan.factor / 2
-    return 300.0 + plan.duration_s / speed + sum(60.0 + fault.duration_s / speed for fault in schedule)

@@ -14,7 +14,7 @@ from coldloop_optimizer_plc.plausibility import watched_output
 from coldloop_optimizer_plc.qp.linear_algebra import real_of
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, prediction_of
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem
-from coldloop_optimizer_plc.settings import ControlDesign, ProgramSettings, SolverName, Target, trivial_design
+from coldloop_optimizer_plc.settings import ProgramSettings, SolverName, Target, trivial_design
 from coldloop_rig.plc_sizing import operations
 from coldloop_rig.plc_sizing.operations import ACTIVE_ROWS, SOLVERS, WORD, Operations, QpSizes
 from coldloop_rig.plc_sizing.plc import MEMORY_BYTES, PlcProfile, cholesky_times, reference_curve, residuals, slow_down
@@ -111,16 +111,10 @@ def power_of(profile: PlcProfile, size: int) -> float:
 
 
 def capacity(size: int, needed: Footprint, memory_bytes: int, budget: PlcBudget) -> Capacity:
-    """Return what a PLC has room and time for.
+    """Return what a PLC has room and time for, where a problem of `size` variables needs so much memory.
 
     Matrices grow with the square of the variables and the time of an iteration with their third power, as rows grow
     with them; the estimator, the sequences and the preparation stay.
-
-    Args:
-        size: Variables of the problem.
-        needed: What it takes in memory.
-        memory_bytes: The PLC's.
-        budget: Of the PLC and the solver.
     """
     fixed = needed.estimator + needed.sequence
     room = max(memory_bytes - fixed, 0)
@@ -130,62 +124,44 @@ def capacity(size: int, needed: Footprint, memory_bytes: int, budget: PlcBudget)
     )
 
 
-def fits(profile: PlcProfile, program: ProgramSettings, problem: PredictiveProblem, needed: Footprint) -> bool:
-    """Return whether a PLC has memory and time for a problem; as `verdict`."""
-    budget = PlcBudget(program.budget, program.iteration_s)
-    return min(capacity(problem.size, needed, profile.memory_bytes, budget)) + ROUNDING >= problem.size
-
-
-def verdict(profile: PlcProfile, program: ProgramSettings, problem: PredictiveProblem, needed: Footprint) -> str:
-    """Return what a PLC can do with a problem; `program` has the power of this PLC.
-
-    Args:
-        profile: The PLC.
-        program: Solver and budget.
-        problem: The problem in single precision.
-        needed: What it takes in memory.
-    """
+def verdict(
+    profile: PlcProfile, program: ProgramSettings, problem: PredictiveProblem, needed: Footprint
+) -> tuple[bool, str]:
+    """Return whether a PLC has memory and time for a problem, and what it can do with it; `program` has its power."""
     budget = PlcBudget(program.budget, program.iteration_s)
     limits = capacity(problem.size, needed, profile.memory_bytes, budget)
     problem_text = f"the problem ({problem.size} variables, {len(problem.Gamma)} rows) with {program.solver_name}"
-    if not fits(profile, program, problem, needed):
+    if min(limits) + ROUNDING < problem.size:
         lacks = []
         if limits.by_memory < problem.size:
             lacks.append(f"it takes {needed.total:,} of {profile.memory_bytes:,} bytes")
         if limits.by_time < problem.size:
             lacks.append(budget.too_slow())
-        return f"{profile.name}: {problem_text} does not fit: {', and '.join(lacks)}."
+        return False, f"{profile.name}: {problem_text} does not fit: {', and '.join(lacks)}."
     memory = f"{needed.total / 1e3:,.0f} of {profile.memory_bytes / 1e3:,.0f} kB"
     ends = budget.ladder[0], budget.ladder[-1]
     first, then = sorted((("memory", limits.by_memory), ("time", limits.by_time)), key=lambda one: one[1])
     shortest_s, longest_s = (ticks * budget.times.tick_s for ticks in ends)
     soonest, most = (f"{count} iteration{'s' * (count != 1)}" for count in map(budget.iterations, ends))
     variables = [MANY if count >= MANY else floor(count + ROUNDING) for _, count in (first, then)]
-    return (
+    longest_call_s, what = max((budget.times.iteration, "an iteration"), (budget.times.preparation, "the preparation"))
+    calls = ""
+    if profile.cycle_s is not None and longest_call_s > profile.cycle_s:
+        calls = (
+            f"; {what} takes {longest_call_s:.3g} s and its cycle monitoring stops a program after {profile.cycle_s:g}"
+            f" s: divide it over {-int(-longest_call_s // profile.cycle_s)} calls, or set that higher"
+        )
+    return True, (
         f"{profile.name}: {problem_text} fits, in {memory}; it updates every {shortest_s:g} s at the "
         f"soonest ({soonest}), {most} in {longest_s:g} s; {first[0]} gives way first, with more than {variables[0]} "
-        f"variables ({then[0]} with more than {variables[1]}){_calls(profile, budget)}."
-    )
-
-
-def _calls(profile: PlcProfile, budget: PlcBudget) -> str:
-    longest_s, what = max((budget.times.iteration, "an iteration"), (budget.times.preparation, "the preparation"))
-    if profile.cycle_s is None or longest_s <= profile.cycle_s:
-        return ""
-    calls = -int(-longest_s // profile.cycle_s)
-    return (
-        f"; {what} takes {longest_s:.3g} s and its cycle monitoring stops a program after "
-        f"{profile.cycle_s:g} s: divide it over {calls} calls, or set that higher"
+        f"variables ({then[0]} with more than {variables[1]}){calls}."
     )
 
 
 def budget_tables(settings: Settings, period_s: float | None, executed: Callable[[PredictiveProblem], str]) -> str:
-    """Return the tables as text, for the configured power and one updating period or several.
+    """Return the tables as text, for the configured power and one updating period or several (None).
 
-    Args:
-        settings: Of the optimiser.
-        period_s: One updating period, or None for several.
-        executed: Returns what an iteration as exported takes.
+    `executed` returns what an iteration as exported takes.
     """
     problem, prediction = problem_of(settings)
     program = settings.optimizer_plc.program
@@ -210,27 +186,22 @@ def plc_tables(
 ) -> str:
     """Return what a PLC can do as text: a sentence, what updating periods cost there, and the tables that differ.
 
-    Args:
-        settings: With any power: it becomes this PLC's.
-        period_s: One updating period, or None for several.
-        profile: The PLC.
-        costs: Returns a sentence or nothing; it is asked where the controller runs there.
+    The power in the settings becomes this PLC's; `period_s` is one updating period, or None for several. `costs`
+    returns a sentence or nothing, and is called where the controller runs there.
     """
     problem, prediction = problem_of(settings)
     settings = with_power(settings, power_of(profile, problem.size))
     program = settings.optimizer_plc.program
     apart = predicted_apart(program, prediction)
     needed = footprint(problem, estimator_memory(prediction, program.estimator, apart), program.solver)
-    sentences = [verdict(profile, program, problem, needed)]
-    if fits(profile, program, problem, needed):
-        sentences += [costs(settings)]
+    fits, sentence = verdict(profile, program, problem, needed)
     speed = (
         f"\nP = {program.budget.power:.3g}, {profile.flops_per_s(problem.size) / 1e6:.3g} Mflop/s in loops of length "
         f"{problem.size}: {profile.source}\n"
         f"for a run there: --set optimizer_plc.program.budget.power={program.budget.power:.4g}\n"
     )
     return "\n".join([
-        *filter(None, sentences),
+        *filter(None, [sentence, costs(settings) if fits else ""]),
         speed,
         _iterations(program, problem, period_s),
         _memory(settings, problem, prediction, profile.memory_bytes),
@@ -242,12 +213,8 @@ def problem_of(settings: Settings) -> tuple[PredictiveProblem, PredictionModel]:
     program = settings.optimizer_plc.program
     prediction = prediction_of(load(settings.model.file), program.estimator.disturbed, program.design)
     check_detectability(prediction)
-    return _problem(settings, prediction, program.design), prediction
-
-
-def _problem(settings: Settings, prediction: PredictionModel, design: ControlDesign) -> PredictiveProblem:
-    penalties = settings.optimizer_plc.program.penalties
-    return PredictiveProblem(prediction, design, settings.limits, real_of(Arithmetic.FLOAT32), penalties)
+    real = real_of(Arithmetic.FLOAT32)
+    return PredictiveProblem(prediction, program.design, settings.limits, real, program.penalties), prediction
 
 
 def with_power(settings: Settings, power: float) -> Settings:
@@ -323,7 +290,10 @@ def _memory(
 ) -> str:  # fmt: skip
     program = settings.optimizer_plc.program
     estimator = estimator_memory(prediction, program.estimator, predicted_apart(program, prediction))
-    problems = (problem, _problem(settings, prediction, trivial_design(program.design)))
+    trivial = PredictiveProblem(
+        prediction, trivial_design(program.design), settings.limits, real_of(Arithmetic.FLOAT32), program.penalties
+    )
+    problems = (problem, trivial)
     footprints = [footprint(one, estimator, program.solver) for one in problems]
     names = {"hessian": "Phi", "problem": "Gamma and maps", "shift": "shift of the profile", "solver": "solver",
              "estimator": "estimator", "sequence": "sequence buffers"}  # fmt: skip

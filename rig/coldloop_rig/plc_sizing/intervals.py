@@ -116,16 +116,13 @@ def jackknife(statistic: Callable[[list[int]], float], draws: int, above: float 
     least = min(value, *without)
     if least < above:
         raise ValueError(f"a statistic of {least:g} that cannot be below {above:g}")
-    changes = without - value
-    logarithmic = -np.inf < above < least
-    if logarithmic:
+    quantile = float(stdtrit(draws - 1, 1.0 - TAIL)) * (draws - 1) ** 0.5
+    if -np.inf < above < least:
         logarithms = np.log((without - above) / (value - above))
-        logarithmic = bool(np.abs(logarithms).max() < MOST_CHANGE)
-        changes = logarithms if logarithmic else changes
-    reach = float(stdtrit(draws - 1, 1.0 - TAIL) * np.sqrt((draws - 1) * changes.var()))
-    if logarithmic:
-        factor = float(np.exp(reach))
-        return Interval(value, above + (value - above) / factor, above + (value - above) * factor)
+        if np.abs(logarithms).max() < MOST_CHANGE:
+            factor = float(np.exp(quantile * logarithms.std()))
+            return Interval(value, above + (value - above) / factor, above + (value - above) * factor)
+    reach = quantile * float(without.std())
     return Interval(value, max(value - reach, above), value + reach)
 
 
@@ -160,11 +157,11 @@ def interval_of_mean(values: Sequence[float], above: float = -np.inf) -> Interva
 def crossing(powers: Array, one: Array, other: Array) -> float:
     """Return the power from which on `one` is not above `other` any more; NaN if there is none."""
     above = np.log(one / other)
-    if not np.isfinite(above).all():
-        return float("nan")
     behind = np.flatnonzero(above > 0)
-    if len(behind) == 0 or behind[-1] == len(powers) - 1:
-        return float("nan") if len(behind) else float(powers[0])
+    if not np.isfinite(above).all() or (len(behind) and behind[-1] == len(powers) - 1):
+        return float("nan")
+    if not len(behind):
+        return float(powers[0])
     i = behind[-1]
     share = above[i] / (above[i] - above[i + 1])
     return float(np.exp(np.interp(share, [0, 1], np.log(powers[i : i + 2]))))
@@ -182,11 +179,10 @@ OWN_SEEDS: Final = 10**9
 
 
 class Problem(NamedTuple):
-    """A problem that the loop met."""
+    """A problem that the loop met, with the guess, which is the shifted optimum of the problem before."""
 
     qp: QuadraticProblem
     guess: Array
-    """The shifted optimum of the problem before."""
     optimum: Array
 
 
@@ -214,13 +210,10 @@ class Certificate(NamedTuple):
 
 
 def iterations_needed(solver: Solver, problem: Problem, tolerance: float, floor: float) -> int:
-    """Return from which iteration on J stays within a tolerance of its optimum; `LONGEST` + 1 if from none.
+    """Return from which iteration on J stays within a tolerance, a share of its optimum; `LONGEST` + 1 if from none.
 
-    Args:
-        solver: Begins from the problem's guess.
-        problem: With its optimum.
-        tolerance: Share of the optimal J.
-        floor: Constant that J has besides that of the problem, as in Algorithm 1.
+    The solver begins from the problem's guess; `floor` is a constant that J has besides that of the problem, as in
+    Algorithm 1.
     """
     qp = problem.qp
     rest = qp.constant + floor
@@ -252,35 +245,6 @@ def scenario_needs(solver: Solver, problems: list[Problem], number: int, toleran
     return Needs(max(needs), needs[random.Random(number).randrange(len(needs))])  # noqa: S311
 
 
-def certify(
-    settings: Settings, scenarios: int, tolerance: float, beta: float, progress: Callable[[int], None]
-) -> list[Certificate]:
-    """Return a certificate for each solver that is installed.
-
-    Args:
-        settings: Of plant, problem and solvers.
-        scenarios: N.
-        tolerance: Share of the optimal J that an answer may cost more.
-        beta: One minus the confidence.
-        progress: Called with the number of scenarios done.
-    """
-    program = settings.optimizer_plc.program
-    solvers = dict[SolverName, Solver]()
-    for name in SolverName:
-        with suppress(ConfigurationError):  # it is not installed
-            solvers[name] = make_solver(program.model_copy(update={"solver": name}))
-    floor = program.adaptive.cost_floor
-    needs: dict[SolverName, list[Needs]] = {name: [] for name in solvers}
-    for number in range(scenarios):
-        problems = scenario_problems(settings, number)
-        for name, solver in solvers.items():
-            needs[name].append(scenario_needs(solver, problems, number, tolerance, floor))
-        progress(number + 1)
-    longest = program.process.ticks_per_sample
-    fitting = {name: PlcBudget(program.budget, one.tau_1_s).iterations(longest) for name, one in solvers.items()}
-    return [_certificate(name, fitting[name], needs[name], beta) for name in solvers]
-
-
 def _certificate(name: SolverName, fitting: int, needs: list[Needs], beta: float) -> Certificate:
     failures = sum(one.at_random > fitting for one in needs)
     run_failures = sum(one.worst > fitting for one in needs)
@@ -291,22 +255,28 @@ def _certificate(name: SolverName, fitting: int, needs: list[Needs], beta: float
 
 
 def certification_table(settings: Settings, scenarios: int, tolerance_pct: float, confidence_pct: float) -> str:
-    """Sample scenarios and return what they certify, as text.
+    """Sample scenarios, 1 or more, and return what they certify of each solver that is installed, as text.
 
-    Args:
-        settings: Of plant, problem, solvers and budget.
-        scenarios: N, 1 or more.
-        tolerance_pct: An answer is good when its J is within this of the optimum.
-        confidence_pct: Of the bounds.
+    An answer is good when its J is within the tolerance of the optimum; the bounds have the confidence.
     """
-    beta = 1.0 - confidence_pct / 100.0
+    beta, program = 1.0 - confidence_pct / 100.0, settings.optimizer_plc.program
+    solvers = dict[SolverName, Solver]()
+    for name in SolverName:
+        with suppress(ConfigurationError):  # it is not installed
+            solvers[name] = make_solver(program.model_copy(update={"solver": name}))
+    needs: dict[SolverName, list[Needs]] = {name: [] for name in solvers}
     with make_console().status("") as status:
-        found = certify(
-            settings, scenarios, tolerance_pct / 100.0, beta,
-            lambda done: status.update(f"{done} of {scenarios} scenarios"),
-        )  # fmt: skip
+        for number in range(scenarios):
+            problems = scenario_problems(settings, number)
+            for name, solver in solvers.items():
+                needed = scenario_needs(solver, problems, number, tolerance_pct / 100.0, program.adaptive.cost_floor)
+                needs[name].append(needed)
+            status.update(f"{number + 1} of {scenarios} scenarios")
+    longest = program.process.ticks_per_sample
+    fitting = {name: PlcBudget(program.budget, one.tau_1_s).iterations(longest) for name, one in solvers.items()}
+    found = [_certificate(name, fitting[name], needs[name], beta) for name in solvers]
     none_failed = 100.0 * failure_bound(0, scenarios, beta)
-    power, period_s = settings.optimizer_plc.program.budget.power, settings.process.sampling_period_s
+    power, period_s = program.budget.power, settings.process.sampling_period_s
     heading = (
         f"{scenarios} independent scenarios of {SCENARIO_TICKS // 240} min under random telegraphs, problems "
         f"every {period_s:g} s; good is an answer within {tolerance_pct:g} % of the optimal J\n"
@@ -365,15 +335,10 @@ def fixed_periods(process: Process) -> tuple[float, ...]:
 def adaptive_gain(
     settings: Settings, names: Sequence[str], period_s: float | None, done: Callable[[int, int], None]
 ) -> str:
-    """Return, as a sentence, J_BF of the adaptive period over that of the best fixed one.
+    """Return, as a sentence, J_BF of the adaptive period over that of a fixed one under loads, named ones or files.
 
-    The best is chosen on the same loads, which favours it.
-
-    Args:
-        settings: With the power of the PLC.
-        names: Loads, named ones or files.
-        period_s: The fixed period to compare with; None for the best of `fixed_periods` in which an iteration fits.
-        done: Is called with the number of runs done and that of all.
+    The settings have the power of the PLC. Without `period_s` the fixed one is the best of `fixed_periods` in which an
+    iteration fits, chosen on the same loads, which favours it. `done` takes the numbers of runs done and of all.
     """
     program = settings.optimizer_plc.program
     budget = PlcBudget(program.budget, program.iteration_s)

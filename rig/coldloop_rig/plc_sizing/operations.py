@@ -242,7 +242,7 @@ def daqp(s: QpSizes, active: float = WORKING_SET) -> Operations:
 
 
 class PreparationSizes(NamedTuple):
-    """Sizes of what happens once an updating period."""
+    """Sizes of what is computed once in an updating period."""
 
     problem: QpSizes
     rate_rows: int
@@ -345,18 +345,13 @@ def iteration_shares(sizes: ProblemSizes) -> dict[str, float]:
 
     Dense operations are counted in both, with the cold box's number of active rows.
     """
-    here, there = (_operations(each) for each in (sizes, COLD_BOX_SIZES))
+    counts: list[dict[str, float]] = []
+    for knots, inputs, outputs, bands, constraints, states in (sizes, COLD_BOX_SIZES):
+        moves = knots * inputs
+        problem = dense_sizes(moves + 2 * bands * knots, 2 * (bands * constraints + moves), moves)
+        once = PreparationSizes(problem, 2 * moves, knots, states, inputs, outputs, targets=False, limited=False)
+        solvers = {str(name): each for name, each in SOLVERS.items() if name is not SolverName.HYBRID}
+        counts.append({name: each.operations(problem).flops for name, each in solvers.items()})
+        counts[-1]["preparation"] = preparation(once, ACTIVE_ROWS.mean).flops
+    here, there = counts
     return {name: here[name] / there[name] for name in here}
-
-
-def _operations(sizes: ProblemSizes) -> dict[str, float]:
-    n_inputs, rate_rows = sizes.knots * sizes.inputs, 2 * sizes.knots * sizes.inputs
-    rows = 2 * sizes.bands * sizes.constraints + rate_rows
-    problem = dense_sizes(n_inputs + 2 * sizes.bands * sizes.knots, rows, n_inputs)
-    once = PreparationSizes(
-        problem=problem, rate_rows=rate_rows, knots=sizes.knots, states=sizes.states, inputs=sizes.inputs,
-        outputs=sizes.outputs, targets=False, limited=False,
-    )  # fmt: skip
-    counts = {str(name): each.operations(problem).flops for name, each in SOLVERS.items()
-              if name is not SolverName.HYBRID}  # fmt: skip
-    return {**counts, "preparation": preparation(once, ACTIVE_ROWS.mean).flops}

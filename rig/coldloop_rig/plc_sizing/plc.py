@@ -73,9 +73,7 @@ def reference_curve() -> SpeedCurve:
 
 def residuals(curve: SpeedCurve, times: CholeskyTimes) -> Array:
     """Return the relative errors of the curve, shape (25,)."""
-    modelled = np.array([curve.time_s(n) for n in times.size.tolist()])
-    errors: Array = modelled / times.plc_s - 1.0
-    return errors
+    return np.array([curve.time_s(n) for n in times.size.tolist()]) / times.plc_s - 1.0
 
 
 def slow_down(times: CholeskyTimes, size: float) -> float:
@@ -265,18 +263,16 @@ def cost_text(cost: ExportCost, profile: PlcProfile | None = None) -> str:
         header = ("what", *header[1:])
         took = f", {cost.seconds(cost.work + cost.piece, profile):.3g} s" if profile else ""
         title = f"Operations, in calls that do {cost.work:,} and at most {cost.piece:,} more{took}:"
-    rows = [(name, *_numbers(each), *((f"{cost.seconds(each.bound, profile):.3f}",) if profile else ()))
-            for name, each in cost.operations.items()]  # fmt: skip
+    rows = []
+    for name, call in cost.operations.items():
+        counts = ("" if each is None else f"{each:,.0f}" for each in (call.least, call.mean, call.most, call.worst))
+        rows.append((name, *counts, *((f"{cost.seconds(call.bound, profile):.3f}",) if profile else ())))
     memory = [(what, f"{size:,}") for what, size in cost.bytes.items()]
     tables = [markdown_table(header, rows, title), markdown_table(("bytes", ""), memory)]
     if profile:
         found = misfits(cost, profile)
         tables += ["\n".join(found) if found else f"{profile.name}: it fits, in memory and time."]
     return "\n\n".join(tables) + "\n"
-
-
-def _numbers(call: CallCost) -> tuple[str, ...]:
-    return tuple("" if each is None else f"{each:,.0f}" for each in (call.least, call.mean, call.most, call.worst))
 
 
 def misfits(cost: ExportCost, profile: PlcProfile) -> list[str]:
