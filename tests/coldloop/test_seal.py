@@ -4,7 +4,7 @@ import zlib
 
 import pytest
 
-from coldloop.registers.codec import CRC_BYTES, Seal, WordOrder, codec_of, seal_of, sealed_bytes
+from coldloop.registers.codec import CRC_BYTES, Seal, WordOrder, codec_of
 from coldloop.registers.plant import Actuators, Measurement
 from tests.harness.records import PLANT_MAP, sealed
 
@@ -18,14 +18,14 @@ def test_the_seal_of_a_record_with_any_nan_is_intact(bits: int) -> None:
     raw = bytearray(codec.encode(RECORD))
     raw[8:12] = bits.to_bytes(4, "big")  # L1
     raw[-CRC_BYTES:] = zlib.crc32(raw[:-CRC_BYTES]).to_bytes(CRC_BYTES, "big")
-    assert seal_of(codec, raw) is Seal.INTACT
+    assert codec.seal_of(raw) is Seal.INTACT
     raw[9] ^= 1
-    assert seal_of(codec, raw) is Seal.BROKEN
+    assert codec.seal_of(raw) is Seal.BROKEN
 
 
 @pytest.mark.parametrize("order", WordOrder)
 def test_a_record_that_is_sealed_while_it_is_encoded_is_that_which_was_sealed_before(order: WordOrder) -> None:
     codec = codec_of(PLANT_MAP.block_of(Actuators), order)
     record = Actuators(7, (43.5, 75.25, 36.1), 0x1234_5678, holder=0xDEAD_BEEF, crc=99)
-    assert sealed_bytes(codec, record) == codec.encode(sealed(record))
-    assert seal_of(codec, sealed_bytes(codec, record)) is Seal.INTACT
+    assert codec.encode_sealed(record) == codec.encode(sealed(record))
+    assert codec.seal_of(codec.encode_sealed(record)) is Seal.INTACT

@@ -17,7 +17,7 @@ from coldloop.errors import ImplausibleAnswerError
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.bank import ANYBODY, RefusedAccessError
-from coldloop.registers.codec import DomainError, codec_of, sealed_bytes
+from coldloop.registers.codec import DomainError, codec_of
 from coldloop.registers.control_plc import LadderStatus, Operator, OperatorMode, PlantLinkState, PlantLinkStatus, Status
 from coldloop.registers.declaration import Block, Role
 from coldloop.registers.plant import Measurement
@@ -71,12 +71,12 @@ class Poison(NamedTuple):
         element = self.value % len(field.elements) if field.elements else 0
         new = (*record[number][:element], value, *record[number][element + 1 :]) if field.elements else value
         changed_record = type(record)(*record[:number], new, *record[number + 1 :])
-        return sealed_bytes(codec, changed_record) if block.sealed else codec.encode(changed_record)
+        return codec.encode_sealed(changed_record) if block.sealed else codec.encode(changed_record)
 
     @staticmethod
     def _sealed(raw: bytes, block: Block) -> bytes:
         codec = codec_of(block)
-        return sealed_bytes(codec, codec.decode(raw)) if block.sealed else raw
+        return codec.encode_sealed(codec.decode(raw)) if block.sealed else raw
 
 
 poisons = st.builds(

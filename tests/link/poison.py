@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any, Final
 
-from coldloop.registers.codec import RecordCodec, Seal, codec_of, seal_of, sealed_bytes
+from coldloop.registers.codec import RecordCodec, Seal, codec_of
 from coldloop.registers.declaration import Block, Field, Kind, RegisterMap
 from coldloop_chaos.faults import Direction
 from tests.harness.records import map_of
@@ -25,14 +25,14 @@ Change = Callable[[tuple[Any, ...]], tuple[Any, ...]]
 def record_in(answer: bytes, block: Block) -> tuple[Any, ...] | None:
     """Return the record of a sealed block that an answer carries, if it is that."""
     codec = codec_of(block)
-    if len(answer) != HEAD + codec.size or answer[7] not in READS or seal_of(codec, answer, HEAD) is not Seal.INTACT:
+    if len(answer) != HEAD + codec.size or answer[7] not in READS or codec.seal_of(answer, HEAD) is not Seal.INTACT:
         return None
     return codec.decode(answer, HEAD)
 
 
 def with_record(answer: bytes, codec: RecordCodec, record: tuple[Any, ...]) -> bytes:
     """Return an answer with another record, sealed."""
-    return answer[:HEAD] + sealed_bytes(codec, record)
+    return answer[:HEAD] + codec.encode_sealed(record)
 
 
 def changed(answer: bytes, block: Block, change: Change) -> bytes:
@@ -105,5 +105,5 @@ class PoisonedReads:
         change = _setting(list(fields).index(name), fields[name], self._draw.choice(values_of(fields[name])))
         record = change(codec.decode(frame, begin))
         self.made[f"{block.name}.{name}"] += 1
-        data = sealed_bytes(codec, record) if block.sealed else codec.encode(record)
+        data = codec.encode_sealed(record) if block.sealed else codec.encode(record)
         return frame[:begin] + data + frame[begin + codec.size :]

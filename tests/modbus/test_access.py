@@ -53,8 +53,8 @@ async def test_each_role_writes_its_own_blocks_and_no_others(serve: "Serve") -> 
         assert await operator.ask(write_of(a_plan(4))) == b"\x90\x01"
         assert running.bank.get(Plan).update == 3
         assert running.written == ["plan", "grant"]
-        assert running.server.counters.access_refused == 2
-        assert running.server.counters.illegal_function == running.server.counters.illegal_address == 0
+        assert running.server.statistics().access_refused == 2
+        assert running.server.statistics().illegal_function == running.server.statistics().illegal_address == 0
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ async def test_a_reader_reads_and_whatever_it_writes_is_refused_and_not_stored(
         assert running.bank.get(Grant) == Grant(0)
         assert running.bank.get(Operator) == Operator(0, (0.0, 0.0, 0.0))
         assert running.written == []
-        assert running.server.counters.access_refused == 1
+        assert running.server.statistics().access_refused == 1
         assert kinds == ["access_refused"]
         assert await wire.ask(READ_MAGIC) == MAGIC
 
@@ -116,7 +116,7 @@ async def test_who_may_not_even_read_is_turned_away(serve: "Serve", caplog: pyte
     async with serve(CONTROL_MAP, access=ACCESS) as running:
         wire = await running.connect(STRANGER)
         assert await wire.closed() == b""
-        assert running.server.counters.access_refused == 1
+        assert running.server.statistics().access_refused == 1
         assert f"peer={STRANGER}:" in caplog.messages[0]
         assert await still_serves(running)
 

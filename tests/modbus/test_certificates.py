@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from coldloop.errors import ConfigurationError, PeerUnreachableError, UntrustedPeerError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.settings import Endpoint, TlsSettings
-from coldloop.modbus.tls import certificate_days_left, first_expiry, server_context
+from coldloop.modbus.tls import first_expiry, server_context
 from coldloop_rig.cli.certificates import Authority, Pair, revoked_now
 from tests.harness.records import CONTROL_MAP
 
@@ -69,7 +69,7 @@ async def test_a_client_whose_certificate_has_expired_exists_and_is_refused_by_t
         with pytest.raises(PeerUnreachableError, match="that it accepts our certificate"):
             await client.connect(0.0)
         client.close()
-        assert running.server.counters.tls_refused == 1
+        assert running.server.statistics().tls_refused == 1
     assert "old.crt expired on" in caplog.messages[0]
     assert "certificate has expired" in caplog.messages[1]
 
@@ -91,18 +91,18 @@ def test_days_left_are_those_of_whatever_expires_first(pki: "Pki", tmp_path: Pat
     for file, data in zip(files.values(), contents, strict=True):
         file.write_bytes(data)
     tls = TlsSettings(**files)
-    assert certificate_days_left(tls) == pytest.approx(20, abs=0.01)
-    assert certificate_days_left(tls, datetime.now(UTC) + timedelta(days=25)) == pytest.approx(-5, abs=0.01)
+    assert first_expiry(tls).days_left() == pytest.approx(20, abs=0.01)
+    assert first_expiry(tls).days_left(datetime.now(UTC) + timedelta(days=25)) == pytest.approx(-5, abs=0.01)
     (tmp_path / "l").write_bytes(long.revocation_list([], 7))
     listed = tls.model_copy(update={"crl": tmp_path / "l"})
     assert first_expiry(listed).what == f"crl {tmp_path / 'l'}"
-    assert certificate_days_left(listed) == pytest.approx(7, abs=0.01)
+    assert first_expiry(listed).days_left() == pytest.approx(7, abs=0.01)
     files["ca"].write_bytes(pki.authority.pair.certificate_pem)
     assert first_expiry(tls).what == f"ca {tmp_path / 'a'}"
-    assert certificate_days_left(tls) == pytest.approx(1, abs=0.01)
+    assert first_expiry(tls).days_left() == pytest.approx(1, abs=0.01)
     files["certificate"].unlink()
     with pytest.raises(ConfigurationError, match=r"certificate .*: No such file"):
-        certificate_days_left(tls)
+        first_expiry(tls).days_left()
 
 
 @pytest.mark.parametrize(("warn_days", "lines"), [(0.0, 0), (0.5, 0), (30.0, 1)])
@@ -125,7 +125,7 @@ async def test_a_client_whose_certificate_is_revoked_is_refused_counted_and_logg
             await client.connect(0.0)
         client.close()
         assert await (await running.connect()).ask(READ_MAGIC) == MAGIC
-        assert running.server.counters.tls_refused == 1
+        assert running.server.statistics().tls_refused == 1
         assert "its certificate is invalid: certificate revoked" in caplog.messages[0]
 
 

@@ -36,7 +36,7 @@ async def test_when_full_the_connection_that_has_been_idle_longest_makes_room(se
         assert await wires[1].closed() == b""
         for wire in (wires[0], wires[2], newcomer):
             assert len(await wire.ask(READ_MAGIC)) == 6
-        assert running.server.counters.connection_evicted == 1
+        assert running.server.statistics().connection_evicted == 1
         assert running.server.connections == 3
 
 
@@ -50,7 +50,7 @@ async def test_readers_without_a_role_do_not_take_the_place_of_one_with_a_role(s
             reader = await running.connect("127.0.0.3")
             assert len(await reader.ask(READ_MAGIC)) == 6
         assert len(await control.ask(READ_MAGIC)) == 6
-        assert running.server.counters.connection_evicted == 3
+        assert running.server.statistics().connection_evicted == 3
 
 
 async def test_a_crowd_leaves_as_many_connections_as_the_limit_says(serve: "Serve") -> None:
@@ -95,7 +95,7 @@ async def test_when_all_have_a_request_in_flight_the_newcomer_is_refused(serve: 
         await waiting.wait()
         newcomer = await running.connect()
         assert await newcomer.closed() == b""
-        assert running.server.counters.connection_refused == 1
+        assert running.server.statistics().connection_refused == 1
 
 
 async def test_an_idle_connection_is_closed_after_the_timeout(serve: "Serve") -> None:
@@ -103,7 +103,7 @@ async def test_an_idle_connection_is_closed_after_the_timeout(serve: "Serve") ->
         wire = await running.connect()
         await wire.ask(READ_MAGIC)
         assert await wire.closed() == b""
-        assert running.server.counters.idle_timeout == 1
+        assert running.server.statistics().idle_timeout == 1
 
 
 async def test_half_a_request_does_not_keep_a_connection(serve: "Serve") -> None:
@@ -120,12 +120,12 @@ async def test_a_client_that_does_not_read_costs_bounded_memory_and_is_dropped(s
         tracemalloc.start()
         greedy.send(requests)
         dropped = asyncio.ensure_future(greedy.writer.wait_closed())
-        while not dropped.done() and not running.server.counters.idle_timeout:
+        while not dropped.done() and not running.server.statistics().idle_timeout:
             assert len(await other.ask(READ_MAGIC)) == 6
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         dropped.cancel()
-        assert running.server.counters.idle_timeout == 1
+        assert running.server.statistics().idle_timeout == 1
         assert peak < 8e6
 
 

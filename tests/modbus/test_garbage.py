@@ -46,7 +46,7 @@ def test_random_bytes(serve: "Serve", conversations: list[list[bytes]]) -> None:
                 wire.writer.write_eof()
                 await wire.closed()
             assert await still_serves(running)
-            assert running.server.counters.server_failure == 0
+            assert running.server.statistics().server_failure == 0
 
     complaints: list[Any] = []
     asyncio.run(story(complaints))

@@ -26,8 +26,8 @@ async def test_where_two_hundred_are_at_work_the_next_one_is_refused_politely(
         newcomer = await running.connect()
         assert await newcomer.reader.read() == b""  # the end of the stream, not a reset
         assert [await wire.ask(READ_MAGIC) for wire in wires] == [MAGIC] * 200
-        assert running.server.counters.connection_refused == 1
-        assert running.server.counters.connection_evicted == 0
+        assert running.server.statistics().connection_refused == 1
+        assert running.server.statistics().connection_evicted == 0
         assert "kind=connection_refused peer=127.0.0.1:" in caplog.messages[0]
 
 
@@ -49,7 +49,7 @@ async def test_beyond_its_rate_a_connection_is_read_from_later_and_gets_every_an
         assert await other.ask(READ_MAGIC) == MAGIC
         assert [(await hasty.answer())[0] for _ in range(40)] == list(range(20, 60))
         assert time.monotonic() - began >= 0.19  # forty requests beyond the burst
-        assert running.server.counters.rate_limited >= 1
+        assert running.server.statistics().rate_limited >= 1
 
 
 async def test_a_client_that_keeps_its_rate_is_not_limited(serve: "Serve") -> None:
@@ -59,7 +59,7 @@ async def test_a_client_that_keeps_its_rate_is_not_limited(serve: "Serve") -> No
             await wire.ask(READ_MAGIC)
         wire.send(numbered(1))
         assert (await wire.answer())[0] == 1
-        assert running.server.counters.idle_timeout == 0
+        assert running.server.statistics().idle_timeout == 0
 
 
 async def test_one_that_is_made_to_wait_costs_bounded_memory_and_is_not_idle(serve: "Serve") -> None:

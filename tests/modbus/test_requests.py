@@ -185,7 +185,7 @@ async def test_an_unknown_unit_id_is_refused_with_0x0b(serve: "Serve") -> None:
     async with serve() as running:
         wire = await running.connect()
         assert (await wire.ask(bytes.fromhex("03 0000 0002"), unit=2)).hex() == "830b"
-        assert running.server.counters.unknown_unit == 1
+        assert running.server.statistics().unknown_unit == 1
 
 
 async def test_an_unknown_unit_id_is_met_with_silence_where_so_configured(serve: "Serve") -> None:

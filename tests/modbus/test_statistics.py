@@ -1,12 +1,11 @@
 """What a server has done stands in its registers."""
 
-from dataclasses import fields
 from typing import TYPE_CHECKING
 
 import pytest
 
 from coldloop.modbus.client import RegisterClient
-from coldloop.modbus.connection import ErrorCounters
+from coldloop.modbus.connection import REFUSALS, RefusalLog
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import STATISTICS_BLOCK, Identity, ServerStatistics
 from coldloop.registers.declaration import RegisterMap
@@ -54,13 +53,16 @@ async def test_the_block_is_made_anew_for_any_read_that_touches_it_and_for_no_ot
 
 
 def test_there_is_a_register_for_every_kind_of_error() -> None:
-    assert {field.name for field in fields(ErrorCounters)} <= set(ServerStatistics._fields)
+    refusals = RefusalLog("test")
+    for kind in REFUSALS:
+        refusals.note(kind, "somebody", "a test")
+    assert ServerStatistics(1, 2, 3, **refusals.counts)[3:] == (1,) * len(REFUSALS)
     assert STATISTICS_BLOCK.end <= 100
 
 
 async def test_counts_wrap_as_their_registers_do(serve: "Serve") -> None:
     async with serve() as running:
-        running.server.counters.illegal_value = 2**32 + 5
+        running.server.refusals.counts["illegal_value"] = 2**32 + 5
         wire = await running.connect()
         assert (await wire.ask(bytes.fromhex("03 003c 001d")))[0] == 3
         assert running.bank.get(ServerStatistics).illegal_value == 5

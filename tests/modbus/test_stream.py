@@ -61,7 +61,7 @@ async def test_a_malformed_header_closes_the_connection_after_the_answers_owed(s
         wire, other = await running.connect(), await running.connect()
         wire.send(numbered(1) + bytes.fromhex(garbage))
         assert await wire.closed() == bytes.fromhex("0001 0000 0007 01") + MAGIC_PDU
-        assert running.server.counters.malformed_frame == 1
+        assert running.server.statistics().malformed_frame == 1
         assert await other.ask(b"\x03\x00\x00\x00\x02") == MAGIC_PDU
 
 

@@ -46,7 +46,7 @@ async def test_the_role_in_the_certificate_counts_and_not_the_address(
         assert (await wire.ask(WRITE_ROW))[0] == row
         assert running.bank.get(Grant) == Grant(9 if grant == 16 else 0)
         assert running.bank.get(SequenceRow).u[0] == (10.0 if row == 16 else 0.0)
-        assert running.server.counters.access_refused == 1
+        assert running.server.statistics().access_refused == 1
         assert f"CN=client-{role}" in caplog.messages[0]
         assert f'role="{role}"' in caplog.messages[0]
         assert "block '" in caplog.messages[0]
@@ -76,10 +76,10 @@ async def turned_away(running: "Running", context: ssl.SSLContext) -> None:
 
 async def refused_for(running: "Running", caplog: pytest.LogCaptureFixture) -> str:
     """Return why the last client was refused; others are still served."""
-    while not running.server.counters.tls_refused:
+    while not running.server.statistics().tls_refused:
         assert await (await running.connect()).ask(READ_MAGIC) == MAGIC
-    assert running.server.counters.tls_refused == 1
-    assert running.server.counters.server_failure == 0
+    assert running.server.statistics().tls_refused == 1
+    assert running.server.statistics().server_failure == 0
     return next(line for line in caplog.messages if "kind=tls_refused" in line)
 
 
@@ -131,7 +131,7 @@ async def test_tls_where_plain_modbus_is_spoken(serve: "Serve", pki: "Pki") -> N
         client = client_of(running, files)
         with pytest.raises(PeerUnreachableError, match=r"does not speak TLS 1\.3: check server.tls there"):
             await client.connect(0.0)
-        assert running.server.counters.malformed_frame == 1
+        assert running.server.statistics().malformed_frame == 1
 
 
 async def test_handshakes_under_way_are_bounded_and_do_not_keep_others_out(serve: "Serve", pki: "Pki") -> None:

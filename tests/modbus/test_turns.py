@@ -193,4 +193,4 @@ async def test_a_reader_that_floods_is_read_from_later_and_one_with_a_role_is_no
             wire.send(pipeline(5000))
         assert [(await control.answer())[0] for _ in range(5000)] == list(range(5000))
         assert [(await reader.answer())[0] for _ in range(10)] == list(range(10))
-        assert running.server.counters.rate_limited == 1
+        assert running.server.statistics().rate_limited == 1

@@ -168,5 +168,5 @@ async def test_a_program_that_fails_is_answered_with_exception_04(serve: "Serve"
     async with serve(on_write=fail) as running:
         wire = await running.connect()
         assert (await wire.ask(STEP)).hex() == "9704"
-        assert running.server.counters.server_failure == 1
+        assert running.server.statistics().server_failure == 1
         assert len(await wire.ask(READ_TICK)) == 6

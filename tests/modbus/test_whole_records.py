@@ -17,7 +17,7 @@ from coldloop.errors import DamagedAnswerError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.connection import RefusalLog
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
-from coldloop.registers.codec import Seal, WordOrder, codec_of, seal_of
+from coldloop.registers.codec import Seal, WordOrder, codec_of
 from coldloop.registers.control_plc import Heartbeat
 from coldloop.registers.declaration import Block, Field, Kind, Register, RegisterMap
 from coldloop.registers.plant import Actuators, Measurement, PlantSession
@@ -58,7 +58,7 @@ def is_right(block: Block, raw: bytes) -> bool:
         for name, field in block.fields.items()
         for value, (_, one) in zip(values[name] if field.elements else (values[name],), field.registers, strict=True)
     )
-    return ranges and not (block.sealed and seal_of(codec, raw) is Seal.BROKEN)
+    return ranges and not (block.sealed and codec.seal_of(raw) is Seal.BROKEN)
 
 
 def starting_record(block: Block, kind: str) -> tuple[Any, ...]:
@@ -136,7 +136,7 @@ def check(plug: "Plug", bank: RegisterBank, block: Block, row: int, write: Write
         assert answer == bytes((write.pdu[0] | 0x80, 3))
         assert memory(bank) == was
         assert told == []
-    assert refusals.counters.server_failure == 0
+    assert refusals.counts["server_failure"] == 0
     connection.connection_lost(None)
 
 
@@ -183,7 +183,7 @@ async def test_at_boot_a_part_of_a_session_does_not_start_one(serve: "Serve") ->
             assert (await wire.ask(struct.pack(">BHH", 6, address + offset, word))).hex() == "8603"
         assert running.bank.get(PlantSession).session == 0
         assert running.written == []
-        assert running.server.counters.server_failure == 0
+        assert running.server.statistics().server_failure == 0
 
 
 def requests_with(function: int, block: Block, raw: bytes) -> bytes:
@@ -268,7 +268,7 @@ async def test_a_second_writer_is_refused_with_06_counted_as_such_and_stores_not
             with pytest.raises(RequestRefusedError, match="exception 6, another client holds the lease") as refusal:
                 await client.exchange(Actuators(7, (43.0, 75.0, 36.0), session=1), Measurement)
             assert refusal.value.exception_code == 6
-            assert running.server.counters.second_writer == refused
+            assert running.server.statistics().second_writer == refused
         assert kinds == ["second_writer"] * 3
         assert running.written == []
         assert running.bank.get(Actuators).tick == 0

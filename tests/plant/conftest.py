@@ -12,7 +12,7 @@ from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.bank import ALL_ROLES, Caller, RefusedAccessError
-from coldloop.registers.codec import Seal, codec_of, seal_of
+from coldloop.registers.codec import Seal, codec_of
 from coldloop.registers.common import EVENT_ROWS, Event, EventKind
 from coldloop.registers.declaration import Role
 from coldloop.registers.plant import Actuators, Measurement
@@ -120,7 +120,7 @@ class RackClient:
     def _decoded(record: type[R], data: bytes) -> R:
         block = PLANT_MAP.block_of(record)
         codec = codec_of(block)
-        assert not block.sealed or seal_of(codec, data) is Seal.INTACT
+        assert not block.sealed or codec.seal_of(data) is Seal.INTACT
         return cast("R", codec.decode(data))
 
     def write(self, record: tuple[Any, ...], row: int = 0) -> Refused | None:

@@ -24,7 +24,7 @@ def read(values: dict[str, Any]) -> dict[str, Any]:
     bank = RegisterBank(PLANT_MAP, WordOrder.HIGH_FIRST)
     publish_configuration(bank, values)
     digest = bank.get(ConfigurationDigest)
-    return configuration_of(digest, [bank.get(ConfigurationLine, row) for row in range(lines_of(digest))])
+    return configuration_of(digest, [bank.get(ConfigurationLine, row) for row in range(lines_of(digest.length))])
 
 
 @pytest.mark.parametrize("values", [{}, {"a": 1}, {"a.b": [0.1, -5.0], "c": None, "d": "Ĵ", "e": {}, "f": "x  "}])

@@ -66,7 +66,7 @@ async def read_configuration(client: RegisterClient, shown: Sequence[str]) -> di
         LinkError: It does not answer, or its text is not whole, or it shows something else.
     """
     digest = await client.read(ConfigurationDigest)
-    lines = await client.read_rows(ConfigurationLine, 0, lines_of(digest))
+    lines = await client.read_rows(ConfigurationLine, 0, lines_of(digest.length))
     try:
         values = flattened(configuration_of(digest, lines))
     except ValueError as error:

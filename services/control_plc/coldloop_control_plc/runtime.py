@@ -94,9 +94,9 @@ class CertificateWatch:
             await asyncio.sleep(CERTIFICATES_S)
 
     def _days_of_those_to_renew(self) -> list[float]:
-        from coldloop.modbus.tls import certificate_days_left  # noqa: PLC0415 not needed without TLS
+        from coldloop.modbus.tls import first_expiry  # noqa: PLC0415 not needed without TLS
 
-        return [days for tls in self._certificates if (days := certificate_days_left(tls)) < tls.warn_days]
+        return [days for tls in self._certificates if (days := first_expiry(tls).days_left()) < tls.warn_days]
 
     def _judge(self, days: Sequence[float]) -> None:
         """Take the days that are left of those to be renewed."""

@@ -176,7 +176,7 @@ class Poller:
             return
         digest = self._model.record(self._service, ConfigurationDigest)
         if digest is not None and digest != self._configured:
-            lines = await self._client.read_rows(ConfigurationLine, 0, lines_of(digest))
+            lines = await self._client.read_rows(ConfigurationLine, 0, lines_of(digest.length))
             with suppress(ValueError):  # not one of ours, or it has changed meanwhile
                 self._model.configuration = configuration_of(digest, lines)
                 self._configured = digest

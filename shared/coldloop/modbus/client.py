@@ -7,27 +7,12 @@ import struct
 from collections.abc import Sequence
 from typing import Any, Final, Self, TypeVar, cast
 
-from coldloop.errors import (
-    DamagedAnswerError,
-    ImplausibleAnswerError,
-    PeerUnreachableError,
-    RequestRefusedError,
-    UnfitValueError,
-    UntrustedPeerError,
-)
-from coldloop.modbus.requests import (
-    MAX_READ_WORDS,
-    MAX_WRITE_WORDS,
-    READ_HOLDING_REGISTERS,
-    READ_WRITE_REGISTERS,
-    WRITE_MULTIPLE_REGISTERS,
-    MalformedFrameError,
-    framed,
-    next_frame,
-)
+from coldloop import errors
+from coldloop.errors import PeerUnreachableError, UntrustedPeerError
+from coldloop.modbus import requests as protocol
 from coldloop.modbus.settings import Endpoint, TlsSettings
 from coldloop.process.declaration import Process
-from coldloop.registers.codec import DomainError, RecordCodec, Seal, WordOrder, codec_of, seal_of, sealed_bytes
+from coldloop.registers.codec import DomainError, RecordCodec, Seal, WordOrder, codec_of
 from coldloop.registers.common import IDENTITY_BLOCK, MAGIC, Identity
 from coldloop.registers.declaration import Block, RegisterMap
 
@@ -38,10 +23,10 @@ def check_peer(raw: bytes, register_map: RegisterMap, order: WordOrder, peer: st
     Raises:
         PeerUnreachableError: It is something else, uses the other word order, or has another register map.
     """
-    identity = _identity(raw, order)
-    if not _has_magic(identity):
-        other = WordOrder.LOW_FIRST if order is WordOrder.HIGH_FIRST else WordOrder.HIGH_FIRST
-        if _has_magic(_identity(raw, other)):
+    other = WordOrder.LOW_FIRST if order is WordOrder.HIGH_FIRST else WordOrder.HIGH_FIRST
+    identity, swapped = (Identity(*codec_of(IDENTITY_BLOCK, each).decode(raw)) for each in (order, other))
+    if not math.isclose(identity.magic, MAGIC, rel_tol=1e-6):
+        if math.isclose(swapped.magic, MAGIC, rel_tol=1e-6):
             raise PeerUnreachableError(f"{peer} has the other word order: set it to {other} here, or {order} there")
         raise PeerUnreachableError(
             f"{peer}: another program answers there (register 0 is not {MAGIC}): check host and port"
@@ -52,14 +37,6 @@ def check_peer(raw: bytes, register_map: RegisterMap, order: WordOrder, peer: st
             f"not version {register_map.version}, {register_map.digest:08x}): "
             "check the port, and run the same release, of the same process, on both sides"
         )
-
-
-def _identity(raw: bytes, order: WordOrder) -> Identity:
-    return Identity(*codec_of(IDENTITY_BLOCK, order).decode(raw))
-
-
-def _has_magic(identity: Identity) -> bool:
-    return math.isclose(identity.magic, MAGIC, rel_tol=1e-6)
 
 
 UNIT: Final = 1
@@ -192,7 +169,7 @@ class _Wire(asyncio.Protocol):
         for place, pdu in enumerate(requests):
             self._last_id = transaction = self._last_id + 1 & 0xFFFF
             self._awaited[transaction] = place
-            frames += framed(transaction, UNIT, pdu)
+            frames += protocol.framed(transaction, UNIT, pdu)
         self._done = done = self._loop.create_future()
         if self.transport.is_closing():  # uvloop raises RuntimeError when it is written to
             self._fail(closed=True)
@@ -231,12 +208,12 @@ class _Wire(asyncio.Protocol):
         self._buffer += data
         position = 0
         try:
-            while position < len(self._buffer) and (frame := next_frame(self._buffer, position)) is not None:
+            while position < len(self._buffer) and (frame := protocol.next_frame(self._buffer, position)) is not None:
                 transaction, unit, pdu, position = frame
                 place = self._awaited.pop(transaction, None) if unit == UNIT else None
                 if place is not None:  # else it is an answer that nobody waits for any more, or a second one
                     self._answers[place] = pdu
-        except MalformedFrameError:
+        except protocol.MalformedFrameError:
             self.transport.abort()
             self._answers = [NONSENSE] * len(self._answers)
             self._awaited.clear()
@@ -299,7 +276,11 @@ class RegisterClient:
         self.map = register_map
         self._order = order
         self._timeout_s = timeout_s
-        context = _secured(tls, f"tls of the client of {register_map.service} at {host}:{port}") if tls else None
+        context: ssl.SSLContext | None = None
+        if tls is not None:
+            from coldloop.modbus.tls import client_context  # noqa: PLC0415 without TLS, nothing needs cryptography
+
+            context = client_context(tls, f"tls of the client of {register_map.service} at {host}:{port}")
         self._secure = context is not None
         self._transport = Transport(register_map.service, host, port, timeout_s, context)
         self._turn = asyncio.Lock()
@@ -355,7 +336,7 @@ class RegisterClient:
                 if loop.time() >= deadline:
                     raise
                 await asyncio.sleep(min(CONNECT_PAUSE_S, patience_s))
-            except RequestRefusedError as error:
+            except errors.RequestRefusedError as error:
                 raise PeerUnreachableError(
                     f"{self.peer}: another program answers there (no identity block): check host and port"
                 ) from error
@@ -374,13 +355,16 @@ class RegisterClient:
         that is longer than a request is read in pieces: the seal of a record tells torn ones.
         """
         block, codec = self._places[record]
-        row_words = codec.size // 2
-        if row_words > MAX_READ_WORDS:
-            return [await self._long_row(block, codec, row) for row in range(start, start + count)]
-        rows_at_once = MAX_READ_WORDS // row_words
-        end = start + count
-        parts = [(first, min(rows_at_once, end - first)) for first in range(start, end, rows_at_once)]
+        row_words, end = codec.size // 2, start + count
         rows: list[R] = []
+        if row_words > protocol.MAX_READ_WORDS:
+            for first in range(block.address + start * row_words, block.address + end * row_words, row_words):
+                pieces = range(0, row_words, protocol.MAX_READ_WORDS)
+                words = [(first + done, min(protocol.MAX_READ_WORDS, row_words - done)) for done in pieces]
+                rows.append(self._decoded(block, codec, b"".join(await self._read_words(block, words))))
+            return rows
+        rows_at_once = protocol.MAX_READ_WORDS // row_words
+        parts = [(first, min(rows_at_once, end - first)) for first in range(start, end, rows_at_once)]
         for place in range(0, len(parts), REQUESTS_AT_ONCE):
             words = [
                 (block.address + first * row_words, here * row_words)
@@ -389,11 +373,6 @@ class RegisterClient:
             for raw in await self._read_words(block, words):
                 rows += [self._decoded(block, codec, raw, offset) for offset in range(0, len(raw), codec.size)]
         return rows
-
-    async def _long_row(self, block: Block, codec: RecordCodec, row: int) -> Any:  # noqa: ANN401 a record of the block
-        first, words = block.address + row * codec.size // 2, codec.size // 2
-        pieces = [(first + done, min(MAX_READ_WORDS, words - done)) for done in range(0, words, MAX_READ_WORDS)]
-        return self._decoded(block, codec, b"".join(await self._read_words(block, pieces)), 0)
 
     async def write(self, record: tuple[Any, ...]) -> None:
         """Write the record (its first row)."""
@@ -404,7 +383,7 @@ class RegisterClient:
         if not records:
             return
         block, codec = self._places[type(records[0])]
-        rows_at_once = MAX_WRITE_WORDS // (codec.size // 2)
+        rows_at_once = protocol.MAX_WRITE_WORDS // (codec.size // 2)
         for first in range(0, len(records), rows_at_once):
             request = self._writing(records[first : first + rows_at_once], start + first)
             self._check_written(request, (await self._transact([request], block))[0], block)
@@ -414,7 +393,7 @@ class RegisterClient:
         block, codec = self._places[type(records[0])]
         data = _encoded(block, codec, *records)
         address = block.address + start * codec.size // 2
-        return _WRITE.pack(WRITE_MULTIPLE_REGISTERS, address, len(data) // 2, len(data)) + data
+        return _WRITE.pack(protocol.WRITE_MULTIPLE_REGISTERS, address, len(data) // 2, len(data)) + data
 
     def _check_written(self, request: bytes, answer: bytes, block: Block) -> None:
         if answer != request[_WRITTEN]:
@@ -439,7 +418,12 @@ class RegisterClient:
         if rows:
             data += _encoded(*self._places[type(rows[0])], *rows)
         head = _READ_WRITE.pack(
-            READ_WRITE_REGISTERS, answer_block.address, answer_codec.size // 2, block.address, len(data) // 2, len(data)
+            protocol.READ_WRITE_REGISTERS,
+            answer_block.address,
+            answer_codec.size // 2,
+            block.address,
+            len(data) // 2,
+            len(data),
         )
         requests = [head + data] if before is None else [self._writing([before]), head + data]
         *written, raw = await self._transact(requests, block, patience_s)
@@ -459,7 +443,7 @@ class RegisterClient:
         size = codec.size + count * row_codec.size
         data = _encoded(written, own_codec, record)
         head = _READ_WRITE.pack(
-            READ_WRITE_REGISTERS, block.address, size // 2, written.address, len(data) // 2, len(data)
+            protocol.READ_WRITE_REGISTERS, block.address, size // 2, written.address, len(data) // 2, len(data)
         )
         (raw,) = await self._transact([head + data], written)
         raw = self._checked(raw, size, block)
@@ -473,24 +457,27 @@ class RegisterClient:
 
     async def _read_words(self, block: Block, parts: Sequence[tuple[int, int]]) -> list[bytes]:
         """Return the words of parts of a block, each given by its address and the number of words."""
-        requests = [_READ.pack(READ_HOLDING_REGISTERS, address, count) for address, count in parts]
+        requests = [_READ.pack(protocol.READ_HOLDING_REGISTERS, address, count) for address, count in parts]
         answers = await self._transact(requests, block)
         return [self._checked(raw, 2 * count, block) for raw, (_, count) in zip(answers, parts, strict=True)]
 
     def _checked(self, raw: bytes, size: int, block: Block) -> bytes:
-        """Return the words of an answer to a read."""
         if len(raw) != size + 1 or raw[0] != size:
             raise self._nonsense(block)
         return raw[1:]
 
     def _decoded(self, block: Block, codec: RecordCodec, raw: bytes, offset: int = 0) -> Any:  # noqa: ANN401 - a record
         """Return a record of an answer, its seal and its values checked."""
-        if block.sealed and seal_of(codec, raw, offset) is not Seal.INTACT:
-            raise DamagedAnswerError(f"{self.peer}: block '{block.name}' arrived damaged, or is not sealed there")
+        if block.sealed and codec.seal_of(raw, offset) is not Seal.INTACT:
+            raise errors.DamagedAnswerError(
+                f"{self.peer}: block '{block.name}' arrived damaged, or is not sealed there"
+            )
         try:
             return codec.decode_checked(raw, offset)
         except DomainError as error:
-            raise ImplausibleAnswerError(f"{self.peer}: block '{block.name}' is not plausible: {error}") from None
+            raise errors.ImplausibleAnswerError(
+                f"{self.peer}: block '{block.name}' is not plausible: {error}"
+            ) from None
 
     async def _transact(self, requests: Sequence[bytes], block: Block, patience_s: float | None = None) -> list[bytes]:
         """Send PDUs, connecting first where needed; return the bytes behind the function codes of the answers."""
@@ -500,29 +487,22 @@ class RegisterClient:
             try:
                 answers = await self._transport.transact(requests, patience_s or self._timeout_s)
             except NoAnswerError as error:
-                raise self._silent(block, closed=error.closed) from error
-        return [self._payload(request, answer, block) for request, answer in zip(requests, answers, strict=True)]
-
-    def _payload(self, request: bytes, answer: bytes, block: Block) -> bytes:
-        if answer[0] == request[0]:
-            return answer[1:]
-        if answer[0] & 0x7F != request[0]:
-            raise self._nonsense(block)
-        raise self._refused(request[0], block, answer[1:])
-
-    def _silent(self, block: Block, *, closed: bool) -> PeerUnreachableError:
-        what = "closed the connection" if closed else "did not answer in time"
-        return PeerUnreachableError(
-            f"{self.peer} {what} at a request for block '{block.name}': check that it runs and is what listens there"
-            f"{', and that it accepts our certificate' if self._secure else ''}"
-        )
-
-    def _refused(self, function: int, block: Block, payload: bytes) -> RequestRefusedError:
-        code = int.from_bytes(payload, "big")
-        meaning = _EXCEPTIONS.get(code, "not a code that Coldloop uses")
-        return RequestRefusedError(
-            f"{self.peer} refused function {function} on block '{block.name}': exception {code}, {meaning}", code
-        )
+                what = "closed the connection" if error.closed else "did not answer in time"
+                raise PeerUnreachableError(
+                    f"{self.peer} {what} at a request for block '{block.name}': check that it runs and is what listens "
+                    f"there{', and that it accepts our certificate' if self._secure else ''}"
+                ) from error
+        for request, answer in zip(requests, answers, strict=True):
+            if answer[0] == request[0]:
+                continue
+            if answer[0] & 0x7F != request[0]:
+                raise self._nonsense(block)
+            code = int.from_bytes(answer[1:], "big")
+            meaning = _EXCEPTIONS.get(code, "not a code that Coldloop uses")
+            raise errors.RequestRefusedError(
+                f"{self.peer} refused function {request[0]} on block '{block.name}': exception {code}, {meaning}", code
+            )
+        return [answer[1:] for answer in answers]
 
     def _nonsense(self, block: Block) -> PeerUnreachableError:
         return PeerUnreachableError(
@@ -530,14 +510,8 @@ class RegisterClient:
         )
 
 
-def _secured(tls: TlsSettings, name: str) -> ssl.SSLContext:
-    from coldloop.modbus.tls import client_context  # noqa: PLC0415 a service without TLS starts without cryptography
-
-    return client_context(tls, name)
-
-
 def _encoded(block: Block, codec: RecordCodec, *records: tuple[Any, ...]) -> bytes:
     try:
-        return b"".join([sealed_bytes(codec, one) for one in records]) if block.sealed else codec.encode_rows(records)
+        return b"".join(map(codec.encode_sealed, records)) if block.sealed else codec.encode_rows(records)
     except (struct.error, OverflowError) as error:
-        raise UnfitValueError(f"block '{block.name}' cannot hold the values to be written: {error}") from None
+        raise errors.UnfitValueError(f"block '{block.name}' cannot hold the values to be written: {error}") from None

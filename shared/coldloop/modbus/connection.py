@@ -10,21 +10,21 @@ that we do not know, may only read.
 """
 
 import asyncio
+import contextlib
 import json
 import logging
-import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterator
-from dataclasses import dataclass, fields
 from functools import partial
-from ipaddress import IPv4Address, IPv6Address, ip_address
+from ipaddress import ip_address
 from itertools import count
 from time import monotonic
 from typing import Final, Protocol, cast
 
 from coldloop.modbus import requests
-from coldloop.modbus.settings import AccessSettings, Networks, ServerSettings
+from coldloop.modbus.settings import AccessSettings, ServerSettings
 from coldloop.registers.bank import ANYBODY, Caller, ForbiddenWriteError, RefusedAccessError
+from coldloop.registers.common import ServerStatistics
 from coldloop.registers.declaration import Block, Role
 
 LOG_INTERVAL_S: Final = 10.0
@@ -32,23 +32,8 @@ LOG_INTERVAL_S: Final = 10.0
 _logger = logging.getLogger("coldloop.modbus")
 
 
-@dataclass(slots=True)
-class ErrorCounters:
-    """Errors since the server was made, by kind."""
-
-    illegal_function: int = 0
-    illegal_address: int = 0
-    illegal_value: int = 0
-    server_failure: int = 0
-    unknown_unit: int = 0
-    malformed_frame: int = 0
-    idle_timeout: int = 0
-    connection_evicted: int = 0
-    connection_refused: int = 0
-    access_refused: int = 0
-    tls_refused: int = 0
-    rate_limited: int = 0
-    second_writer: int = 0
+REFUSALS: Final = ServerStatistics._fields[3:]
+"""Kinds of refusals, which the registers count."""
 
 
 class RefusalLog:
@@ -60,18 +45,19 @@ class RefusalLog:
     """
 
     def __init__(self, service: str, on_refusal: Callable[[str], None] | None = None) -> None:
-        self.counters = ErrorCounters()
+        self.counts = dict.fromkeys(REFUSALS, 0)
+        """Refusals so far, by kind."""
         self._service = service
         self._on_refusal = on_refusal
-        self._next_line = dict.fromkeys((field.name for field in fields(ErrorCounters)), 0.0)
-        self._unlogged = dict.fromkeys(self._next_line, 0)
+        self._next_line = dict.fromkeys(REFUSALS, 0.0)
+        self._unlogged = dict.fromkeys(REFUSALS, 0)
 
     def note(self, kind: str, peer: str, reason: str) -> None:
-        """Count a refusal of `kind`, a field of `ErrorCounters`."""
-        setattr(self.counters, kind, getattr(self.counters, kind) + 1)
+        """Count a refusal of a kind, one of `REFUSALS`."""
+        self.counts[kind] += 1
         if self._on_refusal is not None:
             self._on_refusal(kind)
-        now = time.monotonic()
+        now = monotonic()
         if now < self._next_line[kind]:
             self._unlogged[kind] += 1
             return
@@ -190,14 +176,14 @@ _numbers = count(1)
 class Connection(asyncio.Protocol):
     """Serves one client.
 
-    `opened` reports the connection to the server and returns whether it may stay; `lost` reports its end.
+    `opened` reports the connection to the server, which may close it; `lost` reports its end.
     """
 
     _handle: Callable[[bytes], bytes | requests.Written]
 
     def __init__(
         self, *, handler_for: Callable[[Caller], requests.RequestHandler], settings: ServerSettings, on_write: OnWrite,
-        refusals: RefusalLog, turns: Turns, opened: Callable[["Connection"], bool],
+        refusals: RefusalLog, turns: Turns, opened: Callable[["Connection"], None],
         lost: Callable[["Connection"], None],
     ) -> None:  # fmt: skip
         self._handler_for = handler_for
@@ -248,12 +234,11 @@ class Connection(asyncio.Protocol):
             self.abort()
             return
         self.peer = f"{address[0]}:{address[1]}"
-        if secure is None:
-            self._welcome(caller_at(address[0], self.peer, self._settings.access))
-        else:
-            self._welcome(caller_with(secure.getpeercert(binary_form=True), self.peer))
-
-    def _welcome(self, caller: Caller | None) -> None:
+        caller = (
+            caller_at(address[0], self.peer, self._settings.access)
+            if secure is None
+            else caller_with(secure.getpeercert(binary_form=True), self.peer)
+        )
         if caller is None:
             self._refusals.note("access_refused", self.peer, "this address has no role and may not read")
             self.close()
@@ -306,14 +291,13 @@ class Connection(asyncio.Protocol):
         """Serve what this turn of the event loop has time for; the rest waits for later ones."""
         if self._queued:
             return
-        until = self._turns.until()
-        if self.serve_some(until) if until else self._wait_for_a_turn():
+        if until := self._turns.until():
+            self.serve_some(until)
+        else:
+            self._queued = self._ready and bool(self._buffer)
+            self._regulate_reading()
+        if self._queued:
             self._turns.queue(self)
-
-    def _wait_for_a_turn(self) -> bool:
-        self._queued = self._ready and bool(self._buffer)
-        self._regulate_reading()
-        return self._queued
 
     def serve_some(self, until: float) -> bool:
         """Answer a few requests, none after `until` (monotonic time, s); return whether there are more for now."""
@@ -378,20 +362,13 @@ class Connection(asyncio.Protocol):
         """Carry a request out; return its answer, or nothing when it waits or is to be ignored."""
         self.requests += 1
         if frame.unit not in self._settings.unit_ids:
-            self._refusals.note("unknown_unit", self.peer, f"unit id {frame.unit} is not served")
-            if self._settings.unknown_unit == "silence":
-                return b""
-            return requests.framed(
-                frame.transaction, frame.unit, requests.exception_answer(frame.pdu[0], requests.NO_SUCH_UNIT)
-            )
+            refusal = self._refuse(frame, "unknown_unit", f"unit id {frame.unit} is not served", requests.NO_SUCH_UNIT)
+            return b"" if self._settings.unknown_unit == "silence" else refusal
         try:
             outcome = self._handle(frame.pdu)
-        except RefusedAccessError as refusal:
-            kind = _KINDS[refusal.exception_code] if not isinstance(refusal, ForbiddenWriteError) else "access_refused"
-            self._refusals.note(kind, self.peer, f"function {frame.pdu[0]}: {refusal}")
-            return requests.framed(
-                frame.transaction, frame.unit, requests.exception_answer(frame.pdu[0], refusal.exception_code)
-            )
+        except RefusedAccessError as error:
+            kind = "access_refused" if isinstance(error, ForbiddenWriteError) else _KINDS[error.exception_code]
+            return self._refuse(frame, kind, f"function {frame.pdu[0]}: {error}", error.exception_code)
         except Exception as error:  # noqa: BLE001 - whatever goes wrong in here, the client gets an answer
             return self._failure(frame, error)
         if isinstance(outcome, requests.Written):
@@ -426,10 +403,12 @@ class Connection(asyncio.Protocol):
         self._serve()
 
     def _failure(self, frame: requests.Frame, error: BaseException) -> bytes:
-        self._refusals.note("server_failure", self.peer, f"function {frame.pdu[0]}: {error!r}")
-        return requests.framed(
-            frame.transaction, frame.unit, requests.exception_answer(frame.pdu[0], requests.SERVER_FAILURE)
-        )
+        return self._refuse(frame, "server_failure", f"function {frame.pdu[0]}: {error!r}", requests.SERVER_FAILURE)
+
+    def _refuse(self, frame: requests.Frame, kind: str, reason: str, exception_code: int) -> bytes:
+        """Count and log a refusal; return the answer to the request."""
+        self._refusals.note(kind, self.peer, reason)
+        return requests.framed(frame.transaction, frame.unit, bytes((frame.pdu[0] | 0x80, exception_code)))
 
     def _check_idle(self) -> None:
         now = monotonic()
@@ -452,45 +431,30 @@ MAX_LENGTH: Final = 127
 
 def caller_at(host: str, name: str, access: AccessSettings) -> Caller | None:
     """Return the caller at an address, or None if the address is not allowed."""
-    address = _plain_address(host)
-    places = {Role.CONTROL: access.control, Role.OPTIMIZER: access.optimizer, Role.OPERATOR: access.operator}
-    roles = frozenset(role for role, networks in places.items() if _within(address, networks))
-    if not roles and not _within(address, access.readers):
-        return None
-    return Caller(name, roles)
+    address = ip_address(host)
+    address = getattr(address, "ipv4_mapped", None) or address  # an IPv4 client of a dual-stack socket
+    places = (
+        (Role.CONTROL, access.control), (Role.OPTIMIZER, access.optimizer), (Role.OPERATOR, access.operator),
+        (None, access.readers),
+    )  # fmt: skip
+    found = {role for role, networks in places if any(address in network for network in networks)}
+    return Caller(name, frozenset(role for role in found if role is not None)) if found else None
 
 
 def caller_with(certificate: bytes, name: str) -> Caller:
     """Return the caller with a verified certificate (DER)."""
-    subject, role = _subject_and_role(certificate)
-    known = {each.value: each for each in Role}
-    described = " ".join(f"{key}={json.dumps(text)}" for key, text in (("certificate", subject), ("role", role)))
-    return Caller(f"{name} {described}", frozenset({known[role]} if role in known else ()))
-
-
-def _plain_address(host: str) -> IPv4Address | IPv6Address:
-    """Return an address; an IPv4 client of a dual-stack socket is returned as IPv4."""
-    address = ip_address(host)
-    return getattr(address, "ipv4_mapped", None) or address
-
-
-def _within(address: IPv4Address | IPv6Address, networks: Networks) -> bool:
-    return any(address in network for network in networks)
-
-
-def _subject_and_role(der: bytes) -> tuple[str, str]:
-    """Return both as they stand in a certificate; empty where it is too odd to be read, though OpenSSL took it."""
     from cryptography import x509  # noqa: PLC0415 a service without TLS starts without it
 
     odd = (x509.DuplicateExtension, x509.UnsupportedGeneralNameType, x509.InvalidVersion)
-    subject = ""
-    try:
-        certificate = x509.load_der_x509_certificate(der)
-        subject = certificate.subject.rfc4514_string()
-        extension = certificate.extensions.get_extension_for_oid(x509.ObjectIdentifier(ROLE_EXTENSION)).value
-    except (x509.ExtensionNotFound, ValueError, *odd):
-        return subject, ""
-    return subject, decoded_role(extension.public_bytes())
+    subject = role = ""
+    with contextlib.suppress(x509.ExtensionNotFound, ValueError, *odd):  # OpenSSL takes some that cannot be read here
+        parsed = x509.load_der_x509_certificate(certificate)
+        subject = parsed.subject.rfc4514_string()
+        extension = parsed.extensions.get_extension_for_oid(x509.ObjectIdentifier(ROLE_EXTENSION)).value
+        role = decoded_role(extension.public_bytes())
+    known = {each.value: each for each in Role}
+    described = " ".join(f"{key}={json.dumps(text)}" for key, text in (("certificate", subject), ("role", role)))
+    return Caller(f"{name} {described}", frozenset({known[role]} if role in known else ()))
 
 
 def encoded_role(text: str) -> bytes:

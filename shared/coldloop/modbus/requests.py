@@ -20,14 +20,7 @@ from pydantic import BaseModel, StringConstraints
 from pymodbus.constants import DeviceInformation
 from pymodbus.pdu.mei_message import ReadDeviceInformationRequest, ReadDeviceInformationResponse
 
-from coldloop.registers.bank import (
-    ANYBODY,
-    Caller,
-    IllegalAddressError,
-    IllegalValueError,
-    RefusedAccessError,
-    RegisterBank,
-)
+from coldloop.registers.bank import Caller, IllegalAddressError, IllegalFunctionError, IllegalValueError, RegisterBank
 from coldloop.registers.declaration import Block
 
 MIN_LENGTH: Final = 2
@@ -111,28 +104,25 @@ def identification_answer(identity: DeviceIdentity, pdu: bytes) -> bytes:
         RefusedAccessError: The request is not 43 / 14, or asks for what does not exist.
     """
     if len(pdu) > 1 and pdu[1] != READ_DEVICE_IDENTIFICATION:
-        raise RefusedAccessError(1, f"encapsulated interface type {pdu[1]} is not served")
+        raise IllegalFunctionError(f"encapsulated interface type {pdu[1]} is not served")
     if len(pdu) != 4:
         raise IllegalValueError(f"a PDU of {len(pdu)} bytes, not 4")
     request = ReadDeviceInformationRequest()
     request.decode(pdu[1:])
-    objects = identity.objects()
-    answer = ReadDeviceInformationResponse(request.read_code, _selected(objects, request.read_code, request.object_id))
-    answer.conformity = _REGULAR_CONFORMITY if identity.url else _BASIC_CONFORMITY
-    return bytes((ENCAPSULATED_INTERFACE,)) + answer.encode()
-
-
-def _selected(objects: dict[int, bytes], read_code: int, first: int) -> dict[int, bytes]:
+    objects, read_code, first = identity.objects(), request.read_code, request.object_id
     if read_code == DeviceInformation.SPECIFIC:
         if first not in objects:
             raise IllegalAddressError(f"no identification object {first}")
-        return {first: objects[first]}
-    if read_code not in _LAST_OBJECT:
+        selected = {first: objects[first]}
+    elif read_code not in _LAST_OBJECT:
         raise IllegalValueError(f"read device id code {read_code}, not 1..4")
-    in_category = {number: text for number, text in objects.items() if number <= _LAST_OBJECT[read_code]}
-    if first not in in_category:
-        first = 0  # the standard's rule for streams: an unknown object starts from the beginning
-    return {number: text for number, text in in_category.items() if number >= first}
+    else:
+        in_category = {number: text for number, text in objects.items() if number <= _LAST_OBJECT[read_code]}
+        first = first if first in in_category else 0  # the standard's rule for streams: begin again at the first object
+        selected = {number: text for number, text in in_category.items() if number >= first}
+    answer = ReadDeviceInformationResponse(read_code, selected)
+    answer.conformity = _REGULAR_CONFORMITY if identity.url else _BASIC_CONFORMITY
+    return bytes((ENCAPSULATED_INTERFACE,)) + answer.encode()
 
 
 READ_COILS: Final = 1
@@ -146,7 +136,6 @@ WRITE_MULTIPLE_REGISTERS: Final = 16
 MASK_WRITE_REGISTER: Final = 22
 READ_WRITE_REGISTERS: Final = 23
 
-ILLEGAL_FUNCTION: Final = 1
 SERVER_FAILURE: Final = 4
 NO_SUCH_UNIT: Final = 0x0B
 
@@ -170,28 +159,20 @@ class Written(NamedTuple):
     answer: Callable[[], bytes]
 
 
-def exception_answer(function: int, exception_code: int) -> bytes:
-    """Return the PDU that refuses a request."""
-    return bytes((function | 0x80, exception_code))
-
-
 class RequestHandler:
     """Carries requests of one client out on one bank.
 
     Nothing is stored unless the whole request is right.
     """
 
-    def __init__(self, bank: RegisterBank, identity: DeviceIdentity, caller: Caller = ANYBODY) -> None:
+    def __init__(self, bank: RegisterBank, identity: DeviceIdentity, caller: Caller) -> None:
         self._bank = bank
         self._caller = caller
         self._functions: Final[dict[int, Callable[[bytes], bytes | Written]]] = {
-            READ_COILS: _read_bits,
-            READ_DISCRETE_INPUTS: _read_bits,
+            **dict.fromkeys((READ_COILS, READ_DISCRETE_INPUTS, WRITE_SINGLE_COIL, WRITE_MULTIPLE_COILS), _refuse_bits),
             READ_HOLDING_REGISTERS: self._read,
             READ_INPUT_REGISTERS: self._read,
-            WRITE_SINGLE_COIL: _write_bit,
             WRITE_SINGLE_REGISTER: self._write_single,
-            WRITE_MULTIPLE_COILS: _write_bits,
             WRITE_MULTIPLE_REGISTERS: self._write_multiple,
             MASK_WRITE_REGISTER: self._mask_write,
             READ_WRITE_REGISTERS: self._read_write,
@@ -206,7 +187,7 @@ class RequestHandler:
         """
         function = self._functions.get(pdu[0])
         if function is None:
-            raise RefusedAccessError(ILLEGAL_FUNCTION, f"function {pdu[0]} is not served")
+            raise IllegalFunctionError(f"function {pdu[0]} is not served")
         return function(pdu)
 
     def _read(self, pdu: bytes) -> bytes:
@@ -217,25 +198,22 @@ class RequestHandler:
     def _registers(self, function: int, address: int, count: int) -> bytes:
         return bytes((function, 2 * count)) + self._bank.read(address, count)
 
-    def _write(self, address: int, data: bytes) -> list[Block]:
-        return self._bank.write(address, data, self._caller)
-
     def _write_single(self, pdu: bytes) -> Written:
         address, _ = _unpacked(_PAIR, pdu)
-        return Written(self._write(address, pdu[3:]), lambda: pdu)
+        return Written(self._bank.write(address, pdu[3:], self._caller), lambda: pdu)
 
     def _write_multiple(self, pdu: bytes) -> Written:
         address, count, byte_count = _unpacked(_WRITE, pdu, has_data=True)
         data = pdu[_WRITE.size :]
         _check_quantity(count, MAX_WRITE_WORDS)
         _check_byte_count(byte_count, 2 * count, data)
-        return Written(self._write(address, data), lambda: pdu[: _PAIR.size])
+        return Written(self._bank.write(address, data, self._caller), lambda: pdu[: _PAIR.size])
 
     def _mask_write(self, pdu: bytes) -> Written:
         address, and_mask, or_mask = _unpacked(_MASK, pdu)
         (present,) = _WORD.unpack(self._bank.read(address, 1))
         word = (present & and_mask) | (or_mask & ~and_mask)
-        return Written(self._write(address, _WORD.pack(word)), lambda: pdu)
+        return Written(self._bank.write(address, _WORD.pack(word), self._caller), lambda: pdu)
 
     def _read_write(self, pdu: bytes) -> Written:
         read_address, read_count, address, count, byte_count = _unpacked(_READ_WRITE, pdu, has_data=True)
@@ -244,28 +222,23 @@ class RequestHandler:
         _check_quantity(count, MAX_READ_WRITE_WORDS)
         _check_byte_count(byte_count, 2 * count, data)
         self._bank.check_readable(read_address, read_count)  # before anything is stored
-        blocks = self._write(address, data)
+        blocks = self._bank.write(address, data, self._caller)
         return Written(blocks, partial(self._registers, READ_WRITE_REGISTERS, read_address, read_count))
 
 
-def _read_bits(pdu: bytes) -> bytes:
-    address, count = _unpacked(_PAIR, pdu)
-    _check_quantity(count, MAX_READ_BITS)
+def _refuse_bits(pdu: bytes) -> bytes:
+    """Refuse a request for coils or discrete inputs, after the checks that the standard makes first."""
+    if pdu[0] == WRITE_MULTIPLE_COILS:
+        address, count, byte_count = _unpacked(_WRITE, pdu, has_data=True)
+        _check_quantity(count, MAX_WRITE_BITS)
+        _check_byte_count(byte_count, (count + 7) // 8, pdu[_WRITE.size :])
+    else:
+        address, value = _unpacked(_PAIR, pdu)
+        if pdu[0] != WRITE_SINGLE_COIL:
+            _check_quantity(value, MAX_READ_BITS)
+        elif value not in (0x0000, 0xFF00):
+            raise IllegalValueError(f"coil value 0x{value:04x}, not 0x0000 or 0xff00")
     raise IllegalAddressError(f"no coil or discrete input at {address}: this server has registers only")
-
-
-def _write_bit(pdu: bytes) -> bytes:
-    address, value = _unpacked(_PAIR, pdu)
-    if value not in (0x0000, 0xFF00):
-        raise IllegalValueError(f"coil value 0x{value:04x}, not 0x0000 or 0xff00")
-    raise IllegalAddressError(f"no coil at {address}: this server has registers only")
-
-
-def _write_bits(pdu: bytes) -> bytes:
-    address, count, byte_count = _unpacked(_WRITE, pdu, has_data=True)
-    _check_quantity(count, MAX_WRITE_BITS)
-    _check_byte_count(byte_count, (count + 7) // 8, pdu[_WRITE.size :])
-    raise IllegalAddressError(f"no coil at {address}: this server has registers only")
 
 
 def _unpacked(layout: struct.Struct, pdu: bytes, *, has_data: bool = False) -> tuple[int, ...]:

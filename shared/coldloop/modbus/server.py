@@ -4,13 +4,12 @@ import asyncio
 import contextlib
 import errno
 from collections.abc import Callable
-from dataclasses import asdict
 from functools import partial
 from time import monotonic
 from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import PortInUseError
-from coldloop.modbus.connection import Connection, ErrorCounters, OnWrite, RefusalLog, Turns
+from coldloop.modbus.connection import Connection, OnWrite, RefusalLog, Turns
 from coldloop.modbus.requests import DeviceIdentity, RequestHandler
 from coldloop.modbus.settings import ServerSettings
 from coldloop.registers.bank import Caller, RegisterBank
@@ -20,7 +19,7 @@ from coldloop.registers.declaration import Role
 if TYPE_CHECKING:
     from coldloop.modbus.tls import TlsListener
 
-__all__ = ["DeviceIdentity", "ErrorCounters", "ModbusServer", "OnWrite", "ServerSettings"]
+__all__ = ["DeviceIdentity", "ModbusServer", "OnWrite", "ServerSettings"]
 
 CLOSING_GRACE_S: Final = 1.0
 """How long `close` lets clients take the answers that are on their way."""
@@ -46,7 +45,7 @@ class ModbusServer:
         on_departure: Called with a role when the last open connection that has written a block of that role closes,
             unless the server itself is being closed.
         on_close: Called with the caller of each connection that closes.
-        on_refusal: Called with the kind, a field of `ErrorCounters`, of everything that is refused.
+        on_refusal: Called with the kind, one of `connection.REFUSALS`, of everything that is refused.
 
     The block of `ServerStatistics`, where the map has one, is kept up to date.
     """
@@ -62,8 +61,8 @@ class ModbusServer:
         self._on_departure = on_departure
         self._on_close = on_close
         self._handler_for = partial(RequestHandler, bank, identity)
-        self._refusals = RefusalLog(bank.map.service, on_refusal)
-        self._turns = Turns()
+        self.refusals = RefusalLog(bank.map.service, on_refusal)
+        """Counts of what was refused."""
         self._closing = False
         self._accepted = self._past_requests = 0
         self._connections: dict[Connection, None] = {}  # in the order of their arrival
@@ -74,11 +73,6 @@ class ModbusServer:
             bank.keep_fresh(ServerStatistics, self.statistics)
 
     @property
-    def counters(self) -> ErrorCounters:
-        """Errors since the server was made, by kind."""
-        return self._refusals.counters
-
-    @property
     def connections(self) -> int:
         """Number of connections being served."""
         return len(self._connections)
@@ -86,7 +80,7 @@ class ModbusServer:
     def statistics(self) -> ServerStatistics:
         """Return what the server has done so far; counts wrap as their registers do."""
         requests = self._past_requests + sum(connection.requests for connection in self._connections)
-        errors = {kind: count & 0xFFFFFFFF for kind, count in asdict(self.counters).items()}
+        errors = {kind: count & 0xFFFFFFFF for kind, count in self.refusals.counts.items()}
         return ServerStatistics(
             connections=min(self.connections, 0xFFFF), accepted=self._accepted & 0xFFFFFFFF,
             requests=requests & 0xFFFFFFFF, **errors,
@@ -106,23 +100,24 @@ class ModbusServer:
             PortInUseError: The address cannot be listened on.
             ConfigurationError: The files for TLS cannot be used.
         """
-        host, port = self._settings.host, self._settings.port
+        host, port, tls = self._settings.host, self._settings.port, self._settings.tls
+        make_connection = partial(
+            Connection, handler_for=self._handler_for, settings=self._settings, on_write=self._on_write,
+            refusals=self.refusals, turns=Turns(), opened=self._admit, lost=self._forget,
+        )  # fmt: skip
         try:
-            self._listener = await self._listen(host, port)
+            if tls is None:
+                self._listener = await asyncio.get_running_loop().create_server(make_connection, host, port)
+            else:
+                from coldloop.modbus import tls as security  # noqa: PLC0415 without TLS, nothing needs cryptography
+
+                self._listener = await security.TlsListener.at(
+                    host, port, security.server_context(tls, f"{self._service}.server.tls"),
+                    make_protocol=make_connection, limit=self._settings.connection_limit, refusals=self.refusals,
+                )  # fmt: skip
         except OSError as error:
             reason = _REMEDIES.get(error.errno or 0, f"{error.strerror}; choose another host or port")
             raise PortInUseError(f"{self._service} cannot listen on {host}:{port}: {reason}") from error
-
-    async def _listen(self, host: str, port: int) -> "asyncio.Server | TlsListener":
-        tls = self._settings.tls
-        if tls is None:
-            return await asyncio.get_running_loop().create_server(self._new_connection, host, port)
-        from coldloop.modbus.tls import TlsListener, server_context  # noqa: PLC0415 without TLS, nothing needs cryptography
-
-        return await TlsListener.at(
-            host, port, server_context(tls, f"{self._service}.server.tls"), make_protocol=self._new_connection,
-            limit=self._settings.connection_limit, refusals=self._refusals,
-        )  # fmt: skip
 
     async def close(self) -> None:
         """Stop listening and close all connections; waits of `on_write` are cancelled."""
@@ -138,22 +133,15 @@ class ModbusServer:
             connection.abort()
         await self._none_connected.wait()
 
-    def _new_connection(self) -> Connection:
-        return Connection(
-            handler_for=self._handler_for, settings=self._settings, on_write=self._on_write, refusals=self._refusals,
-            turns=self._turns, opened=self._admit, lost=self._forget,
-        )  # fmt: skip
-
-    def _admit(self, newcomer: Connection) -> bool:
-        """Take a connection in, where need be in the place of an idle one; return whether it may stay."""
+    def _admit(self, newcomer: Connection) -> None:
+        """Take a connection in, where need be in the place of an idle one, or close it."""
         if len(self._connections) >= self._settings.connection_limit and not self._make_room(newcomer):
-            self._refusals.note("connection_refused", newcomer.peer, "too many connections, and none is idle")
+            self.refusals.note("connection_refused", newcomer.peer, "too many connections, and none is idle")
             newcomer.close()
-            return False
+            return
         self._accepted += 1
         self._connections[newcomer] = None
         self._none_connected.clear()
-        return True
 
     def _make_room(self, newcomer: Connection) -> bool:
         """Close the connection that has been idle longest, first those that never made a request.
@@ -174,7 +162,7 @@ class ModbusServer:
         if not idle:
             return False
         oldest = min(idle, key=lambda connection: (connection.requests > 0, connection.last_request))
-        self._refusals.note("connection_evicted", oldest.peer, f"idle longest, replaced by {newcomer.peer}")
+        self.refusals.note("connection_evicted", oldest.peer, f"idle longest, replaced by {newcomer.peer}")
         del self._connections[oldest]
         oldest.abort()
         return True

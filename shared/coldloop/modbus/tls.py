@@ -17,7 +17,7 @@ from typing import Final, NamedTuple, Self
 
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric.types import PublicKeyTypes
-from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from coldloop.errors import ConfigurationError, UsageError
 from coldloop.modbus.connection import RefusalLog
@@ -74,29 +74,32 @@ def first_expiry(settings: TlsSettings, name: str = "tls") -> Expiry:
     Raises:
         ConfigurationError: A file cannot be used.
     """
-    certificate = _certificates(settings.certificate, f"{name}: certificate")[0]
-    authorities = _certificates(settings.ca, f"{name}: ca")
+    certificate, authorities, lists = _read(settings, name)
     ends = [Expiry(f"certificate {settings.certificate}", certificate.not_valid_after_utc)]
     ends += [Expiry(f"ca {settings.ca}", authority.not_valid_after_utc) for authority in authorities]
-    lists = _revocation_lists(settings.crl, authorities, f"{name}: crl") if settings.crl else []
     ends += [Expiry(f"crl {settings.crl}", each.next_update_utc) for each in lists if each.next_update_utc]
     return min(ends, key=lambda expiry: expiry.end)
 
 
-def certificate_days_left(settings: TlsSettings, now: datetime | None = None) -> float:
-    """Return the days until the first of the files expires, negative when one has.
-
-    Raises:
-        ConfigurationError: A file cannot be used.
-    """
-    return first_expiry(settings).days_left(now)
-
-
 def _context(protocol: int, settings: TlsSettings, name: str) -> ssl.SSLContext:
-    authorities = _check_files(settings, name)
+    certificate, authorities, lists = _read(settings, name)
+    key = _public_key_of(settings.key, f"{name}: key")  # OpenSSL would only hint at what is wrong
+    if key != certificate.public_key():
+        raise ConfigurationError(
+            f"{name}: key {settings.key} does not belong to certificate {settings.certificate}: name a pair"
+        )
     if settings.key.stat().st_mode & stat.S_IROTH:
         _logger.warning("%s: key %s: everyone can read it; `chmod o-r` it", name, settings.key)
-    _warn_of_time(settings, name)
+    # Peers refuse files that have expired or are not valid yet, but the service starts.
+    expiry, start = first_expiry(settings, name), certificate.not_valid_before_utc
+    if (days := expiry.days_left()) < settings.warn_days:
+        when = f"{'expired' if days < 0 else 'expires'} on {expiry.end:%Y-%m-%d}"
+        _logger.warning("%s: %s %s; make a new one", name, expiry.what, when)
+    if datetime.now(UTC) < start:
+        when = f"{start:%Y-%m-%d %H:%M}"
+        _logger.warning(
+            "%s: certificate %s is not valid before %s UTC; check this clock", name, settings.certificate, when
+        )
     context = ssl.SSLContext(protocol)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     try:
@@ -106,37 +109,20 @@ def _context(protocol: int, settings: TlsSettings, name: str) -> ssl.SSLContext:
             context.load_verify_locations(settings.crl)
     except ssl.SSLError as error:
         raise ConfigurationError(f"{name}: {settings.certificate} cannot be used for TLS: {error.reason}") from None
-    if settings.crl is not None:
-        issuers = {each.issuer for each in _revocation_lists(settings.crl, authorities, f"{name}: crl")}
-        whole = issuers >= {authority.subject for authority in authorities}
+    if lists:
+        whole = {each.issuer for each in lists} >= {authority.subject for authority in authorities}
         context.verify_flags |= ssl.VERIFY_CRL_CHECK_CHAIN if whole else ssl.VERIFY_CRL_CHECK_LEAF
     return context
 
 
-def _check_files(settings: TlsSettings, name: str) -> list[x509.Certificate]:
-    """Say what OpenSSL would only hint at; return the authorities."""
+def _read(
+    settings: TlsSettings, name: str
+) -> tuple[x509.Certificate, list[x509.Certificate], list[x509.CertificateRevocationList]]:
+    """Return our certificate, those of the authorities, and the revocation lists."""
     certificate = _certificates(settings.certificate, f"{name}: certificate")[0]
-    key = _public_key_of(settings.key, f"{name}: key")
-    if _comparable(key) != _comparable(certificate.public_key()):
-        raise ConfigurationError(
-            f"{name}: key {settings.key} does not belong to certificate {settings.certificate}: name a pair"
-        )
-    return _certificates(settings.ca, f"{name}: ca")
-
-
-def _warn_of_time(settings: TlsSettings, name: str) -> None:
-    """Log what has expired, expires soon or is not valid yet: peers refuse it, but the service starts."""
-    expiry = first_expiry(settings, name)
-    days = expiry.days_left()
-    if days < settings.warn_days:
-        when = f"{'expired' if days < 0 else 'expires'} on {expiry.end:%Y-%m-%d}"
-        _logger.warning("%s: %s %s; make a new one", name, expiry.what, when)
-    start = _certificates(settings.certificate, f"{name}: certificate")[0].not_valid_before_utc
-    if datetime.now(UTC) < start:
-        _logger.warning(
-            "%s: certificate %s is not valid before %s UTC; check this clock",
-            name, settings.certificate, f"{start:%Y-%m-%d %H:%M}",
-        )  # fmt: skip
+    authorities = _certificates(settings.ca, f"{name}: ca")
+    lists = _revocation_lists(settings.crl, authorities, f"{name}: crl") if settings.crl else []
+    return certificate, authorities, lists
 
 
 def _revocation_lists(
@@ -185,10 +171,6 @@ def _contents(file: Path, what: str) -> bytes:
         return read_bytes(file, "name a readable file, or make some with `coldloop certificates`", most=2**24)
     except UsageError as error:
         raise ConfigurationError(f"{what} {error}") from None
-
-
-def _comparable(key: PublicKeyTypes) -> bytes:
-    return key.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
 
 
 HANDSHAKE_S: Final = 5.0
@@ -261,17 +243,14 @@ class TlsListener:
                 await asyncio.sleep(PAUSE_S)
                 continue
             if len(self._handshakes) >= self._limit:
-                self._give_up_oldest()
+                oldest = next(iter(self._handshakes))
+                oldest.cancel()
+                why = "too many handshakes under way, and this is the oldest"
+                self._refusals.note("tls_refused", self._handshakes.pop(oldest), why)
             peer = f"{address[0]}:{address[1]}"
             task = loop.create_task(self._secure(client, peer), name="TLS handshake")
             self._handshakes[task] = peer
             task.add_done_callback(partial(self._forget, client))
-
-    def _give_up_oldest(self) -> None:
-        task, peer = next(iter(self._handshakes.items()))
-        del self._handshakes[task]
-        task.cancel()
-        self._refusals.note("tls_refused", peer, "too many handshakes under way, and this is the oldest")
 
     def _forget(self, client: socket, task: asyncio.Task[None]) -> None:
         self._handshakes.pop(task, None)
@@ -284,13 +263,12 @@ class TlsListener:
                 self._make_protocol, client,
                 ssl=self._context, ssl_handshake_timeout=HANDSHAKE_S, ssl_shutdown_timeout=FAREWELL_S,
             )  # fmt: skip
+        except ssl.SSLCertVerificationError as error:
+            reason = f"its certificate is invalid: {error.verify_message}"
+        except ssl.SSLError as error:
+            reason = (error.reason or "TLS failed").replace("_", " ").lower()
         except OSError as error:
-            self._refusals.note("tls_refused", peer, _reason(error))
-
-
-def _reason(error: OSError) -> str:
-    if isinstance(error, ssl.SSLCertVerificationError):
-        return f"its certificate is invalid: {error.verify_message}"
-    if isinstance(error, ssl.SSLError):
-        return (error.reason or "TLS failed").replace("_", " ").lower()
-    return f"the handshake ended early: {error}".rstrip(": ")
+            reason = f"the handshake ended early: {error}".rstrip(": ")
+        else:
+            return
+        self._refusals.note("tls_refused", peer, reason)

@@ -4,17 +4,7 @@ from bisect import bisect_left
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar, cast
 
-from coldloop.registers.codec import (
-    Domain,
-    DomainError,
-    RecordCodec,
-    Seal,
-    ValueCodec,
-    WordOrder,
-    codec_of,
-    seal_of,
-    sealed_bytes,
-)
+from coldloop.registers.codec import Domain, DomainError, RecordCodec, Seal, ValueCodec, WordOrder, codec_of
 from coldloop.registers.declaration import Block, Field, Kind, RegisterMap, Role
 
 R = TypeVar("R", bound=tuple[Any, ...])
@@ -44,39 +34,39 @@ ANYBODY = Caller("program", ALL_ROLES)
 
 
 class RefusedAccessError(Exception):
-    """A read or write that the map does not allow; carries the Modbus exception code."""
+    """A read or write that the map does not allow; its kind says the Modbus exception code."""
 
-    def __init__(self, exception_code: int, reason: str) -> None:
-        super().__init__(reason)
-        self.exception_code = exception_code
+    exception_code: int
 
 
-class IllegalAddressError(RefusedAccessError):
-    """Exception 02: a register that does not exist, or may not be written."""
+class IllegalFunctionError(RefusedAccessError):
+    """Exception 01: a function that is not served."""
 
-    def __init__(self, reason: str) -> None:
-        super().__init__(2, reason)
+    exception_code = 1
 
 
 class ForbiddenWriteError(RefusedAccessError):
     """Exception 01: a register that another role writes, as Modbus/TCP Security asks for where a role is refused."""
 
-    def __init__(self, reason: str) -> None:
-        super().__init__(1, reason)
+    exception_code = 1
 
 
-class BusyError(RefusedAccessError):
-    """Exception 06: another client holds the lease of this role."""
+class IllegalAddressError(RefusedAccessError):
+    """Exception 02: a register that does not exist, or may not be written."""
 
-    def __init__(self, reason: str) -> None:
-        super().__init__(6, reason)
+    exception_code = 2
 
 
 class IllegalValueError(RefusedAccessError):
     """Exception 03: a value outside its range, not finite, or half of a 32-bit register pair."""
 
-    def __init__(self, reason: str) -> None:
-        super().__init__(3, reason)
+    exception_code = 3
+
+
+class BusyError(RefusedAccessError):
+    """Exception 06: another client holds the lease of this role."""
+
+    exception_code = 6
 
 
 Judge = Callable[[Any, int, Caller], None]
@@ -149,7 +139,7 @@ class RegisterBank:
         """Store the row of a sealed block, with its seal."""
         block, codec = self._places[type(record)]
         start = 2 * block.address
-        self._memory[start : start + codec.size] = sealed_bytes(codec, record)
+        self._memory[start : start + codec.size] = codec.encode_sealed(record)
 
     def judged_by(self, judge: Judge, *records: type[tuple[Any, ...]], every_row: bool = True) -> None:
         """Let `judge` have a say in what clients write to the blocks of these records: in every row, or in the first.
@@ -230,20 +220,17 @@ class RegisterBank:
             offset = 2 * (address - span.first)
             image = bytes(self._memory[2 * span.first : 2 * address]) + data
             image += self._memory[2 * span.first + offset + len(data) : 2 * span.end]
-        self._check(span, image)
-        for judge, codec, offset, row in span.judged:
-            judge(codec.decode(image, offset), row, caller)
-        self._memory[2 * span.first : 2 * span.end] = image
-        return span.blocks
-
-    def _check(self, span: "_Span", image: bytes) -> None:
         try:
             span.domain.check(span.codec.unpack(image))
         except DomainError as error:
             raise IllegalValueError(str(error)) from None
         for codec, offset, name in span.sealed:
-            if seal_of(codec, image, offset) is Seal.BROKEN:
+            if codec.seal_of(image, offset) is Seal.BROKEN:
                 raise IllegalValueError(f"the CRC of block '{name}' is not that of its registers: write all of them")
+        for judge, codec, offset, row in span.judged:
+            judge(codec.decode(image, offset), row, caller)
+        self._memory[2 * span.first : 2 * span.end] = image
+        return span.blocks
 
     def _span(self, address: int, words: int, caller: Caller) -> "_Span":
         span = self._spans.get((address, words))
@@ -272,34 +259,20 @@ class RegisterBank:
         first = rows[0][0].address + rows[0][1] * rows[0][0].row_words
         end = rows[-1][0].address + (rows[-1][1] + 1) * rows[-1][0].row_words
         checks = self._checks[bisect_left(self._check_addresses, first) : bisect_left(self._check_addresses, end)]
-        return _Span(
-            first=first,
-            end=end,
-            codec=ValueCodec("".join(kind.letter for _, kind, _, _ in checks), self.order),
-            domain=Domain([field for *_, field, _ in checks], [name for *_, name in checks]),
-            blocks=blocks,
-            writers=writers,
-            sealed=[
-                (self._places[block.record][1], self._offset(block, row, first), block.name)
-                for block, row in rows
-                if block.sealed
-            ],
-            judged=self._judged(rows, first),
-        )
-
-    def _judged(self, rows: list[tuple[Block, int]], first: int) -> list[tuple[Judge, RecordCodec, int, int]]:
-        judged = []
+        sealed: list[tuple[RecordCodec, int, str]] = []
+        judged: list[tuple[Judge, RecordCodec, int, int]] = []
         before: Block | None = None
         for block, row in rows:
+            codec, offset = self._places[block.record][1], 2 * (block.address + row * block.row_words - first)
+            if block.sealed:
+                sealed.append((codec, offset, block.name))
             judge, every_row = self._judges.get(block.record, (None, False))
             if judge is not None and (every_row or block is not before):
-                judged.append((judge, self._places[block.record][1], self._offset(block, row, first), row))
+                judged.append((judge, codec, offset, row))
             before = block
-        return judged
-
-    @staticmethod
-    def _offset(block: Block, row: int, first: int) -> int:
-        return 2 * (block.address + row * block.row_words - first)
+        values = ValueCodec("".join(kind.letter for _, kind, _, _ in checks), self.order)
+        domain = Domain([field for *_, field, _ in checks], [name for *_, name in checks])
+        return _Span(first, end, values, domain, blocks, writers, sealed, judged)
 
 
 class _Span(NamedTuple):

@@ -45,7 +45,16 @@ class Domain:
     def __init__(self, fields: Sequence[Field], names: Sequence[str]) -> None:
         self._fields = fields
         self._names = names
-        self._runs = _runs_of(fields)
+        self._runs: list[_Run] = []
+        """Runs of values whose range is narrower than what their registers can hold."""
+        for place, field in enumerate(fields):
+            low, high = _stored_range(field)
+            if (low, high) == WIDEST[field.kind]:
+                continue
+            if self._runs and self._runs[-1][1:] == (place, low, high):
+                self._runs[-1] = self._runs[-1]._replace(end=place + 1)
+            else:
+                self._runs.append(_Run(place, place + 1, low, high))
 
     def check(self, values: Sequence[Any]) -> None:
         """Check values, one for each register.
@@ -64,20 +73,6 @@ class Domain:
                 return
         for value, field, name in zip(values, self._fields, self._names, strict=True):
             _check_value(value, field, name)
-
-
-def _runs_of(fields: Sequence[Field]) -> list[_Run]:
-    """Return the runs of values whose range is narrower than what their registers can hold."""
-    runs: list[_Run] = []
-    for place, field in enumerate(fields):
-        low, high = _stored_range(field)
-        if (low, high) == WIDEST[field.kind]:
-            continue
-        if runs and runs[-1][1:] == (place, low, high):
-            runs[-1] = runs[-1]._replace(end=place + 1)
-        else:
-            runs.append(_Run(place, place + 1, low, high))
-    return runs
 
 
 def _stored_range(field: Field) -> tuple[float, float]:
@@ -124,7 +119,13 @@ class ValueCodec:
 
     def __init__(self, letters: str, order: WordOrder) -> None:
         self._struct = struct.Struct(">" + letters)
-        self._swaps = _swapped_words(letters) if order is WordOrder.LOW_FIRST else None
+        self._swaps: list[int] | None = None
+        """Place of each word in the other order."""
+        if order is WordOrder.LOW_FIRST:
+            self._swaps = []
+            for letter in letters:
+                place = len(self._swaps)
+                self._swaps += [place] if letter == "H" else [place + 1, place]
         self._words = struct.Struct(f">{self._struct.size // 2}H")
         self.size = self._struct.size
 
@@ -151,6 +152,24 @@ class ValueCodec:
     def _reordered(self, raw: bytes | bytearray | memoryview) -> bytes:
         words = self._words.unpack(raw)
         return self._words.pack(*[words[source] for source in self._swaps or ()])
+
+
+CRC_BYTES: Final = 4
+_ABSENT: Final = bytes(CRC_BYTES)
+
+
+class Seal(Enum):
+    """Result of the check of a record's seal.
+
+    TCP's checksum does not see what a gateway, a proxy or a memory does to a value. A sealed record ends with the
+    CRC-32 of all before it, as big-endian words whatever the word order of the link; 0 is "not sealed", as a simple
+    client leaves it. A seal is checked on the bytes that arrived: decoding changes some of them (a signalling NaN
+    becomes a quiet one).
+    """
+
+    ABSENT = "absent"
+    INTACT = "intact"
+    BROKEN = "broken"
 
 
 class RecordCodec:
@@ -218,6 +237,19 @@ class RecordCodec:
             raise DomainError(f"a value does not fit its register: {error}") from None
         self._domain.check(values)
 
+    def encode_sealed(self, record: tuple[Any, ...]) -> bytes:
+        """Return the bytes of the row with its seal."""
+        raw = self.canonical(self.encode(record))
+        return self.canonical(raw[:-CRC_BYTES] + _checksum(raw))  # words back in order
+
+    def seal_of(self, data: bytes | bytearray | memoryview, offset: int = 0) -> Seal:
+        """Return what the seal says of the record in `data` at `offset` (bytes)."""
+        raw = self.canonical(data, offset)
+        crc = raw[-CRC_BYTES:]
+        if crc == _ABSENT:
+            return Seal.ABSENT
+        return Seal.INTACT if crc == _checksum(raw) else Seal.BROKEN
+
 
 def _places_of(arrays: list[int]) -> tuple[_Places | None, _Places | None]:
     """Return what takes a record to tuples of values, and all values to its fields; None where each field is a value.
@@ -233,14 +265,6 @@ def _places_of(arrays: list[int]) -> tuple[_Places | None, _Places | None]:
     if len(arrays) == 1:  # a getter of one place returns what is there, not a tuple of it
         return itemgetter(slice(1)), lambda values: (values,)
     return itemgetter(*parts), itemgetter(*fields)
-
-
-def _swapped_words(letters: str) -> list[int]:
-    swapped: list[int] = []
-    for letter in letters:
-        position = len(swapped)
-        swapped += [position] if letter == "H" else [position + 1, position]
-    return swapped
 
 
 @cache
@@ -270,43 +294,10 @@ def blank(record: type[R], of: RegisterMap) -> R:
     return cast("R", codec_of(block).decode(bytes(2 * block.row_words)))
 
 
-CRC_BYTES: Final = 4
-_ABSENT: Final = bytes(CRC_BYTES)
-
-
-class Seal(Enum):
-    """Result of the check of a record's seal.
-
-    TCP's checksum does not see what a gateway, a proxy or a memory does to a value. A sealed record ends with the
-    CRC-32 of all before it, as big-endian words whatever the word order of the link; 0 is "not sealed", as a simple
-    client leaves it. A seal is checked on the bytes that arrived: decoding changes some of them (a signalling NaN
-    becomes a quiet one).
-    """
-
-    ABSENT = "absent"
-    INTACT = "intact"
-    BROKEN = "broken"
-
-
-def seal_of(codec: RecordCodec, data: bytes | bytearray | memoryview, offset: int = 0) -> Seal:
-    """Return what the seal says of the record in `data` at `offset`."""
-    raw = codec.canonical(data, offset)
-    crc = raw[-CRC_BYTES:]
-    if crc == _ABSENT:
-        return Seal.ABSENT
-    return Seal.INTACT if crc == _checksum(raw) else Seal.BROKEN
-
-
 def sealed(record: R, of: RegisterMap) -> R:
     """Return a record of a map with its field `crc`, the last one, filled in."""
     crc = _checksum(codec_of(of.block_of(type(record))).encode(record))
     return cast("R", record._replace(crc=int.from_bytes(crc, "big")))  # type: ignore[attr-defined] # a NamedTuple
-
-
-def sealed_bytes(codec: RecordCodec, record: tuple[Any, ...]) -> bytes:
-    """Return the bytes of `sealed`, which is encoded once only."""
-    raw = codec.canonical(codec.encode(record))
-    return codec.canonical(raw[:-CRC_BYTES] + _checksum(raw))  # words back in order
 
 
 def _checksum(raw: bytes) -> bytes:

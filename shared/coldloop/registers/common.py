@@ -7,7 +7,7 @@ it.
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Final, NamedTuple
 
 from coldloop.registers.bank import RegisterBank
@@ -252,13 +252,14 @@ def publish_configuration(bank: RegisterBank, values: Mapping[str, Any]) -> None
     """Show values by dotted key in the registers of a service."""
     document = json.dumps(values, sort_keys=True, separators=(",", ":"))
     bank.put(ConfigurationDigest(min(len(document), 0xFFFF), to_words(_digest(document), DIGEST_WORDS)))
-    for row, line in enumerate(_lines(document)):
+    for row in range(lines_of(len(document))):
+        line = document[row * LINE_CHARACTERS : (row + 1) * LINE_CHARACTERS]
         bank.put(ConfigurationLine(to_words(line, LINE_WORDS)), row)
 
 
-def lines_of(digest: ConfigurationDigest) -> int:
-    """Return the number of lines that the text takes."""
-    return min(LINES, -(-digest.length // LINE_CHARACTERS))
+def lines_of(length: int) -> int:
+    """Return the number of lines that a text takes."""
+    return min(LINES, -(-length // LINE_CHARACTERS))
 
 
 def configuration_of(digest: ConfigurationDigest, lines: Sequence[ConfigurationLine]) -> dict[str, Any]:
@@ -275,11 +276,6 @@ def configuration_of(digest: ConfigurationDigest, lines: Sequence[ConfigurationL
         return {**parsed_json(document)}
     except TypeError:
         raise ValueError("the text is not an object") from None
-
-
-def _lines(document: str) -> Iterator[str]:
-    for start in range(0, min(len(document), LINES * LINE_CHARACTERS), LINE_CHARACTERS):
-        yield document[start : start + LINE_CHARACTERS]
 
 
 def _digest(document: str) -> str:

@@ -6,7 +6,7 @@ from typing import Annotated, Final, NamedTuple
 from coldloop.process.declaration import LAST_NUMBER, LAST_TICK, Process
 from coldloop.registers import declaration as reg
 from coldloop.registers.common import IDENTITY_BLOCK, LAST_BLOCKS, STATISTICS_BLOCK, SessionPace, TimeBaseKind
-from coldloop.registers.declaration import Block, RegisterMap, Role, Worded
+from coldloop.registers.declaration import Block, Numbers, RegisterMap, Role, Worded
 from coldloop.registers.plant import MAX_STATE
 from coldloop.registers.safety import Alarm, AlarmCommand, LeaseStatus, WatchdogStatus, WatchdogTime, alarms_of
 
@@ -144,8 +144,8 @@ class ProcessNow(NamedTuple):
 
     tick: Annotated[int, reg.u32("Tick of the scan")]
     load: Annotated[float, reg.of_load("{noun} {name}", finite=False)]
-    u: Annotated[tuple[float, ...], reg.of_inputs("Input being applied")]
-    y: Annotated[tuple[float, ...], reg.of_outputs("Measured output")]
+    u: Annotated[Numbers, reg.of_inputs("Input being applied")]
+    y: Annotated[Numbers, reg.of_outputs("Measured output")]
 
 
 class Status(NamedTuple):
@@ -187,10 +187,10 @@ class Update(NamedTuple):
         int, reg.u32("Number of the sequence being played from this instant on; 0 is none", high=LAST_NUMBER)
     ]
     load: Annotated[float, reg.of_load("{noun} {name}", in_span=True)]
-    u_before: Annotated[tuple[float, ...], reg.of_inputs("Input applied until this instant", in_span=True)]
-    u: Annotated[tuple[float, ...], reg.of_inputs("Input applied from this instant on", in_span=True)]
+    u_before: Annotated[Numbers, reg.of_inputs("Input applied until this instant", in_span=True)]
+    u: Annotated[Numbers, reg.of_inputs("Input applied from this instant on", in_span=True)]
     y: Annotated[
-        tuple[float, ...],
+        Numbers,
         reg.of_outputs(
             "Output measured at this instant; not a number where the measurement is bad",
             low=-MAX_STATE,
@@ -198,7 +198,7 @@ class Update(NamedTuple):
             finite=False,
         ),
     ]
-    x: Annotated[tuple[float, ...], reg.of_states("Simulated state, not measured", low=-MAX_STATE, high=MAX_STATE)]
+    x: Annotated[Numbers, reg.of_states("Simulated state, not measured", low=-MAX_STATE, high=MAX_STATE)]
     crc: Annotated[int, reg.u32("CRC-32 of the registers before; 0 is none")] = 0
 
 
@@ -261,7 +261,7 @@ class Operator(NamedTuple):
     """Request of an operator: mode and setpoints. Setpoints count in manual mode; they are clamped and rate-limited."""
 
     mode: Annotated[int, reg.u16("{}", values=OperatorMode)]
-    u: Annotated[tuple[float, ...], reg.each_input("Setpoint: {}")]
+    u: Annotated[Numbers, reg.each_input("Setpoint: {}")]
 
 
 class SequenceHeader(NamedTuple):
@@ -282,7 +282,7 @@ class SequenceHeader(NamedTuple):
 class SequenceRow(NamedTuple):
     """Inputs of one tick."""
 
-    u: Annotated[tuple[float, ...], reg.each_input("{}", in_span=False)]
+    u: Annotated[Numbers, reg.each_input("{}", in_span=False)]
 
 
 class PlantLinkStatus(NamedTuple):

@@ -12,7 +12,7 @@ import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, StrEnum
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from typing import NamedTuple, Self, TypeAlias, cast, get_type_hints
 
 from coldloop.process.cold_box import COLD_BOX
@@ -130,11 +130,6 @@ def u32(description: str, *, unit: str = "", low: int | None = None, high: int |
     return Field(Kind.U32, description, unit, low, high)
 
 
-def u16_array(description: str, elements: tuple[str, ...], *, unit: str = "") -> Field:
-    """Declare one unsigned 16-bit register for each element."""
-    return Field(Kind.U16, description, unit, elements=elements)
-
-
 def text(description: str, words: int) -> Field:
     """Declare a text of two ASCII characters a word, padded with zeros; `registers.codec` converts it."""
     return Field(Kind.U16, description, elements=tuple(f"{word}" for word in range(words)), is_text=True)
@@ -155,6 +150,8 @@ def f32_array(
     return Field(Kind.F32, description, "", low, high, elements, units, finite=finite)
 
 
+Numbers: TypeAlias = tuple[float, ...]
+"""Values of an array."""
 Declared: TypeAlias = Field | Callable[[Process], Field]
 """A declaration, or what it is for a process."""
 
@@ -176,14 +173,27 @@ def of_load(description: str, *, in_span: bool = False, low: float | None = None
     return declared
 
 
-def of_inputs(description: str, *, in_span: bool = False, finite: bool = True) -> Declared:
-    """Declare a value for each input; `in_span`: none is outside of all their spans."""
-
+def _of_each(
+    signals: str, description: str, *, low: float | None = None, high: float | None = None, finite: bool = True,
+    unit: str | None = None, in_span: bool = False,
+) -> Declared:  # fmt: skip
     def declared(process: Process) -> Field:
-        low, high = process.span_of_inputs if in_span else (None, None)
-        return f32_array(description, process.input_names, process.input_units, low=low, high=high, finite=finite)
+        each = getattr(process, signals)
+        names, units = tuple(one.name for one in each), tuple(one.unit if unit is None else unit for one in each)
+        least, largest = process.span_of_inputs if in_span else (low, high)
+        return f32_array(description, names, units, low=least, high=largest, finite=finite)
 
     return declared
+
+
+of_inputs = partial(_of_each, "inputs")
+"""Declare a value for each input; `in_span`: none is outside of all their spans."""
+of_outputs = partial(_of_each, "outputs")
+"""Declare a value for each output, in its unit or in this one."""
+of_states = partial(_of_each, "states")
+"""Declare a value for each state of the model."""
+of_banded = partial(_of_each, "banded")
+"""Declare a value for each output that has a band."""
 
 
 def each_input(description: str, *, in_span: bool = True) -> Declared:
@@ -202,33 +212,6 @@ def each_input(description: str, *, in_span: bool = True) -> Declared:
         )  # fmt: skip
 
     return declared
-
-
-def of_outputs(
-    description: str, *, low: float | None = None, high: float | None = None, finite: bool = True,
-    unit: str | None = None,
-) -> Declared:  # fmt: skip
-    """Declare a value for each output, in its unit or in this one."""
-    return lambda process: f32_array(
-        description, process.output_names,
-        process.output_units if unit is None else (unit,) * len(process.outputs), low=low, high=high, finite=finite,
-    )  # fmt: skip
-
-
-def of_states(
-    description: str, *, low: float | None = None, high: float | None = None, finite: bool = True
-) -> Declared:
-    """Declare a value for each state of the model."""
-    return lambda process: f32_array(
-        description, process.state_names, process.state_units, low=low, high=high, finite=finite
-    )
-
-
-def of_banded(description: str) -> Declared:
-    """Declare a value for each output that has a band."""
-    return lambda process: f32_array(
-        description, tuple(one.name for one in process.banded), tuple(one.unit for one in process.banded)
-    )
 
 
 @cache

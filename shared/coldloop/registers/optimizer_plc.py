@@ -7,7 +7,7 @@ from coldloop.process.declaration import Process
 from coldloop.registers import declaration as reg
 from coldloop.registers.common import IDENTITY_BLOCK, LAST_BLOCKS, STATISTICS_BLOCK, SessionPace, TimeBaseKind
 from coldloop.registers.control_plc import Verdict
-from coldloop.registers.declaration import Block, RegisterMap, Role, Worded
+from coldloop.registers.declaration import Block, Numbers, RegisterMap, Role, Worded
 
 HISTORY_ROWS: Final = 256
 PREDICTED_SAMPLES: Final = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 80, 100)
@@ -135,11 +135,11 @@ class UpdatingRuleStatus(NamedTuple):
 class OperatingLimits(NamedTuple):
     """Limits that the optimiser keeps the process within: bands of constrained outputs, bounds and rates of inputs."""
 
-    output_low: Annotated[tuple[float, ...], reg.of_banded("Low end of the band")]
-    output_high: Annotated[tuple[float, ...], reg.of_banded("High end of the band")]
-    input_low: Annotated[tuple[float, ...], reg.of_inputs("Lowest value")]
-    input_high: Annotated[tuple[float, ...], reg.of_inputs("Highest value")]
-    input_rate: Annotated[tuple[float, ...], reg.of_inputs("Largest change in a sampling period")]
+    output_low: Annotated[Numbers, reg.of_banded("Low end of the band")]
+    output_high: Annotated[Numbers, reg.of_banded("High end of the band")]
+    input_low: Annotated[Numbers, reg.of_inputs("Lowest value")]
+    input_high: Annotated[Numbers, reg.of_inputs("Highest value")]
+    input_rate: Annotated[Numbers, reg.of_inputs("Largest change in a sampling period")]
 
 
 class Prediction(NamedTuple):
@@ -147,13 +147,13 @@ class Prediction(NamedTuple):
 
     update: Annotated[int, reg.u32("Update that the prediction belongs to")]
     tick: Annotated[int, reg.u32('Tick at which its sequence begins, t_{i+1}; element "5s" is 5 s later')]
-    y: Annotated[tuple[float, ...], _predicted]
+    y: Annotated[Numbers, _predicted]
     """Values of one output that has a band after the other, at `PREDICTED_SAMPLES`."""
-    u: Annotated[tuple[float, ...], _planned]
+    u: Annotated[Numbers, _planned]
     crc: Annotated[int, reg.u32("CRC-32 of the registers before")] = 0
 
 
-def outputs_of(prediction: Prediction) -> tuple[tuple[float, ...], ...]:
+def outputs_of(prediction: Prediction) -> tuple[Numbers, ...]:
     """Return the prediction of each output that has a band, at `PREDICTED_SAMPLES`."""
     samples = len(PREDICTED_SAMPLES)
     return tuple(prediction.y[start : start + samples] for start in range(0, len(prediction.y), samples))
@@ -163,10 +163,10 @@ class ModelDeviation(NamedTuple):
     """Deviation of the plant from its model, as the filter estimates it; also 0 where nothing is estimated."""
 
     load: Annotated[float, reg.of_load("{word} beyond what is measured or, unmeasured, usual", finite=False)]
-    u: Annotated[tuple[float, ...], reg.of_inputs("Acts like so much more of the input", finite=False)]
-    y: Annotated[tuple[float, ...], reg.of_outputs("Constant difference of the reading from the model's", finite=False)]
+    u: Annotated[Numbers, reg.of_inputs("Acts like so much more of the input", finite=False)]
+    y: Annotated[Numbers, reg.of_outputs("Constant difference of the reading from the model's", finite=False)]
     surprise: Annotated[
-        tuple[float, ...],
+        Numbers,
         reg.of_outputs(
             "How far the reading was from what prediction and other readings say, over what the filter expects: "
             "root mean square over a minute; about 1 or less is as designed",

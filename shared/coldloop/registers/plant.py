@@ -10,7 +10,7 @@ from coldloop.process.cold_box import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS
 from coldloop.process.declaration import LAST_TICK, Process
 from coldloop.registers import declaration as reg
 from coldloop.registers.common import IDENTITY_BLOCK, LAST_BLOCKS, STATISTICS_BLOCK, SessionPace, TimeBaseKind
-from coldloop.registers.declaration import Block, RegisterMap, Role, Worded
+from coldloop.registers.declaration import Block, Numbers, RegisterMap, Role, Worded
 from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 
 HISTORY_ROWS: Final = 256
@@ -22,6 +22,7 @@ MAX_AGE: Final = 1e5
 """Longest time, in ticks, by which a rack that was stopped may be late."""
 AHEAD_STEPS: Final = 24
 """Steps of the load in one request."""
+_STEPS: Final = tuple(map(str, range(AHEAD_STEPS)))
 LONGEST_AHEAD_TICKS: Final = 0xFFFF
 """Ticks that one request can say that a step lasts."""
 
@@ -50,7 +51,7 @@ class Actuators(NamedTuple):
     tick: Annotated[
         int, reg.u32("Tick of these outputs; in lock-step the present one advances the plant", high=LAST_TICK)
     ]
-    u: Annotated[tuple[float, ...], reg.each_input("{}")]
+    u: Annotated[Numbers, reg.each_input("{}")]
     session: Annotated[int, reg.u32("Session of these outputs")]
     holder: Annotated[int, reg.u32("Number chosen by the writer; 0 is a simple client")] = 0
     generation: Annotated[int, reg.u32("Generation that was read back; 0 does not compare")] = 0
@@ -65,10 +66,10 @@ class Measurement(NamedTuple):
 
     tick: Annotated[int, reg.u32("Tick at which these values were read", high=LAST_TICK)]
     load: Annotated[float, reg.of_load("{noun} {name}, which is known", finite=False)]
-    y: Annotated[tuple[float, ...], reg.of_outputs("Measured output", finite=False)]
-    x: Annotated[tuple[float, ...], reg.of_states("Simulated state, not measured", finite=False)]
+    y: Annotated[Numbers, reg.of_outputs("Measured output", finite=False)]
+    x: Annotated[Numbers, reg.of_states("Simulated state, not measured", finite=False)]
     session: Annotated[int, reg.u32("Session")]
-    u: Annotated[tuple[float, ...], reg.of_inputs("Input being applied", in_span=True)]
+    u: Annotated[Numbers, reg.of_inputs("Input being applied", in_span=True)]
     holder: Annotated[int, reg.u32("Holder of these outputs; 0 is a simple client, safe or initial state")] = 0
     generation: Annotated[
         int, reg.u32("Rises when outputs change other than by their writer: safe state, session, new writer", low=1)
@@ -142,16 +143,12 @@ class LoadAhead(NamedTuple):
     tick: Annotated[int, reg.in_ticks(reg.u32("Tick of the first step, in the future", high=LAST_TICK))] = 0
     length: Annotated[int, reg.u16("Steps in use", low=1, high=AHEAD_STEPS)] = 1
     watts: Annotated[
-        tuple[float, ...],
-        lambda process: reg.f32_array(
-            f"{process.load.noun} of step", tuple(map(str, range(AHEAD_STEPS))), (process.load.unit,) * AHEAD_STEPS
-        ),
+        Numbers,
+        lambda process: reg.f32_array(f"{process.load.noun} of step", _STEPS, (process.load.unit,) * AHEAD_STEPS),
     ] = (0.0,) * AHEAD_STEPS
     ticks: Annotated[
         tuple[int, ...],
-        reg.u16_array(
-            "Ticks from this step to the next one; of the last one unused", tuple(map(str, range(AHEAD_STEPS)))
-        ),
+        reg.Field(reg.Kind.U16, "Ticks from this step to the next one; of the last one unused", elements=_STEPS),
     ] = (0,) * AHEAD_STEPS
     crc: Annotated[int, reg.u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
@@ -195,9 +192,9 @@ class PlantSample(NamedTuple):
 
     tick: Annotated[int, reg.u32("Tick of the row")]
     load: Annotated[float, reg.of_load("{noun}")]
-    u: Annotated[tuple[float, ...], reg.of_inputs("Input applied from this tick on")]
-    y: Annotated[tuple[float, ...], reg.of_outputs("Measured output", finite=False)]
-    x: Annotated[tuple[float, ...], reg.of_states("Simulated state", finite=False)]
+    u: Annotated[Numbers, reg.of_inputs("Input applied from this tick on")]
+    y: Annotated[Numbers, reg.of_outputs("Measured output", finite=False)]
+    x: Annotated[Numbers, reg.of_states("Simulated state", finite=False)]
 
 
 class StationMode(Worded):
@@ -242,13 +239,15 @@ class StationAlarm(IntFlag):
     """The low pressure has stopped a compressor; held until that is switched off."""
 
 
+_WARM_SIGNALS: Final = reg.f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, finite=False)
+_WARM_VALVES: Final = reg.f32_array("Requested opening of valve", STATION_VALVE_NAMES, ("%",) * 4)
+
+
 class StationSample(NamedTuple):
     """Compression station and nitrogen pre-cooler at one tick; all 0 where the plant is a cold box alone."""
 
     tick: Annotated[int, reg.u32("Tick of the row")]
-    signals: Annotated[
-        tuple[float, ...], reg.f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, finite=False)
-    ]
+    signals: Annotated[Numbers, _WARM_SIGNALS]
     mode: Annotated[int, reg.u16("Pressure control: {}", high=0xFFFF, values=StationMode)] = StationMode.AUTOMATIC
     alarms: Annotated[
         int,
@@ -266,13 +265,9 @@ class StationStatus(NamedTuple):
     tick: Annotated[int, reg.u32("Tick at which these values were read")] = 0
     mode: Annotated[int, reg.u16("As in the station history")] = StationMode.AUTOMATIC
     alarms: Annotated[int, reg.u16("As in the station history")] = 0
-    signals: Annotated[
-        tuple[float, ...], reg.f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, finite=False)
-    ] = (0.0,) * len(STATION_SIGNAL_NAMES)
-    commands: Annotated[
-        tuple[float, ...], reg.f32_array("Requested opening of valve", STATION_VALVE_NAMES, ("%",) * 4)
-    ] = (0.0,) * len(STATION_VALVE_NAMES)
-    acting: Annotated[tuple[float, ...], reg.of_inputs("Acting on the cold box, whatever is asked")] = (0.0,) * 3
+    signals: Annotated[Numbers, _WARM_SIGNALS] = (0.0,) * len(STATION_SIGNAL_NAMES)
+    commands: Annotated[Numbers, _WARM_VALVES] = (0.0,) * len(STATION_VALVE_NAMES)
+    acting: Annotated[Numbers, reg.of_inputs("Acting on the cold box, whatever is asked")] = (0.0,) * 3
 
 
 class ModelRangeStatus(NamedTuple):
@@ -320,7 +315,7 @@ OF_A_REFRIGERATOR: Final = (StationStatus, StationSample, Surroundings, ModelRan
 @cache
 def plant_map(process: Process) -> RegisterMap:
     """Return the map of the rack of a process."""
-    noun = process.load.noun
+    noun, outputs, operator = process.load.noun, len(process.outputs), Role.OPERATOR
     blocks = (
         IDENTITY_BLOCK,
         STATISTICS_BLOCK,
@@ -329,29 +324,16 @@ def plant_map(process: Process) -> RegisterMap:
         Block("watchdog", 330, WatchdogStatus, "Watches the control PLC; applies the safe state when it expires"),
         Block("watchdog time", 340, WatchdogTime, "Sets that watchdog", Role.CONTROL),
         Block("lease", 350, LeaseStatus, "Who may write outputs"),
-        Block("session", 400, PlantSession, "Start of a simulation session", Role.OPERATOR),
-        Block("pace", 410, SessionPace, "Time base of the present session", Role.OPERATOR),
+        Block("session", 400, PlantSession, "Start of a simulation session", operator),
+        Block("pace", 410, SessionPace, "Time base of the present session", operator),
         Block("load status", 420, LoadStatus, f"The {noun.lower()} and its known steps"),
-        Block("live load", 440, LiveLoad, f"{noun} from a tick on", Role.OPERATOR, sealed=True),
-        Block(
-            "sensor faults",
-            500,
-            SensorFault,
-            "Faults injected into the measured outputs",
-            Role.OPERATOR,
-            len(process.outputs),
-        ),
-        Block("load ahead", 600, LoadAhead, f"Future steps of the {noun.lower()}", Role.OPERATOR, sealed=True),
+        Block("live load", 440, LiveLoad, f"{noun} from a tick on", operator, sealed=True),
+        Block("sensor faults", 500, SensorFault, "Faults injected into the measured outputs", operator, outputs),
+        Block("load ahead", 600, LoadAhead, f"Future steps of the {noun.lower()}", operator, sealed=True),
         Block("station", 700, StationStatus, "Compression station and nitrogen pre-cooler of a whole refrigerator"),
-        Block(
-            "surroundings",
-            760,
-            Surroundings,
-            "Trips, nitrogen, leak and weather of a whole refrigerator",
-            Role.OPERATOR,
-        ),
+        Block("surroundings", 760, Surroundings, "Trips, nitrogen, leak and weather of a whole refrigerator", operator),
         Block("model range", 780, ModelRangeStatus, "Alarm of the simulation: it has left its property tables"),
-        Block("load table", 1000, LoadStep, f"{noun} over the session", Role.OPERATOR, LOAD_ROWS),
+        Block("load table", 1000, LoadStep, f"{noun} over the session", operator, LOAD_ROWS),
         Block("station history", 9200, StationSample, "The last ticks of the warm part", rows=STATION_ROWS),
         Block("history", 16384, PlantSample, "The last ticks", rows=HISTORY_ROWS),
         *LAST_BLOCKS,
