@@ -19,7 +19,16 @@ from aiohttp.test_utils import make_mocked_request
 from coldloop.errors import ConfigurationError, UsageError
 from coldloop.modbus.settings import Endpoint, TlsSettings
 from coldloop.process.cold_box import COLD_BOX
-from coldloop_hmi.guard import Connections, Guard, host_of, is_own_origin, port_of, told_in_a_line
+from coldloop_hmi.guard import (
+    REQUEST_BURST,
+    REQUESTS_A_BROWSER,
+    Connections,
+    Guard,
+    host_of,
+    is_own_origin,
+    port_of,
+    told_in_a_line,
+)
 from coldloop_hmi.page_server import PageServer, PageSite
 from coldloop_hmi.process_image import Model
 from coldloop_hmi.settings import HmiSection, LoginSettings
@@ -27,8 +36,6 @@ from coldloop_hmi.users import (
     LOGIN_BURST,
     LOGINS_A_MINUTE,
     PASSWORD_BURST,
-    REQUEST_BURST,
-    REQUESTS_A_BROWSER,
     Audit,
     ClientLimit,
     LoginLimit,

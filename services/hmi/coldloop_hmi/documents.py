@@ -24,7 +24,7 @@ from coldloop.registers.control_plc import Mode
 from coldloop.registers.declaration import Kind, RegisterMap
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, Prediction
 from coldloop.registers.plant import StationAlarm, StationMode, StationStatus
-from coldloop.registers.safety import Alarm, AlarmAction, AlarmPriority, AlarmState
+from coldloop.registers.safety import AlarmAction, AlarmPriority, AlarmState
 from coldloop.service.journal import alarm_cause, alarm_word, flag_words
 from coldloop.service.monitoring import block_families, build_family, gauge
 from coldloop.text import finite_json
@@ -35,7 +35,7 @@ KIND: Final = "plant.kind"
 REFRIGERATOR: Final = "refrigerator"
 SIGNALS: Final = "plant.station.signals."
 ALARMS: Final = "plant.station.alarms."
-LIMITS: Final[Mapping[str, tuple[str | None, str | None]]] = {
+LIMITS: Final = {
     "P12": ("hp_low_bar", "hp_high_bar"),
     "P11": ("lp_low_bar", "lp_high_bar"),
     "L_N2": ("nitrogen_low", None),
@@ -201,13 +201,11 @@ def plant_document(model: image.Model) -> dict[str, Any]:
         "kind": kind,
         "mode": StationMode.word_of(status.mode),
         "alarms": flag_words(StationAlarm(status.alarms)),
-        "bands": {f"{SIGNALS}{name}": _band(model, *keys) for name, keys in LIMITS.items()},
+        "bands": {
+            f"{SIGNALS}{name}": [model.configuration.get(f"{ALARMS}{key}") for key in keys]
+            for name, keys in LIMITS.items()
+        },
     }
-
-
-def _band(model: image.Model, *keys: str | None) -> list[float | None]:
-    values = (model.configuration.get(f"{ALARMS}{key}") if key else None for key in keys)
-    return [float(value) if isinstance(value, int | float) else None for value in values]
 
 
 Document = dict[str, Any]
@@ -247,30 +245,29 @@ def catalog(model: image.Model, *, training: bool, replay: bool) -> Document:
     }  # fmt: skip
 
 
-def alarm_document(kind: int, alarm: Alarm, process: Process) -> Document:
-    """Return one alarm in words."""
-    return {
-        "number": int(kind),
-        "name": alarm_word(kind, process),
-        "state": AlarmState.word_of(alarm.state),
-        "active": bool(alarm.active),
-        "cause": alarm_cause(kind, alarm.cause, process) if alarm.times else "",
-        "priority": int(alarm.priority),
-        "priority_word": AlarmPriority.word_of(alarm.priority),
-        "times": alarm.times,
-        "raised_s": alarm.raised * process.tick_s,
-        "returned_s": alarm.returned * process.tick_s,
-        "shelved_until_s": alarm.shelved_until * process.tick_s,
-    }
-
-
 def alarms_document(model: image.Model) -> list[Document]:
-    """Return all alarms: those that are active first, of these the unacknowledged ones, then by priority and age."""
+    """Return all alarms in words: the active ones first, of these the unacknowledged, then by priority and age."""
     rank: dict[int, int] = {AlarmState.UNACKNOWLEDGED: 0, AlarmState.ACKNOWLEDGED: 1, AlarmState.RETURNED: 2}
     rows = sorted(
         enumerate(model.alarms), key=lambda row: (rank.get(row[1].state, 3), -row[1].priority, -row[1].raised)
     )
-    return [alarm_document(kind, alarm, model.process) for kind, alarm in rows]
+    process = model.process
+    return [
+        {
+            "number": kind,
+            "name": alarm_word(kind, process),
+            "state": AlarmState.word_of(alarm.state),
+            "active": bool(alarm.active),
+            "cause": alarm_cause(kind, alarm.cause, process) if alarm.times else "",
+            "priority": int(alarm.priority),
+            "priority_word": AlarmPriority.word_of(alarm.priority),
+            "times": alarm.times,
+            "raised_s": alarm.raised * process.tick_s,
+            "returned_s": alarm.returned * process.tick_s,
+            "shelved_until_s": alarm.shelved_until * process.tick_s,
+        }
+        for kind, alarm in rows
+    ]
 
 
 def event_document(entry: image.JournalEntry, tick_s: float) -> Document:
@@ -348,8 +345,6 @@ def explanation_document(model: image.Model, number: int | None, at_tick: int | 
     document["sentence"] = sentence(found, model.rule)
     document["update"] = update._asdict()
     document["before"] = found.before._asdict() if found.before is not None else None
-    document["increments"] = found.increments._asdict() if found.increments else None
-    document["budget"]["slack"] = found.budget.slack
     document["time_s"] = update.tick * model.process.tick_s
     document["neighbours"] = [before.update if before else None, after.update if after else None]
     document["rule"] = model.rule._asdict()

@@ -7,8 +7,7 @@ A pure function of registers: it works on a running rig and on a recorded run al
 import math
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import cache
-from typing import Final, NamedTuple
+from typing import Final
 
 from coldloop.process.declaration import Process
 from coldloop.process.updating_periods import ComputingTimes
@@ -62,7 +61,8 @@ DECIDED: Final = frozenset({Branch.DOWN, Branch.UP, Branch.LEVEL})
 """Branches of Algorithm 1."""
 
 
-class Increments(NamedTuple):
+@dataclass(frozen=True)
+class Increments:
     """The quantities per iteration that Gamma is made of."""
 
     mismatch: float
@@ -98,11 +98,8 @@ class Budget:
     iterations: int
     iteration: float
     """Time of one iteration."""
-
-    @property
-    def slack(self) -> float:
-        """Time that is left; negative when the answer is late."""
-        return self.period - self.answer
+    slack: float
+    """Time that is left; negative when the answer is late."""
 
 
 @dataclass(frozen=True)
@@ -143,6 +140,7 @@ def explain(
     n_before = times.iterations(times.period(before.q)) if before is not None else 0
     increments = increments_of(update, n_before) if branch in DECIDED and before is not None else None
     needed = update.tau_u if branch is Branch.FIXED else times.period(update.q)
+    answer, period_s = rule.preparation + update.iterations * rule.iteration, update.tau_u * tick_s
     return Explanation(
         update=update,
         before=before,
@@ -152,10 +150,10 @@ def explain(
         spare_s=(update.tau_u - needed) * tick_s,
         period_before_s=before.tau_u * tick_s if before is not None else None,
         elapsed_s=(update.tick - before.tick) * tick_s if before is not None else None,
-        period_s=update.tau_u * tick_s,
+        period_s=period_s,
         increments=increments,
         alternatives=_alternatives(update, before.q, increments, rule.delta, times) if increments and before else (),
-        budget=budget_of(update, rule, tick_s),
+        budget=Budget(rule.preparation, answer, period_s, update.iterations, rule.iteration, period_s - answer),
         predicted=update.j_delivered,
         came=after.j_effective if after is not None and after.update == update.update + 1 else None,
     )
@@ -179,12 +177,6 @@ def increments_of(update: Optimization, iterations_before: int) -> Increments | 
         dK = (update.gamma * log_K**2 + log_K) * K / iterations_before
     dE = (dK - E * dD) / D
     return Increments(dD, dE if abs(dE) * iterations_before > RESOLUTION else 0.0, dK)
-
-
-def budget_of(update: Optimization, rule: UpdatingRuleStatus, tick_s: float) -> Budget:
-    """Return how the PLC spends the period."""
-    answer = rule.preparation + update.iterations * rule.iteration
-    return Budget(rule.preparation, answer, update.tau_u * tick_s, update.iterations, rule.iteration)
 
 
 def _branch(update: Optimization, before: Optimization | None, rule: UpdatingRuleStatus) -> Branch:
@@ -234,14 +226,6 @@ def _alternatives(
     return tuple(found)
 
 
-@cache
-def _notable(process: Process) -> tuple[float, ...]:
-    """Return what is worth a word, by input and output."""
-    usual = [(one.unit, NOTABLE_SHARE * (one.high - one.low)) for one in process.inputs]
-    usual += [(one.unit, NOTABLE_NOISE * one.noise) for one in process.outputs]
-    return tuple(process.notable.get(unit, value) for unit, value in usual)
-
-
 def deviation(found: ModelDeviation, process: Process, suspects: int = 0) -> str:
     """Return how the plant differs from its model, without the load, the most notable first; empty where it agrees.
 
@@ -249,21 +233,16 @@ def deviation(found: ModelDeviation, process: Process, suspects: int = 0) -> str
     not what the filter takes it for; and those that are not used for that reason (bit i is output i); and inputs
     that have no effect (the bits after those).
     """
-    names = process.output_names
-    parts = [
-        (value, f"needs {number_text(abs(value), 3)} {unit} {'less' if value > 0 else 'more'} of {name}")
-        for name, unit, value in zip(process.input_names, process.input_units, found.u, strict=True)
-    ]
-    parts += [
-        (value, f"{name} {'+' if value > 0 else ''}{number_text(value, 3)} {unit}")
-        for name, unit, value in zip(names, process.output_units, found.y, strict=True)
-    ]
-    notable = [
-        (abs(value) / least, text)
-        for (value, text), least in zip(parts, _notable(process), strict=True)
-        if abs(value) >= least
-    ]
-    texts = [text for _, text in sorted(notable, reverse=True)[:MOST_DEVIATIONS]]
+    names, notable = process.output_names, list[tuple[float, str]]()
+    for moved, value in zip(process.inputs, found.u, strict=True):
+        least = process.notable.get(moved.unit, NOTABLE_SHARE * (moved.high - moved.low))
+        more = f"{number_text(abs(value), 3)} {moved.unit} {'less' if value > 0 else 'more'}"
+        notable.append((abs(value) / least, f"needs {more} of {moved.name}"))
+    for output, value in zip(process.outputs, found.y, strict=True):
+        least = process.notable.get(output.unit, NOTABLE_NOISE * output.noise)
+        more = f"{'+' if value > 0 else ''}{number_text(value, 3)} {output.unit}"
+        notable.append((abs(value) / least, f"{output.name} {more}"))
+    texts = [text for _, text in sorted((one for one in notable if one[0] >= 1.0), reverse=True)[:MOST_DEVIATIONS]]
     surprise, name = max(zip(found.surprise, names, strict=True))
     if surprise >= SURPRISING:
         texts.append(f"{name} {number_text(surprise, 2)} times further from its prediction than expected")

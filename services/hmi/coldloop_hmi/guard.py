@@ -22,20 +22,13 @@ from typing import Final
 from aiohttp import hdrs, web
 from aiohttp.http_exceptions import HttpProcessingError
 
+from coldloop.errors import printable
 from coldloop_hmi.settings import HmiSection
-from coldloop_hmi.users import (
-    REQUEST_BURST,
-    REQUESTS_A_BROWSER,
-    Audit,
-    ClientLimit,
-    LoginLimit,
-    LoginSession,
-    LoginSessions,
-    Party,
-    User,
-    Users,
-)
+from coldloop_hmi.users import Audit, ClientLimit, LoginLimit, LoginSession, LoginSessions, Party, User, Users
 
+REQUESTS_A_BROWSER: Final = 3.0
+"""In a second. Behind a proxy all browsers have one address, and each asks for two trends a second."""
+REQUEST_BURST: Final = 150.0
 REQUEST_S: Final = 10.0
 """A request that takes longer, because its client is slow to read the answer, keeps no place; a stream does."""
 HEADERS: Final = {
@@ -113,14 +106,14 @@ class Connections:
         return server()
 
     def _make_room(self, now: float) -> bool:
-        crowd = Counter(map(_address, self._uses))
+        addresses = {one: str(one.peername[0]) if isinstance(one.peername, tuple) else "" for one in self._uses}
+        crowd = Counter(addresses.values())
         ranks = {one: rank for one, use in self._uses.items() if (rank := use.rank(now)) is not None}
         if not ranks:
             return False
-        first = min(ranks, key=lambda one: (ranks[one], -crowd[_address(one)], self._uses[one].since))
-        transport = first.transport
-        if transport is not None:
-            transport.abort()  # do not wait for unread data
+        first = min(ranks, key=lambda one: (ranks[one], -crowd[addresses[one]], self._uses[one].since))
+        if first.transport is not None:
+            first.transport.abort()  # do not wait for unread data
         first.force_close()
         return True
 
@@ -135,16 +128,8 @@ class Connections:
             use.since, use.is_busy = self._now(), False
 
 
-def _address(handler: web.RequestHandler) -> str:
-    peer = handler.peername
-    return str(peer[0]) if isinstance(peer, tuple) else ""
-
-
 class _Refused(asyncio.Protocol):
-    """Ends a connection for which there is no room."""
-
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """End it."""
         if isinstance(transport, asyncio.WriteTransport):
             transport.abort()
 
@@ -235,71 +220,74 @@ class Guard:
         who = self.who(request)
         return Party(who, has_session=True) if who else Party(request.remote or "", has_session=False)
 
-    async def log_in(self, name: str, password: str, address: str, limit: LoginLimit) -> User | web.Response:
-        """Return the user with this password, or the refusal; both take as long."""
+    async def log_in(self, name: str, password: str, address: str, limit: LoginLimit) -> User:
+        """Return the user with this password; a refusal takes as long.
+
+        Raises:
+            HTTPTooManyRequests, HTTPUnauthorized: Too many attempts; a wrong name or password.
+        """
+        refuse = partial(self._audit.refuse, "login", who=name[:40], address=address, has_session=False)
         if not limit.allows(address, name):
-            self._audit.refuse("login", who=name[:40], address=address, reason="too many attempts", has_session=False)
-            return refusal(429, "too many attempts to log in: wait a minute")
+            refuse(reason="too many attempts")
+            raise web.HTTPTooManyRequests(reason="too many attempts to log in: wait a minute")
         async with self._checking:
             user = await asyncio.to_thread(self._users.check, name, password)
         if user is None:
-            self._audit.refuse(
-                "login", who=name[:40], address=address, reason="wrong name or password", has_session=False
-            )
-            return refusal(401, "wrong name or password")
+            refuse(reason="wrong name or password")
+            raise web.HTTPUnauthorized(reason="wrong name or password")
         limit.succeeded(address, name)
         return user
 
-    def _refused(self, request: web.Request, status: int, reason: str, message: str = "") -> web.Response:
-        party = self.party(request)
+    def _noted(self, request: web.Request, error: web.HTTPException, reason: str = "") -> web.HTTPException:
+        """Return the refusal of a request, which the audit has by now."""
+        who = self.who(request)
         self._audit.refuse(
-            "request", who=self.who(request), address=request.remote or "", reason=reason,
-            detail=f"{request.method} {request.path} of {host_header(request)}", has_session=party.has_session,
+            "request", who=who, address=request.remote or "", reason=reason or error.reason,
+            detail=f"{request.method} {request.path} of {host_header(request)}", has_session=bool(who),
         )  # fmt: skip
-        return refusal(status, message or reason)
+        return error
 
-    def _judge(self, request: web.Request) -> web.Response | None:
-        """Return why a request is refused; None when it is not."""
+    def _judge(self, request: web.Request) -> None:
+        """Raise the refusal of a request that is not allowed."""
         path, host = path_in_site(request), host_header(request)
         is_file = path in FILES or path.startswith("/static/")
         limit = self._files if is_file else self._requests
         if path not in UNLIMITED and not limit.allows(self.party(request)):
-            return self._refused(request, 429, "too many requests: wait a little")
+            raise self._noted(request, web.HTTPTooManyRequests(reason="too many requests: wait a little"))
         if host_of(host) not in self._hosts:
-            reason = "host name not allowed"
-            return self._refused(request, 421, reason, f"host '{host}' is not allowed: add it to hmi.allowed_hosts")
+            reason = f"host '{printable(host)}' is not allowed: add it to hmi.allowed_hosts"
+            raise self._noted(request, web.HTTPMisdirectedRequest(reason=reason), "host name not allowed")
         if request.method not in SAFE and not is_own_origin(request.headers.get(hdrs.ORIGIN), host):
-            return self._refused(request, 403, "commands are accepted from the page itself only, not from another site")
+            reason = "commands are accepted from the page itself only, not from another site"
+            raise self._noted(request, web.HTTPForbidden(reason=reason))
         is_open = path in OPEN or is_file
         if not is_open and not self._settings.login.anonymous_view and self.session(request) is None:
-            return refusal(401, "log in first")
-        return None
+            raise web.HTTPUnauthorized(reason="log in first")
 
-    async def _receive(self, request: web.Request) -> web.Response | None:
-        """Wait for the rest of a request; return why it is refused, None when it is not."""
-        length, is_stranger = request.content_length, not self.party(request).has_session
-        if is_stranger and request.can_read_body and (length is None or length > LARGEST_OF_STRANGERS):
-            return refusal(413, f"a request has at most {LARGEST_OF_STRANGERS} bytes, and says how many: log in first")
+    async def _receive(self, request: web.Request) -> None:
+        """Wait for the rest of a request; raise its refusal if it is not to be had."""
+        length, most = request.content_length, LARGEST_OF_STRANGERS
+        if not self.who(request) and request.can_read_body and (length is None or length > most):
+            reason = f"a request has at most {most} bytes, and says how many: log in first"
+            raise web.HTTPRequestEntityTooLarge(most, length or 0, reason=reason)
         try:
             async with asyncio.timeout(BODY_S):
                 await request.read()
         except TimeoutError:
-            return refusal(408, f"the request was not complete within {BODY_S:g} s")
+            raise web.HTTPRequestTimeout(reason=f"the request was not complete within {BODY_S:g} s") from None
         except web.RequestPayloadError:
-            return refusal(400, "the request is malformed")
-        return None
+            raise web.HTTPBadRequest(reason="the request is malformed") from None
 
     @web.middleware
     async def middleware(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Judge a request, answer it, and put the headers on the answer."""
-        answer: web.StreamResponse | None = self._judge(request)
+        answer: web.StreamResponse
         try:
-            answer = answer or await self._receive(request)
-            if answer is None:
-                is_stream = path_in_site(request) == STREAM
-                has_session = self.party(request).has_session
-                with self._connections.serving(request, is_stream=is_stream, has_session=has_session):
-                    answer = await handler(request)
+            self._judge(request)
+            await self._receive(request)
+            is_stream, has_session = path_in_site(request) == STREAM, bool(self.who(request))
+            with self._connections.serving(request, is_stream=is_stream, has_session=has_session):
+                answer = await handler(request)
         except web.HTTPException as error:
             answer = refusal(error.status, error.reason)
         if not answer.prepared:
@@ -389,50 +377,37 @@ def _compressed(body: bytes) -> bytes:
     return gzip.compress(body, 6, mtime=0)
 
 
-class StreamCompression:
-    """Compresses messages one by one with what was sent before, the last message at least: 160 kB for each stream."""
-
-    def __init__(self) -> None:
-        self._stream = zlib.compressobj(wbits=16 + 15, memLevel=6)
-
-    def message(self, message: bytes) -> bytes:
-        """Return a message as it is sent: complete, so that it waits for no later one."""
-        return self._stream.compress(message) + self._stream.flush(zlib.Z_SYNC_FLUSH)
+def stream_compression() -> Callable[[bytes], bytes]:
+    """Return what compresses the messages of a stream with those before, in 160 kB; each waits for no later one."""
+    stream = zlib.compressobj(wbits=16 + 15, memLevel=6)
+    return lambda message: stream.compress(message) + stream.flush(zlib.Z_SYNC_FLUSH)
 
 
-class Stream:
-    """Messages to one browser.
+class Stream(asyncio.Queue[bytes | None]):
+    """Messages to one browser, None at their end.
 
     Args:
         party: Whose browser it is.
     """
 
     def __init__(self, party: Party) -> None:
+        super().__init__(WAITING)
         self.party = party
-        self._messages: asyncio.Queue[bytes | None] = asyncio.Queue(WAITING)
-        self.is_behind = True
+        self.is_behind = False
         """It has missed messages: it needs the whole state next."""
 
     def offer(self, message: bytes) -> None:
         """Add a message; a browser that is too slow loses all that wait."""
-        try:
-            self._messages.put_nowait(message)
-        except asyncio.QueueFull:
-            self._drop()
+        if self.full():
+            self.clear()
             self.is_behind = True
+        else:
+            self.put_nowait(message)
 
-    def end(self) -> None:
-        """End it: nothing follows."""
-        self._drop()
-        self._messages.put_nowait(None)
-
-    def _drop(self) -> None:
-        while not self._messages.empty():
-            self._messages.get_nowait()
-
-    async def next(self) -> bytes | None:
-        """Return the next message; None at its end."""
-        return await self._messages.get()
+    def clear(self) -> None:
+        """Drop what waits."""
+        while not self.empty():
+            self.get_nowait()
 
 
 class Broadcast:
@@ -470,9 +445,9 @@ class Broadcast:
             if loser is None:
                 return None
             del self._streams[loser]
-            loser.end()
+            loser.clear()
+            loser.put_nowait(None)
         stream = Stream(party)
-        stream.is_behind = False
         stream.offer(self._whole())
         self._streams[stream] = None
         return stream
@@ -493,7 +468,7 @@ class Broadcast:
     async def messages(self, stream: Stream) -> AsyncIterator[bytes]:
         """Yield the whole state, and then what changes, until the stream ends."""
         try:
-            while (message := await stream.next()) is not None:
+            while (message := await stream.get()) is not None:
                 yield message
         finally:
             self._streams.pop(stream, None)

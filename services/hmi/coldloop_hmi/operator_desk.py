@@ -23,7 +23,7 @@ from coldloop_hmi.documents import encoded
 from coldloop_hmi.guard import Guard, compressed_answer, cookie_name, refusal
 from coldloop_hmi.process_image import Model
 from coldloop_hmi.settings import HmiSection
-from coldloop_hmi.users import Audit, LoginSession, Users
+from coldloop_hmi.users import Audit, Users
 
 Premises = dict[str, str]
 """Present values by what they are of, in words."""
@@ -156,27 +156,23 @@ class OperatorDesk:
 
     def _consequences(self, command: commands.Command) -> str:
         """Return what a command means at present, beyond its own words."""
-        if isinstance(command, commands.TreatAlarm) and command.action == AlarmAction.SHELVE and command.time_s:
-            return self._by_the_clock(command.time_s)
-        load = self._model.record("plant", LoadStatus)
+        pace, load = self._model.record("plant", SessionPace), self._model.record("plant", LoadStatus)
+        shelved_s = 0
+        if isinstance(command, commands.TreatAlarm) and command.action == AlarmAction.SHELVE:
+            shelved_s = command.time_s
+        if shelved_s and pace and pace.session:
+            if not pace.realtime:
+                return " of plant time, which advances as it is granted"
+            if pace.paused:
+                return " of plant time, which is paused"
+            if pace.factor != 1.0 and pace.factor > 0.0:
+                length = commands.duration_text(shelved_s / pace.factor)
+                return f" of plant time, {length} by the clock at factor {pace.factor:g}"
         if isinstance(command, commands.SetLoad | commands.PlayLoad) and load and load.upcoming:
             until = commands.clock_text(load.last_tick * self.process.tick_s)
             steps = f"{load.upcoming} steps" if load.upcoming > 1 else "step"
             return f"; the {steps} of the load still to come, until {until}, will be dropped"
         return ""
-
-    def _by_the_clock(self, seconds: float) -> str:
-        """Return what so much plant time is at present."""
-        pace = self._model.record("plant", SessionPace)
-        if pace is None or not pace.session:
-            return ""
-        if not pace.realtime:
-            return " of plant time, which advances as it is granted"
-        if pace.paused:
-            return " of plant time, which is paused"
-        if pace.factor == 1.0 or pace.factor <= 0.0:
-            return ""
-        return f" of plant time, {commands.duration_text(seconds / pace.factor)} by the clock at factor {pace.factor:g}"
 
     async def confirm(self, token: str, user: str) -> CommandResult:
         """Carry out a command that was prepared, once.
@@ -268,8 +264,6 @@ class Commanding:
             return refusal(400, "user and password must be text")
         address = request.remote or ""
         user = await self._guard.log_in(name, password, address, self._guard.logins)
-        if isinstance(user, web.Response):
-            return user
         self._guard.sessions.end(request.cookies.get(cookie_name(request)))
         answer = web.json_response({"user": user.name, "role": user.role.value})
         answer.set_cookie(
@@ -291,19 +285,15 @@ class Commanding:
 
     async def audit(self, request: web.Request) -> web.Response:
         """Answer with the last entries of the audit, for operators."""
-        operator = self._operator(request)
-        if isinstance(operator, web.Response):
-            return operator
+        self._operator(request)
         return compressed_answer(request, encoded({"entries": self._audit.entries[::-1]}))
 
     async def prepare(self, request: web.Request) -> web.Response:
         """Take a command: answer with what it would do and the token that confirms it."""
-        operator = self._operator(request)
-        if isinstance(operator, web.Response) or self._desk is None:
-            return operator if isinstance(operator, web.Response) else refusal(409, "a recorded run takes no commands")
+        user, desk = self._operator(request), self._required_desk()
         try:
-            command = commands.read_command(await _document(request), self._desk.process)
-            preview = await self._desk.prepare(command, operator.user.name)
+            command = commands.read_command(await _document(request), desk.process)
+            preview = await desk.prepare(command, user)
         except (UsageError, LinkError) as error:
             self._refuse(request, str(error))
             return refusal(422, str(error))
@@ -311,11 +301,9 @@ class Commanding:
 
     async def confirm(self, request: web.Request) -> web.Response:
         """Carry out a prepared command; answer with the command and its result."""
-        operator = self._operator(request)
-        if isinstance(operator, web.Response) or self._desk is None:
-            return operator if isinstance(operator, web.Response) else refusal(409, "a recorded run takes no commands")
+        user, desk = self._operator(request), self._required_desk()
         try:
-            outcome = await self._desk.confirm(request.match_info["token"], operator.user.name)
+            outcome = await desk.confirm(request.match_info["token"], user)
         except (UsageError, LinkError) as error:
             self._refuse(request, str(error))
             preview = error.preview._asdict() if isinstance(error, PremisesChangedError) else {}
@@ -323,20 +311,25 @@ class Commanding:
         word = "refused" if outcome.refused_because else "uncertain" if outcome.uncertain_because else "done"
         detail = f"{outcome.asked}: {' '.join(filter(None, outcome[1:]))}"
         self._audit.note(  # by name: the login may have ended meanwhile
-            "command", who=operator.user.name, address=request.remote or "", outcome=word, detail=detail
+            "command", who=user, address=request.remote or "", outcome=word, detail=detail
         )
         return compressed_answer(request, encoded(outcome._asdict()))
 
-    def _operator(self, request: web.Request) -> LoginSession | web.Response:
-        """Return the session of an operator, or the refusal."""
+    def _required_desk(self) -> OperatorDesk:
+        if self._desk is None:
+            raise web.HTTPConflict(reason="a recorded run takes no commands")
+        return self._desk
+
+    def _operator(self, request: web.Request) -> str:
+        """Return the name of an operator; raise the refusal of anybody else."""
         session = self._guard.session(request)
         if session is None:
             self._refuse(request, "not logged in, or the session has ended")
-            return refusal(401, "log in first: the session has ended, or there was none")
+            raise web.HTTPUnauthorized(reason="log in first: the session has ended, or there was none")
         if not session.may_operate:
             self._refuse(request, "the user may only view")
-            return refusal(403, f"{session.user.name} may view, but not operate")
-        return session
+            raise web.HTTPForbidden(reason=f"{session.user.name} may view, but not operate")
+        return session.user.name
 
     def _refuse(self, request: web.Request, reason: str) -> None:
         who = self._guard.who(request)

@@ -6,10 +6,10 @@ import io
 import math
 import ssl
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Coroutine, Iterable, Mapping
 from contextlib import AbstractAsyncContextManager, suppress
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 from aiohttp import BasicAuth, hdrs, web
 from aiohttp.log import server_logger
@@ -27,6 +27,7 @@ from coldloop_hmi.process_image import JournalEntry, Model
 from coldloop_hmi.settings import HmiSection
 from coldloop_hmi.users import Audit, Users
 
+Task = Callable[[], Coroutine[Any, Any, None]]
 POINTS: Final = 800
 MOST_POINTS: Final = 4000
 PENS: Final = 8
@@ -104,8 +105,8 @@ class Reading:
         if stream is None:
             return refusal(503, f"{len(self._broadcast)} browsers are connected: close some, or raise hmi.browsers")
         answer = web.StreamResponse(headers={hdrs.CONTENT_TYPE: "text/event-stream"})
-        compression = guards.StreamCompression() if guards.takes_gzip(request) else None
-        if compression is not None:
+        compressed = guards.stream_compression() if guards.takes_gzip(request) else None
+        if compressed is not None:
             answer.headers[hdrs.CONTENT_ENCODING] = "gzip"
         guards.add_headers(answer)
         try:
@@ -114,7 +115,7 @@ class Reading:
                 if not self._settings.login.anonymous_view and self._guard.session(request) is None:
                     break
                 async with asyncio.timeout(STALLED_S):
-                    await answer.write(compression.message(message) if compression else message)
+                    await answer.write(compressed(message) if compressed else message)
         except (ConnectionError, TimeoutError, asyncio.CancelledError):
             pass
         return answer
@@ -267,9 +268,7 @@ class Reading:
                 auth = None
             if auth is None:
                 return refusal(401, "log in first, or send name and password (basic)")
-            user = await self._guard.log_in(auth.login, auth.password, request.remote or "", self._guard.scrapes)
-            if isinstance(user, web.Response):
-                return user
+            await self._guard.log_in(auth.login, auth.password, request.remote or "", self._guard.scrapes)
         body = exposition(documents.page_families(self._model, len(self._broadcast)))
         return compressed_answer(request, body, CONTENT_TYPE)
 
@@ -353,30 +352,22 @@ class PageServer:
             PortInUseError: Another program already does.
             ConfigurationError: The files for HTTPS cannot be used.
         """
-        settings = self._settings
-        https = _https(settings)
-        await self._runner.setup()
+        host, port = self._settings.host, self._settings.port
+        https = _https(self._settings)
+        await self._runner.setup()  # the places of aiohttp take in everybody who comes, so these are our own
+        newcomer = partial(self._connections.newcomer, cast("web.Server", self._runner.server))
         try:
-            self._listener = await self._listen(https)
+            if https is None:
+                self._listener = await asyncio.get_running_loop().create_server(newcomer, host, port)
+            else:
+                self._listener = await TlsListener.at(
+                    host, port, https, make_protocol=newcomer, limit=self._settings.connections,
+                    refusals=RefusalLog("hmi"),
+                )  # fmt: skip
         except OSError as error:
             await self._runner.cleanup()
-            raise PortInUseError(
-                f"{settings.host}:{settings.port}: {error.strerror}; give another port with hmi.port"
-            ) from None
+            raise PortInUseError(f"{host}:{port}: {error.strerror}; give another port with hmi.port") from None
         self.port = self._listener.sockets[0].getsockname()[1]
-
-    async def _listen(self, https: ssl.SSLContext | None) -> asyncio.Server | TlsListener:
-        """Listen; the places of aiohttp take in everybody who comes, so these are our own."""
-        server, host, port = self._runner.server, self._settings.host, self._settings.port
-        if server is None:
-            raise RuntimeError("the runner is not set up")
-        newcomer = partial(self._connections.newcomer, server)
-        if https is None:
-            return await asyncio.get_running_loop().create_server(newcomer, host, port)
-        refusals = RefusalLog("hmi")
-        return await TlsListener.at(
-            host, port, https, make_protocol=newcomer, limit=self._settings.connections, refusals=refusals
-        )
 
     @property
     def address(self) -> str:
@@ -385,11 +376,22 @@ class PageServer:
         host = f"[{name}]" if ":" in name else name
         return f"{'https' if self._settings.https else 'http'}://{host}:{self.port}/"
 
-    async def run(self) -> None:
-        """Send what changes to all browsers until cancelled."""
-        async with asyncio.TaskGroup() as tasks:
-            for stream in self._streams:
-                tasks.create_task(_send_changes(*stream), name="stream")
+    async def serve(self, others: Iterable[Task], announce: Callable[[], None]) -> None:
+        """Listen, announce it, and send what changes to all browsers beside other tasks, until cancelled.
+
+        Raises:
+            PortInUseError, ConfigurationError: As `start`.
+        """
+        await self.start()
+        announce()
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                for stream in self._streams:
+                    tasks.create_task(_send_changes(*stream), name="stream")
+                for each in others:
+                    tasks.create_task(each())
+        finally:
+            await self.close()
 
     async def close(self) -> None:
         """End all streams and stop listening."""

@@ -176,12 +176,8 @@ class TrendStore:
         values = (process.load, *process.u, *process.y, float(mode), *kept)
         for name, value in zip(self.names, values, strict=True):
             self._columns[name].append(value)
-        self._trim()
-
-    def _trim(self) -> None:
-        excess = max(len(self.ticks) - MOST_ROWS, 0)
         oldest = bisect_left(self.ticks, self.ticks[-1] - self._kept_ticks)
-        drop = max(excess, oldest)
+        drop = max(len(self.ticks) - MOST_ROWS, oldest)
         if drop >= SPARE_ROWS or (drop and 2 * drop >= len(self.ticks)):
             del self.ticks[:drop], self._doubts[:drop]
             for column in self._columns.values():
@@ -322,13 +318,6 @@ class JournalEntry(NamedTuple):
         return cls(service, event.number, event.boot, utc_text(event), event.tick, describe(event, process))
 
 
-def _same(one: Any, other: Any) -> bool:  # noqa: ANN401 a value of any register
-    """Return whether two values are the same; not a number is the same as itself."""
-    if isinstance(one, float) and isinstance(other, float) and math.isnan(one):
-        return math.isnan(other)
-    return bool(one == other)
-
-
 @dataclass
 class Source:
     """One service, as far as it has been heard."""
@@ -394,7 +383,8 @@ class Model:
             return
         source.records[block.name] = record
         for name, value in values_of(service, block, record).items():
-            if not _same(self.values.get(name), value):
+            known = self.values.get(name)
+            if known != value and str(known) != str(value):  # not a number is no news either
                 self.values[name] = value
                 self.changed.add(name)
         if isinstance(record, Identity):

@@ -22,25 +22,7 @@ from coldloop.modbus.settings import Endpoint
 from coldloop.operating.observer import JournalReader, UpdateReader, read_alarms
 from coldloop.process.cold_box import STATION_VALVE_NAMES
 from coldloop.process.declaration import Process
-from coldloop.registers import Maps
-from coldloop.registers.common import (
-    ConfigurationDigest,
-    ConfigurationLine,
-    Identity,
-    JournalPage,
-    SessionPace,
-    configuration_of,
-    lines_of,
-)
-from coldloop.registers.control_plc import LadderStatus, Operator, PlantLinkStatus, ProcessNow, Status
-from coldloop.registers.optimizer_plc import (
-    ControlLinkStatus,
-    OperatingLimits,
-    Optimization,
-    Prediction,
-    UpdatingRuleStatus,
-)
-from coldloop.registers.plant import LoadStatus, SensorFault, StationSample, StationStatus
+from coldloop.registers import common, control_plc, optimizer_plc, plant
 from coldloop.registers.safety import Alarm
 from coldloop_hmi.documents import KIND, REFRIGERATOR
 from coldloop_hmi.guard import refusal
@@ -52,10 +34,16 @@ from coldloop_hmi.settings import HmiSection, HmiSettings
 log = logging.getLogger("coldloop.hmi")
 
 FAST: Final[dict[str, tuple[type[tuple[Any, ...]], ...]]] = {
-    "plant": (SessionPace, LoadStatus),
-    "control_plc": (LadderStatus, ProcessNow, Status, PlantLinkStatus, Operator),
-    "optimizer_plc": (ControlLinkStatus,),
-}
+    "plant": (common.SessionPace, plant.LoadStatus),
+    "control_plc": (
+        control_plc.LadderStatus,
+        control_plc.ProcessNow,
+        control_plc.Status,
+        control_plc.PlantLinkStatus,
+        control_plc.Operator,
+    ),
+    "optimizer_plc": (optimizer_plc.ControlLinkStatus,),
+}  # fmt: skip
 """Records that are read in each look; the mode is read before the process that is drawn with it."""
 SLOW_S: Final = 1.0
 """Time between two looks at a record that is not among these."""
@@ -74,27 +62,17 @@ async def serve(settings: HmiSettings) -> None:
     """
     hmi = settings.hmi
     model = Model(settings.process, time.monotonic, hmi.kept_s)
-    desk = OperatorDesk(operator_endpoints(hmi), model, time.monotonic, training=hmi.training)
+    ends: dict[str, Endpoint] = {service: getattr(hmi, service) for service in model.maps}
+    tls = {"tls": hmi.operator_tls} if hmi.operator_tls else {}
+    operated = {service: end.model_copy(update=tls) for service, end in ends.items()}
+    desk = OperatorDesk(operated, model, time.monotonic, training=hmi.training)
     server = PageServer(hmi, PageSite(model, desk))
-    clients = {service: RegisterClient.at(each, getattr(hmi, service)) for service, each in model.maps.items()}
+    clients = {service: RegisterClient.at(model.maps[service], end) for service, end in ends.items()}
     pollers = [Poller(service, client, model, hmi.poll_s) for service, client in clients.items()]
-    await server.start()
-    log.info("serving", extra={"host": hmi.host, "port": server.port, "address": server.address})
-    try:
-        async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(server.run(), name="stream")
-            for service, poller in zip(clients, pollers, strict=True):
-                tasks.create_task(poller.run(), name=f"poll {service}")
-    finally:
-        await server.close()
-
-
-def operator_endpoints(hmi: HmiSection) -> dict[str, Endpoint]:
-    """Return where the services are for commands: with the operator's certificate, if there is one."""
-    ends: dict[str, Endpoint] = {service: getattr(hmi, service) for service in Maps._fields}
-    if hmi.operator_tls is None:
-        return ends
-    return {service: end.model_copy(update={"tls": hmi.operator_tls}) for service, end in ends.items()}
+    await server.serve(
+        [poller.run for poller in pollers],
+        lambda: log.info("serving", extra={"host": hmi.host, "port": server.port, "address": server.address}),
+    )
 
 
 class Poller:
@@ -107,12 +85,12 @@ class Poller:
         self._poll_s = poll_s
         self._journal = JournalReader(client, queries=False, most=AT_ONCE)
         self._updates = UpdateReader(client, lambda update: model.put_updates([update]), most=AT_ONCE)
-        frequent = (Identity, JournalPage, *FAST[service])
+        frequent = (common.Identity, common.JournalPage, *FAST[service])
         self._slow = [block.record for block in shown_blocks(model.maps[service]) if block.record not in frequent]
         self._slow_at = 0.0
         self._alarms_at = 0.0
         self._checked = False
-        self._configured: ConfigurationDigest | None = None
+        self._configured: common.ConfigurationDigest | None = None
         self._told = ""
 
     async def run(self) -> None:
@@ -149,14 +127,14 @@ class Poller:
             await client.connect(0.0)
             self._checked = True
             self._slow_at = 0.0
-        identity = await client.read(Identity)
+        identity = await client.read(common.Identity)
         model.put(service, identity)
         for record in FAST[service]:
             model.put(service, await client.read(record))
         if service == "plant" and model.configuration.get(KIND) == REFRIGERATOR:
-            model.put(service, await client.read(StationStatus))
+            model.put(service, await client.read(plant.StationStatus))
         if service == "optimizer_plc" and await self._updates.read(identity):
-            model.put(service, await client.read(Prediction))
+            model.put(service, await client.read(optimizer_plc.Prediction))
         now = time.monotonic()
         if service == "control_plc" and now - self._alarms_at >= ALARMS_S:
             self._alarms_at = now
@@ -174,14 +152,14 @@ class Poller:
                 self._model.put(self._service, await self._client.read(record))
         if self._service != "plant":
             return
-        digest = self._model.record(self._service, ConfigurationDigest)
+        digest = self._model.record(self._service, common.ConfigurationDigest)
         if digest is not None and digest != self._configured:
-            lines = await self._client.read_rows(ConfigurationLine, 0, lines_of(digest.length))
+            lines = await self._client.read_rows(common.ConfigurationLine, 0, common.lines_of(digest.length))
             with suppress(ValueError):  # not one of ours, or it has changed meanwhile
-                self._model.configuration = configuration_of(digest, lines)
+                self._model.configuration = common.configuration_of(digest, lines)
                 self._configured = digest
         with suppress(RequestRefusedError):  # a plant without sensor faults
-            faults = await self._client.read_rows(SensorFault, 0, len(self._model.process.outputs))
+            faults = await self._client.read_rows(plant.SensorFault, 0, len(self._model.process.outputs))
             self._model.faulty_sensors = sum(bool(fault.kind) << i for i, fault in enumerate(faults))
 
 
@@ -193,14 +171,14 @@ MOST_AT_ONCE: Final = 400
 class ReplayFrame(NamedTuple):
     """One tick of a run."""
 
-    process: ProcessNow
+    process: control_plc.ProcessNow
     mode: int
     cause: int
     since: int
     """Tick at which the mode began."""
     doubts: Doubts = SOUND
     """Outputs whose readings were in doubt. The process has the true value."""
-    station: StationSample | None = None
+    station: plant.StationSample | None = None
     """Sample of the station of a whole refrigerator."""
 
 
@@ -211,12 +189,12 @@ class RecordedRun(Protocol):
     process: Process
     ticks: int
     """Ticks that were recorded, from 0 on."""
-    updates: Sequence[Optimization]
+    updates: Sequence[optimizer_plc.Optimization]
     events: Sequence[JournalEntry]
     """Events in the order of their ticks."""
-    rule: UpdatingRuleStatus
+    rule: optimizer_plc.UpdatingRuleStatus
     """Rule that decided the updating period."""
-    limits: OperatingLimits
+    limits: optimizer_plc.OperatingLimits
     configuration: Mapping[str, Any]
     """Values of the configuration by dotted key."""
 
@@ -247,7 +225,7 @@ class Replay:
         self._tick = -1
         self._in_gap = False
         """The data read last are missing in the recording."""
-        model.put("control_plc", Identity(session=1))
+        model.put("control_plc", common.Identity(session=1))
         model.configuration = run.configuration
         model.put("optimizer_plc", run.rule)
         model.put("optimizer_plc", run.limits)
@@ -324,34 +302,31 @@ class Replay:
             self._in_gap = frame is None
         self._tick = tick
         if newest is not None:  # after a step back it may be the one known
-            self._put(newest)
+            ladder = (newest.mode, newest.cause, newest.since, 1, newest.doubts.bad, 0)
+            model.put("control_plc", control_plc.LadderStatus(*ladder))
+            model.recorded_doubts = newest.doubts
+            model.put("control_plc", newest.process)
+            model.put("plant", plant.LoadStatus(watts=newest.process.load))
+            if (one := newest.station) is not None:  # what its controller asked for is not recorded
+                unknown = (math.nan,) * len(STATION_VALVE_NAMES)
+                model.put("plant", plant.StationStatus(one.tick, one.mode, one.alarms, one.signals, unknown))
         model.put_updates(run.updates[_count(run.updates, before) : _count(run.updates, tick)])
         events = run.events[: _count(run.events, tick)]
         model.put_events(events[_count(events, before) :])
         model.put_alarms(run.alarms(events))
 
-    def _put(self, frame: ReplayFrame) -> None:
-        model, process = self._model, frame.process
-        model.put("control_plc", LadderStatus(frame.mode, frame.cause, frame.since, 1, frame.doubts.bad, 0))
-        model.recorded_doubts = frame.doubts
-        model.put("control_plc", process)
-        model.put("plant", LoadStatus(watts=process.load))
-        if (one := frame.station) is not None:  # what its controller asked for is not recorded
-            unknown = (math.nan,) * len(STATION_VALVE_NAMES)
-            model.put("plant", StationStatus(one.tick, one.mode, one.alarms, one.signals, unknown))
-
     def _show(self) -> None:
         for service in self._model.maps:
-            self._model.put(service, Identity(session=1, tick=self._tick))
+            self._model.put(service, common.Identity(session=1, tick=self._tick))
             self._model.heard(service)
-        self._model.put("plant", SessionPace(1, 1, self._speed, int(not self._playing)))
+        self._model.put("plant", common.SessionPace(1, 1, self._speed, int(not self._playing)))
         self._model.replay = {
             "name": self._run.name, "playing": self._playing, "speed": self._speed, "tick": self._tick,
             "last_tick": self._run.ticks - 1,
         }  # fmt: skip
 
 
-def _count(rows: Sequence[Optimization] | Sequence[JournalEntry], tick: int) -> int:
+def _count(rows: Sequence[optimizer_plc.Optimization] | Sequence[JournalEntry], tick: int) -> int:
     """Return how many of these there are up to a tick."""
     return bisect_right(rows, tick, key=lambda row: row.tick)
 
@@ -366,12 +341,4 @@ async def serve_replays(runs: Sequence[RecordedRun], settings: HmiSection, annou
     models = [Model(run.process, time.monotonic, settings.kept_s) for run in runs]
     replays = [Replay(run, model, settings.kept_s) for run, model in zip(runs, models, strict=True)]
     server = PageServer(settings, *(PageSite(m, None, r.routes()) for m, r in zip(models, replays, strict=True)))
-    await server.start()
-    announce(server.address)
-    try:
-        async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(server.run(), name="streams")
-            for replay in replays:
-                tasks.create_task(replay.run(), name="replay")
-    finally:
-        await server.close()
+    await server.serve([replay.run for replay in replays], lambda: announce(server.address))

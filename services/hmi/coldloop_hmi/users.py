@@ -205,9 +205,6 @@ PASSWORDS_A_SECOND: Final = 4.0
 PASSWORD_BURST: Final = 12.0
 """Passwords that are checked for all names of one address together, but for those that have logged in from there: each
 takes a twentieth of a second of a core."""
-REQUESTS_A_BROWSER: Final = 3.0
-"""In a second. Behind a proxy all browsers have one address, and each asks for two trends a second."""
-REQUEST_BURST: Final = 150.0
 
 
 class PageRole(StrEnum):
