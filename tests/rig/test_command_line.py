@@ -19,8 +19,7 @@ from coldloop_chaos.faults import shipped_plans
 from coldloop_optimizer_plc.settings import Preset, SolverName
 from coldloop_plant.load import NAMED
 from coldloop_rig.cli import EXTRAS, command_names, make_parser
-from coldloop_rig.cli.commands import options
-from coldloop_rig.cli.commands.rig import COMMANDS as RIG_COMMANDS
+from coldloop_rig.cli.commands import options, rig
 from coldloop_rig.cli.registers import EXPORTS, FORMATS
 from coldloop_studies import commands
 from coldloop_studies.reproduction import APART, STUDIES
@@ -277,7 +276,7 @@ def test_an_error_that_is_not_the_outputs_is_not_called_so(
     def refused(_: object) -> int:
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
-    monkeypatch.setitem(RIG_COMMANDS, "down", RIG_COMMANDS["down"]._replace(execute=refused))
+    monkeypatch.setattr(rig, "execute_down", refused)
     assert coldloop("down").complaints == ["coldloop: down: Operation not permitted"]
 
 

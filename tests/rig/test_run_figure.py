@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from coldloop.process.cold_box import COLD_BOX, INPUT_NAMES
-from coldloop_rig.figures.plot import Bounds, RunCurves, curves_of, draw_run, label_marks, labels_of
+from coldloop_rig.figures.plot import RunCurves, curves_of, draw_run, label_marks, labels_of
 from coldloop_rig.results.run_folder import RunFolder, _in_force
 from coldloop_studies.drawing import _updates
 from coldloop_studies.request import Outcome
@@ -24,13 +24,13 @@ TICKS = 4000
 def curves(level: float = 60.0, **pressures: tuple[float, float]) -> RunCurves:
     series = {name: np.ones(TICKS) for name in (*labels_of(COLD_BOX), *pressures)}
     series |= {"time_s": np.arange(TICKS) * 0.25, "L1": np.full(TICKS, level), "T5": np.full(TICKS, 10.0)}
-    bounds = Bounds({"L1": (59.0, 61.0), "T5": (9.0, 16.0)}, dict.fromkeys(INPUT_NAMES, (0.0, 100.0)))
+    edges = {"L1": (59.0, 61.0), "T5": (9.0, 16.0)} | dict.fromkeys(INPUT_NAMES, (0.0, 100.0))
     events = [
         {"time_s": 0.0, "kind": "mode", "subject": "hold"},
         {"time_s": 0.25, "kind": "mode", "subject": "mpc"},
         {"time_s": 500.0, "kind": "mode", "subject": "classical"},
     ]
-    return RunCurves(COLD_BOX, series, events, bounds, "", "", pressures)
+    return RunCurves(COLD_BOX, series, events, edges, "", "", pressures)
 
 
 def legends(figure: Figure) -> list[list[str]]:

@@ -147,7 +147,7 @@ MODULES: Final = {
 BROKEN: Final = "commands that cannot be loaded"
 """Group in `coldloop --help` of commands whose package is damaged, or for another version."""
 MODULE_OF: Final = {name: module for module, names in MODULES.items() for name in names}
-"""Modules of `coldloop_rig.cli.commands`."""
+"""Modules of `coldloop_rig.cli.commands`: `_declare_NAME` declares a command's options, `execute_NAME` does it."""
 QUESTION: Final = """Can this predictive controller run on that PLC, and how often should it update?
 A networked PLC rig for fast MPC."""
 VERSION: Final = f"coldloop {__version__} (Python {platform.python_version()})"
@@ -198,9 +198,11 @@ def make_parser(chosen: str | None) -> argparse.ArgumentParser:
         command = commands.add_parser(name)
         if name == chosen:
             with _of_its_package(name):
-                own = f"coldloop_rig.cli.commands.{MODULE_OF.get(name)}"
-                module = import_module(own) if name in COMMANDS else _beside()[name].load()
-                declare, execute = module.COMMANDS[name]
+                if name in COMMANDS:
+                    module = import_module(f"coldloop_rig.cli.commands.{MODULE_OF[name]}")
+                    declare, execute = (getattr(module, f"{part}_{name}") for part in ("_declare", "execute"))
+                else:
+                    declare, execute = _beside()[name].load().COMMANDS[name]
                 said = str(execute.__doc__)
                 command.description = f"`coldloop {name}`: {said[0].lower()}{said[1:]}"
                 declare(command)

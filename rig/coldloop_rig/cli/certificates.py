@@ -5,11 +5,12 @@ For trying Modbus/TCP Security out. A real plant has its own authority, and keep
 
 import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, TypeVar
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
@@ -23,6 +24,8 @@ from coldloop.registers.declaration import Role
 from coldloop.text import read_bytes, replace_file, require_regular_file
 from coldloop_rig.cosim.wiring import SERVICES
 from coldloop_rig.results.folders import prepare_folder, writing
+
+T = TypeVar("T")
 
 
 class Pair(NamedTuple):
@@ -203,13 +206,14 @@ def revoke(out: Path, names: Sequence[str], days: int) -> tuple[int, Path]:
         UsageError: The folder has no such certificate, list or key of the authority.
         ResultsError: The list cannot be written.
     """
-    authority = Authority(Pair(_certificate(out / "ca.crt"), _key(out / "ca.key")))
-    try:
-        revoked = list(x509.load_pem_x509_crl(read_bytes(out / REVOCATIONS, OURS)))
-    except ValueError as error:
-        raise UsageError(f"{out / REVOCATIONS}: {error}; {OURS}") from None
+    certificate = _loaded(out / "ca.crt", MADE, x509.load_pem_x509_certificate)
+    key = _loaded(out / "ca.key", KEY, partial(load_pem_private_key, password=None))
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise UsageError(f"{out / 'ca.key'}: not a key that `coldloop certificates` has made")
+    authority = Authority(Pair(certificate, key))
+    revoked = list(_loaded(out / REVOCATIONS, OURS, x509.load_pem_x509_crl))
     present = {each.serial_number for each in revoked}
-    certificates = [_certificate(out / f"{name}.crt") for name in names]
+    certificates = [_loaded(out / f"{name}.crt", MADE, x509.load_pem_x509_certificate) for name in names]
     revoked += [revoked_now(each) for each in certificates if each.serial_number not in present]
     with writing(out / REVOCATIONS):
         require_regular_file(out / REVOCATIONS)
@@ -217,21 +221,11 @@ def revoke(out: Path, names: Sequence[str], days: int) -> tuple[int, Path]:
     return len(revoked), out / REVOCATIONS
 
 
-def _certificate(file: Path) -> x509.Certificate:
+def _loaded(file: Path, remedy: str, load: Callable[[bytes], T]) -> T:
     try:
-        return x509.load_pem_x509_certificate(read_bytes(file, MADE))
-    except ValueError as error:
-        raise UsageError(f"{file}: {error}; {MADE}") from None
-
-
-def _key(file: Path) -> ec.EllipticCurvePrivateKey:
-    try:
-        key = load_pem_private_key(read_bytes(file, KEY), password=None)
+        return load(read_bytes(file, remedy))
     except (ValueError, TypeError) as error:
-        raise UsageError(f"{file}: {error}; {KEY}") from None
-    if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise UsageError(f"{file}: not a key that `coldloop certificates` has made")
-    return key
+        raise UsageError(f"{file}: {error}; {remedy}") from None
 
 
 def _configuration(folder: Path) -> str:

@@ -59,9 +59,18 @@ def describe_model(
         at_rest = kind_named(plant.kind).at_rest(plant, control)
     rest, box, model, lines_of_kind = at_rest
     error = cold_box.linearisation_error(rest.x, rest.u, rest.w, box, helium)
+    values = sorted(np.linalg.eigvals(model.A), key=lambda value: -value.real)
+    texts = [f"{v.real:.4f}" if abs(v.imag) < 1e-12 else f"{v.real:.4f}{v.imag:+.4f}i" for v in values]
+    held = model.discretised(HORIZON_S)
+    effects = np.column_stack([model.C @ held.B + model.D, model.C @ held.F + model.G])
+    signals = zip((*model.input_names, model.load_name), (*model.input_units, model.load_unit), strict=True)
     kink = "kink       derivatives differ on both sides: the second law limits cells of NEF1 or NEF2; less UA there"
     lines = [
-        *_equilibrium_lines(model, rest), *lines_of_kind, *_eigenvalue_lines(model, error), *_gain_lines(model),
+        *_equilibrium_lines(model, rest), *lines_of_kind,
+        *(f"eigenvalues {'  '.join(texts[i : i + 10])} /s" for i in range(0, len(texts), 10)),
+        f"derivatives within {error:.1e} of extrapolated central differences (scaled)",
+        *(f"after {HORIZON_S:g} s of +1 {unit} {name}: L1 {effects[L1, i]:+.5f} %, T5 {effects[T5, i]:+.5f} K"
+          for i, (name, unit) in enumerate(signals)),
         *([kink] if error >= TWO_SIDED else []), *_band_lines(rest, design), f"model      sha256 {model.digest}",
     ]  # fmt: skip
     with suppress(ModelFileError):  # the command then says what is wrong with it
@@ -72,38 +81,14 @@ def describe_model(
 
 
 def _equilibrium_lines(model: LtiModel, rest: cold_box.Equilibrium) -> list[str]:
-    inputs = ", ".join(
-        f"{name} {value:g} {unit}"
-        for name, value, unit in zip(model.input_names, rest.u, model.input_units, strict=True)
-    )
-    outputs = [
-        f"{name} {value:.4f} {unit}"
-        for name, value, unit in zip(model.output_names, rest.y, model.output_units, strict=True)
-    ]
+    given = zip(model.input_names, rest.u, model.input_units, strict=True)
+    found = zip(model.output_names, rest.y, model.output_units, strict=True)
+    inputs = ", ".join(f"{name} {value:g} {unit}" for name, value, unit in given)
+    outputs = [f"{name} {value:.4f} {unit}" for name, value, unit in found]
     return [
         f"operating point: {inputs}, load {rest.w:.2f} W; cold power {rest.w + rest.u[1]:.2f} W",
         f"residual   {rest.residual:.2e} per second (2 kPa, 1 % of level, 1 K)",
         *(f"outputs    {'  '.join(outputs[i : i + 6])}" for i in range(0, len(outputs), 6)),
-    ]
-
-
-def _eigenvalue_lines(model: LtiModel, error: float) -> list[str]:
-    values = sorted(np.linalg.eigvals(model.A), key=lambda value: -value.real)
-    texts = [f"{v.real:.4f}" if abs(v.imag) < 1e-12 else f"{v.real:.4f}{v.imag:+.4f}i" for v in values]
-    return [
-        *(f"eigenvalues {'  '.join(texts[i : i + 10])} /s" for i in range(0, len(texts), 10)),
-        f"derivatives within {error:.1e} of extrapolated central differences (scaled)",
-    ]
-
-
-def _gain_lines(model: LtiModel) -> list[str]:
-    held = model.discretised(HORIZON_S)
-    effects = np.column_stack([model.C @ held.B + model.D, model.C @ held.F + model.G])
-    names = (*model.input_names, model.load_name)
-    units = (*model.input_units, model.load_unit)
-    return [
-        f"after {HORIZON_S:g} s of +1 {unit} {name}: L1 {effects[L1, i]:+.5f} %, T5 {effects[T5, i]:+.5f} K"
-        for i, (name, unit) in enumerate(zip(names, units, strict=True))
     ]
 
 

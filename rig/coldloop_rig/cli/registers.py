@@ -81,8 +81,7 @@ def as_csv(maps: Sequence[RegisterMap]) -> str:
 def as_table(maps: Sequence[RegisterMap]) -> str:
     """Return aligned columns for a terminal."""
     shown = ("service", "block", "name", "address", "modicon", "type", "unit", "writer")
-    rows = [shown, *[tuple(_text(entry[column]) for column in shown) for entry in _entries(maps)]]
-    return aligned(rows)
+    return aligned([shown, *(tuple(_text(entry[column]) for column in shown) for entry in _entries(maps))])
 
 
 def as_markdown(maps: Sequence[RegisterMap]) -> str:
@@ -92,22 +91,19 @@ def as_markdown(maps: Sequence[RegisterMap]) -> str:
         parts += [
             f"## {one.service} (port {PORTS[one.service]}, map version {one.version}, digest {one.digest:08x})\n",
             f"Addresses 0 to {one.end - 1}; those in no table read 0 and are not written.\n",
-            *(_block_markdown(one.service, block) for block in one.shown),
         ]
+        for block in one.shown:
+            writer = f"written by the {block.writer.value}" if block.writer else "read-only"
+            many = f"; {block.rows} rows of {block.row_words} words, the first one shown" if block.rows > 1 else ""
+            caption = f"### {block.name}: {block.description} ({writer}{many})\n\n`{mbpoll_line(one.service, block)}`"
+            header = ("address", "4xxxx", "name", "type", "unit", "range", "description")
+            rows = [
+                (r.address, modicon(r.address), r.name, r.kind.label, r.unit,
+                 "" if r.low is r.high is None else f"{_text(r.low)}..{_text(r.high)}", r.description)
+                for r in block.registers()
+            ]  # fmt: skip
+            parts.append(markdown_table(header, rows, caption) + "\n")
     return "\n".join(parts)
-
-
-def _block_markdown(service: str, block: Block) -> str:
-    writer = f"written by the {block.writer.value}" if block.writer else "read-only"
-    many = f"; {block.rows} rows of {block.row_words} words, the first one shown" if block.rows > 1 else ""
-    caption = f"### {block.name}: {block.description} ({writer}{many})\n\n`{mbpoll_line(service, block)}`"
-    header = ("address", "4xxxx", "name", "type", "unit", "range", "description")
-    rows = [
-        (r.address, modicon(r.address), r.name, r.kind.label, r.unit,
-         "" if r.low is r.high is None else f"{_text(r.low)}..{_text(r.high)}", r.description)
-        for r in block.registers()
-    ]  # fmt: skip
-    return markdown_table(header, rows, caption) + "\n"
 
 
 def mbpoll_line(service: str, block: Block) -> str:
@@ -127,8 +123,6 @@ WIDTH: Final = 24
 UNITS: Final = {"%": "percent", "K": "kelvin", "W": "watt"}
 """Grafana's names of units; others are in the title of the panel."""
 DATASOURCE: Final = {"type": "prometheus", "uid": "${datasource}"}
-Curve = tuple[str, str]
-"""Expression and legend."""
 
 
 class Panel(NamedTuple):
@@ -136,7 +130,8 @@ class Panel(NamedTuple):
 
     title: str
     unit: str
-    curves: tuple[Curve, ...]
+    curves: tuple[tuple[str, str], ...]
+    """Expression and legend of each."""
 
 
 STATE: Final = (
@@ -177,29 +172,20 @@ def board(process: Process) -> str:
 
 def _of_process(process: Process) -> Iterable[Panel]:
     """Yield outputs with their bands, then the inputs by unit, those in the unit of the load with it."""
-    limits = "coldloop_optimizer_plc_operating_limits_output"
+    prefix, limits = "coldloop_control_plc_process", "coldloop_optimizer_plc_operating_limits_output"
+    found = []
     for one in process.banded:
-        bounds = ((f"{limits}_{end}{_labelled(one.name)}", end) for end in ("low", "high"))
-        yield _panel(one.name, one.unit, ((f"coldloop_control_plc_process_y{_labelled(one.name)}", one.name), *bounds))
-    unit_of_load = process.load.unit
-    curves = {unit_of_load: [("coldloop_control_plc_process_load", "load")]}
-    for unit, group in groupby(sorted(process.inputs, key=lambda one: one.unit), key=lambda one: one.unit):
-        curves.setdefault(unit, []).extend(
-            (f"coldloop_control_plc_process_u{_labelled(one.name)}", one.name) for one in group
-        )
-    with_load = curves.pop(unit_of_load)
-    for unit, each in curves.items():
-        yield _panel("Inputs", unit, tuple(each))
-    yield _panel("Load", unit_of_load, tuple(with_load))
-
-
-def _panel(title: str, unit: str, curves: tuple[Curve, ...]) -> Panel:
-    known = UNITS.get(unit)
-    return Panel(title if known or not unit else f"{title} ({unit})", known or "short", curves)
-
-
-def _labelled(name: str) -> str:
-    return f'{{element="{name}"}}'
+        element = f'{{element="{one.name}"}}'
+        bounds = ((f"{limits}_{end}{element}", end) for end in ("low", "high"))
+        found.append((one.name, one.unit, [(f"{prefix}_y{element}", one.name), *bounds]))
+    curves = {process.load.unit: [(f"{prefix}_load", "load")]}
+    for each in sorted(process.inputs, key=lambda each: each.unit):
+        curves.setdefault(each.unit, []).append((f'{prefix}_u{{element="{each.name}"}}', each.name))
+    with_load = curves.pop(process.load.unit)
+    found += [("Inputs", unit, pairs) for unit, pairs in curves.items()]
+    for title, unit, pairs in (*found, ("Load", process.load.unit, with_load)):
+        known = UNITS.get(unit)
+        yield Panel(title if known or not unit else f"{title} ({unit})", known or "short", tuple(pairs))
 
 
 def _laid_out(panels: Sequence[Panel], kind: str, top: int, across: int, height: int) -> Iterable[dict[str, Any]]:
@@ -238,28 +224,23 @@ class Tag(NamedTuple):
 
 def exported(register_map: RegisterMap) -> Iterator[Tag]:
     """Yield the tags of a service, in the order of their addresses; names that would be the same end with these."""
-    tags = list(_named(register_map))
-    count = Counter(tag.name.lower() for tag in tags)
-    for tag in tags:
-        yield tag._replace(name=f"{tag.name}_{tag.register.address}") if count[tag.name.lower()] > 1 else tag
-
-
-def _named(register_map: RegisterMap) -> Iterator[Tag]:
+    process, tags = register_map.process, list[Tag]()
     for block in register_map.shown:
         if block.writer is not None and block.record is not Operator:
             continue
+        rows = {0: block.name} if block.rows == 1 else {}
         if block.record is Alarm:
-            for kind in alarms_of(register_map.process):
-                yield from _tags(block, int(kind), f"{block.name}_{alarm_word(kind, register_map.process)}")
-        elif block.rows == 1:
-            yield from _tags(block, 0, block.name)
-
-
-def _tags(block: Block, row: int, prefix: str) -> Iterator[Tag]:
-    texts = {name for name, field in block.fields.items() if field.is_text}
-    for register in block.registers(row):
-        if register.name.partition(".")[0] not in texts:
-            yield Tag(_NOT_IN_NAMES.sub("_", f"{prefix}_{register.name}"), block.name, register)
+            rows = {int(kind): f"{block.name}_{alarm_word(kind, process)}" for kind in alarms_of(process)}
+        texts = {name for name, field in block.fields.items() if field.is_text}
+        tags += [
+            Tag(_NOT_IN_NAMES.sub("_", f"{prefix}_{register.name}"), block.name, register)
+            for row, prefix in rows.items()
+            for register in block.registers(row)
+            if register.name.partition(".")[0] not in texts
+        ]
+    count = Counter(tag.name.lower() for tag in tags)
+    for tag in tags:
+        yield tag._replace(name=f"{tag.name}_{tag.register.address}") if count[tag.name.lower()] > 1 else tag
 
 
 def runs(tags: Sequence[Tag]) -> Iterator[list[Tag]]:
@@ -387,11 +368,10 @@ def as_ignition(maps: Sequence[RegisterMap], places: Places) -> str:
     """Return tags for Ignition, of Modbus TCP devices that are called like the services."""
     designators = {Kind.U16: ("HRUS", "Int4"), Kind.U32: ("HRUI", "Int8"), Kind.F32: ("HRF", "Float4")}
     text = io.StringIO()
-    columns = (
-        "Path", "Name", "TagType", "DataType", "OPCServer", "OPCItemPath", "AccessRights", "EngUnit", "Documentation",
-    )  # fmt: skip
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
+    writer.writerow(
+        ["Path", "Name", "TagType", "DataType", "OPCServer", "OPCItemPath", "AccessRights", "EngUnit", "Documentation"]
+    )
     for register_map in maps:
         place = places[register_map.service]
         for tag in exported(register_map):

@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import IO, Any, Final, Self, TypeVar
 
@@ -82,7 +83,7 @@ async def keep_up(
     """
     loop = asyncio.get_running_loop()
     restarts, since = 0, loop.time()
-    work: Callable[[], Awaitable[None]] = _nothing
+    work: Callable[[], Awaitable[None]] = partial(asyncio.sleep, 0.0)
     while True:
         how = await _run_until_exit(ended, work)
         if loop.time() - since > STEADY_S:
@@ -95,11 +96,7 @@ async def keep_up(
         await asyncio.sleep(pause)
         since = loop.time()
         await restart()
-        work = restarted or _nothing
-
-
-async def _nothing() -> None:
-    """Do nothing after a start."""
+        work = restarted or work
 
 
 async def _run_until_exit(ended: Callable[[], Awaitable[str]], work: Callable[[], Awaitable[None]]) -> str:
@@ -146,15 +143,9 @@ class LocalServices:
     """
 
     def __init__(
-        self,
-        settings: Settings,
-        log_folder: Path,
-        *,
-        links: Links | None = None,
-        ports: Sequence[int] | None = None,
-        services: Sequence[str] = SERVICES,
-        optimizer: Sequence[str] = (),
-    ) -> None:
+        self, settings: Settings, log_folder: Path, *, links: Links | None = None, ports: Sequence[int] | None = None,
+        services: Sequence[str] = SERVICES, optimizer: Sequence[str] = (),
+    ) -> None:  # fmt: skip
         self._ports = ReservedPorts(len(SERVICES) if ports is None else 0)
         self.endpoints = endpoints_on(ports or self._ports.numbers, settings)
         self._links = links
@@ -212,7 +203,13 @@ class LocalServices:
         self.processes[service] = process
         if may_end:
             return
-        watcher = asyncio.create_task(self._watch(service, process), name=f"watch {service}")
+
+        async def watch() -> None:
+            await process.wait()
+            if self.processes.get(service) is process:
+                self._ended.put_nowait(service)
+
+        watcher = asyncio.create_task(watch(), name=f"watch {service}")
         self._watchers.add(watcher)
         watcher.add_done_callback(self._watchers.discard)
 
@@ -249,8 +246,8 @@ class LocalServices:
         death = asyncio.ensure_future(self._ended.get())
         try:
             await asyncio.wait({task, death}, return_when=asyncio.FIRST_COMPLETED)
-            if _is_link_error(task):  # a service that ends closes its connections before its process has ended
-                await asyncio.wait({death}, timeout=EXIT_S)
+            if task.done() and not task.cancelled() and isinstance(task.exception(), LinkError):
+                await asyncio.wait({death}, timeout=EXIT_S)  # it closes its connections before its process ends
             if death.done():  # first: work that needs the service may fail in the same turn
                 dead = death.result()
                 raise LinkError(f"the {dead} service {self.end_of(dead)}")
@@ -259,11 +256,6 @@ class LocalServices:
             for pending in (task, death):
                 pending.cancel()
             await asyncio.gather(task, death, return_exceptions=True)
-
-    async def _watch(self, service: str, process: asyncio.subprocess.Process) -> None:
-        await process.wait()
-        if self.processes.get(service) is process:
-            self._ended.put_nowait(service)
 
     def log(self, service: str) -> Path:
         """Return the file that a service logs to."""
@@ -279,10 +271,6 @@ class LocalServices:
         process = self.processes.get(service)
         code = 0 if process is None or process.returncode is None else process.returncode
         return f"{end_of(code, last_line(self.log(service)))} (log: {self.log(service)})"
-
-
-def _is_link_error(task: "asyncio.Future[T]") -> bool:
-    return task.done() and not task.cancelled() and isinstance(task.exception(), LinkError)
 
 
 def last_line(log: Path) -> str:

@@ -1,10 +1,11 @@
 """A run over the bus: on services that are started for it, or on a rig that is up, with what that really runs."""
 
 import asyncio
-from collections.abc import Awaitable, Coroutine, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Any, Final, TypeVar, get_args
 
 from pydantic import BaseModel
 
@@ -23,6 +24,8 @@ from coldloop_rig.cosim.scenario import Job, Scenario, StopRequest, with_copied_
 from coldloop_rig.cosim.wiring import RigEndpoints, answered_in_time
 from coldloop_rig.results.recording import Recorder, Way
 from coldloop_rig.settings import Settings
+
+T = TypeVar("T")
 
 SHOWN: Final[Mapping[str, Sequence[str]]] = {
     "plant": coldloop_plant.settings.SHOWN,
@@ -83,26 +86,23 @@ def _text(value: object) -> str:
     return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}..."
 
 
-async def running_configuration(endpoints: RigEndpoints, settings: Settings, patience_s: float) -> dict[str, Any]:
+async def running_configuration(client: session.SessionClient) -> dict[str, Any]:
     """Return what the services of a rig run, by dotted key, without what belongs to a session.
 
     Raises:
         LinkError: A service does not answer.
-        ModelFileError: One runs another model than ours.
         UsageError: Two services run different limits.
     """
     running: dict[str, Any] = {}
-    with closing(session.SessionClient(endpoints, settings)) as client:
-        await client.connect(patience_s)
-        for service, one in client.clients.items():
-            shown = await read_configuration(one, SHOWN[service])
-            for key in running.keys() & shown.keys():
-                if running[key] != shown[key]:
-                    raise UsageError(
-                        f"{one.peer} runs {key} = {_text(shown[key])}, another one {_text(running[key])}: give all "
-                        "of them the same"
-                    )
-            running |= shown
+    for service, one in client.clients.items():
+        shown = await read_configuration(one, SHOWN[service])
+        for key in running.keys() & shown.keys():
+            if running[key] != shown[key]:
+                raise UsageError(
+                    f"{one.peer} runs {key} = {_text(shown[key])}, another one {_text(running[key])}: give all "
+                    "of them the same"
+                )
+        running |= shown
     return {key: value for key, value in running.items() if key not in OF_SESSION}
 
 
@@ -143,33 +143,33 @@ def as_attached(effective: Configuration[Settings], endpoints: Sequence[Endpoint
     Raises:
         UsageError: The user asks for something else, which a client cannot change.
         LinkError: A service does not answer.
+        ModelFileError: One runs another model than ours.
     """
-    running: dict[str, Any] = {}
-
-    async def read() -> int:
-        rig = RigEndpoints(*endpoints)
-        async with answered_in_time("to read what the rig runs"):
-            running.update(await running_configuration(rig, effective.settings, ATTACH_PATIENCE_S))
-        return 0
-
-    run_event_loop(read)
-    return attached(effective, running)
+    return attached(effective, _read(effective, endpoints, "runs", running_configuration))
 
 
-def session_under_way(effective: Configuration[Settings], endpoints: Sequence[Endpoint]) -> session.SessionUnderWay:
-    """Return the session of a rig that is up.
+def session_under_way(effective: Configuration[Settings], endpoints: Sequence[Endpoint], ticks: int) -> Scenario:
+    """Return what so many ticks of the session of a rig that is up are.
 
     Raises:
         UsageError: It has none.
         LinkError: A service does not answer, or runs another model.
     """
-    found: list[session.SessionUnderWay] = []
+    return _read(effective, endpoints, "does", partial(session.present_scenario, ticks=ticks))
+
+
+def _read(
+    effective: Configuration[Settings], endpoints: Sequence[Endpoint], what: str,
+    work: Callable[[session.SessionClient], Awaitable[T]],
+) -> T:  # fmt: skip
+    """Return what is read from a rig that is up."""
+    found: list[T] = []
 
     async def read() -> int:
         with closing(session.SessionClient(RigEndpoints(*endpoints), effective.settings)) as rig:
-            async with answered_in_time("to read what the rig does"):
+            async with answered_in_time(f"to read what the rig {what}"):
                 await rig.connect(ATTACH_PATIENCE_S)
-                found.append(await session.find_session(rig))
+                found.append(await work(rig))
         return 0
 
     run_event_loop(read)
@@ -185,16 +185,23 @@ def drive(job: Job, recorder: Recorder, folder: Path, stop: StopRequest) -> None
     run_event_loop(lambda: _stoppable(_run(job, recorder, folder), stop))
 
 
-def _run(job: Job, recorder: Recorder, folder: Path) -> Awaitable[None]:
-    settings, scenario = job.effective.settings, job.scenario
+async def _run(job: Job, recorder: Recorder, folder: Path) -> None:
+    settings, scenario, recorded = job.effective.settings, job.scenario, job.way is Way.RECORDED
     if job.conduct is not None:
-        return job.conduct(recorder, folder)
-    if job.way is Way.RECORDED:
-        return _looked_at(RigEndpoints(*job.endpoints), settings, scenario, recorder)
-    if job.way is Way.ATTACHED:
-        return _attached(RigEndpoints(*job.endpoints), settings, scenario, recorder)
-    settings = with_copied_load(settings, scenario.load, folder)
-    return run_on_localhost(settings, scenario, recorder, folder / "logs", job.optimizer)
+        return await job.conduct(recorder, folder)
+    if not (recorded or job.way is Way.ATTACHED):
+        settings = with_copied_load(settings, scenario.load, folder)
+        return await run_on_localhost(settings, scenario, recorder, folder / "logs", job.optimizer)
+    with closing(session.SessionClient(RigEndpoints(*job.endpoints), settings, tolerant=recorded)) as rig:
+        await rig.connect(ATTACH_PATIENCE_S)
+        if recorded:
+            return await session.record_session(rig, scenario, recorder)
+        async with answered_in_time("to read what the rig does"):
+            saved = await session.save_session(rig)
+        try:
+            await rig.run(scenario, recorder)
+        finally:
+            await _to_its_end(session.restore_session(rig, saved, rig.session))
 
 
 async def _stoppable(run: Awaitable[None], stop: StopRequest) -> int:
@@ -212,23 +219,6 @@ async def _stoppable(run: Awaitable[None], stop: StopRequest) -> int:
     finally:
         stop.cancel = None
     return 0
-
-
-async def _looked_at(endpoints: RigEndpoints, settings: Settings, scenario: Scenario, recorder: Recorder) -> None:
-    with closing(session.SessionClient(endpoints, settings, tolerant=True)) as rig:
-        await rig.connect(ATTACH_PATIENCE_S)
-        await session.record_session(rig, scenario, recorder)
-
-
-async def _attached(endpoints: RigEndpoints, settings: Settings, scenario: Scenario, recorder: Recorder) -> None:
-    with closing(session.SessionClient(endpoints, settings)) as rig:
-        await rig.connect(ATTACH_PATIENCE_S)
-        async with answered_in_time("to read what the rig does"):
-            saved = await session.save_session(rig)
-        try:
-            await rig.run(scenario, recorder)
-        finally:
-            await _to_its_end(session.restore_session(rig, saved, rig.session))
 
 
 async def _to_its_end(work: Coroutine[Any, Any, None]) -> None:

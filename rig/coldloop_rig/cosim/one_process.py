@@ -1,7 +1,7 @@
 """The three programs in one process, by direct calls; what would cross the bus is rounded as the bus would round it."""
 
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from coldloop.errors import LoadFileError
 from coldloop.kernels.cache import kernels_of
@@ -11,8 +11,7 @@ from coldloop.process.lti_model import load as load_model
 from coldloop.registers import Maps, maps_of
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Update, Verdict
-from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.plant import LoadStep, Measurement, PlantSample, StationSample, plant_map
+from coldloop.registers.plant import LoadStep, Measurement, PlantSample, plant_map
 from coldloop_control_plc.program import ControlProgram
 from coldloop_control_plc.program import make_program as make_control_program
 from coldloop_optimizer_plc.program import OptimizerProgram
@@ -30,19 +29,6 @@ SHORT: Final = 10_000
 """Ticks below which the programs are done before a loop would be compiled."""
 
 
-class Listener(Protocol):
-    """Takes what the programs do, as it would cross the bus."""
-
-    def sample(self, sample: PlantSample) -> None:
-        """Take a tick of the plant."""
-
-    def station(self, sample: StationSample) -> None:
-        """Take a tick of the compression station, where the plant has one."""
-
-    def update(self, update: Optimization) -> None:
-        """Take an update that was answered."""
-
-
 class Programs(NamedTuple):
     """The programs of a session, connected by calls."""
 
@@ -51,13 +37,26 @@ class Programs(NamedTuple):
     optimizer: OptimizerProgram
     maps: Maps
 
-    def tick(self, listener: Listener) -> None:
-        """Do one tick."""
-        if self.control.awaiting_sequence:
-            self._deliver(listener)
-        if not self.control.player.invited:
-            self.control.optimizer_seen()  # an optimiser that idles goes on to send heartbeats
-        self.plan(self._scan(listener))
+    def tick(self, recorder: Recorder) -> None:
+        """Do one tick, recorded as it would cross the bus."""
+        plant, control, optimizer, to_plant = self.plant, self.control, self.optimizer, self.maps.plant
+        if control.awaiting_sequence:
+            answer = control.offer(optimizer.solve())
+            optimizer.answered(late=False)
+            recorder.update(as_transmitted(optimizer.report(Verdict(answer.verdict)), self.maps.optimizer_plc))
+        if not control.player.invited:
+            control.optimizer_seen()  # an optimiser that idles goes on to send heartbeats
+        actuators = as_transmitted(control.begin_scan(), to_plant)
+        u = actuators.u
+        plant.apply(u)
+        measurement = as_transmitted(
+            Measurement(plant.tick, plant.load, plant.measure(), plant.state, actuators.session, u), to_plant
+        )
+        if plant.station is not None:
+            recorder.station(as_transmitted(plant.station, to_plant))
+        recorder.sample(PlantSample(plant.tick, measurement.load, u, measurement.y, measurement.x))
+        plant.advance()
+        self.plan(control.end_scan(measurement))
 
     def plan(self, update: Update | None) -> None:
         """Let the optimiser plan an update, if one was latched."""
@@ -65,26 +64,6 @@ class Programs(NamedTuple):
             to_control = self.maps.control_plc
             plan = self.optimizer.plan(as_transmitted(update, to_control))
             self.control.accept_plan(as_transmitted(plan, to_control))
-
-    def _deliver(self, listener: Listener) -> None:
-        sequence = self.optimizer.solve()
-        answer = self.control.offer(sequence)
-        self.optimizer.answered(late=False)
-        listener.update(as_transmitted(self.optimizer.report(Verdict(answer.verdict)), self.maps.optimizer_plc))
-
-    def _scan(self, listener: Listener) -> Update | None:
-        plant, to_plant = self.plant, self.maps.plant
-        actuators = as_transmitted(self.control.begin_scan(), to_plant)
-        u = actuators.u
-        plant.apply(u)
-        measurement = as_transmitted(
-            Measurement(plant.tick, plant.load, plant.measure(), plant.state, actuators.session, u), to_plant
-        )
-        if plant.station is not None:
-            listener.station(as_transmitted(plant.station, to_plant))
-        listener.sample(PlantSample(plant.tick, measurement.load, u, measurement.y, measurement.x))
-        plant.advance()
-        return self.control.end_scan(measurement)
 
 
 def load_table(load: LoadProfile, process: Process) -> LoadProfile:
@@ -111,19 +90,34 @@ class OneProcessRig:
     """
 
     def __init__(self, settings: Settings, *, compiled: bool | None = None) -> None:
-        header = own_header(settings.model.file)
-        self._settings = settings
-        self._header = header
-        self._compiled = compiled
+        self._settings, self._compiled = settings, compiled
+        self._header = own_header(settings.model.file)
         program = settings.optimizer_plc.program
         with self._kernels():
             self.optimizer = OptimizerProgram(load_model(settings.model.file), program, settings.limits)
-        self.control = make_control_program(header, settings.control_plc, settings.limits)
+        self.control = make_control_program(self._header, settings.control_plc, settings.limits)
 
     def run(self, scenario: Scenario, recorder: Recorder) -> None:
         """Run a scenario from the operating point, in lock-step."""
         with self._kernels():
-            self._run(scenario, recorder)
+            load = load_table(scenario.load, self._settings.process)
+            plant = self._plant(load, scenario.seed)
+            programs = Programs(plant, self.control, self.optimizer, maps_of(self._settings.process))
+            self.optimizer.restart(scenario.updating_period_s)
+            noted = self.control.journal.count
+            self.control.restart(session=1)
+            stretches = self._stretches(plant, load, scenario.ticks)
+            recorder.begin()
+            while self.control.tick < scenario.ticks:
+                stretch = stretches.ahead(scenario.ticks) if stretches else None
+                if stretch is None:
+                    programs.tick(recorder)
+                else:
+                    recorder.stretch(stretch.block, stretch.updates)
+                    programs.plan(stretch.latched)
+                for event in self.control.journal.since(noted):
+                    recorder.event(event)
+                    noted = event.number
 
     def _kernels(self) -> AbstractContextManager[None]:
         """Announce what is compiled as the kernels of a run like this one."""
@@ -146,23 +140,3 @@ class OneProcessRig:
             return None
         may_compile = self._compiled is True or ticks >= SHORT
         return CompiledStretches(plant, compiled, self.control, self.optimizer, load, may_compile=may_compile)
-
-    def _run(self, scenario: Scenario, recorder: Recorder) -> None:
-        load = load_table(scenario.load, self._settings.process)
-        plant = self._plant(load, scenario.seed)
-        programs = Programs(plant, self.control, self.optimizer, maps_of(self._settings.process))
-        self.optimizer.restart(scenario.updating_period_s)
-        noted = self.control.journal.count
-        self.control.restart(session=1)
-        stretches = self._stretches(plant, load, scenario.ticks)
-        recorder.begin()
-        while self.control.tick < scenario.ticks:
-            stretch = stretches.ahead(scenario.ticks) if stretches else None
-            if stretch is None:
-                programs.tick(recorder)
-            else:
-                recorder.stretch(stretch.block, stretch.updates)
-                programs.plan(stretch.latched)
-            for event in self.control.journal.since(noted):
-                recorder.event(event)
-                noted = event.number

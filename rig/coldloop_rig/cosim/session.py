@@ -8,7 +8,7 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Awaitable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import chain
 from typing import Final, NamedTuple, TypeVar
@@ -18,22 +18,11 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.operating.execution import LoadStream, lead_ticks, write_pace, write_table
 from coldloop.operating.observer import BATCH, JournalReader, SampleReader, Subscriber, UpdateReader, last_update
 from coldloop.process.load_profile import LoadProfile
-from coldloop.registers import maps_of
+from coldloop.registers import maps_of, plant
 from coldloop.registers.codec import sealed
 from coldloop.registers.common import Event, EventKind, Identity, JournalPage, SessionPace
 from coldloop.registers.control_plc import ControlSession, Grant, LadderStatus, Mode, Operator, OperatorMode, Status
 from coldloop.registers.optimizer_plc import Optimization, OptimizerSession
-from coldloop.registers.plant import (
-    HISTORY_ROWS,
-    LOAD_ROWS,
-    STATION_ROWS,
-    LiveLoad,
-    LoadStatus,
-    LoadStep,
-    PlantSample,
-    PlantSession,
-    StationSample,
-)
 from coldloop_plant.kinds import own_header
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.cosim.wiring import QUIET_S, SERVICES, RigEndpoints
@@ -42,9 +31,9 @@ from coldloop_rig.settings import Settings
 
 T = TypeVar("T")
 
-AHEAD: Final = HISTORY_ROWS - 32
+AHEAD: Final = plant.HISTORY_ROWS - 32
 """Ticks that the control PLC may be ahead of the recording, so that the history still has them."""
-STATION_AHEAD: Final = STATION_ROWS - 32
+STATION_AHEAD: Final = plant.STATION_ROWS - 32
 """Ticks that the control PLC may be ahead where the station's history is recorded too."""
 SHORTEST_PAUSE_S: Final = 0.001
 LONGEST_PAUSE_S: Final = 0.2
@@ -209,26 +198,30 @@ class SessionClient:
                 OptimizerSession(session, realtime, scenario.factor, round(scenario.updating_period_s / self._tick_s))
             )
         rows = await write_table(self.plant, scenario.load)
-        await self.plant.write(PlantSession(session, realtime, scenario.factor, scenario.seed, rows))
+        await self.plant.write(plant.PlantSession(session, realtime, scenario.factor, scenario.seed, rows))
         self.load = LoadStream(self.plant, session, scenario.load, sent=rows)
         await self.control.write(ControlSession(session, realtime, scenario.factor))
         return session
 
-    async def hold(self, look_s: float) -> None:
+    async def hold(self, look_s: float, failed: Callable[[LinkError], object]) -> None:
         """Keep the session that was started last, in real time, supplied with its load until cancelled.
 
         A load that another client writes replaces all of it, as it replaces the plant's later steps.
 
-        Raises:
-            PeerUnreachableError: The plant does not answer.
-            LinkError: It refuses the load, which is not written any more.
+        Args:
+            look_s: Interval at which the plant is polled, s.
+            failed: Takes the error where the plant does not answer (`PeerUnreachableError`), or refuses the load, which
+                is not written any more.
         """
         while True:
-            identity = await self.plant.read(Identity)
-            if identity.session != self.session:  # another client has begun one
-                self.load = None
-            elif self.load is not None and not self.load.done:
-                await self._supply(self.load, identity.tick)
+            try:
+                identity = await self.plant.read(Identity)
+                if identity.session != self.session:  # another client has begun one
+                    self.load = None
+                elif self.load is not None and not self.load.done:
+                    await self._supply(self.load, identity.tick)
+            except LinkError as error:
+                failed(error)
             await asyncio.sleep(look_s)
 
     async def _supply(self, load: LoadStream, tick: int) -> None:
@@ -288,11 +281,9 @@ class SessionClient:
                     "see the logs of the control PLC and of the optimiser"
                 )
             ticks = recorder.next_tick - done
-            if scenario.realtime:
-                pass
-            elif ticks > 2 * BATCH:  # the rig must not come to the end of its grant, ...
+            if not scenario.realtime and ticks > 2 * BATCH:  # the rig must not come to the end of its grant, ...
                 pause_s /= 2
-            elif ticks < BATCH:  # ... and each look asks all three services, so it is worth some ticks
+            elif not scenario.realtime and ticks < BATCH:  # ... and each look asks all three services
                 pause_s = min(pause_s * 1.5, LONGEST_LOCKSTEP_PAUSE_S)
             pause_s = max(pause_s, SHORTEST_PAUSE_S)
             await asyncio.sleep(pause_s)
@@ -355,32 +346,29 @@ class SessionClient:
             return None
 
 
-class SessionUnderWay(NamedTuple):
-    """Session that is under way at a rig."""
-
-    identity: Identity
-    pace: SessionPace
-    load: float
-    """Present load, W."""
-
-    def scenario(self, ticks: int) -> Scenario:
-        """Return what is recorded of it in so many ticks; what its load will be is not known."""
-        load = LoadProfile((0,), (self.load,))
-        return Scenario(ticks, load, updating_period_s=0.0, seed=0, realtime=bool(self.pace.realtime),
-                        factor=self.pace.factor)  # fmt: skip
-
-
-async def find_session(rig: SessionClient) -> SessionUnderWay:
+async def find_session(rig: SessionClient) -> Identity:
     """Return the session of a rig.
 
     Raises:
         UsageError: It has none.
         LinkError: The plant does not answer.
     """
-    identity, pace = await rig.plant.read(Identity), await rig.plant.read(SessionPace)
+    identity = await rig.plant.read(Identity)
     if not identity.session:
         raise UsageError(f"{rig.plant.peer} has no session: there is nothing to record")
-    return SessionUnderWay(identity, pace, (await rig.plant.read(LoadStatus)).watts)
+    return identity
+
+
+async def present_scenario(rig: SessionClient, ticks: int) -> Scenario:
+    """Return what is recorded of the session of a rig in so many ticks; what its load will be is not known.
+
+    Raises:
+        UsageError: It has none.
+        LinkError: The plant does not answer.
+    """
+    await find_session(rig)
+    pace, load = await rig.plant.read(SessionPace), (await rig.plant.read(plant.LoadStatus)).watts
+    return Scenario(ticks, LoadProfile((0,), (load,)), 0.0, 0, realtime=bool(pace.realtime), factor=pace.factor)
 
 
 class _FromNow:
@@ -393,10 +381,10 @@ class _FromNow:
     def next_tick(self) -> int:
         return self._tick + self._recorder.next_tick
 
-    def sample(self, sample: PlantSample) -> None:
+    def sample(self, sample: plant.PlantSample) -> None:
         self._recorder.sample(sample._replace(tick=sample.tick - self._tick))
 
-    def station(self, sample: StationSample) -> None:
+    def station(self, sample: plant.StationSample) -> None:
         self._recorder.station(sample._replace(tick=sample.tick - self._tick))
 
     def update(self, update: Optimization) -> None:
@@ -419,18 +407,17 @@ async def record_session(rig: SessionClient, scenario: Scenario, recorder: Recor
         UsageError: The rig has no session.
         LinkError: The plant does not answer for long, or is in another session.
     """
-    session = await find_session(rig)
-    last = await last_update(rig.optimizer)
+    identity, last = await find_session(rig), await last_update(rig.optimizer)
     first_update = 0 if last is None else last.update + 1
-    from_now = _FromNow(recorder, session.identity.tick, first_update)
+    from_now = _FromNow(recorder, identity.tick, first_update)
     readers = {service: JournalReader(rig.clients[service]) for service in (CONTROL, PLANT)}
     for service, reader in readers.items():
-        for event in state_of(await reader.read_on(), session.identity.tick):
+        for event in state_of(await reader.read_on(), identity.tick):
             from_now.event(event, service)
     events = SessionEvents(readers, from_now)
-    number, end = session.identity.session, session.identity.tick + scenario.ticks
+    number, end = identity.session, identity.tick + scenario.ticks
     samples = SampleReader(
-        rig.plant, from_now, number, end, first=session.identity.tick, tolerant=True, realtime=scenario.realtime
+        rig.plant, from_now, number, end, first=identity.tick, tolerant=True, realtime=scenario.realtime
     )
     updates = UpdateReader(rig.optimizer, from_now.update, number, first=first_update, tolerant=True)
     late = Lateness(await rig.control.read(Status))
@@ -491,16 +478,15 @@ class Lateness:
         """Return what was late up to a look, None where there was no answer; the largest lateness is of the session."""
         if status is not None:
             before, self._before, late = self._before, status, self._late
+            counts = zip(
+                (before.deadline_misses, before.overruns), (status.deadline_misses, status.overruns), strict=True
+            )
+            misses, overruns = (now - then if now >= then else now for then, now in counts)
+            largest = max(late.lateness_max_ms, status.lateness_max)
             self._late = LinkStatistics(
-                late.deadline_misses + _gained(before.deadline_misses, status.deadline_misses),
-                late.overruns + _gained(before.overruns, status.overruns),
-                max(late.lateness_max_ms, status.lateness_max), status.lateness_p99,
-            )  # fmt: skip
+                late.deadline_misses + misses, late.overruns + overruns, largest, status.lateness_p99
+            )
         return self._late
-
-
-def _gained(before: int, now: int) -> int:
-    return now - before if now >= before else now
 
 
 log = logging.getLogger("coldloop.rig")
@@ -529,10 +515,10 @@ async def save_session(rig: SessionClient) -> SavedSession | None:
 
 async def _load_from(rig: SessionClient, now: int) -> LoadProfile:
     """Return the load from now on: of the session's table, unless another client has written one since."""
-    status, asked = await rig.plant.read(LoadStatus), await rig.plant.read(PlantSession)
-    steps: list[LoadStep] = []
+    status, asked = await rig.plant.read(plant.LoadStatus), await rig.plant.read(plant.PlantSession)
+    steps: list[plant.LoadStep] = []
     if status.upcoming:
-        steps = await rig.plant.read_rows(LoadStep, 0, min(asked.load_steps, LOAD_ROWS))
+        steps = await rig.plant.read_rows(plant.LoadStep, 0, min(asked.load_steps, plant.LOAD_ROWS))
     if not steps or steps[-1].tick != status.last_tick:
         steps = []
     coming = [step for step in steps if step.tick > now]
@@ -558,7 +544,7 @@ async def restore_session(rig: SessionClient, saved: SavedSession | None, sessio
         if saved.operator.mode != OperatorMode.AUTO:
             await rig.control.write(saved.operator)
         tick = (await rig.plant.read(Identity)).tick
-        await rig.plant.write(sealed(LiveLoad(0, saved.load.watts[0]), rig.plant.map))
+        await rig.plant.write(sealed(plant.LiveLoad(0, saved.load.watts[0]), rig.plant.map))
         coming = LoadProfile(saved.load.times, saved.load.watts)
         await LoadStream(
             rig.plant, session, coming, begin=tick + lead_ticks(saved.pace, rig.plant.process.tick_s)

@@ -82,20 +82,18 @@ LABEL_AT: Final = -0.068
 """Place of letters and labels of panels, in widths of a panel: beside numbers of six characters."""
 
 
-class Bounds(NamedTuple):
-    """Bands of the outputs and limits of the inputs: lowest and highest value, by column."""
+Edges = Mapping[str, tuple[float, float]]
+"""Bands of the outputs and limits of the inputs: lowest and highest value, by column."""
 
-    bands: Mapping[str, tuple[float, float]]
-    inputs: Mapping[str, tuple[float, float]]
 
-    @classmethod
-    def of(cls, configuration: Mapping[str, Any], process: Process) -> "Bounds":
-        """Return the bounds of a configuration by dotted key."""
-        design = "optimizer_plc.program.design.output_"
-        bands = zip(configuration[f"{design}low"], configuration[f"{design}high"], strict=True)
-        inputs = zip(configuration["limits.low"], configuration["limits.high"], strict=True)
-        names = tuple(one.name for one in process.banded)
-        return cls(dict(zip(names, bands, strict=True)), dict(zip(process.input_names, inputs, strict=True)))
+def edges_of(configuration: Mapping[str, Any], process: Process) -> Edges:
+    """Return the bands and limits of a configuration by dotted key."""
+    found: dict[str, tuple[float, float]] = {}
+    names = tuple(one.name for one in process.banded)
+    for columns, key in ((names, "optimizer_plc.program.design.output_"), (process.input_names, "limits.")):
+        pairs = zip(configuration[f"{key}low"], configuration[f"{key}high"], strict=True)
+        found |= dict(zip(columns, pairs, strict=True))
+    return found
 
 
 class RunCurves(NamedTuple):
@@ -105,7 +103,7 @@ class RunCurves(NamedTuple):
     series: Mapping[str, Series]
     """`time_s` and the columns of `labels_of`."""
     events: Sequence[Mapping[str, Any]]
-    bounds: Bounds
+    edges: Edges
     title: str
     identity: str
     """Identity of the run: a line below the figure."""
@@ -128,15 +126,22 @@ def draw_run(curves: RunCurves) -> Figure:
             if name not in NOT_CURVES:
                 word = process.load.name if name == process.load.column else name
                 _curve(place, time, curves.series[name], label, word)
-            for what, edges in (("band", curves.bounds.bands.get(name)), ("bounds", curves.bounds.inputs.get(name))):
-                if edges is not None:
-                    limit(place, curves.series[name], edges, f"{what} {ends_text(*edges)} {units[name]}".rstrip())
+            if (edges := curves.edges.get(name)) is not None:
+                what = "bounds" if name in process.input_names else "band"
+                limit(place, curves.series[name], edges, f"{what} {ends_text(*edges)} {units[name]}".rstrip())
         behind = len(labels) - len(NOT_CURVES)
         for place, (name, ends) in zip(axes[behind:], curves.pressures.items(), strict=False):
             _curve(place, time, curves.series[name], f"{name} (bar)", name)
             limit(place, curves.series[name], ends, f"no alarm from {ends_text(*ends)} bar")
-        _updating_period(axes[behind + len(curves.pressures)], time, curves.series, process.sampling_period_s)
-        place, cost = axes[behind + len(curves.pressures) + 1], curves.series["stage_cost"]
+        behind += len(curves.pressures)
+        place, tau_u = axes[behind], curves.series["tau_u_s"]
+        place.set_ylabel("tau_u (s)")
+        place.set_ylim(0, process.sampling_period_s + 0.3)
+        if np.isnan(tau_u).all():
+            place.text(0.5, 0.5, "no updates", transform=place.transAxes, ha="center", va="center", color=ACCENT)
+        else:
+            draw_tau_u(place, time, tau_u, curves.series["time_s"], INK, "tau_u")
+        place, cost = axes[behind + 1], curves.series["stage_cost"]
         place.plot(time, np.maximum(cost, LEAST_COST), color=INK, linewidth=1, label="stage cost")
         place.set_ylabel("stage cost (1)")
         if spans_a_decade(cost):
@@ -222,16 +227,6 @@ def view(values: Series) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def _updating_period(axes: Axes, time: Series, series: Mapping[str, Series], longest_s: float) -> None:
-    tau_u = series["tau_u_s"]
-    axes.set_ylabel("tau_u (s)")
-    axes.set_ylim(0, longest_s + 0.3)
-    if np.isnan(tau_u).all():
-        axes.text(0.5, 0.5, "no updates", transform=axes.transAxes, ha="center", va="center", color=ACCENT)
-        return
-    draw_tau_u(axes, time, tau_u, series["time_s"], INK, "tau_u")
-
-
 def draw_tau_u(axes: Axes, time: Series, tau_u: Series, time_s: Series, colour: str, label: str) -> None:
     """Draw the updating period at these times as steps; where it chatters, also its mean over a minute."""
     changes = int(np.count_nonzero(np.diff(np.nan_to_num(tau_u))))
@@ -310,8 +305,8 @@ def plot_run(folder: Path, formats: Sequence[str]) -> list[Path]:
 
 def draw_nothing() -> None:
     """Draw one tick into memory: fonts, and what else the first figure of a process needs, are loaded then."""
-    series, edges = {name: np.zeros(1) for name in ("time_s", *labels_of(COLD_BOX))}, {"L1": (0.0, 1.0)}
-    draw_run(RunCurves(COLD_BOX, series, [], Bounds(edges, {}), "", "")).savefig(BytesIO(), dpi=DPI)
+    series = {name: np.zeros(1) for name in ("time_s", *labels_of(COLD_BOX))}
+    draw_run(RunCurves(COLD_BOX, series, [], {"L1": (0.0, 1.0)}, "", "")).savefig(BytesIO(), dpi=DPI)
 
 
 def save_figure(figure: Figure, path: Path) -> None:
@@ -330,8 +325,8 @@ def curves_of(run: RunFolder) -> RunCurves:
     series = run.series([*labels_of(process)])
     if pressures:
         series |= at_times(run.series(list(pressures), file_name=STATION), series["time_s"])
-    bounds, title = Bounds.of(configuration, process), title_of(configuration, process, run.manifest["way"])
-    return RunCurves(process, series, run.events(), bounds, title, identity_of(run.manifest), pressures)
+    edges, title = edges_of(configuration, process), title_of(configuration, process, run.manifest["way"])
+    return RunCurves(process, series, run.events(), edges, title, identity_of(run.manifest), pressures)
 
 
 def pressure_limits(configuration: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
@@ -430,11 +425,11 @@ def _draw_comparison(runs: Sequence[RunFolder], labels: Sequence[str]) -> Figure
                     draw_tau_u(place, one["time_s"] / scale_s, one[name], one["time_s"], colour, label)
                 else:
                     place.plot(one["time_s"] / scale_s, one[name], color=colour, linewidth=0.9, label=label)
-        bounds = Bounds.of(runs[0].configuration, runs[0].process)
-        for name, edges in {**bounds.bands, **bounds.inputs}.items():
-            values, what = np.concatenate([one[name] for one in curves]), "band" if name in bounds.bands else "bounds"
-            limit(axes[name], values, edges, f"{what} {ends_text(*edges)}")
-        axes["tau_u_s"].set_ylim(0, runs[0].process.sampling_period_s + 0.3)
+        process = runs[0].process
+        for name, edges in edges_of(runs[0].configuration, process).items():
+            what = "bounds" if name in process.input_names else "band"
+            limit(axes[name], np.concatenate([one[name] for one in curves]), edges, f"{what} {ends_text(*edges)}")
+        axes["tau_u_s"].set_ylim(0, process.sampling_period_s + 0.3)
         axes["stage_cost"].set_yscale("log")
         axes["stage_cost"].set_ylim(bottom=LEAST_COST)
         for name, label in named.items():
@@ -499,8 +494,12 @@ def _plots(run: RunFolder) -> str:
     for row, (name, label) in enumerate(labels.items(), start=1):
         _add_curve(figure, row, curves, name, process)
         figure.update_yaxes(title_text=label, row=row, col=1)
-    bounds = Bounds.of(run.configuration, process)
-    _add_bounds(figure, {name: row for row, name in enumerate(labels, start=1)}, curves, bounds)
+    for name, (low, high) in edges_of(run.configuration, process).items():  # far ones are outside the view
+        row = [*labels].index(name) + 1
+        figure.add_hrect(y0=low, y1=high, fillcolor=BAND, opacity=0.2, line_width=0, row=row, col=1)
+        for edge in (low, high):
+            figure.add_hline(y=edge, line={"color": ACCENT, "width": 1, "dash": "dash"}, row=row, col=1)
+        figure.update_yaxes(range=view_with_limits(curves[name], (low, high)), row=row, col=1)
     if len(curves["time_s"]):
         for begin, end in alarm_times(run.events(), scale_s, float(curves["time_s"][-1]) / scale_s):
             figure.add_vrect(x0=begin, x1=end, fillcolor="#b3261e", opacity=0.12, line_width=0)
@@ -530,13 +529,3 @@ def _add_curve(figure: Any, row: int, curves: Curves, name: str, process: Proces
     scale_s, _ = time_unit(curves["time_s"])
     curve = Scattergl(x=curves["time_s"] / scale_s, y=values, name=name, mode="lines", line=line)
     figure.add_trace(curve, row=row, col=1)
-
-
-def _add_bounds(figure: Any, rows: Mapping[str, int], curves: Mapping[str, Series], bounds: Bounds) -> None:  # noqa: ANN401 plotly has no types
-    """Draw bands and bounds; those that are far from the curve stay outside the view, until it is zoomed out."""
-    edges: Mapping[str, tuple[float, float]] = {**bounds.bands, **bounds.inputs}
-    for name, (low, high) in edges.items():
-        figure.add_hrect(y0=low, y1=high, fillcolor=BAND, opacity=0.2, line_width=0, row=rows[name], col=1)
-        for edge in (low, high):
-            figure.add_hline(y=edge, line={"color": ACCENT, "width": 1, "dash": "dash"}, row=rows[name], col=1)
-        figure.update_yaxes(range=view_with_limits(curves[name], (low, high)), row=rows[name], col=1)

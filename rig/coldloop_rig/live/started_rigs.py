@@ -20,7 +20,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Annotated, Final, NamedTuple, Self
+from typing import IO, Annotated, Any, Final, NamedTuple, Self, TypeVar
 
 from pydantic import Field, TypeAdapter, ValidationError
 
@@ -31,6 +31,7 @@ from coldloop_rig import PYTHON
 from coldloop_rig.cosim.wiring import REQUIRED, RigEndpoints
 from coldloop_rig.interruption import INTERRUPTION
 
+T = TypeVar("T", bound=tuple[Any, ...])
 MOST_BYTES: Final = 65536
 """Size of a file about a rig, at most."""
 STATE, STARTED = 0, 19
@@ -159,6 +160,18 @@ def identity_of(pid: int) -> str | None:
     return f"{boot} {int(fields[STARTED])}"
 
 
+def parsed_as(kind: type[T], text: str, writer: str, *, strict: bool = False) -> T:
+    """Return the named tuple of this kind that a JSON text has.
+
+    Raises:
+        ValueError: It is none; names what should have written it.
+    """
+    try:
+        return kind(*TypeAdapter(kind).validate_json(text, strict=strict))
+    except ValidationError:
+        raise ValueError(f"not what {writer} writes") from None
+
+
 Pid = Annotated[int, Field(gt=1, lt=2**31)]
 Port = Annotated[int, Field(gt=0, lt=0x10000)]
 
@@ -218,12 +231,9 @@ class RunningRig(NamedTuple):
         Raises:
             ValueError: It was not written by `coldloop up`, or by another version.
         """
-        try:
-            rig = cls(*TypeAdapter(cls).validate_json(text, strict=True))
-        except ValidationError:
-            raise ValueError("not what `coldloop up` of this version writes") from None
+        rig = parsed_as(cls, text, writer := "`coldloop up` of this version", strict=True)
         if not set(REQUIRED) <= rig.services.keys() <= set(RigEndpoints._fields):
-            raise ValueError("not what `coldloop up` of this version writes")
+            raise ValueError(f"not what {writer} writes")
         return rig
 
     @property
@@ -271,22 +281,19 @@ def rigs_up() -> list[RunningRig]:
     Raises:
         UsageError: There is none, and its record is damaged.
     """
-    found: list[RunningRig] = []
+    found: list[RunningRig | None] = []
     damaged: UsageError | None = None
     with suppress(OSError):
         for name in sorted(folder.name for folder in base_folder().iterdir()):
-            if not (name.isascii() and name.isdecimal() and len(name) < len("100000")):
-                continue
-            try:
-                rig = running_rig(int(name))
-            except UsageError as error:
-                damaged = error
-                continue
-            if rig is not None:
-                found.append(rig)
-    if damaged is not None and not found:
+            if name.isascii() and name.isdecimal() and len(name) < len("100000"):
+                try:
+                    found.append(running_rig(int(name)))
+                except UsageError as error:
+                    damaged = error
+    rigs = list(filter(None, found))
+    if damaged is not None and not rigs:
         raise damaged
-    return found
+    return rigs
 
 
 def find_rig(first_port: int | None) -> RunningRig | None:
@@ -329,32 +336,27 @@ class RigLock:
 
     def __init__(self, first_port: int, inherited: int | None = None) -> None:
         folder = make_own_folder(str(first_port))
-        if inherited is not None:
-            self.descriptor = inherited
-            self._sign()
-            return
-        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-        try:
-            self.descriptor = os.open(folder / LOCK_FILE, flags, mode=0o600)
-        except OSError as error:
-            raise UsageError(f"{folder / LOCK_FILE}: {error.strerror}; remove it") from None
-        try:
-            fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            os.close(self.descriptor)
-            raise UsageError(f"port {first_port}: {self._holder(first_port)}, or give another --port-base") from None
-        self._sign()
-
-    def _sign(self) -> None:
-        """Leave our number, for those who come later."""
-        with suppress(OSError):  # the disk may be full
+        self.descriptor = self._locked(folder / LOCK_FILE, first_port) if inherited is None else inherited
+        with suppress(OSError):  # our number, for those who come later; the disk may be full
             os.ftruncate(self.descriptor, 0)
             os.pwrite(self.descriptor, str(os.getpid()).encode(), 0)
 
+    def _locked(self, file: Path, first_port: int) -> int:
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        try:
+            descriptor = os.open(file, flags, mode=0o600)
+        except OSError as error:
+            raise UsageError(f"{file}: {error.strerror}; remove it") from None
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(descriptor)
+            raise UsageError(f"port {first_port}: {self._holder(first_port)}, or give another --port-base") from None
+        return descriptor
+
     @staticmethod
     def _holder(first_port: int) -> str:
-        rig = running_rig(first_port)
-        if rig is not None:
+        if (rig := running_rig(first_port)) is not None:
             return f"a rig is up here (process {rig.pid}): end it with `coldloop down`"
         try:
             number = int(read_own(state_folder(first_port) / LOCK_FILE))
@@ -426,7 +428,10 @@ def detached(ports: Sequence[int], lock: RigLock) -> int:
             stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, pass_fds=[lock.descriptor],
         )  # fmt: skip
         bound_log(process.pid)
-        while process.poll() is None and not (ended_by or _is_up(ports[0], process.pid)):
+        while process.poll() is None and not ended_by:
+            with suppress(UsageError):  # a file that another rig has left, until it is replaced
+                if (rig := running_rig(ports[0])) is not None and rig.pid == process.pid:
+                    break
             time.sleep(LOOK_UP_S)
         if ended_by:
             process.terminate()
@@ -437,14 +442,6 @@ def detached(ports: Sequence[int], lock: RigLock) -> int:
         raise ColdloopError((lines or ["the rig has ended"])[-1].removeprefix("coldloop: "))
     sys.stdout.write(output.read_text(encoding="utf-8"))
     return 0
-
-
-def _is_up(first_port: int, pid: int) -> bool:
-    try:
-        rig = running_rig(first_port)
-    except UsageError:  # a file that another rig has left, until it is replaced
-        return False
-    return rig is not None and rig.pid == pid
 
 
 def take_down(first_port: int | None, patience_s: float) -> int:

@@ -12,11 +12,12 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext, suppress
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Final, Literal, NamedTuple, Self
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field
 
 from coldloop.config import to_environment
 from coldloop.errors import ColdloopError, LinkError, PeerUnreachableError, UsageError
@@ -55,18 +56,6 @@ class Cut(NamedTuple):
     seconds: Annotated[float, Field(gt=0, le=3600)]
     """Duration in real time, s."""
 
-    @classmethod
-    def parsed(cls, text: str) -> Self:
-        """Return the cut that a file asks for.
-
-        Raises:
-            ValueError: It asks for none.
-        """
-        try:
-            return cls(*TypeAdapter(cls).validate_json(text))
-        except ValidationError:
-            raise ValueError("not what `coldloop fault cut` writes") from None
-
 
 class CuttableLinks:
     """Cuts links on request, by files in the folder of their rig."""
@@ -95,7 +84,7 @@ class CuttableLinks:
         for file in self._folder.glob(CUT_FILES):
             with suppress(OSError):
                 try:
-                    yield Cut.parsed(started_rigs.read_own(file))
+                    yield started_rigs.parsed_as(Cut, started_rigs.read_own(file), "`coldloop fault cut`")
                 except ValueError as error:
                     local_services.say(f"{file}: {error}")
                 file.unlink(missing_ok=True)
@@ -175,32 +164,19 @@ def readers(tls: TlsSettings | None) -> TlsSettings | None:
     return tls.model_copy(update={"certificate": certificate, "key": key})
 
 
-class FirstLogin(NamedTuple):
-    """The operator of a page whose configuration names no users."""
+def with_own_files(section: HmiSection, folder: Path) -> tuple[HmiSection, str]:
+    """Return the settings of a page with users and an audit in a private folder, where they name none.
 
-    file: Path
-    password: str
-
-    @classmethod
-    def made_in(cls, folder: Path) -> Self:
-        """Write a user with a random password into a folder."""
-        login = cls(folder / "page-users", secrets.token_urlsafe(9))
-        login.file.unlink(missing_ok=True)
-        write_user(login.file, OPERATOR, PageRole.OPERATE, login.password)
-        return login
-
-    @property
-    def line(self) -> str:
-        """Line that says how to log in."""
-        return f"  to operate     user {OPERATOR}, password {self.password} (of this run)\n"
-
-
-def with_own_files(section: HmiSection, folder: Path) -> tuple[HmiSection, FirstLogin | None]:
-    """Return the settings of a page with users and an audit in a private folder, where they name none."""
+    With them comes the line that says how to log in: as a new user with a random password, where they name no users.
+    """
     update: dict[str, object] = {}
-    login = None if section.login.users else FirstLogin.made_in(folder)
-    if login is not None:
-        update["login"] = section.login.model_copy(update={"users": login.file})
+    login = ""
+    if not section.login.users:
+        file, password = folder / "page-users", secrets.token_urlsafe(9)
+        file.unlink(missing_ok=True)
+        write_user(file, OPERATOR, PageRole.OPERATE, password)
+        login = f"  to operate     user {OPERATOR}, password {password} (of this run)\n"
+        update["login"] = section.login.model_copy(update={"users": file})
     if section.audit is None:
         update["audit"] = folder / "page-audit.jsonl"
     return section.model_copy(update=update), login
@@ -266,10 +242,7 @@ class PageProcess:
     def addresses(self) -> str:
         """Lines that say where the page is, and who may operate."""
         scheme = "https" if self._section.https else "http"
-        text = f"  page           {scheme}://{self._section.host}:{self._section.port}/\n"
-        if self._login is not None:
-            text += self._login.line
-        return text
+        return f"  page           {scheme}://{self._section.host}:{self._section.port}/\n{self._login}"
 
 
 class UpRig:
@@ -284,14 +257,10 @@ class UpRig:
         self, settings: Settings, ports: Sequence[int], tls: Path | None, *, page: bool = False, cuttable: bool = False,
         services: Sequence[str] = wiring.SERVICES, optimizer: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        self._optimizer = tuple(optimizer)
+        self._optimizer, self._services, self._ports = tuple(optimizer), tuple(services), tuple(ports)
         self.folder = started_rigs.make_own_folder(str(ports[0]))
         self._settings = wiring.retaining(settings, self.folder, always=False)
-        self._scenario = make_scenario(settings)
-        self._page = page
-        self._services = tuple(services)
-        self._ports = tuple(ports)
-        self._tls = tls
+        self._scenario, self._page, self._tls = make_scenario(settings), page, tls
         self._links = CuttableLinks(self.folder, wiring.fault_injection("links")("up")) if cuttable else None
         self._sessions = asyncio.Lock()
         """One session is begun at a time."""
@@ -303,14 +272,11 @@ class UpRig:
             ColdloopError: The session could not begin, or a service has ended again and again.
         """
         links = self._links
+        settings = with_copied_load(self._settings, self._scenario.load, self.folder)
         services = local_services.LocalServices(
-            with_copied_load(self._settings, self._scenario.load, self.folder),
-            started_rigs.make_private(self.folder / "logs"),
-            ports=self._ports,
-            links=None if links is None else links.proxies,
-            services=self._services,
-            optimizer=self._optimizer,
-        )
+            settings, started_rigs.make_private(self.folder / "logs"), links=None if links is None else links.proxies,
+            ports=self._ports, services=self._services, optimizer=self._optimizer,
+        )  # fmt: skip
         async with services:
             if links is not None:
                 await links.proxies.connect()
@@ -344,9 +310,19 @@ class UpRig:
         started_rigs.RunningRig.of_this_process(self._ports, tls, pids, cuttable=self._links is not None).write()
 
     async def _keep(self, services: local_services.LocalServices, rig: SessionClient, page: PageProcess | None) -> None:
-        work = [self._hold(rig), *(self._keep_service(services, service, rig) for service in self._services)]
+        def unwritten(error: LinkError) -> None:
+            if not isinstance(error, PeerUnreachableError):  # else the plant is being started again
+                local_services.say(f"the rest of the load is not written: {error}")
+
+        async def keep_page(page: PageProcess) -> None:
+            try:
+                await local_services.keep_up("the page", page.ended, page.restart)
+            except LinkError as error:  # the rig keeps running without it
+                local_services.say(str(error))
+
+        work = [rig.hold(LOOK_S, unwritten), *(self._keep_service(services, each, rig) for each in self._services)]
         if page is not None:
-            work.append(_keep_page(page))
+            work.append(keep_page(page))
         if self._links is not None:
             work.append(self._links.keep())
         tasks = [asyncio.create_task(one) for one in work]
@@ -356,16 +332,6 @@ class UpRig:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-
-    async def _hold(self, rig: SessionClient) -> None:
-        while True:
-            try:
-                await rig.hold(LOOK_S)
-            except PeerUnreachableError:
-                pass  # the plant is being started again
-            except LinkError as error:
-                local_services.say(f"the rest of the load is not written: {error}")
-            await asyncio.sleep(LOOK_S)
 
     async def _keep_service(self, services: local_services.LocalServices, service: str, rig: SessionClient) -> None:
         async def restarted() -> None:
@@ -380,12 +346,8 @@ class UpRig:
                         return
                 await asyncio.sleep(LOOK_S)
 
-        await local_services.keep_up(
-            f"the {service} service",
-            lambda: services.exit_of(service),
-            lambda: services.start(service, may_end=True),
-            restarted,
-        )
+        ended, restart = partial(services.exit_of, service), partial(services.start, service, may_end=True)
+        await local_services.keep_up(f"the {service} service", ended, restart, restarted)
 
     async def _goes_on(self, service: str, rig: SessionClient) -> bool:
         """Print whether the session was resumed after a restart of a service, or a new one has begun.
@@ -402,14 +364,6 @@ class UpRig:
             session = await rig.start(self._scenario)
             local_services.say(f"session {session} has begun: the {service} service had no state to resume")
             return True
-
-
-async def _keep_page(page: PageProcess) -> None:
-    """Keep the page up; the rig keeps running without it once it is given up."""
-    try:
-        await local_services.keep_up("the page", page.ended, page.restart)
-    except LinkError as error:
-        local_services.say(str(error))
 
 
 def addresses(settings: Settings, ports: Sequence[int], folder: Path, services: Sequence[str]) -> str:
@@ -435,12 +389,10 @@ def addresses(settings: Settings, ports: Sequence[int], folder: Path, services: 
         f"  logs           {folder / 'logs'}",
     ]
     if tls:
-        lines += ["Modbus/TCP Security: clients show a certificate; `coldloop certificates` has made some"]
+        lines.append("Modbus/TCP Security: clients show a certificate; `coldloop certificates` has made some")
     else:
-        lines += [
-            f"read {shown.name} ({shown.unit}):",
-            f"  mbpoll -0 -1 -m tcp -p {ports[0]} -t 4:float -B -r {address} -c 1 127.0.0.1",
-        ]
+        lines.append(f"read {shown.name} ({shown.unit}):")
+        lines.append(f"  mbpoll -0 -1 -m tcp -p {ports[0]} -t 4:float -B -r {address} -c 1 127.0.0.1")
     lines += [
         f"coldloop status{base} --follow    its status",
         f"coldloop set{base} {load:<15}and {more}setpoint, factor, pause, resume, acknowledge",

@@ -115,8 +115,8 @@ class Simulation:
             series |= plot.at_times(batch_series(station), series["time_s"])
         identity = f"trace {self.summary['trace_sha256'][:12]}  ·  coldloop {__version__}  ·  in-process"
         process, events = self.process, self.events.arrow.to_pylist()
-        bounds, title = plot.Bounds.of(self.configuration, process), plot.title_of(self.configuration, process)
-        figure = plot.draw_run(plot.RunCurves(process, series, events, bounds, title, identity, pressures))
+        edges, title = plot.edges_of(self.configuration, process), plot.title_of(self.configuration, process)
+        figure = plot.draw_run(plot.RunCurves(process, series, events, edges, title, identity, pressures))
         if path is not None:
             plot.save_figure(figure, Path(path))
         return figure

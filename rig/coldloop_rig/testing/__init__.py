@@ -219,24 +219,25 @@ class LiveRig:
         ticks = seconds / self._tick_s
         if not ticks > 0 or ticks != round(ticks):
             raise UsageError(f"advance({seconds}): not a positive multiple of {self._tick_s} s")
-        return float(self._call(self._advanced(round(ticks)))) * self._tick_s
 
-    async def _advanced(self, ticks: int) -> int:
-        tick = (await self._clients["plant"].read(Identity)).tick
-        until, moved = tick + ticks, time.monotonic()
-        while tick < until:
-            if not self._scenario.realtime:
-                await self._driver.advance(tick, until)
-            await asyncio.sleep(LOOK_S)
-            before, tick = tick, (await self._clients["plant"].read(Identity)).tick
-            if tick != before:
-                moved = time.monotonic()
-            elif time.monotonic() - moved > max(wiring.QUIET_S, 4 * self._tick_s / self._scenario.factor):
-                raise LinkError(
-                    f"the plant is at {tick * self._tick_s:g} s of plant time for {wiring.QUIET_S:g} s: "
-                    f"see the logs in {self._folder / 'logs'}"
-                )
-        return tick
+        async def advanced() -> int:
+            tick = (await self._clients["plant"].read(Identity)).tick
+            until, moved = tick + round(ticks), time.monotonic()
+            while tick < until:
+                if not self._scenario.realtime:
+                    await self._driver.advance(tick, until)
+                await asyncio.sleep(LOOK_S)
+                before, tick = tick, (await self._clients["plant"].read(Identity)).tick
+                if tick != before:
+                    moved = time.monotonic()
+                elif time.monotonic() - moved > max(wiring.QUIET_S, 4 * self._tick_s / self._scenario.factor):
+                    raise LinkError(
+                        f"the plant is at {tick * self._tick_s:g} s of plant time for {wiring.QUIET_S:g} s: "
+                        f"see the logs in {self._folder / 'logs'}"
+                    )
+            return tick
+
+        return float(self._call(advanced())) * self._tick_s
 
     def wait_until(self, condition: Callable[[], bool], within_s: float = 60.0) -> float:
         """Wait until `condition()` is true, for at most `within_s` of plant time; return the plant time then.
@@ -297,12 +298,9 @@ class LiveRig:
         try:
             yield
         finally:
-            self._call(self._ended(fault))
-
-    async def _ended(self, fault: object) -> None:
-        service = await self._injector.end(fault)
-        if service is not None:
-            await self._clients[service].connect(wiring.START_PATIENCE_S)
+            service = self._call(self._injector.end(fault))
+            if service is not None:
+                self._call(self._clients[service].connect(wiring.START_PATIENCE_S))
 
     def log(self, service: str) -> Path:
         """Return the log of `plant`, `control_plc` or `optimizer_plc`: one JSON object a line."""
@@ -327,13 +325,8 @@ class LiveRig:
         await self._links.connect()
         await self._services.during(self._driver.start(self._scenario))
         if self._scenario.realtime:
-            self._stack.callback(asyncio.create_task(self._feed(), name="load of the session").cancel)
-
-    async def _feed(self) -> None:
-        while True:
-            with contextlib.suppress(LinkError):  # the plant is away on purpose: it is looked at again
-                await self._driver.hold(FEED_S)
-            await asyncio.sleep(FEED_S)
+            feed = self._driver.hold(FEED_S, lambda _: None)  # a plant that is away on purpose is looked at again
+            self._stack.callback(asyncio.create_task(feed, name="load of the session").cancel)
 
     def _stop(self) -> None:
         async def stop() -> None:

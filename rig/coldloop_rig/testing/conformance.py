@@ -5,7 +5,8 @@
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -63,23 +64,29 @@ class Requirement(NamedTuple):
         return "yes" if not self.failures else f"NO, in {self.failures} of {self.cases}"
 
 
+def counted(cases: Iterable[Mapping[str, object]]) -> list[Requirement]:
+    """Return the requirements of cases, which have for each whether it was kept."""
+    kept = list(cases)
+    return [Requirement(text, sum(not case[text] for case in kept), len(kept)) for text in kept[0]]
+
+
 def rule_requirements(make: Callable[[Sequence[int]], OutsideDecision]) -> list[Requirement]:
     """Return what the rules that are made keep, in a session with each ladder."""
-    failed = dict.fromkeys(
-        ("begins with the number of a period", "decides numbers of periods, 1 to their count",
-         "has the number of a period after a load step", "decides the same from the same observations",
-         "begins a session as if there had been none before"), 0,
-    )  # fmt: skip
-    begins, decides, steps, same, fresh = failed
-    for ladder in LADDERS:
+
+    def case(ladder: Sequence[int]) -> dict[str, object]:
         rule, twin = make(ladder), make(ladder)
         decided = session(rule, ladder)
-        failed[begins] += not is_q(decided[0], ladder)
-        failed[decides] += not all(is_q(q, ladder) for q in decided[1:])
-        failed[steps] += not is_q(getattr(rule, "after_interruption", rule.first)(), ladder)
-        failed[same] += decided != session(twin, ladder)
-        failed[fresh] += decided != session(make(ladder), ladder)
-    return [Requirement(text, failures, len(LADDERS)) for text, failures in failed.items()]
+        return {
+            "begins with the number of a period": is_q(decided[0], ladder),
+            "decides numbers of periods, 1 to their count": all(is_q(q, ladder) for q in decided[1:]),
+            "has the number of a period after a load step": is_q(
+                getattr(rule, "after_interruption", rule.first)(), ladder
+            ),
+            "decides the same from the same observations": decided == session(twin, ladder),
+            "begins a session as if there had been none before": decided == session(make(ladder), ladder),
+        }
+
+    return counted(map(case, LADDERS))
 
 
 def is_q(q: float, ladder: Sequence[int]) -> bool:
@@ -114,26 +121,22 @@ def estimator_requirements(make: Made, settings: Settings) -> list[Requirement]:
     program = settings.optimizer_plc.program
     prediction = prediction_of(load(settings.model.file), program.estimator.disturbed, program.design)
 
-    def model() -> PlantModel:
-        return plant_model(prediction, program.estimator)
+    model = partial(plant_model, prediction, program.estimator)
 
-    failed = dict.fromkeys(
-        ("returns a finite state of n numbers and a mismatch", "does so where readings are missing",
-         "leaves the prediction and the measurement as they were", "converges on a plant that is its model",
-         "gives the same bits for the same measurements", "begins a session as if there had been none before"), 0,
-    )  # fmt: skip
-    finite, missing, left, converges, same, fresh = failed
-    for seed in SEEDS:
+    def case(seed: int) -> dict[str, object]:
         world, lossy = (World(model(), settings.process, seed, loses=loses) for loses in (False, True))
         twin = make(model())
-        first = world.session(make(model()))
-        failed[finite] += not all(is_estimate(one, world.n) for one in first)
-        failed[missing] += not all(is_estimate(one, world.n) for one in lossy.session(make(model())))
-        failed[left] += world.touched
-        failed[converges] += not world.left <= LEFT
-        failed[same] += not equal(first, world.session(twin))
-        failed[fresh] += not equal(first, world.session(make(model())))
-    return [Requirement(text, failures, len(SEEDS)) for text, failures in failed.items()]
+        first, second = world.session(make(model())), lossy.session(make(model()))
+        return {
+            "returns a finite state of n numbers and a mismatch": all(is_estimate(one, world.n) for one in first),
+            "does so where readings are missing": all(is_estimate(one, world.n) for one in second),
+            "leaves the prediction and the measurement as they were": not world.touched,
+            "converges on a plant that is its model": world.left <= LEFT,
+            "gives the same bits for the same measurements": equal(first, world.session(twin)),
+            "begins a session as if there had been none before": equal(first, world.session(make(model()))),
+        }
+
+    return counted(map(case, SEEDS))
 
 
 def is_estimate(estimate: Estimate, n: int) -> bool:
@@ -213,24 +216,24 @@ def over(model: PlantModel, ticks: int) -> tuple[Array, Array, Array]:
 
 def requirements(method: OutsideMethod, problems: list[QuadraticProblem]) -> list[Requirement]:
     """Return what a method keeps of what the rig relies on."""
-    failed = dict.fromkeys(
-        ("returns a finite point of n numbers and a count", "with 0 iterations returns the guess",
-         "gives the same bits for the same problem", "leaves the problem and the guess as they were",
-         "does no more iterations than asked for"), 0,
-    )  # fmt: skip
-    shape, zero, same, left, count = failed
-    for problem in problems:
+
+    def case(problem: QuadraticProblem) -> dict[str, object]:
         guess, before = np.clip(0.0, problem.low, problem.high), [np.array(part) for part in problem]
         kept = guess.copy()
         first, done = method.solve(problem, guess, LONGEST)
+        is_point = np.shape(first) == kept.shape and np.isfinite(first).all()
         again, _ = method.solve(problem, kept.copy(), LONGEST)
-        failed[shape] += not (np.shape(first) == kept.shape and np.isfinite(first).all())
-        failed[zero] += not np.array_equal(method.solve(problem, kept.copy(), 0)[0], kept)
-        failed[same] += not np.array_equal(first, again)
+        none = method.solve(problem, kept.copy(), 0)[0]
         intact = all(np.array_equal(np.asarray(now), old) for now, old in zip(problem, before, strict=True))
-        failed[left] += not (intact and np.array_equal(guess, kept))
-        failed[count] += not 0 <= done <= LONGEST
-    return [Requirement(text, failures, len(problems)) for text, failures in failed.items()]
+        return {
+            "returns a finite point of n numbers and a count": is_point,
+            "with 0 iterations returns the guess": np.array_equal(none, kept),
+            "gives the same bits for the same problem": np.array_equal(first, again),
+            "leaves the problem and the guess as they were": intact and np.array_equal(guess, kept),
+            "does no more iterations than asked for": 0 <= done <= LONGEST,
+        }
+
+    return counted(map(case, problems))
 
 
 def quality(solver: OutsideSolver, problems: list[QuadraticProblem]) -> tuple[list[float], float]:
@@ -281,7 +284,7 @@ class Report(NamedTuple):
 
 
 def of_solver(name: str) -> Report:
-    """Return what there is to say of a solver."""
+    """Return the conformance report of a solver, with its quality."""
     problems = list(problems_of(Settings()))
     gaps, rises = quality(OutsideSolver(OutsideSettings(solver=name)), problems)
     table = aligned([
@@ -292,19 +295,11 @@ def of_solver(name: str) -> Report:
     return Report(requirements(made(Part.SOLVER, name), problems), more)
 
 
-def of_rule(name: str) -> Report:
-    """Return what there is to say of a rule of the updating period."""
-    return Report(rule_requirements(lambda periods: made(Part.RULE, name, periods)))
-
-
-def of_estimator(name: str) -> Report:
-    """Return what there is to say of a state estimator."""
-    return Report(estimator_requirements(lambda model: made(Part.ESTIMATOR, name, model), Settings()))
-
-
 REPORTS: Final[Mapping[Part, Callable[[str], Report]]] = {
-    Part.SOLVER: of_solver, Part.RULE: of_rule, Part.ESTIMATOR: of_estimator,
-}  # fmt: skip
+    Part.SOLVER: of_solver,
+    Part.RULE: lambda name: Report(rule_requirements(partial(made, Part.RULE, name))),
+    Part.ESTIMATOR: lambda name: Report(estimator_requirements(partial(made, Part.ESTIMATOR, name), Settings())),
+}
 
 
 def main() -> int:

@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TextIO
 
@@ -17,7 +18,6 @@ from coldloop_rig.interruption import run_until_interrupted
 
 if TYPE_CHECKING:
     from coldloop.modbus.settings import Endpoint
-    from coldloop.operating.observer import JournalReader
     from coldloop.process.declaration import Process
     from coldloop.registers.common import Event
 
@@ -92,33 +92,29 @@ async def _show_journal(options: argparse.Namespace) -> None:
         options.rig = [options.endpoint] * len(common.SERVICES)
     place: Endpoint = getattr(common.rig_endpoints(options, settings), options.service)
     client = RegisterClient.at(maps_of(process).by_service[options.service], place)
+    peer = client.peer
     reader = JournalReader(client, options.since.number, options.kind)
     output = _CsvFile(options.csv, process) if options.csv else _Lines(process)
+    warned: set[str] = set()
     try:
         await client.connect(0)
-        await _copy(reader, options, output, client.peer)
+        while True:
+            events = await reader.read_on()
+            for happened, warning in (
+                (reader.limited, f"no operator role at {peer}: only its last 256 events can be read"),
+                (reader.missed, f"{reader.missed} events are no longer kept"),
+                (reader.restarted, f"{peer} was restarted, and numbers its events from 1 again: it retains no state"),
+            ):
+                if happened and warning not in warned:
+                    warned.add(warning)
+                    sys.stderr.write(f"coldloop: {warning}\n")
+            output.write([event for event in events if event.utc + event.milliseconds / 1000 >= options.since.utc])
+            if not options.follow:
+                return
+            await asyncio.sleep(LOOK_AGAIN_S)
     finally:
         client.close()
         output.close()
-
-
-async def _copy(reader: "JournalReader", options: argparse.Namespace, output: "_Lines | _CsvFile", peer: str) -> None:
-    """Read once, or again and again, and say what cannot be read."""
-    warned: set[str] = set()
-    while True:
-        events = await reader.read_on()
-        for happened, warning in (
-            (reader.limited, f"no operator role at {peer}: only its last 256 events can be read"),
-            (reader.missed, f"{reader.missed} events are no longer kept"),
-            (reader.restarted, f"{peer} was restarted, and numbers its events from 1 again: it retains no state"),
-        ):
-            if happened and warning not in warned:
-                warned.add(warning)
-                sys.stderr.write(f"coldloop: {warning}\n")
-        output.write([event for event in events if event.utc + event.milliseconds / 1000 >= options.since.utc])
-        if not options.follow:
-            return
-        await asyncio.sleep(LOOK_AGAIN_S)
 
 
 class _Lines:
@@ -187,7 +183,8 @@ def _declare_certificates(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type="into", required=True, metavar="DIR", help="folder for the files")
     parser.add_argument("--host", dest="hosts", action="append", default=[], type=_host, metavar="NAME",
                         help="another name or address of the servers, besides localhost; may be repeated")  # fmt: skip
-    parser.add_argument("--days", type=_days, default=365, help="days until they expire (default: 365)")
+    days = partial(common.number_within, least=1, most=3650, what="a number of days from 1 to 3650")
+    parser.add_argument("--days", type=days, default=365, help="days until they expire (default: 365)")
     parser.add_argument("--revoke", action="append", default=[], metavar="NAME",
                         help="revoke a certificate in the folder, such as operator; may be repeated")  # fmt: skip
     parser.add_argument("--renew-list", action="store_true", help="renew the list of revoked certificates")
@@ -197,10 +194,6 @@ def _host(text: str) -> str:
     if not re.fullmatch(r"[A-Za-z0-9]([A-Za-z0-9.:_-]{0,251}[A-Za-z0-9])?|::1?", text):
         raise argparse.ArgumentTypeError(f"'{text}' is not a host name or an address")
     return text
-
-
-def _days(text: str) -> int:
-    return common.number_within(text, 1, 3650, "a number of days from 1 to 3650")
 
 
 def execute_certificates(options: argparse.Namespace) -> int:
@@ -250,10 +243,3 @@ def execute_registers(options: argparse.Namespace) -> int:
     places = {service: common.HostPort(options.host, port) for service, port in zip(IN_ORDER, ports, strict=True)}
     sys.stdout.write(EXPORTS[options.format](maps, places))
     return 0
-
-
-COMMANDS: Final = {
-    "events": common.Command(_declare_events, execute_events),
-    "certificates": common.Command(_declare_certificates, execute_certificates),
-    "registers": common.Command(_declare_registers, execute_registers),
-}

@@ -9,7 +9,7 @@ from typing import Final
 
 from coldloop.errors import UsageError
 from coldloop.service.command_line import add_configuration_options
-from coldloop_rig.cli.commands.options import Command, configuration
+from coldloop_rig.cli.commands.options import configuration
 
 HEADING: Final = re.compile(r"^(#+) +(.+)$")
 FENCE: Final = "```"
@@ -29,8 +29,9 @@ def execute_docs(options: argparse.Namespace) -> int:
     pages = {path.stem: path for path in sorted(found, key=lambda path: path.stem)}
     if options.page is None:
         width = max(map(len, pages), default=0)
-        titles = {name: _title(path.read_text(encoding="utf-8")) for name, path in pages.items()}
-        sys.stdout.write("".join(f"{name:{width}}  {title}\n" for name, title in titles.items()))
+        for name, path in pages.items():
+            title = next((words for *_, words in headings(path.read_text(encoding="utf-8"))), "")
+            sys.stdout.write(f"{name:{width}}  {title}\n")
         return 0
     text = _asked(options.page, pages)
     if sys.stdout.isatty():
@@ -51,11 +52,13 @@ def _asked(asked: str, pages: Mapping[str, Path]) -> str:
     text = pages[name].read_text(encoding="utf-8")
     if not section:
         return text
-    texts = (
-        (text, pages[evidence].read_text(encoding="utf-8")) if (evidence := f"evidence-{name}") in pages else (text,)
-    )
-    if part := next(filter(None, (_section(each, section) for each in texts)), None):
-        return part
+    evidence = pages.get(f"evidence-{name}")
+    for each in (text, "" if evidence is None else evidence.read_text(encoding="utf-8")):
+        parts = list(headings(each))
+        for place, (first, level, words) in enumerate(parts):
+            if anchor(words) == section:
+                last = next((line for line, other, _ in parts[place + 1 :] if other <= level), None)
+                return "\n".join(each.splitlines()[first:last]) + "\n"
     known = ", ".join(anchor(words) for *_, words in headings(text))
     raise UsageError(f"docs: {name} has no section '{section}'; it has {known}")
 
@@ -69,22 +72,9 @@ def headings(text: str) -> Iterator[tuple[int, int, str]]:
             yield number, len(found[1]), found[2]
 
 
-def _title(text: str) -> str:
-    return next((words for *_, words in headings(text)), "")
-
-
 def anchor(words: str) -> str:
     """Return the name by which links lead to a heading."""
     return re.sub(r"[^\w\- ]", "", words.lower()).replace(" ", "-")
-
-
-def _section(text: str, section: str) -> str | None:
-    parts = list(headings(text))
-    for place, (first, level, words) in enumerate(parts):
-        if anchor(words) == section:
-            last = next((line for line, other, _ in parts[place + 1 :] if other <= level), None)
-            return "\n".join(text.splitlines()[first:last]) + "\n"
-    return None
 
 
 def _declare_config(parser: argparse.ArgumentParser) -> None:
@@ -123,10 +113,3 @@ def execute_completion(options: argparse.Namespace) -> int:
 
     sys.stdout.write(shellcode(["coldloop"], shell=options.shell) + "\n")
     return 0
-
-
-COMMANDS: Final = {
-    "docs": Command(_declare_docs, execute_docs),
-    "config": Command(_declare_config, execute_config),
-    "completion": Command(_declare_completion, execute_completion),
-}

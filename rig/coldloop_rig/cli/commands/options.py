@@ -36,19 +36,17 @@ FIGURE_FORMATS: Final = ("png", "pdf", "svg")
 
 
 KEYS = {
-    "load": ("plant.load", "--load"),
-    "seed": ("plant.seed", "--seed"),
-    "solver": ("optimizer_plc.program.solver", "--solver"),
-    "outside_solver": ("optimizer_plc.program.outside.solver", "--outside-solver"),
-    "preset": ("optimizer_plc.program.preset", "--preset"),
-    "updating_period": ("optimizer_plc.program.updating_period_s", "--updating-period"),
-    "mode": ("session.mode", "--mode"),
-    "factor": ("session.factor", "--factor"),
-    "page_port": ("hmi.port", "--page-port"),
+    "load": "plant.load",
+    "seed": "plant.seed",
+    "solver": "optimizer_plc.program.solver",
+    "outside_solver": "optimizer_plc.program.outside.solver",
+    "preset": "optimizer_plc.program.preset",
+    "updating_period": "optimizer_plc.program.updating_period_s",
+    "mode": "session.mode",
+    "factor": "session.factor",
+    "page_port": "hmi.port",
 }
 """Options that set one key of the configuration."""
-
-
 LOOPBACK: Final = ("127.0.0.1", "localhost", "::1")
 
 
@@ -68,24 +66,15 @@ class HostPort(NamedTuple):
 
 def updating_period(text: str) -> float:
     """Return an updating period in seconds, 0 for `adaptive`."""
-    return 0.0 if text == "adaptive" else _period(text, "neither 'adaptive' nor a")
+    return 0.0 if text == "adaptive" else fixed_updating_period(text, "neither 'adaptive' nor a")
 
 
-def fixed_updating_period(text: str) -> float:
-    """Return an updating period in seconds."""
-    return _period(text, "not a")
-
-
-def _period(text: str, what: str) -> float:
+def fixed_updating_period(text: str, what: str = "not a") -> float:
+    """Return an updating period in seconds; `what` goes before the span in the message about another text."""
     from coldloop.process.settings import settings_process
-    from coldloop.process.updating_periods import whole_ticks
 
     process = settings_process()
-    try:
-        ticks = whole_ticks(float(text), process.tick_s)
-    except ValueError:
-        ticks = None
-    if ticks is None or not SHORTEST_TICKS <= ticks <= process.ticks_per_sample:
+    if not SHORTEST_TICKS <= ticks_of(text, process.tick_s) <= process.ticks_per_sample:
         span = f"{SHORTEST_TICKS * process.tick_s:g} to {process.sampling_period_s:g} s"
         raise argparse.ArgumentTypeError(f"'{text}' is {what} multiple of {process.tick_s:g} s, a tick, from {span}")
     return float(text)
@@ -98,9 +87,31 @@ def number_within(text: str, least: int, most: float, what: str) -> int:
     return int(text)
 
 
+def ticks_of(text: str, tick_s: float) -> int:
+    """Return a time in seconds as ticks of `tick_s`; -1 where it is no number, or not whole ticks."""
+    from coldloop.process.updating_periods import whole_ticks
+
+    try:
+        ticks = whole_ticks(float(text), tick_s)
+    except ValueError:
+        ticks = None
+    return -1 if ticks is None else ticks
+
+
 def positive_count(text: str) -> int:
     """Return a number of things of an option, 1 at least."""
     return number_within(text, 1, math.inf, "a whole number of at least 1")
+
+
+def positive_number(most: float, what: str, text: str) -> float:
+    """Return a number of an option above 0, `most` at most; `what` is what the text is not where it is none."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value <= most:
+        raise argparse.ArgumentTypeError(f"'{text}' is not {what}")
+    return value
 
 
 def check_load(name: str | None) -> None:
@@ -143,12 +154,6 @@ def add_rig_options(parser: argparse.ArgumentParser, *, again: bool = False) -> 
                         help="first of its three ports in a row here, where several rigs are up")  # fmt: skip
     parser.add_argument("--tls", type="folder", default=default, metavar="FOLDER",
                         help="folder with the operator's certificate; known for a rig started here")  # fmt: skip
-
-
-def add_to_subcommands(what: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Declare the same options for subcommands, so that they are accepted before and after them."""
-    for subcommand in what.choices.values():
-        add_rig_options(subcommand, again=True)
 
 
 def add_loop_options(parser: argparse.ArgumentParser, loads: str) -> None:
@@ -217,9 +222,9 @@ def rig_endpoints(options: argparse.Namespace, settings: "OperatorSettings | Set
     from coldloop_rig.cosim.wiring import RigEndpoints
     from coldloop_rig.live.started_rigs import find_rig, ports_from, require_listener
 
-    _refuse_two_places(options)
+    first_port = first_port_here(options, anywhere=True)
     tls, folder = settings.rig.tls, options.tls
-    known = None if options.rig else find_rig(options.port_base)
+    known = None if options.rig else find_rig(first_port)
     ports = ports_from(options.port_base) if known is None else known.ports
     if not options.rig and known is None:
         require_listener(ports[0])
@@ -248,24 +253,20 @@ def rig_services(options: argparse.Namespace) -> tuple[str, ...]:
     return RigEndpoints._fields if known is None else tuple(known.services)
 
 
-def first_port_here(options: argparse.Namespace) -> int | None:
+def first_port_here(options: argparse.Namespace, *, anywhere: bool = False) -> int | None:
     """Return the first port of the rig on this machine that `add_rig_options` names, None for the only one.
 
     Raises:
-        UsageError: --rig and --port-base were both given, or the rig is on another machine.
+        UsageError: --rig and --port-base were both given, or the rig is on another machine and not `anywhere`.
     """
-    _refuse_two_places(options)
+    if options.rig and options.port_base:
+        raise UsageError("--rig and --port-base: give one of them")
     if not options.rig:
         return None if options.port_base is None else int(options.port_base)
     plant: HostPort = options.rig[0]
-    if plant.host not in LOOPBACK:
+    if plant.host not in LOOPBACK and not anywhere:
         raise UsageError(f"--rig {plant.host}:{plant.port}: kill and suspend services on their own machine only")
     return plant.port
-
-
-def _refuse_two_places(options: argparse.Namespace) -> None:
-    if options.rig and options.port_base:
-        raise UsageError("--rig and --port-base: give one of them")
 
 
 def _tls_site(folder: Path) -> dict[str, tuple[object, str]]:
@@ -289,14 +290,12 @@ def configuration(options: argparse.Namespace) -> "Configuration[Settings]":
 
     given: Mapping[str, Any] = vars(options)
     site = _tls_site(given["tls"]) if given.get("tls") is not None else {}
-    effective = load_configuration(
-        Settings,
-        file=options.config,
-        assignments=[*options.assignments, *given.get("further_assignments", ())],
-        options=site
-        | process_setting(options.assignments)
-        | {key: (given[name], flag) for name, (key, flag) in KEYS.items() if given.get(name) is not None},
-    )
+    keys = {
+        key: (given[name], f"--{name.replace('_', '-')}") for name, key in KEYS.items() if given.get(name) is not None
+    }
+    assignments = [*options.assignments, *given.get("further_assignments", ())]
+    own = site | process_setting(options.assignments) | keys
+    effective = load_configuration(Settings, file=options.config, assignments=assignments, options=own)
     if given.get("enforce"):
         from coldloop_rig.runs.running import enforced
 

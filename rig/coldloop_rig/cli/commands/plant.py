@@ -3,6 +3,7 @@
 import argparse
 import math
 import sys
+from functools import partial
 from importlib.metadata import entry_points
 from importlib.resources import files
 from pathlib import Path
@@ -11,10 +12,11 @@ from typing import TYPE_CHECKING, Final
 from coldloop.errors import UsageError
 from coldloop.service.command_line import add_configuration_options
 from coldloop.text import require_regular_file, whole_text
-from coldloop_rig.cli.commands.options import Command, check_load, configuration, fixed_updating_period, positive_count
+from coldloop_rig.cli.commands import options as common
 from coldloop_rig.text_tables import aligned, fitted, width
 
 if TYPE_CHECKING:
+    from coldloop.process.lti_model import LtiModel
     from coldloop_optimizer_plc.qp.problem import PredictiveProblem
     from coldloop_rig.settings import Settings
 
@@ -40,7 +42,14 @@ def execute_new(options: argparse.Namespace) -> int:
         place = files("coldloop_rig.process_file") / "template"
         texts = {name: (place / f"{name}.txt").read_text(encoding="utf-8") for name in FILES}
     else:
-        texts = _example(options.example)
+        examples = INSTALLED if INSTALLED.is_dir() else Path(__file__).parents[4] / "examples"
+        name = options.example
+        found = sorted(file for file in examples.rglob("*.*") if name in (file.parent.name, file.name[: len(name)]))
+        texts = {file.name: file.read_text(encoding="utf-8") for file in found if file.suffix != ".pyc"}
+        if not texts:
+            raise UsageError(
+                f"--example {name}: this installation has no examples; they are in the wheel and in a clone"
+            )
     present = next((name for name in texts if (folder / name).exists()), None)
     if present is not None:
         raise UsageError(f"{folder / present}: is there already; name another folder")
@@ -55,22 +64,13 @@ def execute_new(options: argparse.Namespace) -> int:
     return 0
 
 
-def _example(name: str) -> dict[str, str]:
-    folder = INSTALLED if INSTALLED.is_dir() else Path(__file__).parents[4] / "examples"
-    found = sorted(file for file in folder.rglob("*.*") if name in (file.parent.name, file.name[: len(name)]))
-    texts = {file.name: file.read_text(encoding="utf-8") for file in found if file.suffix != ".pyc"}
-    if not texts:
-        raise UsageError(f"--example {name}: this installation has no examples; they are in the wheel and in a clone")
-    return texts
-
-
 def _declare_process(parser: argparse.ArgumentParser) -> None:
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("file", type="read", nargs="?", metavar="FILE", help="process file (TOML)")
     what.add_argument("--keys", action="store_true", help="list the keys of process files, as Markdown")
     parser.add_argument("--out", type="write", metavar="MODEL",
                         help="write the model file; then --process MODEL, or the key model.file")  # fmt: skip
-    parser.add_argument("--limit", type=positive_count, default=300, metavar="SECONDS",
+    parser.add_argument("--limit", type=common.positive_count, default=300, metavar="SECONDS",
                         help="how long its plant may take, in a process of its own (default: 300)")  # fmt: skip
 
 
@@ -95,16 +95,19 @@ def execute_process(options: argparse.Namespace) -> int:
 
     def work() -> str:
         made = made_from(options.file)
-        if out is None:
-            return described(made)
-        try:
-            made.model.save(out)
-        except OSError as error:
-            raise UsageError(f"{out}: {error.strerror}; name a file that can be written with --out") from None
-        return f"{described(made)}written to {out}\n"
+        return described(made) if out is None else f"{described(made)}{_saved(made.model, out)}"
 
     sys.stdout.write(fitted(text_of_child(options.file, work, options.limit), width()))
     return 0
+
+
+def _saved(model: "LtiModel", out: Path) -> str:
+    """Write a model file; return the line that says so."""
+    try:
+        model.save(out)
+    except OSError as error:
+        raise UsageError(f"{out}: {error.strerror}; name a file that can be written with --out") from None
+    return f"written to {out}\n"
 
 
 def _declare_import(parser: argparse.ArgumentParser) -> None:
@@ -169,7 +172,7 @@ def execute_model(options: argparse.Namespace) -> int:
 
     if options.out is not None:
         require_regular_file(options.out)
-    settings = configuration(options).settings
+    settings = common.configuration(options).settings
     in_use = settings.model.file
     whole = settings.plant.kind is PlantKind.REFRIGERATOR
     plant = kind_named(PlantKind.REFRIGERATOR).read_plant_file(options.plant, settings.limits, whole=whole)
@@ -181,11 +184,7 @@ def execute_model(options: argparse.Namespace) -> int:
         raise UsageError(f"{options.plant or 'the reference plant'}: {error}") from None
     sys.stdout.write(text)
     if options.out is not None:
-        try:
-            model.save(options.out)
-        except OSError as error:
-            raise UsageError(f"{options.out}: {error.strerror}; name a file that can be written with --out") from None
-        sys.stdout.write(f"written to {options.out}\n")
+        sys.stdout.write(_saved(model, options.out))
     sys.stdout.flush()
     if options.plant is not None:  # a long search
         sys.stdout.write(
@@ -242,8 +241,10 @@ USUAL_SCENARIOS: Final = 100
 
 def _declare_budget(parser: argparse.ArgumentParser) -> None:
     add_configuration_options(parser)
+    power = partial(common.positive_number, sys.float_info.max, "a positive number")
+    percent = partial(common.positive_number, math.nextafter(100.0, 0.0), "a percentage above 0 and below 100")
     speed = parser.add_mutually_exclusive_group()
-    speed.add_argument("--power", type=_power, metavar="P",
+    speed.add_argument("--power", type=power, metavar="P",
                        help="one power relative to the paper's PLC (default: as configured)")  # fmt: skip
     speed.add_argument("--plc", type="name", metavar="PLC",
                        help="a PLC instead: a profile (TOML) or one that is shipped, and a sentence that says whether "
@@ -252,7 +253,7 @@ def _declare_budget(parser: argparse.ArgumentParser) -> None:
     add("--export", type="folder", metavar="FOLDER",
         help="what an export for a PLC costs: operations of its calls and bytes; with --plc also times there, and what"
         " does not fit")  # fmt: skip
-    add("--took", type=_power, metavar="US",
+    add("--took", type=power, metavar="US",
         help="with --export: a PLC took so many microseconds for the iterations of the solver's self-test; prints its"
         " profile")  # fmt: skip
     add("--list", action="store_true", help="list the shipped PLCs")
@@ -260,33 +261,15 @@ def _declare_budget(parser: argparse.ArgumentParser) -> None:
     add("--load", type="name", dest="loads", nargs="+", metavar="LOAD", default=[],
         help="with --plc: whether an adaptive updating period pays there under these loads, against --updating-period "
         "or the best fixed one")  # fmt: skip
-    add("--updating-period", dest="period", type=fixed_updating_period, metavar="SECONDS",
+    add("--updating-period", dest="period", type=common.fixed_updating_period, metavar="SECONDS",
         help="one updating period (default: a fifth, a half and all of a sampling period)")  # fmt: skip
-    add("--certify", type=positive_count, nargs="?", const=USUAL_SCENARIOS, metavar="N",
+    add("--certify", type=common.positive_count, nargs="?", const=USUAL_SCENARIOS, metavar="N",
         help="how many iterations are enough, by N sampled scenarios, with its confidence "
         f"(default: {USUAL_SCENARIOS})")  # fmt: skip
-    add("--tolerance", type=_percent, default=5.0, metavar="PERCENT",
+    add("--tolerance", type=percent, default=5.0, metavar="PERCENT",
         help="with --certify: enough is within this of the optimum (default: 5)")  # fmt: skip
-    add("--confidence", type=_percent, default=99.9, metavar="PERCENT",
+    add("--confidence", type=percent, default=99.9, metavar="PERCENT",
         help="with --certify: of the bounds (default: 99.9)")  # fmt: skip
-
-
-def _power(text: str) -> float:
-    return _number_below(math.inf, "a positive number", text)
-
-
-def _percent(text: str) -> float:
-    return _number_below(100.0, "a percentage above 0 and below 100", text)
-
-
-def _number_below(end: float, what: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < end:
-        raise argparse.ArgumentTypeError(f"'{text}' is not {what}")
-    return value
 
 
 def execute_budget(options: argparse.Namespace) -> int:
@@ -319,7 +302,7 @@ def _budget_text(options: argparse.Namespace) -> str:
 
         if any(value is not None for value in (options.power, options.plc, options.period)):
             raise UsageError("--certify: uses the configured PLC; leave out --power, --plc and --updating-period")
-        settings = configuration(options).settings
+        settings = common.configuration(options).settings
         return certification_table(settings, options.certify, options.tolerance, options.confidence)
     return _budget_tables(options)
 
@@ -334,9 +317,9 @@ def _budget_tables(options: argparse.Namespace) -> str:
     if len(set(options.loads)) < len(options.loads):
         raise UsageError("--load: a load is named twice; two of the same are no evidence")
     for name in options.loads:
-        check_load(name)
+        common.check_load(name)
     profile = None if options.plc is None else find_profile(options.plc)
-    settings = configuration(options).settings
+    settings = common.configuration(options).settings
 
     def costs(there: "Settings") -> str:
         if not options.loads:
@@ -364,13 +347,3 @@ def _budget_tables(options: argparse.Namespace) -> str:
         settings = with_power(settings, options.power)
     held, tables = certificate(settings), budget_tables(settings, options.period, executed)
     return f"{held}\n\n{tables}" if held else tables
-
-
-COMMANDS: Final = {
-    "new": Command(_declare_new, execute_new),
-    "process": Command(_declare_process, execute_process),
-    "import": Command(_declare_import, execute_import),
-    "budget": Command(_declare_budget, execute_budget),
-    "model": Command(_declare_model, execute_model),
-    "identify": Command(_declare_identify, execute_identify),
-}

@@ -5,6 +5,7 @@ import asyncio
 import signal
 import sys
 from collections.abc import Coroutine
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,7 +18,6 @@ from coldloop_rig.text_tables import coloured, cut, fitted, width
 
 if TYPE_CHECKING:
     from coldloop.process.declaration import Process
-    from coldloop.process.settings import InputLimits
     from coldloop_rig.live.status import Work
     from coldloop_rig.settings import Settings
 
@@ -80,6 +80,9 @@ def execute_up(options: argparse.Namespace) -> int:
     return 0
 
 
+_declare_down = common.add_rig_options
+
+
 def execute_down(options: argparse.Namespace) -> int:
     """Ends a rig that `coldloop up` has started here."""
     from coldloop_rig.live.started_rigs import take_down
@@ -129,7 +132,8 @@ def _declare_set(parser: argparse.ArgumentParser) -> None:
     what = parser.add_subparsers(title="what", metavar="WHAT", required=True)
     load = what.add_parser("load", help=number)
     load.add_argument("new_load", type="name", metavar="LOAD|FILE", help=f"{number} that begins now")
-    load.add_argument("--at", type=_plant_time, metavar="SECONDS", help="plant time at which it begins (default: now)")
+    load.add_argument("--at", type=_tick_at, default=0, metavar="SECONDS",
+                      help="plant time at which it begins (default: now)")  # fmt: skip
     load.set_defaults(document=_load)
     mode = what.add_parser("mode", help="who drives")
     mode.add_argument("mode", choices=("auto", "classical", "manual"), metavar="auto|classical|manual")
@@ -144,32 +148,28 @@ def _declare_set(parser: argparse.ArgumentParser) -> None:
     factor = what.add_parser("factor", help="seconds of plant time per second; also switches to real time")
     factor.add_argument("factor", type=float)
     factor.set_defaults(document=lambda options: {"kind": "factor", "factor": options.factor})
-    pause = what.add_parser("pause", help="pause plant time")
-    pause.set_defaults(document=lambda _: {"kind": "pause", "paused": True})
-    resume = what.add_parser("resume", help="resume plant time")
-    resume.set_defaults(document=lambda _: {"kind": "pause", "paused": False})
+    for word in ("pause", "resume"):
+        document = {"kind": "pause", "paused": word == "pause"}
+        what.add_parser(word, help=f"{word} plant time").set_defaults(document=lambda _, given=document: given)
     acknowledge = what.add_parser("acknowledge", help="an alarm, or all")
     acknowledge.add_argument("alarm", nargs="?", metavar="ALARM", help="such as mode (default: all)")
     acknowledge.set_defaults(document=_acknowledgement)
-    common.add_to_subcommands(what)
+    for each in what.choices.values():  # these options are accepted before and after a subcommand
+        common.add_rig_options(each, again=True)
 
 
 def _unit(process: "Process") -> str:
     return {"W": "watts"}.get(process.load.unit, process.load.unit)
 
 
-def _plant_time(text: str) -> float:
+def _tick_at(text: str) -> int:
     from coldloop.process.settings import settings_process
-    from coldloop.process.updating_periods import whole_ticks
 
     tick_s = settings_process().tick_s
-    try:
-        ticks = whole_ticks(float(text), tick_s)
-    except ValueError:
-        ticks = None
-    if ticks is None or not 0 <= ticks < LONGEST_TICKS:
+    ticks = common.ticks_of(text, tick_s)
+    if not 0 <= ticks < LONGEST_TICKS:
         raise argparse.ArgumentTypeError(f"'{text}' is not a number of seconds in multiples of {tick_s:g}")
-    return ticks * tick_s
+    return ticks
 
 
 def execute_set(options: argparse.Namespace) -> int:
@@ -181,59 +181,40 @@ def execute_set(options: argparse.Namespace) -> int:
 
 
 async def _send(options: argparse.Namespace) -> None:
+    from coldloop.operating.commands import SetSetpoint, read_command
+    from coldloop.operating.execution import WORK, check_bounds, stream_load
+    from coldloop.process.load_profile import read_load_file
     from coldloop_rig.live.status import ask
 
     settings = common.operator_settings(options)
-    services, work = _stream(options, settings.process) if _is_stream(options) else _command(options, settings.limits)
+    process, limits, document = settings.process, settings.limits, options.document(options)
+    services: tuple[str, ...] = ("plant",)
+    if document is None:  # a load file, which is written without a time limit
+        load = read_load_file(Path(options.new_load), process)
+        work: Work = partial(stream_load, load=load, tick=options.at, say=common.tell)
+    else:
+        command = read_command(document, process)
+        if isinstance(command, SetSetpoint):
+            check_bounds(command, limits.low[command.place], limits.high[command.place])
+        (services, execute), work = WORK[type(command)], lambda clients: execute(clients, command)
     there = common.rig_services(options)
     concerned = [service for service in services if service in there]
-    text = await ask(
-        common.rig_endpoints(options, settings), settings.process, concerned, work, limited=not _is_stream(options)
-    )
+    endpoints = common.rig_endpoints(options, settings)
+    text = await ask(endpoints, process, concerned, work, limited=document is not None)
     sys.stdout.write(f"{text}\n")
 
 
-def _command(options: argparse.Namespace, limits: "InputLimits") -> tuple[tuple[str, ...], "Work"]:
-    """Return the services that a command concerns, and what is done with them."""
-    from coldloop.operating.commands import SetSetpoint, read_command
-    from coldloop.operating.execution import WORK, check_bounds
-
-    command = read_command(options.document(options), limits.process)
-    if isinstance(command, SetSetpoint):
-        check_bounds(command, limits.low[command.place], limits.high[command.place])
-    services, work = WORK[type(command)]
-    return services, lambda clients: work(clients, command)
-
-
-def _stream(options: argparse.Namespace, process: "Process") -> tuple[tuple[str, ...], "Work"]:
-    from coldloop.operating.execution import stream_load
-    from coldloop.process.load_profile import read_load_file
-
-    if not Path(options.new_load).is_file():
-        raise UsageError(f"load '{options.new_load}': neither {_unit(process)} nor a file")
-    load = read_load_file(Path(options.new_load), process)
-    return ("plant",), lambda clients: stream_load(clients, load, _tick(options), common.tell)
-
-
-def _is_stream(options: argparse.Namespace) -> bool:
-    """Return whether a load file is written: that has no time limit."""
-    if options.document is not _load:
-        return False
-    try:
-        float(options.new_load)
-    except ValueError:
-        return True
-    return False
-
-
-def _load(options: argparse.Namespace) -> dict[str, object]:
-    return {"kind": "load", "watts": float(options.new_load), "tick": _tick(options)}
-
-
-def _tick(options: argparse.Namespace) -> int:
+def _load(options: argparse.Namespace) -> dict[str, object] | None:
+    """Return the command; None for a load file."""
     from coldloop.process.settings import settings_process
 
-    return 0 if options.at is None else round(options.at / settings_process().tick_s)
+    try:
+        return {"kind": "load", "watts": float(options.new_load), "tick": options.at}
+    except ValueError:
+        if not Path(options.new_load).is_file():
+            unit = _unit(settings_process())
+            raise UsageError(f"load '{options.new_load}': neither {unit} nor a file") from None
+        return None
 
 
 def _acknowledgement(options: argparse.Namespace) -> dict[str, object]:
@@ -260,29 +241,21 @@ def _declare_fault(parser: argparse.ArgumentParser) -> None:
     kill = what.add_parser("kill", help="kill a service (SIGKILL); `coldloop up` restarts it")
     kill.add_argument("service", choices=SERVICES, metavar="|".join(SERVICES))
     kill.set_defaults(fault=_kill)
+    real_time = partial(common.positive_number, 3600.0, "a number of seconds up to 3600")
     pause = what.add_parser("pause", help="suspend a service for a while")
     pause.add_argument("service", choices=SERVICES, metavar="|".join(SERVICES))
-    pause.add_argument("seconds", type=_real_time, help="duration in real time")
+    pause.add_argument("seconds", type=real_time, help="duration in real time")
     pause.set_defaults(fault=_pause)
     cut = what.add_parser("cut", help="cut a link for a while; needs a rig started with `up --cuttable`")
     cut.add_argument("link", choices=LINKS, metavar="|".join(LINKS), help="control PLC to plant, or optimiser to it")
-    cut.add_argument("seconds", type=_real_time, help="duration in real time")
+    cut.add_argument("seconds", type=real_time, help="duration in real time")
     cut.set_defaults(fault=_cut)
     sensor = what.add_parser("sensor", help="make a sensor fail: not a number, frozen, or a given value")
     sensor.add_argument("output", metavar="OUTPUT", help="its name")
     sensor.add_argument("shows", metavar="dead|stuck|VALUE|none", help="none ends the fault")
-    sensor.set_defaults(fault=_sensor)
-    common.add_to_subcommands(what)
-
-
-def _real_time(text: str) -> float:
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = 0.0
-    if not 0 < seconds <= 3600:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number of seconds up to 3600")
-    return seconds
+    sensor.set_defaults(fault=_send, document=_sensor_fault)
+    for each in what.choices.values():
+        common.add_rig_options(each, again=True)
 
 
 def execute_fault(options: argparse.Namespace) -> int:
@@ -318,24 +291,17 @@ async def _cut(options: argparse.Namespace) -> None:
     sys.stdout.write(f"the {options.link} link is cut for {options.seconds:g} s\n")
 
 
-async def _sensor(options: argparse.Namespace) -> None:
-    from coldloop.operating.commands import read_command
-    from coldloop.operating.execution import WORK
-    from coldloop_rig.live.status import ask
+def _sensor_fault(options: argparse.Namespace) -> dict[str, object]:
+    from coldloop.process.settings import settings_process
 
-    settings, shows = common.operator_settings(options), options.shows
-    process = settings.process
-    if options.output not in process.output_names:
-        raise UsageError(f"unknown output '{options.output}'; choose from {', '.join(process.output_names)}")
-    shown: dict[str, float] = {"fault": 3}
+    names, shows = settings_process().output_names, options.shows
+    if options.output not in names:
+        raise UsageError(f"unknown output '{options.output}'; choose from {', '.join(names)}")
     try:
-        shown |= {"fault": SENSOR_FAULTS[shows]} if shows in SENSOR_FAULTS else {"value": float(shows)}
+        shown = {"fault": SENSOR_FAULTS[shows]} if shows in SENSOR_FAULTS else {"fault": 3, "value": float(shows)}
     except ValueError:
         raise UsageError(f"'{shows}': a sensor shows {', '.join(SENSOR_FAULTS)}, or a value") from None
-    command = read_command({"kind": "sensor_fault", "output": options.output, **shown}, process)
-    services, work = WORK[type(command)]
-    text = await ask(common.rig_endpoints(options, settings), process, services, lambda clients: work(clients, command))
-    sys.stdout.write(f"{text}\n")
+    return {"kind": "sensor_fault", "output": options.output, **shown}
 
 
 def _declare_page(parser: argparse.ArgumentParser) -> None:
@@ -374,16 +340,6 @@ async def _watch(options: argparse.Namespace, settings: "Settings") -> None:
     pointed = pointed_at(settings.hmi, common.rig_endpoints(options, settings))
     section, login = with_own_files(pointed, make_own_folder(f"page-{pointed.port}"))
     common.say(f"http{'s' if section.https else ''}://{section.host}:{section.port}/")
-    if login is not None:
-        common.say(login.line.strip())
+    if login:
+        common.say(login.strip())
     await serve(HmiSettings(model=settings.model, hmi=section))
-
-
-COMMANDS: Final = {
-    "up": common.Command(_declare_up, execute_up),
-    "down": common.Command(common.add_rig_options, execute_down),
-    "status": common.Command(_declare_status, execute_status),
-    "set": common.Command(_declare_set, execute_set),
-    "fault": common.Command(_declare_fault, execute_fault),
-    "page": common.Command(_declare_page, execute_page),
-}

@@ -2,10 +2,9 @@
 
 import argparse
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING
 
 from coldloop.errors import NOT_FINITE, UsageError
 from coldloop.process.updating_periods import duration
@@ -13,10 +12,8 @@ from coldloop.service.command_line import add_configuration_options
 from coldloop_rig.cli.commands import options as common
 
 if TYPE_CHECKING:
-    from coldloop.process.declaration import Process
     from coldloop_rig.cosim.scenario import Job
     from coldloop_rig.figures.worker import FigureProcess
-    from coldloop_rig.results.recording import Sink
 
 
 def _declare_run(parser: argparse.ArgumentParser) -> None:
@@ -97,38 +94,14 @@ def _do(job: "Job", options: argparse.Namespace, figure: "FigureProcess") -> int
     claim_folder(out, force=options.force)
     sys.stdout.write("".join(f"{line}\n" for line in told))
     sys.stdout.flush()
-    with _progress(job) as sinks:
-        summary = run_into(out, job, plain_arguments(options), figure, sinks)
-    _tell(out, summary, job.effective.settings.process)
-    if not summary["failed_updates"]:
-        return 0
-    from coldloop.process.lti_model import load
-    from coldloop_rig.process_file.judgement import unheld
+    settings, progress = job.effective.settings, None
+    process = settings.process
+    if job.way is not Way.IN_PROCESS or job.scenario.ticks > 2400:  # in one process these ticks take half a second
+        from coldloop_rig.progress import RunProgress
 
-    failed, settings = summary["failed_updates"], job.effective.settings
-    sys.stderr.write("coldloop: " + "; ".join(filter(None, (
-        f"{failed} of {failed + summary['updates']} updates have no answer: what the optimiser computed is not finite",
-        unheld(settings.process.banded, load(settings.model.file).A),
-        "`coldloop docs fail-safe#no-answer`",
-    ))) + "\n")  # fmt: skip
-    return NOT_FINITE
-
-
-@contextmanager
-def _progress(job: "Job") -> "Iterator[list[Sink]]":
-    """Show a progress bar during the run; none in one process up to ten minutes of plant time, half a second."""
-    from coldloop_rig.results.recording import Way
-
-    if job.way is Way.IN_PROCESS and job.scenario.ticks <= 2400:
-        yield []
-        return
-    from coldloop_rig.progress import RunProgress
-
-    with RunProgress(job.scenario.ticks, job.effective.settings.process) as progress:
-        yield [progress]
-
-
-def _tell(out: Path, summary: dict[str, Any], process: "Process") -> None:
+        progress = RunProgress(job.scenario.ticks, process)
+    with progress or nullcontext():
+        summary = run_into(out, job, plain_arguments(options), figure, [progress] if progress else [])
     updates = "no updates"
     if summary["updates"]:
         updates = f"{summary['updates']} updates, tau_u {summary['tau_u_mean']:.2f} s on average over time"
@@ -140,6 +113,18 @@ def _tell(out: Path, summary: dict[str, Any], process: "Process") -> None:
         f"trace {summary['trace_sha256']}\n"
         f"results in {out}\n"
     )
+    if not summary["failed_updates"]:
+        return 0
+    from coldloop.process.lti_model import load
+    from coldloop_rig.process_file.judgement import unheld
+
+    failed = summary["failed_updates"]
+    sys.stderr.write("coldloop: " + "; ".join(filter(None, (
+        f"{failed} of {failed + summary['updates']} updates have no answer: what the optimiser computed is not finite",
+        unheld(process.banded, load(settings.model.file).A),
+        "`coldloop docs fail-safe#no-answer`",
+    ))) + "\n")  # fmt: skip
+    return NOT_FINITE
 
 
 def _declare_record(parser: argparse.ArgumentParser) -> None:
@@ -164,7 +149,7 @@ def execute_record(options: argparse.Namespace) -> int:
         ends = tuple(common.rig_endpoints(options, effective.settings))
         effective = as_attached(effective, ends)
         ticks = options.duration.ticks(effective.settings.process.tick_s)
-        job = Job(effective, session_under_way(effective, ends).scenario(ticks), Way.RECORDED, ends)
+        job = Job(effective, session_under_way(effective, ends, ticks), Way.RECORDED, ends)
         return _do(job, options, figure)
 
 
@@ -250,13 +235,3 @@ def execute_compare(options: argparse.Namespace) -> int:
         raise UsageError(f"{options.out}: exists; name another figure with --out, or overwrite with --force")
     sys.stdout.write(compare(options.runs, options.out))
     return 0
-
-
-COMMANDS: Final = {
-    "run": common.Command(_declare_run, execute_run),
-    "record": common.Command(_declare_record, execute_record),
-    "rerun": common.Command(_declare_rerun, execute_rerun),
-    "plot": common.Command(_declare_plot, execute_plot),
-    "report": common.Command(_declare_report, execute_report),
-    "compare": common.Command(_declare_compare, execute_compare),
-}
