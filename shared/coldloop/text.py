@@ -135,11 +135,6 @@ def require_regular_file(path: Path) -> None:
         raise UsageError(f"{path}: exists and is not a regular file; name another one")
 
 
-def draft_of(path: Path) -> Path:
-    """Return the name of a file until it is whole: another one for each process and thread."""
-    return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.{threading.get_native_id()}.draft")
-
-
 def whole_file(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` make the file under another name, then give it its own; others may do so at the same time."""
     require_regular_file(path)
@@ -186,7 +181,8 @@ def replace_file(path: Path, data: bytes, *, synced: bool = False, private: bool
 
 
 def _give_name(path: Path, write: Callable[[Path], object], draft: Path | None = None) -> None:
-    draft = draft or draft_of(path)
+    own = f"{socket.gethostname()}.{os.getpid()}.{threading.get_native_id()}"  # of this process and thread
+    draft = draft or path.with_name(f".{path.name}.{own}.draft")
     try:
         draft.unlink(missing_ok=True)  # left by a process of the same number; a link is not followed
         write(draft)
@@ -203,18 +199,14 @@ TOO_DEEP: Final = f"nested too deeply: more than {MOST_LEVELS} levels"
 TOO_MANY_DIGITS: Final = "a number has too many digits"
 
 
-def parsed_json(text: str | bytes, *, parse_constant: Callable[[str], object] | None = None) -> Any:  # noqa: ANN401
-    """Return what a JSON text holds.
-
-    Args:
-        text: The text; bytes are UTF-8, UTF-16 or UTF-32.
-        parse_constant: What `NaN`, `Infinity` and `-Infinity` are read by; floats by default.
+def parsed_json(text: str | bytes) -> Any:  # noqa: ANN401
+    """Return what a JSON text holds; bytes are UTF-8, UTF-16 or UTF-32.
 
     Raises:
         ValueError: It is not JSON, or beyond what can be read: a number of thousands of digits, too many levels.
     """
     try:
-        return _bounded(json.loads(text, parse_constant=parse_constant))  # noqa: TID251
+        return _bounded(json.loads(text))  # noqa: TID251
     except RecursionError:
         raise ValueError(TOO_DEEP) from None
 
@@ -276,12 +268,13 @@ def number_text(value: float, digits: int = 4) -> str:
     """Return a number with so many significant digits, at least those before the point."""
     if not math.isfinite(value):
         return str(value)
-    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
-    if float(mantissa) == 0.0:
+    text, exponent = f"{value:.{digits - 1}e}".split("e")
+    if float(text) == 0.0:
         return "0"
-    if int(exponent) in PLAIN:
-        return _trimmed(f"{value:.{max(0, digits - 1 - int(exponent))}f}")
-    return f"{_trimmed(mantissa)}e{int(exponent)}"
+    is_plain = int(exponent) in PLAIN
+    text = f"{value:.{max(0, digits - 1 - int(exponent))}f}" if is_plain else text
+    text = _unsigned_zero(text.rstrip("0").rstrip(".") if "." in text else text)
+    return text if is_plain else f"{text}e{int(exponent)}"
 
 
 def value_text(value: float, unit: str = "") -> str:
@@ -309,10 +302,6 @@ def axis_labels(marks: Sequence[float]) -> list[str]:
     while digits < 17 and any(abs(float(f"{mark:.{digits - 1}e}") - mark) > NEAR * step for mark in known):
         digits += 1
     return [number_text(mark, digits) for mark in marks]
-
-
-def _trimmed(text: str) -> str:
-    return _unsigned_zero(text.rstrip("0").rstrip(".") if "." in text else text)
 
 
 def _unsigned_zero(text: str) -> str:

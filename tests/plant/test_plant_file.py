@@ -139,8 +139,8 @@ TAMPERED: dict[str, tuple[Callable[[], object], str]] = {
     "unknown section": (lambda: {"precooler": {}}, "precooler: no such key"),
     "a number": (lambda: 5, "plant_parameters|TypeError"),
     "a list": (lambda: ["bath"], "model file"),
-    "null": (lambda: None, "TypeError"),
-    "nothing": (dict, "plant_parameters: no sections"),
+    "null": (lambda: None, "plant_parameters: Input should be a valid dictionary"),
+    "nothing": (dict, "plant_parameters: Dictionary should have at least 1 item"),
 }
 
 

@@ -49,7 +49,10 @@ class CacheFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._locks = _file_of_locks(path)
+        self._locks: int | None = None
+        if fcntl is not None:
+            with contextlib.suppress(OSError):  # another user's, who shares the folder
+                self._locks = os.open(path / LOCKS, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
 
     def read(self, name: str) -> bytes | None:
         """Return the content of a file, and note that it is used; None where there is none, or a damaged one."""
@@ -119,7 +122,10 @@ def find_cache_folder(name: str = NAME) -> Path:
         ConfigurationError: Others can write to the one that the environment names.
     """
     chosen = os.environ.get("COLDLOOP_CACHE_DIR")
-    for root in [Path(chosen)] if chosen else _usual_roots():
+    roots = [Path(tempfile.gettempdir()) / f"coldloop-cache-{os.getuid() if hasattr(os, 'getuid') else 0}"]
+    with contextlib.suppress(RuntimeError):  # a user without a home
+        roots.insert(0, Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "coldloop")
+    for root in [Path(chosen)] if chosen else roots:
         folder = root / name
         try:
             root.mkdir(mode=0o755, parents=True, exist_ok=True)
@@ -144,14 +150,6 @@ def find_cache_folder(name: str = NAME) -> Path:
     return Path(tempfile.mkdtemp(prefix=f"coldloop-{name}-"))
 
 
-def _usual_roots() -> list[Path]:
-    user = os.getuid() if hasattr(os, "getuid") else 0
-    roots = [Path(tempfile.gettempdir()) / f"coldloop-cache-{user}"]
-    with contextlib.suppress(RuntimeError):  # a user without a home
-        roots.insert(0, Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "coldloop")
-    return roots
-
-
 def _lets_others_write() -> bool:
     """Return whether everyone can write to new files of this process."""
     with _MASK:  # it is read by setting it
@@ -172,15 +170,6 @@ def _is_closed(folder: Path, *, sticky: bool = False) -> bool:
     status = folder.stat()
     by_others = status.st_mode & stat.S_IWOTH or (status.st_mode & stat.S_IWGRP and status.st_gid != os.getgid())
     return status.st_uid in (0, os.getuid()) and not (by_others and not (sticky and status.st_mode & stat.S_ISVTX))
-
-
-def _file_of_locks(folder: Path) -> int | None:
-    if fcntl is None:
-        return None
-    try:
-        return os.open(folder / LOCKS, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-    except OSError:  # another user's, who shares the folder
-        return None
 
 
 @dataclass

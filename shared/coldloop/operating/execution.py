@@ -16,26 +16,17 @@ from coldloop.operating.observer import read_alarms
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers import Maps, maps_of
+from coldloop.registers import plant as registers
 from coldloop.registers.codec import sealed
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
-from coldloop.registers.plant import (
-    AHEAD_STEPS,
-    LOAD_ROWS,
-    LiveLoad,
-    LoadAhead,
-    LoadStatus,
-    LoadStep,
-    SensorFault,
-    SensorFaultKind,
-)
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmState, alarms_of
 from coldloop.service.journal import alarm_word
 from coldloop.text import value_text
 
 R = TypeVar("R")
 LAST_TICK: Final = 2**32 - 1
-KEPT_AHEAD: Final = LOAD_ROWS
+KEPT_AHEAD: Final = registers.LOAD_ROWS
 """Steps that the plant is to know in advance; it keeps twice as many."""
 EFFECT_S: Final = 2.0
 """How long the effect of a command is waited for."""
@@ -117,15 +108,15 @@ class LoadStream:
         """
         if not self._sent:
             await self._send()
-        free = (await self._plant.read(LoadStatus)).free
-        while not self.done and free >= AHEAD_STEPS:
+        free = (await self._plant.read(registers.LoadStatus)).free
+        while not self.done and free >= registers.AHEAD_STEPS:
             free -= await self._send()
         return self._sent
 
     async def _send(self) -> int:
         """Write the next steps; return how many."""
-        some = slice(self._sent, self._sent + AHEAD_STEPS)
-        record = LoadAhead.first_of(self._session, self._times[some], self._watts[some])
+        some = slice(self._sent, self._sent + registers.AHEAD_STEPS)
+        record = registers.LoadAhead.first_of(self._session, self._times[some], self._watts[some])
         self._unanswered = record.length
         try:
             await self._plant.write(sealed(record, self._plant.map))
@@ -143,7 +134,7 @@ class LoadStream:
 
     async def was_replaced(self) -> bool:
         """Return whether another client has written the load since: the last step known is not the last one sent."""
-        status = await self._plant.read(LoadStatus)
+        status = await self._plant.read(registers.LoadStatus)
         if self._unanswered and status.last_tick == self._times[self._sent + self._unanswered - 1]:
             self._sent += self._unanswered  # the answer was lost, the request was not
         self._unanswered = 0
@@ -157,7 +148,10 @@ async def write_table(plant: RegisterClient, load: LoadProfile) -> int:
     Raises:
         LinkError: The plant does not answer, or refuses.
     """
-    steps = [LoadStep(*step) for step in zip(load.times[:LOAD_ROWS], load.watts[:LOAD_ROWS], strict=True)]
+    steps = [
+        registers.LoadStep(*step)
+        for step in zip(load.times[: registers.LOAD_ROWS], load.watts[: registers.LOAD_ROWS], strict=True)
+    ]
     await plant.write_rows(steps)
     return len(steps)
 
@@ -278,34 +272,27 @@ async def set_load(clients: Clients, command: commands.SetLoad) -> str:
 
     Raises:
         UsageError: It is to begin at a tick that has passed.
+        LinkError: The plant knows another load afterwards.
     """
     client = clients["plant"]
-    before, now = await client.read(LoadStatus), (await client.read(Identity)).tick
+    before, now = await client.read(registers.LoadStatus), (await client.read(Identity)).tick
     if 0 < command.tick <= now:
         raise UsageError(f"plant time is {now * client.process.tick_s:g} s already: name a later one")
-    await client.write(sealed(LiveLoad(command.tick, command.watts), client.map))
+    await client.write(sealed(registers.LiveLoad(command.tick, command.watts), client.map))
     status = await _read_until(
-        lambda: client.read(LoadStatus),
+        lambda: client.read(registers.LoadStatus),
         lambda status: bool(command.tick) or math.isclose(status.watts, command.watts, rel_tol=1e-6),
     )
-    return f"{_load_text(command, status)} (was {value_text(before.watts, command.process.load.unit)})"
-
-
-def _load_text(command: commands.SetLoad, status: LoadStatus) -> str:
-    """Return what the plant knows of a load that was written.
-
-    Raises:
-        LinkError: It knows another one.
-    """
     unit, tick_s = command.process.load.unit, command.process.tick_s
+    was = f"(was {value_text(before.watts, unit)})"
     if not status.upcoming:
-        return f"load {value_text(status.watts, unit)} now"
+        return f"load {value_text(status.watts, unit)} now {was}"
     if command.tick and status.last_tick != command.tick:
         raise LinkError(f"the load from {command.tick * tick_s:g} s on is different: another client has overwritten it")
     text = f"load {value_text(command.watts, unit)} from {status.last_tick * tick_s:g} s on"
     if status.next_tick == status.last_tick:
-        return text
-    return f"{text}, before it {value_text(status.next_watts, unit)} from {status.next_tick * tick_s:g} s on"
+        return f"{text} {was}"
+    return f"{text}, before it {value_text(status.next_watts, unit)} from {status.next_tick * tick_s:g} s on {was}"
 
 
 async def play_load(clients: Clients, command: commands.PlayLoad) -> str:
@@ -352,7 +339,7 @@ async def _stream(plant: RegisterClient, load: LoadProfile, tick: int) -> tuple[
 
 
 async def _streamed(plant: RegisterClient, stream: LoadStream, begin: int) -> str:
-    status, tick_s = await plant.read(LoadStatus), plant.process.tick_s
+    status, tick_s = await plant.read(registers.LoadStatus), plant.process.tick_s
     times = f"{begin * tick_s:g} s to {status.last_tick * tick_s:g} s"
     return f"load of {stream.steps} steps from {times}; its last value is held"
 
@@ -453,9 +440,9 @@ def _names(kinds: Sequence[int], process: Process) -> str:
 async def fault_sensor(clients: Clients, command: commands.FaultSensor) -> str:
     """Put a fault into a sensor."""
     client, row = clients["plant"], command.process.output_names.index(command.output)
-    await client.write_rows([SensorFault(command.fault, command.value)], row)
-    (back,) = await client.read_rows(SensorFault, row, 1)
-    return f"sensor of {command.output}: {SensorFaultKind(back.kind).word}"
+    await client.write_rows([registers.SensorFault(command.fault, command.value)], row)
+    (back,) = await client.read_rows(registers.SensorFault, row, 1)
+    return f"sensor of {command.output}: {registers.SensorFaultKind(back.kind).word}"
 
 
 async def set_pace(clients: Clients, command: commands.SetFactor | commands.SetPaused) -> str:

@@ -127,7 +127,14 @@ class SampleReader:
             first = self.read_until
             until = min(last, first + REQUESTS_AT_ONCE)
             samples = await read_ring(self._client, PlantSample, HISTORY_ROWS, first, until - 1)
-            await self._read_stations(first, until)
+            if self.has_station is None:  # the first row that is read decides
+                (station,) = await read_ring(self._client, StationSample, STATION_ROWS, first, first)
+                self.has_station = any(station.signals)
+            if self.has_station:
+                rows = await read_ring(self._client, StationSample, STATION_ROWS, first, until - 1)
+                for tick, station in enumerate(rows, first):
+                    if any(station.signals) and station.tick == tick:
+                        self._subscriber.station(station)
             for tick, sample in enumerate(samples, first):
                 if sample.tick == tick:
                     self._subscriber.sample(sample)
@@ -137,18 +144,6 @@ class SampleReader:
                         "choose a lower --factor"
                     )
                 self.read_until = tick + 1
-
-    async def _read_stations(self, first: int, until: int) -> None:
-        """Read what goes with ticks, if the plant is a whole refrigerator: the first row that is read decides."""
-        if self.has_station is None:
-            (station,) = await read_ring(self._client, StationSample, STATION_ROWS, first, first)
-            self.has_station = any(station.signals)
-        if not self.has_station:
-            return
-        stations = await read_ring(self._client, StationSample, STATION_ROWS, first, until - 1)
-        for tick, station in enumerate(stations, first):
-            if any(station.signals) and station.tick == tick:
-                self._subscriber.station(station)
 
 
 class UpdateReader:

@@ -27,6 +27,10 @@ MOST_SIGNALS: Final = 32
 """Outputs at most: registers have a bit for each."""
 
 
+def _each(signals: str, attribute: str) -> cached_property[tuple[str, ...]]:
+    return cached_property(lambda process: tuple(getattr(one, attribute) for one in getattr(process, signals)))
+
+
 class Process(sections.Section):
     """A process with its time, its signals and its control problem: a value, equal to any of the same content."""
 
@@ -142,35 +146,18 @@ class Process(sections.Section):
     def __hash__(self) -> int:
         return hash(self.content)
 
-    @cached_property
-    def input_names(self) -> tuple[str, ...]:
-        """In the order of the inputs, which is that of u."""
-        return tuple(one.name for one in self.inputs)
-
-    @cached_property
-    def input_units(self) -> tuple[str, ...]:
-        """In the same order."""
-        return tuple(one.unit for one in self.inputs)
-
-    @cached_property
-    def output_names(self) -> tuple[str, ...]:
-        """In the order of the outputs, which is that of y."""
-        return tuple(one.name for one in self.outputs)
-
-    @cached_property
-    def output_units(self) -> tuple[str, ...]:
-        """In the same order."""
-        return tuple(one.unit for one in self.outputs)
-
-    @cached_property
-    def state_names(self) -> tuple[str, ...]:
-        """In the order of the states, which is that of x."""
-        return tuple(one.name for one in self.states)
-
-    @cached_property
-    def state_units(self) -> tuple[str, ...]:
-        """In the same order."""
-        return tuple(one.unit for one in self.states)
+    input_names = _each("inputs", "name")
+    """In the order of the inputs, which is that of u."""
+    input_units = _each("inputs", "unit")
+    """In the same order."""
+    output_names = _each("outputs", "name")
+    """In the order of the outputs, which is that of y."""
+    output_units = _each("outputs", "unit")
+    """In the same order."""
+    state_names = _each("states", "name")
+    """In the order of the states, which is that of x."""
+    state_units = _each("states", "unit")
+    """In the same order."""
 
     @cached_property
     def controlled(self) -> tuple[int, ...]:

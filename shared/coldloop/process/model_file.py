@@ -8,9 +8,9 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
-from pydantic import ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 from coldloop.errors import ModelFileError
 from coldloop.process.cold_box import COLD_BOX as THE_COLD_BOX
@@ -20,6 +20,7 @@ from coldloop.text import parsed_json, read_bytes, whole_text
 FORMAT = 1
 REMEDY = "make a new one with `python -m coldloop_plant.cold_box.model FILE`"
 PROCESS_REMEDY: Final = "make one with `coldloop process FILE --out MODEL`"
+VECTORS = ("x0", "u0", "y0")
 COLD_BOX = "cold-box"
 """The plant of a model file that names none."""
 
@@ -44,11 +45,11 @@ class ModelDescription:
     """Plant that the model was made of."""
     note: str = ""
     """Source of the model, if not the plant's equations."""
-    plant_parameters: dict[str, Any] = field(default_factory=dict)
+    plant_parameters: Annotated[dict[str, Any], Field(min_length=1)] = field(default_factory=dict)
     """The plant's parameters by section, as in a plant file; none are those of the reference plant."""
     process: dict[str, Any] = field(default_factory=dict)
     """`coldloop.process.declaration.Process` as plain data; none is the cold box."""
-    plant_rest: dict[str, Any] = field(default_factory=dict)
+    plant_rest: Annotated[dict[str, Any], Field(min_length=1)] = field(default_factory=dict)
     """A refrigerator's operating point, and the gains of its pressure controller; none are those that are shipped."""
     declaration_digest: str = ""
     """SHA-256 of the process file that it was made from, and of the files that this names; empty: of none."""
@@ -125,31 +126,21 @@ def process_in(declared: Mapping[str, Any], where: str, remedy: str) -> Process:
         raise ModelFileError(f"{where}: {place} {said}; {remedy}") from None
 
 
+_HEADER: Final = TypeAdapter(ModelHeader)
+
+
 def header_of(document: dict[str, Any], path: Path) -> ModelHeader:
     """Return the header part of a document that `read_document` has verified; `path` is for the message."""
     try:
-        described: dict[str, Any] = {name: str(document[name]) for name in TEXTS}
-        described |= {name: tuple(str(text) for text in document[name]) for name in LISTS_OF_TEXT}
-        described |= {name: tuple(float(number) for number in document[name]) for name in VECTORS}
-        described |= {"plant": str(document.get("plant", COLD_BOX)), "note": str(document.get("note", ""))}
-        described["declaration_digest"] = str(document.get("declaration_digest", ""))
-        described |= {name: _sections(document, name) for name in ("plant_parameters", "plant_rest")}
-        described["process"] = dict(document.get("process", {}))
-        header = ModelHeader(w0=float(document["w0"]), file=path, **described)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise ModelFileError(f"{path}: {error!r} in the model file; {REMEDY}") from error
-    for kind, values in zip(KINDS, (header.x0, header.u0, header.y0), strict=True):
+        header = _HEADER.validate_python({**document, "file": path})
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ModelFileError(f"{path}: {first['loc'][0]}: {first['msg']} in the model file; {REMEDY}") from None
+    for kind, values in (("state", header.x0), ("input", header.u0), ("output", header.y0)):
         names, units = getattr(header, f"{kind}_names"), getattr(header, f"{kind}_units")
         if not len(names) == len(units) == len(values):
             raise ModelFileError(f"{path}: {kind} names, units and values differ in number; {REMEDY}")
     return header
-
-
-def _sections(document: dict[str, Any], name: str) -> dict[str, Any]:
-    sections = document.get(name, {})
-    if name in document and not (isinstance(sections, dict) and sections):
-        raise TypeError(f"{name}: no sections")
-    return dict(sections)
 
 
 def read_document(path: Path, remedy: str = REMEDY) -> dict[str, Any]:
@@ -163,7 +154,7 @@ def read_document(path: Path, remedy: str = REMEDY) -> dict[str, Any]:
             raise ModelFileError(f"{path}: no such model file; {remedy}")
         if path.suffix == ".toml":
             raise ModelFileError(f"{path}: a process file; `coldloop process FILE --out MODEL` makes its model file")
-        document = parsed_json(read_bytes(path, remedy, ModelFileError), parse_constant=_refuse)
+        document = parsed_json(read_bytes(path, remedy, ModelFileError))
     except (OSError, ValueError) as error:
         raise ModelFileError(f"{path}: not a readable model file ({error}); {remedy}") from error
     if not isinstance(document, dict) or document.get("format") != FORMAT:
@@ -194,13 +185,3 @@ def digest_of(document: dict[str, Any]) -> str:
     content = {name: value for name, value in document.items() if name != "digest"}
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(canonical.encode()).hexdigest()
-
-
-def _refuse(constant: str) -> float:
-    raise ValueError(f"{constant} is not finite")
-
-
-TEXTS = ("digest", "parameters_digest", "load_name", "load_unit")
-VECTORS = ("x0", "u0", "y0")
-KINDS = ("state", "input", "output")
-LISTS_OF_TEXT = tuple(f"{kind}_{what}" for kind in KINDS for what in ("names", "units"))

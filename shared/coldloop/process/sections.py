@@ -45,6 +45,10 @@ def _near(given: float | None, usual: float, what: str) -> None:
                          f"{usual:g}: single precision loses the other terms of the cost")  # fmt: skip
 
 
+def _width(span: Limits) -> float:
+    return span[1] - span[0]
+
+
 def _rising(span: Range, what: str) -> None:
     if span[0] >= span[1]:
         raise ValueError(f"{what}: give the lower end first")
@@ -116,11 +120,6 @@ def _edges(given: dict[str, Any]) -> Range | None:
     return given["band"] if setpoint is None else (setpoint - tolerance, setpoint + tolerance)
 
 
-def _usual_tolerance(given: dict[str, Any]) -> float | None:
-    low, high = given["range"]
-    return None if given["setpoint"] is None or high <= low else 0.01 * (high - low)
-
-
 def _usual_penalty(given: dict[str, Any]) -> float | None:
     edges = _edges(given)
     if edges is None or edges[0] >= edges[1]:
@@ -152,7 +151,9 @@ class Output(Section):
     """Band that it is to be kept within."""
     setpoint: FiniteFloat | None = None
     """Setpoint that it is to be kept at, instead of a band."""
-    tolerance: PositiveFloat | None = Field(default_factory=_usual_tolerance)
+    tolerance: PositiveFloat | None = Field(
+        default_factory=lambda given: None if given["setpoint"] is None else 0.01 * _width(given["range"])
+    )
     """Deadband on either side of the setpoint, for indicators, figures and alarms; 1 % of `range` if not given."""
     penalty: PositiveFloat | None = Field(default_factory=_usual_penalty)
     """rho, per square of what band or setpoint is missed by and sample; if not given 1 over the square of a twentieth
@@ -258,7 +259,7 @@ class Outside(Section):
     """At the operating point."""
     span: Limits
     """Within which it stays."""
-    walk: PositiveFloat = Field(default_factory=lambda given: 0.01 * (given["span"][1] - given["span"][0]))
+    walk: PositiveFloat = Field(default_factory=lambda given: 0.01 * _width(given["span"]))
     """Random walk that the estimator expects of the part of the load that is not measured, per square root of a
     sampling period; 1 % of the span if not given."""
     forecast: str | None = None

@@ -208,14 +208,12 @@ class InputLimits(ProcessSettings):
         return self
 
 
-def _named(value: object) -> object:
-    return SHIPPED_MODELS.get(value, value) if isinstance(value, str) else value
-
-
 class ModelSettings(BaseModel, frozen=True, extra="forbid"):
     """The LTI model file, downloaded into both PLCs."""
 
-    file: Annotated[Path, BeforeValidator(_named)] = made_by(_MODEL.get)
+    file: Annotated[
+        Path, BeforeValidator(lambda given: SHIPPED_MODELS.get(given, given) if isinstance(given, str) else given)
+    ] = made_by(_MODEL.get)
     """A file, or `cold-box` or `refrigerator` for one that is shipped. It says which process it is."""
 
 

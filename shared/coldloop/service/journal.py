@@ -226,20 +226,8 @@ class _Words:
             AlarmKind.CERTIFICATE: _listed(("", "expires soon", "has expired", "unreadable")),
         }
         suppression = _Wording(self.alarm_word, cause=lambda _: "")  # of an alarm that may never have been raised
+        unit = process.load.unit
         self.wordings: dict[int, _Wording] = {
-            **self._wordings(inputs, outputs), **dict.fromkeys(OF_ALARMS, _Wording(self.alarm_word)),
-            **dict.fromkeys(SUPPRESSIONS, suppression), EventKind.ALARM_SHELVED: suppression._replace(unit="s"),
-        }  # fmt: skip
-
-    def alarm_word(self, number: int) -> str:
-        return self.alarms.get(number, str(number))
-
-    def _time_out(self, ticks: int) -> str:
-        return f"{ticks * self.process.tick_s:g} s" if ticks else "off"
-
-    def _wordings(self, inputs: Words, outputs: Words) -> dict[int, _Wording]:
-        unit = self.process.load.unit
-        return {
             EventKind.MODE: _Wording(control_plc.Mode.word_of, _causes(control_plc.Cause)),
             EventKind.BOOT: _Wording(
                 _listed(("fresh", "with a retained state")), _listed(("", "the previous state was set aside"))
@@ -262,7 +250,16 @@ class _Words:
             EventKind.MODEL_RANGE: _Wording(_listed(flag_words(ModelRange)), _listed(("returned", "left"))),
             EventKind.COOL_DOWN: _Wording(control_plc.CoolDownStep.word_of),
             EventKind.PACE: _Wording(_texts(TimeBaseKind), unit="x real time"),
+            **dict.fromkeys(OF_ALARMS, _Wording(self.alarm_word)),
+            **dict.fromkeys(SUPPRESSIONS, suppression),
+            EventKind.ALARM_SHELVED: suppression._replace(unit="s"),
         }
+
+    def alarm_word(self, number: int) -> str:
+        return self.alarms.get(number, str(number))
+
+    def _time_out(self, ticks: int) -> str:
+        return f"{ticks * self.process.tick_s:g} s" if ticks else "off"
 
 
 _words_of: Final = cache(_Words)

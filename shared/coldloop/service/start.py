@@ -12,11 +12,11 @@ import io
 import json
 import logging
 import os
+import queue
 import signal
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from datetime import UTC, datetime
 from typing import Any, Final, TextIO, TypeVar
@@ -35,70 +35,6 @@ FLUSH_S: Final = 1.0
 """How long the end of a program waits for the reader of its lines."""
 
 Write = Callable[[str], object]
-
-
-class LineWriter:
-    """A bounded queue of lines and the thread that writes them.
-
-    Args:
-        write: Writes one line; it may block, and is called by the thread alone.
-        capacity: Lines that may wait.
-
-    Attributes:
-        dropped: Lines that found the queue full, since the start.
-    """
-
-    def __init__(self, write: Write, capacity: int = CAPACITY) -> None:
-        self.dropped = 0
-        self._write = write
-        self._capacity = capacity
-        self._lines: deque[str] = deque()
-        self._changed = threading.Condition()
-        self._writing = self._closed = False
-        # A daemon: the interpreter does not wait for it at the end, when it may be blocked for good.
-        threading.Thread(target=self._run, name="log lines", daemon=True).start()
-
-    def put(self, line: str) -> bool:
-        """Let a line be written after those before it; return False when it was dropped instead."""
-        with self._changed:
-            if self._closed or len(self._lines) >= self._capacity:
-                self.dropped += 1
-                return False
-            self._lines.append(line)
-            self._changed.notify_all()
-            return True
-
-    def flush(self, within_s: float = FLUSH_S) -> bool:
-        """Wait until all lines are written; return whether they were, in time."""
-        end = time.monotonic() + within_s
-        with self._changed:
-            while self._lines or self._writing:
-                if not self._changed.wait(end - time.monotonic()):
-                    return False
-        return True
-
-    def close(self, within_s: float = FLUSH_S) -> bool:
-        """Take no more lines, and flush."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-        return self.flush(within_s)
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._lines or self._closed)
-                if not self._lines:
-                    return
-                self._writing, line = True, self._lines.popleft()
-            try:
-                self._write(line)
-            except (OSError, ValueError):  # the reader has gone, or the stream is closed
-                with self._changed:
-                    self.dropped += 1
-            with self._changed:
-                self._writing = False
-                self._changed.notify_all()
 
 
 def to_stream(stream: TextIO) -> Write:
@@ -179,17 +115,31 @@ class FloodFilter(logging.Filter):
 
 
 class QueueingHandler(logging.Handler):
-    """Formats records into the queue of a writer."""
+    """Formats records into a bounded queue of lines, which a thread writes.
 
-    def __init__(self, writer: LineWriter) -> None:
+    Args:
+        write: Writes one line; it may block, and is called by the thread alone.
+    """
+
+    def __init__(self, write: Write) -> None:
         super().__init__()
-        self.writer = writer
+        self._write = write
+        self._lines: queue.Queue[str | None] = queue.Queue(CAPACITY)
+        self._refused = self._unread = 0
         self._told = 0
         """Number of dropped lines that a later line has reported."""
+        self._is_closed = False
+        # A daemon: the interpreter does not wait for it at the end, when it may be blocked for good.
+        threading.Thread(target=self._run, name="log lines", daemon=True).start()
+
+    @property
+    def dropped(self) -> int:
+        """Lines that found the queue full, or no reader, since the start."""
+        return self._refused + self._unread
 
     def emit(self, record: logging.LogRecord) -> None:
         """Let a record be written; called with the handler's lock held."""
-        dropped = self.writer.dropped
+        dropped = self.dropped
         if dropped > self._told:
             record.dropped = dropped - self._told
         try:
@@ -198,19 +148,47 @@ class QueueingHandler(logging.Handler):
             about = {"name": record.name, "levelname": record.levelname, "created": record.created}
             what = {"msg": "a record cannot be formatted", "reason": repr(error), "text": str(record.msg)}
             line = self.format(logging.makeLogRecord({**about, **what}))
-        if self.writer.put(line):
+        if self.put(line):
             self._told = dropped
+
+    def put(self, line: str) -> bool:
+        """Let a line be written after those before it; return False when it was dropped instead."""
+        with contextlib.suppress(queue.Full):
+            if not self._is_closed:
+                self._lines.put_nowait(line)
+                return True
+        self._refused += 1
+        return False
+
+    def _run(self) -> None:
+        line: str | None = ""
+        while line is not None:
+            line = self._lines.get()
+            try:
+                if line is not None:
+                    self._write(line)
+            except (OSError, ValueError):  # the reader has gone, or the stream is closed
+                self._unread += 1
+            self._lines.task_done()
+
+    def is_written(self, within_s: float = FLUSH_S) -> bool:
+        """Wait until all lines are written; return whether they were, in time."""
+        with self._lines.all_tasks_done:
+            return self._lines.all_tasks_done.wait_for(lambda: not self._lines.unfinished_tasks, within_s)
 
     def flush(self) -> None:
         """Wait until all is written, for a bounded time."""
-        self.writer.flush()
+        self.is_written()
 
     def close(self) -> None:
-        """Write what waits, for a bounded time, and end the writer."""
-        if self.writer.flush() and self.writer.dropped > self._told:
-            last = {"name": log.name, "levelno": logging.WARNING, "levelname": "WARNING", "msg": "lines dropped"}
-            self.handle(logging.makeLogRecord(last))
-        self.writer.close(LAST_LINE_S)
+        """Write what waits, for a bounded time, and end the thread."""
+        if not self._is_closed:
+            if self.is_written() and self.dropped > self._told:
+                last = {"name": log.name, "levelno": logging.WARNING, "levelname": "WARNING", "msg": "lines dropped"}
+                self.handle(logging.makeLogRecord(last))
+            self._is_closed = True
+            if self.is_written(LAST_LINE_S):
+                self._lines.put_nowait(None)
         super().close()
 
 
@@ -220,7 +198,7 @@ _handlers: list[QueueingHandler] = []
 
 def set_up_logs(service: str, level: str, stream: TextIO = sys.stderr) -> None:
     """Send the logs of this process, from `level` up, to `stream`."""
-    handler = QueueingHandler(LineWriter(to_stream(stream)))
+    handler = QueueingHandler(to_stream(stream))
     handler.setFormatter(JsonFormatter(service))
     handler.addFilter(FloodFilter())
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
@@ -229,14 +207,14 @@ def set_up_logs(service: str, level: str, stream: TextIO = sys.stderr) -> None:
 
 def dropped() -> int:
     """Return how many lines of this process were dropped, because those before them were not read."""
-    return sum(handler.writer.dropped for handler in _handlers)
+    return sum(handler.dropped for handler in _handlers)
 
 
 def end_logs(last_line: str | None = None) -> None:
     """Write a last line of plain text, if there is one, and what waits before it; for a bounded time."""
     for handler in _handlers:
         if last_line is not None:
-            handler.writer.put(last_line)
+            handler.put(last_line)
         handler.close()
 
 
