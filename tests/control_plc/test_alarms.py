@@ -325,10 +325,10 @@ def test_what_happened_at_an_instant_passes_by_also_over_a_restart_and_a_new_ses
     panel.now = 1000
     panel.pulse(AlarmKind.ACCESS_REFUSED)
     again = AlarmPanel(Journal())
-    again.begin_at(1010)
+    again.now = 1010
     again.restore(panel.rows)
     for board, start in ((again, 1010), (panel, 0)):
-        board.begin_at(start)
+        board.now = start
         board.pass_by()
         assert board.rows[AlarmKind.ACCESS_REFUSED].active
         board.now = start + 241
@@ -343,7 +343,7 @@ def test_a_restart_keeps_states_and_shelving_and_takes_the_priorities_of_the_con
     until = shelve(panel, 60)
     again = AlarmPanel(Journal(), AlarmSettings.model_validate({"rules": {NAME: {"priority": "critical"}}}))
     again.restore(panel.rows)
-    again.begin_at(1010)
+    again.now = 1010
     assert again.rows[KIND] == panel.rows[KIND]._replace(priority=AlarmPriority.CRITICAL)
     again.now = until
     again.pass_by()

@@ -281,7 +281,7 @@ async def test_certificates_that_cannot_be_read_for_a_while_end_nothing(
     monkeypatch.setattr("coldloop_control_plc.runtime.CERTIFICATES_S", 0.01)
     tls = {"certificate": certificate, "key": tmp_path / "key", "ca": tmp_path / "ca"}
     async with running(control_plc={"server": {"tls": tls}}) as plc:
-        watching = asyncio.create_task(plc.certificates.run())
+        watching = asyncio.create_task(plc.watch_certificates())
         await until(lambda: plc.bank.get(Alarm, AlarmKind.CERTIFICATE).cause == EXPIRES_SOON)
         content = certificate.read_bytes()
         certificate.unlink()

@@ -4,7 +4,7 @@ import pytest
 
 from coldloop.modbus.requests import MAX_READ_WORDS, MAX_READ_WRITE_WORDS
 from coldloop.registers.common import IDENTITY_BLOCK, Identity
-from coldloop.registers.declaration import Block, Kind, RegisterMap, Role, f32, f32_array, fields_of, u16, u32
+from coldloop.registers.declaration import Block, Kind, RegisterMap, Role, f32, fields_of, u16, u32
 from coldloop.registers.plant import Measurement
 from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP
 
@@ -15,7 +15,7 @@ each_map = pytest.mark.parametrize("register_map", MAPS, ids=lambda register_map
 class Oven(NamedTuple):
     switch: Annotated[int, u16("On", high=1)]
     clock: Annotated[int, u32("Clock", unit="s")]
-    walls: Annotated[tuple[float, ...], f32_array("Temperature", ("left", "right"), ("K", "C"))]
+    walls: Annotated[tuple[float, ...], f32("Temperature", elements=("left", "right"), units=("K", "C"))]
     target: Annotated[float, f32("Setpoint", unit="K", low=4, high=400)]
 
 

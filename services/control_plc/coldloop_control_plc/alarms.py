@@ -20,21 +20,10 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, FiniteFl
 from coldloop.process.declaration import Process
 from coldloop.process.sections import Range
 from coldloop.process.settings import ProcessSettings, declared, settings_process, stretched, within
+from coldloop.registers import safety
 from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Cause, Mode
-from coldloop.registers.safety import (
-    ALL_ALARMS,
-    Alarm,
-    AlarmAction,
-    AlarmCommand,
-    AlarmKind,
-    AlarmPriority,
-    AlarmState,
-    CapacityCause,
-    alarm_key,
-    alarms_of,
-    band_alarms,
-)
+from coldloop.registers.safety import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmPriority, AlarmState
 from coldloop.service.journal import Journal
 from coldloop_control_plc.output_limits import Numbers
 
@@ -87,7 +76,7 @@ DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
 
 def _known_name(name: str) -> str:
     process = settings_process()
-    known = [alarm_key(alarm, process) for alarm in alarms_of(process)]
+    known = [safety.alarm_key(alarm, process) for alarm in safety.alarms_of(process)]
     if name.lower() not in known:
         raise ValueError(f"unknown alarm '{name}'; choose from {', '.join(known)}")
     return name.lower()
@@ -165,14 +154,14 @@ class AlarmSettings(ProcessSettings):
 
     def rule(self, alarm: int) -> AlarmRule:
         """Return how an alarm is treated."""
-        is_band = alarm in band_alarms(self.process)
+        is_band = alarm in safety.band_alarms(self.process)
         default = DEFAULT_RULES[AlarmKind.FIRST_BAND if is_band else AlarmKind(alarm)]
         if alarm == AlarmKind.CAPACITY:
             stretch = self.process.stretch
             default = AlarmRule(default.priority, default.on_delay_s * stretch, default.off_delay_s * stretch)
         if is_band:
             default = default._replace(on_delay_s=self.band_delay_s)
-        return self.rules.get(alarm_key(alarm, self.process), RuleSettings()).changed(default)
+        return self.rules.get(safety.alarm_key(alarm, self.process), RuleSettings()).changed(default)
 
     def shelving_ticks(self, asked_s: int) -> int:
         """Return how long an alarm is shelved when so many seconds are asked for; 0 asks for the default."""
@@ -183,41 +172,36 @@ class AlarmSettings(ProcessSettings):
         return math.ceil(seconds / self.process.tick_s - 1e-9)
 
 
+SET_ASIDE: Final = {
+    EventKind.ALARM_SHELVED: AlarmState.SHELVED,
+    EventKind.ALARM_OUT_OF_SERVICE: AlarmState.OUT_OF_SERVICE,
+}
+"""Transitions of an alarm in service; one that is shelved is shelved for another time."""
 TRANSITIONS: Final[Mapping[AlarmState, Mapping[EventKind, AlarmState]]] = {
-    AlarmState.NORMAL: {
-        EventKind.ALARM_RAISED: AlarmState.UNACKNOWLEDGED,
-        EventKind.ALARM_SHELVED: AlarmState.SHELVED,
-        EventKind.ALARM_OUT_OF_SERVICE: AlarmState.OUT_OF_SERVICE,
-    },
+    AlarmState.NORMAL: {EventKind.ALARM_RAISED: AlarmState.UNACKNOWLEDGED, **SET_ASIDE},
     AlarmState.UNACKNOWLEDGED: {
         EventKind.ALARM_RAISED: AlarmState.UNACKNOWLEDGED,  # for another cause
         EventKind.ALARM_RETURNED: AlarmState.RETURNED,
         EventKind.ALARM_ACKNOWLEDGED: AlarmState.ACKNOWLEDGED,
-        EventKind.ALARM_SHELVED: AlarmState.SHELVED,
-        EventKind.ALARM_OUT_OF_SERVICE: AlarmState.OUT_OF_SERVICE,
+        **SET_ASIDE,
     },
     AlarmState.ACKNOWLEDGED: {
         EventKind.ALARM_RAISED: AlarmState.UNACKNOWLEDGED,  # for another cause
         EventKind.ALARM_RETURNED: AlarmState.NORMAL,
-        EventKind.ALARM_SHELVED: AlarmState.SHELVED,
-        EventKind.ALARM_OUT_OF_SERVICE: AlarmState.OUT_OF_SERVICE,
+        **SET_ASIDE,
     },
     AlarmState.RETURNED: {
         EventKind.ALARM_RAISED: AlarmState.UNACKNOWLEDGED,
         EventKind.ALARM_ACKNOWLEDGED: AlarmState.NORMAL,
-        EventKind.ALARM_SHELVED: AlarmState.SHELVED,
-        EventKind.ALARM_OUT_OF_SERVICE: AlarmState.OUT_OF_SERVICE,
+        **SET_ASIDE,
     },
     AlarmState.SHELVED: {
         EventKind.ALARM_RAISED: AlarmState.SHELVED,  # in the journal, and not shown
         EventKind.ALARM_RETURNED: AlarmState.SHELVED,
-        EventKind.ALARM_SHELVED: AlarmState.SHELVED,  # for another time
         EventKind.ALARM_UNSHELVED: AlarmState.NORMAL,  # and raised again when active
-        EventKind.ALARM_OUT_OF_SERVICE: AlarmState.OUT_OF_SERVICE,
+        **SET_ASIDE,
     },
-    AlarmState.OUT_OF_SERVICE: {
-        EventKind.ALARM_IN_SERVICE: AlarmState.NORMAL,  # and raised again when active
-    },
+    AlarmState.OUT_OF_SERVICE: {EventKind.ALARM_IN_SERVICE: AlarmState.NORMAL},  # and raised again when active
 }
 """The state after an event. What is not here does not happen: it changes nothing, and nothing is noted."""
 
@@ -297,13 +281,13 @@ class AlarmPanel(AlarmConditions):
         process = settings.process
         self._journal = journal
         self._settings = settings
-        self._rules = [settings.rule(alarm) for alarm in alarms_of(process)]
+        self._rules = [settings.rule(alarm) for alarm in safety.alarms_of(process)]
         super().__init__(active=[False for _ in self._rules], since=[NOT for _ in self._rules])
         low, high = zip(*settings.bands.values(), strict=True) if settings.bands else ((), ())
         self.constants = AlarmConstants(
             [settings.ticks(rule.on_delay_s) for rule in self._rules],
             [settings.ticks(rule.off_delay_s) for rule in self._rules],
-            [int(each) for each in band_alarms(process)], process.controlled, low, high, process.dead_bands,
+            [int(each) for each in safety.band_alarms(process)], process.controlled, low, high, process.dead_bands,
         )  # fmt: skip
         self.reports: dict[int, tuple[int, float]] = {}
         """Last reported cause and value of alarms that are about to follow their condition, without those of bands."""
@@ -336,10 +320,6 @@ class AlarmPanel(AlarmConditions):
         self.since[:] = [since if since == NOT else since - back for since in self.since]
         for kind in self._shelved():
             self._store(kind, shelved_until=max(tick + 1, self.rows[kind].shelved_until - back))
-
-    def begin_at(self, tick: int) -> None:
-        """Set the tick, which may lie before the present one."""
-        self.now = tick
 
     def pass_by(self) -> None:
         """Apply expired delays and shelving times; call it once per scan."""
@@ -397,10 +377,12 @@ class AlarmPanel(AlarmConditions):
             return
         self.since[kind] = NOT
         cause, value = self.reports.pop(kind, (0, 0.0))
-        if self.active[kind]:
-            self._return(kind)
-        else:
+        if not self.active[kind]:
             self._raise(kind, cause, value)
+        elif self.rows[kind].state == AlarmState.OUT_OF_SERVICE:
+            self._store(kind, active=0, returned=self.now)
+        else:
+            self._step(kind, EventKind.ALARM_RETURNED, active=0, returned=self.now)
 
     def _raise(self, kind: int, cause: int, value: float = 0.0) -> None:
         row = self.rows[kind]
@@ -413,12 +395,6 @@ class AlarmPanel(AlarmConditions):
             times = (row.times + 1) & 0xFFFF
             self._step(kind, EventKind.ALARM_RAISED, value=value, active=1, cause=cause, times=times, raised=self.now)
 
-    def _return(self, kind: int) -> None:
-        if self.rows[kind].state == AlarmState.OUT_OF_SERVICE:
-            self._store(kind, active=0, returned=self.now)
-        else:
-            self._step(kind, EventKind.ALARM_RETURNED, active=0, returned=self.now)
-
     # -- operators, restarts -------------------------------------------------------------------------------------------
 
     def command(self, command: AlarmCommand, who: str = "") -> None:
@@ -426,21 +402,15 @@ class AlarmPanel(AlarmConditions):
         event = COMMANDED.get(command.action)
         if event is None:
             return
+        ticks = self._settings.shelving_ticks(command.time)
+        until, time_s = min(self.now + ticks, 0xFFFFFFFF), ticks * self._settings.process.tick_s
         for kind in range(len(self.rows)):
-            if command.alarm not in (kind, ALL_ALARMS):
+            if command.alarm not in (kind, safety.ALL_ALARMS):
                 continue
-            if event is EventKind.ALARM_SHELVED:
-                self._shelve(kind, command.time, who)
-            else:
+            if event is not EventKind.ALARM_SHELVED:
                 self._step(kind, event, who=who)
-
-    def _shelve(self, kind: int, asked_s: int, who: str) -> None:
-        ticks = self._settings.shelving_ticks(asked_s)
-        until = min(self.now + ticks, 0xFFFFFFFF)
-        if until != self.rows[kind].shelved_until:
-            self._step(
-                kind, EventKind.ALARM_SHELVED, who=who, value=ticks * self._settings.process.tick_s, shelved_until=until
-            )
+            elif until != self.rows[kind].shelved_until:
+                self._step(kind, event, who=who, value=time_s, shelved_until=until)
 
     def restore(self, rows: Sequence[Alarm]) -> None:
         """Take the alarms of before a restart; priorities are those of the configuration."""
@@ -548,7 +518,7 @@ class ProcessAlarms:
         report(AlarmKind.SEQUENCE_EXHAUSTED, condition=exhausted)
         report(AlarmKind.SEQUENCE_LATE, condition=scan.late)
         report(AlarmKind.OPTIMIZER_LOST, condition=not scan.optimizer)
-        short = CapacityCause.of(shortage if mode == Mode.MPC else 0.0)
+        short = safety.CapacityCause.of(shortage if mode == Mode.MPC else 0.0)
         report(AlarmKind.CAPACITY, condition=bool(short), cause=short, value=abs(shortage))
         self._watch_sensors(tick, AlarmKind.SENSOR_BAD, scan.bad)
         suspects = scan.suspects if mode in OPTIMIZER_DRIVES else 0

@@ -31,29 +31,16 @@ class ControlPublication:
     """
 
     def __init__(
-        self,
-        program: ControlProgram,
-        sessions: Sessions,
-        link: PlantLink,
-        bank: RegisterBank,
-        model_digest: int,
-        keep: Callable[[], None] = lambda: None,
+        self, program: ControlProgram, sessions: Sessions, link: PlantLink, bank: RegisterBank, keep: Callable[[], None]
     ) -> None:
         self._program = program
         self._sessions = sessions
         self._link = link
-        self._bank = bank
-        self._model_digest = model_digest
+        self.bank = bank
         self._keep = keep
         self.journal = JournalPublication(program.journal, bank)
         self._told_alarms = -1
-        self.overruns = 0
-        """Scans that began too late."""
-        self.lateness = LatenessRecord()
-        """Lateness of all scans of this session in real time."""
-        self.skew = Skew(0.0, math.inf)
-        """How much faster the rack's clock is than ours, and its phase error."""
-        self.offset_ms = 0.0
+        self.begin()
         self.lease: WriterLease | None = None
         """Lease of the optimiser."""
         bank.keep_fresh(Identity, self._identity)
@@ -63,16 +50,19 @@ class ControlPublication:
     def begin(self) -> None:
         """Reset the counters: a session begins."""
         self.overruns = 0
+        """Scans that began too late."""
         self.lateness = LatenessRecord()
+        """Lateness of all scans of this session in real time."""
         self.skew, self.offset_ms = Skew(0.0, math.inf), 0.0
+        """How much faster the rack's clock is than ours, and its phase error."""
 
     def _identity(self) -> Identity:
         program = self._program
         return Identity(
-            map_digest=self._bank.map.digest,
-            map_version=self._bank.map.version,
+            map_digest=self.bank.map.digest,
+            map_version=self.bank.map.version,
             state=ServiceState.RUNNING if self._sessions.running else ServiceState.READY,
-            model_digest=self._model_digest,
+            model_digest=program.model_digest,
             session=program.session,
             tick=program.tick,
             heartbeat=program.tick & 0xFFFF,
@@ -95,62 +85,34 @@ class ControlPublication:
             lateness_p99=lateness.percentile_s(0.99) * 1000,
         )
 
-    def _ladder(self) -> registers.LadderStatus:
-        program = self._program
-        return registers.LadderStatus(
-            mode=program.mode,
-            cause=program.ladder.cause,
-            since=program.ladder.since,
-            optimizer=int(program.optimizer_present),
-            bad_sensors=program.bad_sensors,
-            events=program.journal.count,
-        )
-
-    @property
-    def is_behind(self) -> bool:
-        """There are events that have not been shown."""
-        return self.journal.is_behind
-
     def safety(self) -> None:
         """Show ladder, watchdog, links, alarms and events, which agree with each other, and log the events."""
-        program = self._program
+        program, link, ladder = self._program, self._link, self._program.ladder
         if self.lease is not None:
             self.lease.note_end()
-        events = self.journal.show()
-        for event in events:
-            log_event(log, event, self._bank.map.process)
-        if events:
+        shown = self.journal.show()
+        for event in shown:
+            log_event(log, event, self.bank.map.process)
+        if shown:
             self._keep()
         if program.alarms.changes != self._told_alarms:
             self._told_alarms = program.alarms.changes
             for row, alarm in enumerate(program.alarms.rows):
-                self._bank.put(alarm, row)
-        for shown in (self._ladder(), program.watchdog.registers(program.tick), self._plant_link()):
-            self._bank.put(shown)
-        if self.lease is not None:
-            self._bank.put(self.lease.registers())
-
-    def _plant_link(self) -> registers.PlantLinkStatus:
-        link = self._link
-        return registers.PlantLinkStatus(
-            state=link.state,
-            cause=link.cause,
-            since=link.since,
-            breaks=link.breaks & 0xFFFFFFFF,
-            holder=link.holder,
-            generation=link.generation,
-            plant_session=link.session,
-            plant_tick=link.tick,
-            offset=self.offset_ms,
-            skew=self.skew.ppm,
-            skew_error=self.skew.error_ppm,
+                self.bank.put(alarm, row)
+        present, bad, events = int(program.optimizer_present), program.bad_sensors, program.journal.count
+        self.bank.put(registers.LadderStatus(program.mode, ladder.cause, ladder.since, present, bad, events))
+        self.bank.put(program.watchdog.registers(program.tick))
+        self.bank.put(
+            link.registers()._replace(offset=self.offset_ms, skew=self.skew.ppm, skew_error=self.skew.error_ppm)
         )
+        if self.lease is not None:
+            self.bank.put(self.lease.registers())
 
     def snapshot(self) -> Mapping[str, object]:
         """Return what telemetry publishes."""
-        status, process = self._bank.get(registers.Status), self._bank.get(registers.ProcessNow)
+        status, process = self.bank.get(registers.Status), self.bank.get(registers.ProcessNow)
         alarms = {
-            alarm_word(kind, self._bank.map.process).replace(" ", "_"): AlarmState(alarm.state).name.lower()
+            alarm_word(kind, self.bank.map.process).replace(" ", "_"): AlarmState(alarm.state).name.lower()
             for kind, alarm in enumerate(self._program.alarms.rows)
             if alarm.state != AlarmState.NORMAL
         }
@@ -162,8 +124,8 @@ class ControlPublication:
             "cause": registers.Cause(self._program.ladder.cause).name.lower(),
             "alarms": alarms,
             "load_w": process.load,
-            "inputs": dict(zip(self._bank.map.process.input_names, process.u, strict=True)),
-            "outputs": dict(zip(self._bank.map.process.output_names, process.y, strict=True)),
+            "inputs": dict(zip(self.bank.map.process.input_names, process.u, strict=True)),
+            "outputs": dict(zip(self.bank.map.process.output_names, process.y, strict=True)),
         }
 
 
@@ -183,22 +145,16 @@ class Clients:
     Args:
         program: What is written to.
         limits: What setpoints may be.
-        bank: The registers.
-        publication: Shows what has changed.
+        publication: Shows what has changed in the registers.
         sessions: The session under way, and its time base.
     """
 
     def __init__(
-        self,
-        program: ControlProgram,
-        limits: InputLimits,
-        bank: RegisterBank,
-        publication: ControlPublication,
-        sessions: Sessions,
+        self, program: ControlProgram, limits: InputLimits, publication: ControlPublication, sessions: Sessions
     ) -> None:
         self._program = program
         self._limits, self._tick_s = limits, limits.process.tick_s
-        self._bank = bank
+        self._bank = bank = publication.bank
         self._publication = publication
         self._sessions = sessions
         self._waiting: dict[asyncio.Future[None], tuple[int, int]] = {}
@@ -274,8 +230,8 @@ class Clients:
         self._bank.put_sealed(registers.LatchedUpdate(update.session, update.update, update.tick))
         for answer, (wanted, begun) in self._waiting.items():
             # one of a session that has begun since, which counts from 0 again, will do
-            if not answer.done() and (update.update >= wanted or begun != self._begun):
-                answer.set_result(None)
+            if update.update >= wanted or begun != self._begun:
+                _answer(answer)
 
     def on_write(self, block: Block, caller: Caller) -> Awaitable[None] | None:
         """Take what a client has written; an awaitable lets its answer wait."""
@@ -290,7 +246,6 @@ class Clients:
         return wait
 
     def _take(self, block: Block, caller: Caller) -> Awaitable[None] | None:
-        """Take what the optimiser has written."""
         record, program = block.record, self._program
         beat = self._bank.get(registers.Heartbeat) if record is registers.Heartbeat else None
         self.lease.take(caller, beat.holder if beat else None)
@@ -309,41 +264,34 @@ class Clients:
 
     def _command(self, block: Block, caller: Caller) -> None:
         """Do what an operator has written, and note who it was."""
-        record, program = block.record, self._program
-        if record is registers.Grant:
-            self.granted = self._bank.get(registers.Grant).until_tick
-        elif record is registers.ControlSession:
-            self.asked = asked = self._bank.get(registers.ControlSession)
-            self.pending_time_base = None
-            self.granted = 0
-            self._note(EventKind.SESSION, asked.realtime, caller.name, value=asked.factor)
-        elif record is SessionPace:
-            self._ask_for_pace(caller.name)
-        elif record is registers.Operator:
-            self._operate(self._bank.get(registers.Operator), caller.name)
-        elif record is AlarmCommand:
-            program.alarms.command(self._bank.get(AlarmCommand), caller.name)
-        elif record is WatchdogTime:
-            self._set_watchdog(self._bank.get(WatchdogTime).time, caller.name)
-        elif record is JournalQuery:
-            self._publication.journal.answer(self._bank.get(JournalQuery))
-            return
+        command, who = self._bank.get(block.record), caller.name
+        program, watchdog = self._program, self._program.watchdog
+        match command:
+            case JournalQuery():
+                self._publication.journal.answer(command)
+                return
+            case registers.Grant():
+                self.granted = command.until_tick
+                self.changed.set()
+                return
+            case registers.ControlSession():
+                self.asked, self.pending_time_base, self.granted = command, None, 0
+                self._note(EventKind.SESSION, command.realtime, who, value=command.factor)
+            case SessionPace():
+                pace = command.of(program.session)
+                self._bank.put(SessionPace.shown(program.session, pace))
+                if pace != (self.pending_time_base or self._sessions.pace):
+                    self.pending_time_base = pace
+                    self._note(EventKind.PACE, pace_subject(pace), who, value=pace.factor)
+            case registers.Operator():
+                self._operate(command, who)
+            case AlarmCommand():
+                program.alarms.command(command, who)
+            case WatchdogTime(time) if time != watchdog.time:
+                self._note(EventKind.WATCHDOG_TIME, time, who, cause=watchdog.time)
+                watchdog.set(time, program.tick)
         self.changed.set()
-        if record is not registers.Grant:
-            self._publication.safety()
-
-    def _ask_for_pace(self, who: str) -> None:
-        pace = self._bank.get(SessionPace).of(self._program.session)
-        self._bank.put(SessionPace.shown(self._program.session, pace))
-        if pace != (self.pending_time_base or self._sessions.pace):
-            self.pending_time_base = pace
-            self._note(EventKind.PACE, pace_subject(pace), who, value=pace.factor)
-
-    def _set_watchdog(self, time: int, who: str) -> None:
-        watchdog = self._program.watchdog
-        if time != watchdog.time:
-            self._note(EventKind.WATCHDOG_TIME, time, who, cause=watchdog.time)
-            watchdog.set(time, self._program.tick)
+        self._publication.safety()
 
     def _operate(self, operator: registers.Operator, who: str) -> None:
         before = self._program.operator
@@ -383,18 +331,12 @@ class Clients:
                 wanted = latched.update if latched else 0
         elif program.awaiting_plan and not self._latched(wanted):
             program.abandon()  # it has seen this number before our restart, and will not plan it: latch another
-        return None if self._latched(wanted) else self._wait_for(wanted)
-
-    def _latched(self, wanted: int) -> bool:
-        latched = self._program.player.update
-        return latched is not None and latched.update >= wanted
-
-    def _wait_for(self, wanted: int) -> asyncio.Future[None]:
-        """Return what is done when an update is latched, or has been waited for long enough."""
+        if self._latched(wanted):
+            return None
         loop = asyncio.get_running_loop()
         answer: asyncio.Future[None] = loop.create_future()
         self._waiting[answer] = wanted, self._begun
-        timer = loop.call_later(LONGEST_WAIT_S, _answer_anyway, answer)
+        timer = loop.call_later(LONGEST_WAIT_S, _answer, answer)
 
         def end(_: asyncio.Future[None]) -> None:
             timer.cancel()
@@ -402,6 +344,10 @@ class Clients:
 
         answer.add_done_callback(end)
         return answer
+
+    def _latched(self, wanted: int) -> bool:
+        latched = self._program.player.update
+        return latched is not None and latched.update >= wanted
 
     def on_departure(self, role: Role) -> None:
         """The last client of this role has disconnected: do not wait for an optimiser."""
@@ -420,6 +366,6 @@ class Clients:
             self._program.alarms.pulse(AlarmKind.ACCESS_REFUSED)
 
 
-def _answer_anyway(waiting: asyncio.Future[None]) -> None:
+def _answer(waiting: asyncio.Future[None]) -> None:
     if not waiting.done():
         waiting.set_result(None)

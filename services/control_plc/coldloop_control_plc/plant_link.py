@@ -1,12 +1,4 @@
-"""The control PLC's link to the rack as a state machine.
-
-    IDLE          no session
-    SEARCHING     the rack does not answer
-    JOINING       it answers; its outputs are being read back
-    SYNCHRONISED  outputs are written in every scan, and accepted
-    REJECTED      it answers, and rejects the outputs
-    OTHER_MASTER  it is in another session, or has another master
-    FROZEN        it answers, and its clock does not move
+"""The control PLC's link to the rack as a state machine with the states of `registers.control_plc.PlantLinkState`.
 
 One rule decides: *no output is written unless what the rack applies was read twice since the last break: sealed,
 finite, of this session, the same both times, and at ticks as far apart as the readings.* Only SYNCHRONISED writes, and
@@ -20,7 +12,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from coldloop.registers.common import EventKind
-from coldloop.registers.control_plc import LinkCause, PlantLinkState
+from coldloop.registers.control_plc import LinkCause, PlantLinkState, PlantLinkStatus
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import AlarmKind
 from coldloop.service.journal import Journal
@@ -42,6 +34,13 @@ SECOND_MASTER: Final = 2
 """Cause of the alarm SECOND_WRITER."""
 HARMLESS: Final = (LinkCause.STARTED, LinkCause.MISSED_SCANS, LinkCause.TIME_JUMP, LinkCause.TIME_BASE)
 """Causes that raise no alarm: what will be read back is expected to be what we applied."""
+FAILED_REQUESTS: Final = {
+    LinkCause.SECOND_MASTER: PlantLinkState.OTHER_MASTER,
+    LinkCause.REFUSED: PlantLinkState.REJECTED,
+    LinkCause.DAMAGED: PlantLinkState.JOINING,
+    LinkCause.IMPLAUSIBLE: PlantLinkState.JOINING,
+}
+"""States that a failed request leads to; after others the rack does not answer."""
 OUTPUTS_REJECTED: Final = (PlantLinkState.REJECTED, LinkCause.REFUSED)
 REFUSED_OUTPUTS: Final[Mapping[int, tuple[PlantLinkState, LinkCause]]] = {
     OutputVerdict.WRONG_SESSION: (PlantLinkState.OTHER_MASTER, LinkCause.WRONG_SESSION),
@@ -100,6 +99,13 @@ class PlantLink:
         """An alarm of the link is active: it says why no outputs are written."""
         return any(self._alarms.rows[alarm].active for alarm in ALARMS.values())
 
+    def registers(self) -> PlantLinkStatus:
+        """Return what its registers show, without the clocks."""
+        breaks = self.breaks & 0xFFFFFFFF
+        return PlantLinkStatus(
+            self.state, self.cause, self.since, breaks, self.holder, self.generation, self.session, self.tick
+        )
+
     # -- events --------------------------------------------------------------------------------------------------------
 
     def begin(self) -> None:
@@ -119,14 +125,7 @@ class PlantLink:
 
     def unanswered(self, cause: LinkCause) -> None:
         """Note that a request failed: its effect on the rack is unknown."""
-        if cause is LinkCause.SECOND_MASTER:
-            self._enter(PlantLinkState.OTHER_MASTER, cause)
-        elif cause is LinkCause.REFUSED:
-            self._enter(PlantLinkState.REJECTED, cause)
-        elif cause in (LinkCause.DAMAGED, LinkCause.IMPLAUSIBLE):
-            self._enter(PlantLinkState.JOINING, cause)
-        else:
-            self._enter(PlantLinkState.SEARCHING, cause)
+        self._enter(FAILED_REQUESTS.get(cause, PlantLinkState.SEARCHING), cause)
 
     def missed_scans(self) -> None:
         """Note that this program missed scans: the rack's state is unknown."""
@@ -196,7 +195,10 @@ class PlantLink:
         In real time the rack's tick may differ by one: it changes between two scans, and a scan may be late.
         """
         stopped = self._clock_stopped(answer, now)
-        self._watch_others(answer)
+        before, self._has_refused_more = self._has_refused_more, answer.refused != self.refused
+        if before and self._has_refused_more:  # two answers show that the rack has refused another master's outputs
+            self.refused, self._has_refused_more = answer.refused, False
+            self._alarms.pulse(AlarmKind.SECOND_WRITER, SECOND_MASTER)
         if answer.verdict != OutputVerdict.ACCEPTED:
             self._enter(*REFUSED_OUTPUTS.get(answer.verdict, OUTPUTS_REJECTED))
         elif answer.session != sent.session:
@@ -235,13 +237,6 @@ class PlantLink:
         if self._old_since is None:
             self._old_since = now
         return reading.tick > 0 and now - self._old_since < self.frozen_ticks
-
-    def _watch_others(self, answer: Measurement) -> None:
-        """Raise the alarm when two answers show that the rack has refused another master's outputs."""
-        before, self._has_refused_more = self._has_refused_more, answer.refused != self.refused
-        if before and self._has_refused_more:
-            self.refused, self._has_refused_more = answer.refused, False
-            self._alarms.pulse(AlarmKind.SECOND_WRITER, SECOND_MASTER)
 
     def _clock_stopped(self, reading: Measurement, now: float | None) -> bool:
         """Note where the rack is; return whether its clock has stopped. At tick 0 it waits for the first outputs."""

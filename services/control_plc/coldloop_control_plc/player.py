@@ -6,19 +6,14 @@ Scans can be missed and time can leap, so everything here goes by ticks, never b
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any
 
 from coldloop.process.declaration import LAST_NUMBER
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Acknowledgement, Plan, SequenceHeader, Update, Verdict
 from coldloop.safety.writers import Inputs, InputSequence, checksum, with_checksum
 from coldloop_control_plc.output_limits import OutputGuard
 
-NONE: Final = 0
-LATCHED: Final = 1
-PLANNED: Final = 2
-ANSWERED: Final = 3
-REFUSED: Final = 4
-ABANDONED: Final = 5
+NONE, LATCHED, PLANNED, ANSWERED, REFUSED, ABANDONED = range(6)
 """How far the update under way has got.
 
     NONE      ->  LATCHED                                       at an updating instant (`latch`)
@@ -244,15 +239,8 @@ class SequencePlayer(PlayerState):
         for slot, number in enumerate(self.numbers):
             known, length = self.sequences[slot], self.lengths[slot]
             if length and (known is None or known.header.number != number):
-                header = SequenceHeader(
-                    number,
-                    self.answers[slot],
-                    self.first_ticks[slot],
-                    length,
-                    self.periods[slot],
-                    self._model_digest,
-                    0,
-                )
+                times = self.answers[slot], self.first_ticks[slot], length, self.periods[slot]
+                header = SequenceHeader(number, *times, self._model_digest, 0)
                 table = [tuple(map(float, rows[slot][tick])) for tick in range(length)]
                 self.sequences[slot] = with_checksum(header, table)
                 self.acknowledgement = Acknowledgement(max(self.numbers), Verdict.ACCEPTED)

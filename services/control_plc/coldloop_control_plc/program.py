@@ -2,7 +2,7 @@
 
 Pure: no sockets, no clock, no sleeping. A scan is `begin_scan` (decide the outputs), the exchange with the plant's
 rack, `end_scan` (take the measurement, latch an update at an updating instant). Who decides the outputs is the
-ladder's choice (`ladder.py`); what the optimiser sends goes through the sequence player (`player.py`); the guard has
+ladder's choice (`scan.py`); what the optimiser sends goes through the sequence player (`player.py`); the guard has
 the last word (`output_limits.py`).
 """
 
@@ -51,6 +51,7 @@ class ControlProgram:
     ) -> None:
         self._limits = limits
         self._point = point
+        self.model_digest = point.model_digest
         self._section = section
         self.alarm_settings = section.alarms
         self._initial = tuple(point.inputs)
@@ -86,7 +87,7 @@ class ControlProgram:
         """
         self.operator = operator
         self.watchdog.set(watchdog, tick)
-        self.alarms.begin_at(tick)
+        self.alarms.now = tick
         self.alarms.restore(alarms)
 
     def resume(
@@ -128,7 +129,7 @@ class ControlProgram:
         if applied != self._initial:
             self.guard.begin_at(tick, applied)
         self._before = self.guard.applied
-        self.player = SequencePlayer(self.guard, point.model_digest, updates=updates)
+        self.player = SequencePlayer(self.guard, self.model_digest, updates=updates)
         self.sensors = SensorMonitor(section.sensors, point.outputs, [SEEN * rate for rate in limits.rate])
         self.ladder = scan.LadderState(
             mode, cause, tick, list(applied), list(applied), [math.nan for _ in point.outputs], cool_down,
@@ -139,7 +140,7 @@ class ControlProgram:
         self._noted_step = self.ladder.step
         self.watchdog.set(self.watchdog.time, tick)
         self._process_alarms = ProcessAlarms(self.alarms, self.journal, len(point.outputs))
-        self.alarms.begin_at(tick)
+        self.alarms.now = tick
         self.scan = scan.Scan(self.guard.state, self.ladder, self.player, self.sensors, self.alarms, self.watchdog)
         self.scan_constants = scan.ScanConstants(
             self.guard.limits, self.sensors.constants, self.alarms.constants, section.ladder.hold_ticks,
@@ -303,21 +304,17 @@ class ControlProgram:
             passed: Ticks since the last scan by our own clock; None in lock-step.
         """
         if tick < self.tick:
-            self._set_back(tick)
+            if self.tick - tick > self._limits.process.ticks_per_sample:
+                self.player.set_back(tick)
+                self.alarms.pulse(AlarmKind.CLOCK_SKEW, registers.LinkCause.TIME_JUMP)
+            self.sensors.set_back(tick)
+            self.watchdog.set_back(tick)
+            ladder = self.ladder
+            ladder.since = min(ladder.since, tick)
+            ladder.handshake_failed, ladder.held_from = min(ladder.handshake_failed, tick), NONE
         self.tick = self.alarms.now = tick
         self._in_scan = False
         self.guard.begin_at(self.tick, tuple(applied), passed)
-
-    def _set_back(self, tick: int) -> None:
-        if self.tick - tick > self._limits.process.ticks_per_sample:
-            self.player.set_back(tick)
-            self.alarms.pulse(AlarmKind.CLOCK_SKEW, registers.LinkCause.TIME_JUMP)
-        self.sensors.set_back(tick)
-        self.watchdog.set_back(tick)
-        ladder = self.ladder
-        ladder.since = min(ladder.since, tick)
-        ladder.handshake_failed, ladder.held_from = min(ladder.handshake_failed, tick), NONE
-        self.alarms.begin_at(tick)
 
     # -- the optimiser's side ------------------------------------------------------------------------------------------
 
@@ -333,7 +330,7 @@ class ControlProgram:
     def heartbeat(self, beat: registers.Heartbeat) -> None:
         """Take a heartbeat, which names the optimiser's model."""
         self.optimizer_seen()
-        wrong = beat.model_digest != self._point.model_digest
+        wrong = beat.model_digest != self.model_digest
         self.alarms.report(AlarmKind.MODEL_MISMATCH, condition=wrong)
 
     def accept_plan(self, plan: registers.Plan) -> bool:

@@ -163,10 +163,6 @@ class RackClock:
         return self._skew.estimate()
 
 
-Adopt = Callable[[Measurement], bool]
-"""Takes a reading of a rack in another session; returns whether the program has changed to that session."""
-
-
 def cause_of(error: errors.LinkError) -> LinkCause:
     """Return why a request came to nothing."""
     if isinstance(error, errors.ImplausibleAnswerError):
@@ -184,10 +180,10 @@ class ScanCycle:
     Args:
         program: Decides the outputs.
         link: Decides whether they may be written.
-        adopt: Called with a reading of another session.
+        adopt: Takes a reading of a rack in another session; returns whether the program has changed to that session.
     """
 
-    def __init__(self, program: ControlProgram, link: PlantLink, adopt: Adopt) -> None:
+    def __init__(self, program: ControlProgram, link: PlantLink, adopt: Callable[[Measurement], bool]) -> None:
         self._program = program
         self._link = link
         self._adopt = adopt
@@ -239,15 +235,12 @@ class ScanCycle:
         if not link.read_back(reading, program.session, now):
             return
         begun = now is not None and reading.age >= PHASE  # in lock-step a tick lasts until the scan was made
-        program.rejoin(min(reading.tick + begun, LAST_TICK), reading.u, self._passed(now))
+        passed = None  # ticks since the last scan by our own clock
+        if now is not None:
+            passed = 0 if self._scanned_at is None else max(0, int(now - self._scanned_at))
+        program.rejoin(min(reading.tick + begun, LAST_TICK), reading.u, passed)
         self._scanned_at = now
         link.joined()
-
-    def _passed(self, now: float | None) -> int | None:
-        """Return the whole ticks since the last scan by our own clock; None where it does not count."""
-        if now is None:
-            return None
-        return 0 if self._scanned_at is None else max(0, int(now - self._scanned_at))
 
 
 log = logging.getLogger("coldloop.control_plc")
@@ -317,9 +310,13 @@ class RackFinder:
             self.failed(error)
         else:
             self.reached = True
-            if reading is not None:
-                self._take(reading, at, realtime=patience_s is not None)
-                return True
+            if reading is None:
+                return False
+            self._cycle.answered(reading, None if patience_s is None else at / self._clock.tick_s)
+            if self._link.synchronised:
+                # at tick 0 the rack's clock waits for the first outputs
+                self._clock.synchronise(reading.tick + (reading.age or (0.0 if reading.tick else PHASE)), at)
+            return True
         return False
 
     async def _read_back(self) -> tuple[Measurement | None, float]:
@@ -333,24 +330,13 @@ class RackFinder:
         lease = await self._rack.read(LeaseStatus) if self._link.cause is LinkCause.SECOND_MASTER else None
         asked_at = time.monotonic()
         reading = await self._rack.read(Measurement)
-        held = lease is not None and self._is_held_by_another(lease, reading)
-        return None if held else reading, (asked_at + time.monotonic()) / 2
-
-    def _is_held_by_another(self, lease: LeaseStatus, reading: Measurement) -> bool:
-        """Return whether the control PLC that we were refused for still holds the lease of the rack.
-
-        One that has our number is another one if the rack has counted that it refused us.
-        """
-        if lease.holder == self._link.holder:
-            return lease.state == LeaseState.HELD and reading.refused != self._link.refused
-        return lease.state in (LeaseState.HELD, LeaseState.LINGERING)
-
-    def _take(self, reading: Measurement, at: float, *, realtime: bool) -> None:
-        """Resume from a reading if allowed; `at` is when the rack was read, s."""
-        self._cycle.answered(reading, at / self._clock.tick_s if realtime else None)
-        if self._link.synchronised:
-            # at tick 0 the rack's clock waits for the first outputs
-            self._clock.synchronise(reading.tick + (reading.age or (0.0 if reading.tick else PHASE)), at)
+        at = (asked_at + time.monotonic()) / 2
+        if lease is None:
+            return reading, at
+        held = lease.state in (LeaseState.HELD, LeaseState.LINGERING)
+        if lease.holder == self._link.holder:  # it has our number: another one, if the rack counts that it refused us
+            held = lease.state == LeaseState.HELD and reading.refused != self._link.refused
+        return None if held else reading, at
 
     async def pause(self, changed: asyncio.Event) -> None:
         """Wait before the next look, unless something changes."""

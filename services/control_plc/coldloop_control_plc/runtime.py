@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from coldloop import __version__
@@ -32,7 +32,7 @@ from coldloop.service.start import SERVING, dropped
 from coldloop.session import TimeBase
 from coldloop_control_plc.clients import Clients, ControlPublication
 from coldloop_control_plc.plant_link import FROZEN_S, FROZEN_TICKS, PlantLink
-from coldloop_control_plc.program import ControlProgram, make_program
+from coldloop_control_plc.program import make_program
 from coldloop_control_plc.rack import PHASE, RackClock, RackFinder, ScanCycle
 from coldloop_control_plc.sessions import ControlStateStore, Sessions
 from coldloop_control_plc.settings import SHOWN, ControlSettings
@@ -65,65 +65,6 @@ STATE_REFUSED: Final = 1
 """Cause of the alarm STATE_NOT_RETAINED: at the start there was one that is not used."""
 
 
-class CertificateWatch:
-    """Raises the alarm while a certificate has expired, or will soon.
-
-    Args:
-        certificates: Those of our server and of our client, with the days of warning.
-        program: Whose alarm it is.
-        show: Shows the alarms.
-    """
-
-    def __init__(self, certificates: Sequence[TlsSettings], program: ControlProgram, show: Callable[[], None]) -> None:
-        self._certificates = certificates
-        self._program = program
-        self._show = show
-        self._noted = 0
-
-    async def run(self) -> None:
-        """Look every hour, until cancelled."""
-        while self._certificates:
-            try:
-                days = await asyncio.to_thread(self._days_of_those_to_renew)  # no scan waits for a disk
-            except ConfigurationError as error:  # they may be being renewed: keep what was read at the start
-                log.warning("certificates unreadable", extra={"reason": str(error)})
-                self._program.alarms.raised(AlarmKind.CERTIFICATE, UNREADABLE)
-            else:
-                self._judge(days)
-            self._show()
-            await asyncio.sleep(CERTIFICATES_S)
-
-    def _days_of_those_to_renew(self) -> list[float]:
-        from coldloop.modbus.tls import first_expiry  # noqa: PLC0415 not needed without TLS
-
-        return [days for tls in self._certificates if (days := first_expiry(tls).days_left()) < tls.warn_days]
-
-    def _judge(self, days: Sequence[float]) -> None:
-        """Take the days that are left of those to be renewed."""
-        least, program = min(days, default=0.0), self._program
-        cause = (EXPIRED if least < 0.0 else EXPIRES_SOON) if days else 0
-        program.alarms.report(AlarmKind.CERTIFICATE, condition=bool(days), cause=cause)
-        if cause and cause != self._noted:
-            program.journal.note(program.alarms.now, EventKind.CERTIFICATE, cause, value=least)
-        self._noted = cause
-
-
-class ScanWatch:
-    """Whether scans are made, watched from outside of them: an alarm that they are not cannot come from a scan."""
-
-    def __init__(self) -> None:
-        self._looks = 0
-
-    def scanned(self) -> None:
-        """Note that a scan was made, or that none is expected."""
-        self._looks = 0
-
-    def look(self, tick_s: float) -> bool:
-        """Return, `LOOK_S` after the last check, whether scans have stopped; a tick lasts `tick_s` of real time."""
-        self._looks += 1
-        return self._looks > max(LOOKS, SCANS * tick_s / LOOK_S)
-
-
 class ControlPlc:
     """Connects the program to the registers and to the rack."""
 
@@ -148,13 +89,10 @@ class ControlPlc:
         self._finder = RackFinder(self._plant, self._link, self._cycle, self._clock, power_up_s=section.power_up_s)
         self.bank = RegisterBank(maps.control_plc, section.word_order)
         publish_configuration(self.bank, selected(settings, SHOWN))
-        self.publication = ControlPublication(
-            program, self.sessions, self._link, self.bank, header.short_digest, self._keep
-        )
-        self.clients = Clients(program, settings.limits, self.bank, self.publication, self.sessions)
-        certificates = [tls for tls in (section.server.tls, section.plant.tls) if tls is not None]
-        self.certificates = CertificateWatch(certificates, program, self.publication.safety)
-        self._watch = ScanWatch()
+        self.publication = ControlPublication(program, self.sessions, self._link, self.bank, self._keep)
+        self.clients = Clients(program, settings.limits, self.publication, self.sessions)
+        self._looks = 0
+        """Looks without a scan between them."""
         self._ticks_per_second = max(1, round(1 / process.tick_s))
         self._lost_lines = 0
         self._awaiting_since: float | None = None
@@ -258,17 +196,15 @@ class ControlPlc:
         if self._is_called:
             return False
         granted = program.tick < self.clients.granted
-        awaited = granted and (program.awaiting_plan or program.awaiting_sequence)
-        if granted and not awaited:
-            self._awaiting_since = None
-            return True
-        self.clients.changed.clear()
-        if awaited:
+        if granted and (program.awaiting_plan or program.awaiting_sequence):
+            self.clients.changed.clear()
             await self._until_answered()
-        else:
-            self._awaiting_since = None
+            return False
+        self._awaiting_since = None
+        if not granted:
+            self.clients.changed.clear()
             await self.clients.changed.wait()
-        return False
+        return granted
 
     async def _until_answered(self) -> None:
         """Wait for a client's write; an optimiser that keeps us waiting too long is lost."""
@@ -300,12 +236,12 @@ class ControlPlc:
             return
         answered_at = time.monotonic()
         at = (asked_at + answered_at) / 2
-        update = self._cycle.answered(answer, self._in_ticks(at))
+        update = self._cycle.answered(answer, at / self._clock.tick_s if self.sessions.pace.realtime else None)
         if not self._link.synchronised:
             self.publication.safety()
             return
         self._finder.read_soon()
-        self._watch.scanned()
+        self._looks = 0
         if self.sessions.pace.realtime and answer.tick:
             self._clock.observe(answer.tick + answer.age, at, (answered_at - asked_at) / 2)
         if update is not None:
@@ -321,7 +257,7 @@ class ControlPlc:
         if on_the_second:
             self._watch_ourselves()
         program.alarms.pass_by()
-        if publication.is_behind or on_the_second:
+        if publication.journal.is_behind or on_the_second:
             publication.safety()
         self._keep()
 
@@ -347,16 +283,34 @@ class ControlPlc:
         """Raise an alarm while no scans are made, until cancelled: by an independent clock."""
         while True:
             await asyncio.sleep(LOOK_S)
-            self._look_for_scans()
+            pace, alarms = self.sessions.pace, self._program.alarms
+            scans = self.sessions.running and pace.realtime and not pace.paused
+            self._looks = self._looks + 1 if scans else 1
+            missing = self._looks > max(LOOKS, SCANS * self._clock.tick_s / LOOK_S)
+            stopped = missing and not self._link.is_alarmed
+            if stopped is not bool(alarms.rows[AlarmKind.SCANS_STOPPED].active):
+                alarms.report(AlarmKind.SCANS_STOPPED, condition=stopped)
+                self.publication.safety()
 
-    def _look_for_scans(self) -> None:
-        pace, alarms = self.sessions.pace, self._program.alarms
-        if not (self.sessions.running and pace.realtime and not pace.paused):
-            self._watch.scanned()
-        stopped = self._watch.look(self._clock.tick_s) and not self._link.is_alarmed
-        if stopped is not bool(alarms.rows[AlarmKind.SCANS_STOPPED].active):
-            alarms.report(AlarmKind.SCANS_STOPPED, condition=stopped)
+    async def watch_certificates(self) -> None:
+        """Raise an alarm while a certificate of ours has expired, or will soon: look every hour, until cancelled."""
+        section, alarms, noted = self._settings.control_plc, self._program.alarms, 0
+        certificates = [tls for tls in (section.server.tls, section.plant.tls) if tls is not None]
+        while certificates:
+            try:
+                days = await asyncio.to_thread(_days_of_those_to_renew, certificates)  # no scan waits for a disk
+            except ConfigurationError as error:  # they may be being renewed: keep what was read at the start
+                log.warning("certificates unreadable", extra={"reason": str(error)})
+                alarms.raised(AlarmKind.CERTIFICATE, UNREADABLE)
+            else:
+                least = min(days, default=0.0)
+                cause = (EXPIRED if least < 0.0 else EXPIRES_SOON) if days else 0
+                alarms.report(AlarmKind.CERTIFICATE, condition=bool(days), cause=cause)
+                if cause and cause != noted:
+                    self._program.journal.note(alarms.now, EventKind.CERTIFICATE, cause, value=least)
+                noted = cause
             self.publication.safety()
+            await asyncio.sleep(CERTIFICATES_S)
 
     @property
     def _patience_s(self) -> float:
@@ -365,10 +319,6 @@ class ControlPlc:
         if not self.sessions.pace.realtime:
             return longest
         return min(longest, max(SHORTEST_PATIENCE_S, ANSWER_TICKS * self._clock.tick_s))
-
-    def _in_ticks(self, at: float) -> float | None:
-        """Return a moment of real time in ticks; None in lock-step."""
-        return at / self._clock.tick_s if self.sessions.pace.realtime else None
 
     # -- out of step ---------------------------------------------------------------------------------------------------
 
@@ -418,7 +368,7 @@ class ControlPlc:
     def _begin(self) -> None:
         """Begin the session that the program has been put into."""
         self._set_clock()
-        self._watch.scanned()
+        self._looks = 0
         self.publication.begin()
         self.clients.begin()
         self._show_pace()
@@ -433,6 +383,12 @@ class ControlPlc:
         pace, session = self.sessions.pace, self._program.session
         self.bank.put(ControlSession(session, int(pace.realtime), pace.factor))
         self.bank.put(SessionPace.shown(session, pace))
+
+
+def _days_of_those_to_renew(certificates: Sequence[TlsSettings]) -> list[float]:
+    from coldloop.modbus.tls import first_expiry  # noqa: PLC0415 not needed without TLS
+
+    return [days for tls in certificates if (days := first_expiry(tls).days_left()) < tls.warn_days]
 
 
 async def serve(settings: ControlSettings) -> None:
@@ -450,7 +406,7 @@ async def serve(settings: ControlSettings) -> None:
             tasks.create_task(MetricsServer(settings.control_plc.metrics, plc.bank).run(), name="metrics")
             tasks.create_task(plc.run(), name="scan cycle")
             tasks.create_task(plc.watch_scans(), name="scan watch")
-            tasks.create_task(plc.certificates.run(), name="certificates")
+            tasks.create_task(plc.watch_certificates(), name="certificates")
             telemetry = Telemetry(settings.telemetry, "control_plc", plc.publication.snapshot)
             tasks.create_task(telemetry.run(), name="telemetry")
     finally:

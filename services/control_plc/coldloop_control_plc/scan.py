@@ -1,22 +1,12 @@
 """A scan as two functions of one record: `decide` the outputs when a tick begins, `observe` what is measured in it.
 
 Both are plain Python, for the control PLC has no numba; the rig compiles these very functions. Who decides the outputs
-is chosen by the fail-safe ladder:
-
-    MPC        a sequence, within the updating period it was sent for
-    REST       the rest of a sequence: the next one is late
-    HOLD       the sequence is exhausted: its last value, for a set time
-    CLASSICAL  the PI loops, until a sequence is accepted again
-
-An operator may take the ladder away (CLASSICAL, MANUAL). A bad sensor that MPC needs, and a plant that begins warm,
-lead to CLASSICAL at once. The cool-down of a warm plant with a bath is a sequence of steps:
-
-    TURBINE    until the turbine's outlet is at its set point
-    BATH       until there is liquid
-    FILLING    until the level is in its band
-    SETTLING   until level and outlet have stayed in their bands for a while
-
-The level of the cold box is L1, the turbine's outlet T5. How far the turbine may open is its governor's decision.
+is chosen by the fail-safe ladder, from MPC by REST and HOLD down to CLASSICAL, until a sequence is accepted again
+(`registers.control_plc.Mode`). An operator may take the ladder away (CLASSICAL, MANUAL). A bad sensor that MPC needs,
+and a plant that begins warm, lead to CLASSICAL at once. The cool-down of a warm plant with a bath is a sequence of
+steps (`CoolDownStep`): TURBINE ends when the turbine's outlet is at its set point, BATH when there is liquid, FILLING
+when the level is in its band, SETTLING when level and outlet have stayed in their bands for a while. The level of the
+cold box is L1, the turbine's outlet T5. How far the turbine may open is its governor's decision.
 """
 
 import math
@@ -37,13 +27,7 @@ from coldloop_control_plc.settings import ClassicalSettings, CoolDownSettings
 HOLD, MPC, CLASSICAL, REST, MANUAL = map(int, Mode)
 FINISHED, TURBINE, BATH, FILLING, SETTLING = map(int, CoolDownStep)
 AUTO, _, MANUALLY = map(int, OperatorMode)
-BY_OPERATOR: Final = int(Cause.OPERATOR)
-HOLD_EXPIRED: Final = int(Cause.HOLD_EXPIRED)
-COOLS_DOWN: Final = int(Cause.COOL_DOWN)
-SENSOR_BAD: Final = int(Cause.SENSOR_BAD)
-SEQUENCE_BEGAN: Final = int(Cause.SEQUENCE_BEGAN)
-SEQUENCE_LATE: Final = int(Cause.SEQUENCE_LATE)
-EXHAUSTED: Final = int(Cause.SEQUENCE_EXHAUSTED)
+_, _, SEQUENCE_BEGAN, SEQUENCE_LATE, EXHAUSTED, HOLD_EXPIRED, BY_OPERATOR, SENSOR_BAD, _, COOLS_DOWN = map(int, Cause)
 HANDSHAKE_PAUSE_TICKS: Final = 120
 """After a handshake that came to nothing the classical loops are not held again for so long."""
 LONGEST_GAP: Final = 3
@@ -212,8 +196,10 @@ def step_ladder(c: ScanConstants, s: Scan, tick: int, plays: bool) -> bool:  # n
         return False
     if mode == CLASSICAL:
         p.lengths[p.slot] = 0  # what has been played to its end: the loops move the inputs now
-        if d.mode != CLASSICAL:
-            restart_loops(d)
+        if d.mode != CLASSICAL:  # what was measured is forgotten: the loops take over from whatever is applied next
+            d.seen = d.executed = NONE
+            for output in range(len(d.errors)):
+                d.errors[output] = math.nan
     elif d.mode == CLASSICAL:
         d.handshake_failed, d.answer_failed = NEVER, False
     d.held_from = NONE
@@ -277,13 +263,6 @@ def want(d: LadderState, row: Numbers) -> None:
 # -- the classical loops -----------------------------------------------------------------------------------------------
 
 
-def restart_loops(d: LadderState) -> None:
-    """Forget what was measured: the loops take over from whatever is applied next."""
-    d.seen = d.executed = NONE
-    for output in range(len(d.errors)):
-        d.errors[output] = math.nan
-
-
 def move_loops(c: ScanConstants, s: Scan, tick: int) -> None:
     """Write the inputs that the loops ask for at `tick`; the others stay, and those of loops that are open or blind.
 
@@ -292,7 +271,12 @@ def move_loops(c: ScanConstants, s: Scan, tick: int) -> None:
     executes, with the time that has passed.
     """
     loops, d, executed = c.loops, s.ladder, s.ladder.executed
-    if not are_due(loops, d, tick):
+    seen, d.seen = d.seen, tick
+    if executed != NONE and tick <= executed:  # this scan was begun before, or time has gone back
+        d.executed = min(executed, tick)
+        return
+    period = loops.period_ticks
+    if tick % period != 0 and (seen == NONE or tick // period <= seen // period):
         return
     elapsed_s = loops.period_s
     if executed != NONE:
@@ -304,17 +288,6 @@ def move_loops(c: ScanConstants, s: Scan, tick: int) -> None:
         if is_open(c.cooling, d.step, output) or is_missing(s.sensors, output, c.sensors.bridged_ticks):
             measured = math.nan
         d.wanted[actuator] = execute(c, d, loop, measured, s.guard.applied[actuator], elapsed_s)
-
-
-def are_due(loops: LoopConstants, d: LadderState, tick: int) -> bool:
-    """Return whether the loops are executed at a tick."""
-    seen, d.seen = d.seen, tick
-    if d.executed != NONE and tick <= d.executed:  # this scan was begun before, or time has gone back
-        d.executed = min(d.executed, tick)
-        return False
-    return tick % loops.period_ticks == 0 or (
-        seen != NONE and tick // loops.period_ticks > seen // loops.period_ticks
-    )  # fmt: skip
 
 
 def execute(c: ScanConstants, d: LadderState, loop: int, measured: float, applied: float, elapsed_s: float) -> float:
@@ -394,23 +367,18 @@ def next_step(c: CoolDownConstants, d: LadderState, tick: int, y: Numbers) -> in
     if d.step == FINISHED:
         return FINISHED
     if d.step == SETTLING:
-        return FINISHED if has_settled(c, d, tick, y) else SETTLING
+        if not (c.low[0] <= y[c.level] <= c.high[0] and c.low[1] <= y[c.outlet] <= c.high[1]):
+            d.settled_since = NONE
+            return SETTLING
+        if d.settled_since == NONE or tick < d.settled_since:
+            d.settled_since = tick
+        return FINISHED if (tick - d.settled_since) * c.tick_s >= c.settled_s else SETTLING
     ended = (
         (d.step == TURBINE and y[c.outlet] <= c.cold)
         or (d.step == BATH and y[c.level] >= c.liquid)
         or (d.step == FILLING and y[c.level] >= c.low[0])
     )
     return d.step + ended
-
-
-def has_settled(c: CoolDownConstants, d: LadderState, tick: int, y: Numbers) -> bool:
-    """Return whether level and outlet have stayed in their bands for long enough."""
-    if not (c.low[0] <= y[c.level] <= c.high[0] and c.low[1] <= y[c.outlet] <= c.high[1]):
-        d.settled_since = NONE
-        return False
-    if d.settled_since == NONE or tick < d.settled_since:
-        d.settled_since = tick
-    return (tick - d.settled_since) * c.tick_s >= c.settled_s
 
 
 def cool_down_constants(

@@ -31,15 +31,6 @@ RECOVERY_TICKS = 8
 """Ticks in which all measurements of a sensor must be good until it counts as good again."""
 
 
-class Kinds(NamedTuple):
-    """Index of the first output of each kind: other outputs are one kind, and both are 0."""
-
-    temperatures: int
-    """The first temperature; they end where the pressures begin."""
-    pressures: int
-    """The first pressure; they are the last outputs."""
-
-
 class SensorCheckSettings(ProcessSettings):
     """Ranges of sensors, and how long a bad one is bridged."""
 
@@ -92,7 +83,10 @@ class SensorConstants(NamedTuple):
     """Ticks for which an output is at least unchanged before it is frozen."""
     controlled: Numbers
     """Whether the output has a band."""
-    kinds: Kinds
+    temperatures: int
+    """Index of the first temperature; they end where the pressures begin. Other outputs are one kind: both are 0."""
+    pressures: int
+    """Index of the first pressure; they are the last outputs."""
     moves: Numbers
     """How far an input must have moved for something to be seen of it."""
     may_rest: bool
@@ -208,7 +202,7 @@ def count_unchanged(c: SensorConstants, s: SensorState, y: Numbers, elapsed: int
     `y` was measured `elapsed` ticks after the last one. For those that are not controlled the others are most
     temperatures and most pressures: exact sensors of one kind rest with the plant while noisy ones of the other do not.
     """
-    first, end = c.kinds.temperatures, c.kinds.pressures
+    first, end = c.temperatures, c.pressures
     few = int(end == 0)  # most of the others are counted without the output itself, which matters where there are few
     temperatures, pressures = moved(s.before, y, first, end), moved(s.before, y, end, len(y))
     count = temperatures + pressures + (moved(s.before, y, 0, first) if end > 0 else 0)
@@ -337,15 +331,17 @@ class SensorMonitor(SensorState):
         frozen_ticks, resting_ticks = (round(s / process.tick_s) for s in (settings.frozen_s, settings.resting_s))
         controlled = [output in process.controlled for output in range(count)]
         quantities, bath = [output.quantity for output in process.outputs], process.bath
-        kinds = (quantities.index(kind) if kind in quantities else 0 for kind in ("temperature", "pressure"))
+        temperatures, pressures = (
+            quantities.index(kind) if kind in quantities else 0 for kind in ("temperature", "pressure")
+        )
         turbine = (-1, -1, -1)
         if bath is not None and bath.turbine_speed:
             before, behind = map(process.output_names.index, bath.turbine_pressures)
             turbine = process.output_names.index(bath.turbine_speed), before, behind
         low, high = zip(*settings.ranges, strict=True)
         self.constants = SensorConstants(
-            low, high, [frozen_ticks if each else resting_ticks for each in controlled], controlled, Kinds(*kinds),
-            moves, settings.may_rest, settings.may_rest and not process.moves_as_one, frozen_ticks,
+            low, high, [frozen_ticks if each else resting_ticks for each in controlled], controlled, temperatures,
+            pressures, moves, settings.may_rest, settings.may_rest and not process.moves_as_one, frozen_ticks,
             *turbine, *process.load.stored_span, round(settings.bridged_s / process.tick_s),
             round(settings.estimated_s / process.tick_s), settings.estimated_most,
         )  # fmt: skip

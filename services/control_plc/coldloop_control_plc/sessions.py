@@ -13,20 +13,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
 
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from coldloop.process.declaration import LAST_NUMBER, LAST_TICK, Process
-from coldloop.process.settings import ProcessSettings, settings_of, settings_process
+from coldloop.process.settings import ProcessSettings, settings_of
+from coldloop.registers import control_plc
 from coldloop.registers.codec import check_record
 from coldloop.registers.common import SessionPace
-from coldloop.registers.control_plc import (
-    SEQUENCE_ROWS,
-    ControlSession,
-    CoolDownStep,
-    Operator,
-    SequenceHeader,
-    control_map,
-)
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import Alarm, alarms_of
 from coldloop.safety.retained import RetainedFile, RetainedStateError, RetainedStateWriter
@@ -48,12 +41,6 @@ def _row(process: Process) -> struct.Struct:
     return struct.Struct(f">{len(process.inputs)}f")
 
 
-def _not_longer(text: str) -> str:
-    if len(text) > 2 * SEQUENCE_ROWS * _row(settings_process()).size:
-        raise ValueError("a sequence longer than the longest")
-    return text
-
-
 class RetainedControlState(ProcessSettings):
     """The session, how far it has got, what is being played, what operators have said, the alarms, and who we are."""
 
@@ -68,10 +55,10 @@ class RetainedControlState(ProcessSettings):
     pace: TimeBase
     updates: Annotated[int, Field(ge=0, le=LAST_NUMBER)]
     """Number of the next update."""
-    playing: tuple[SequenceHeader, Annotated[str, AfterValidator(_not_longer)]] | None
+    playing: tuple[control_plc.SequenceHeader, str] | None
     """Header and rows (base64 of single precision, high byte first) of the sequence being played."""
-    cool_down: CoolDownStep
-    operator: Operator
+    cool_down: control_plc.CoolDownStep
+    operator: control_plc.Operator
     watchdog: Annotated[int, Field(ge=0, lt=2**16)]
     """Time-out of the optimiser's watchdog, in ticks."""
     alarms: list[Alarm]
@@ -80,11 +67,14 @@ class RetainedControlState(ProcessSettings):
     def _possible(self) -> Self:
         if len(self.alarms) != len(alarms_of(self.process)):
             raise ValueError(f"{len(self.alarms)} alarms of {len(alarms_of(self.process))}")
-        registers = control_map(self.process)
+        registers = control_plc.control_map(self.process)
         for record in (SessionPace.shown(self.session, self.pace), self.operator, *self.alarms):
             check_record(record, registers)
         if self.playing is not None:
-            check_record(self.playing[0], registers)
+            header, rows = self.playing
+            check_record(header, registers)
+            if len(rows) > 2 * control_plc.SEQUENCE_ROWS * _row(self.process).size:
+                raise ValueError("a sequence longer than the longest")
         return self
 
     @classmethod
@@ -123,7 +113,7 @@ class ControlStateStore:
         self._process, self._row = process, _row(process)
         self._file = RetainedFile(file, OWNER, model_digest) if file else None
         self._writer = RetainedStateWriter(self._file) if self._file else None
-        self._packed: tuple[InputSequence, tuple[SequenceHeader, str]] | None = None
+        self._packed: tuple[InputSequence, tuple[control_plc.SequenceHeader, str]] | None = None
         self.refused = False
         """A previous state exists and is not used."""
         self.boot = 1
@@ -168,7 +158,7 @@ class ControlStateStore:
             "alarms": tuple(program.alarms.rows),
         }  # fmt: skip
 
-    def _playing(self, sequence: InputSequence | None) -> tuple[SequenceHeader, str] | None:
+    def _playing(self, sequence: InputSequence | None) -> tuple[control_plc.SequenceHeader, str] | None:
         if sequence is None:
             return None
         if self._packed is None or self._packed[0] is not sequence:
@@ -222,7 +212,7 @@ class Sessions:
         """There is a session, or one to be resumed if the rack is in it."""
         return self.running or self._configured.autostart or self.kept is not None
 
-    def start(self, asked: ControlSession) -> None:
+    def start(self, asked: control_plc.ControlSession) -> None:
         """Begin the session requested by an operator."""
         self.forget_kept()
         self._program.restart(asked.session)

@@ -125,29 +125,15 @@ def u16(
     return Field(Kind.U16, description, unit, least, most, values=values)
 
 
-def u32(description: str, *, unit: str = "", low: int | None = None, high: int | None = None) -> Field:
-    """Declare an unsigned 32-bit register pair."""
-    return Field(Kind.U32, description, unit, low, high)
+u32 = partial(Field, Kind.U32)
+"""Declare an unsigned 32-bit register pair."""
+f32 = partial(Field, Kind.F32)
+"""Declare an IEEE-754 single-precision register pair, or one for each of `elements`, in `units`, all of one range."""
 
 
 def text(description: str, words: int) -> Field:
     """Declare a text of two ASCII characters a word, padded with zeros; `registers.codec` converts it."""
     return Field(Kind.U16, description, elements=tuple(f"{word}" for word in range(words)), is_text=True)
-
-
-def f32(
-    description: str, *, unit: str = "", low: float | None = None, high: float | None = None, finite: bool = True
-) -> Field:
-    """Declare an IEEE-754 single-precision register pair."""
-    return Field(Kind.F32, description, unit, low, high, finite=finite)
-
-
-def f32_array(
-    description: str, elements: tuple[str, ...], units: tuple[str, ...], *, low: float | None = None,
-    high: float | None = None, finite: bool = True,
-) -> Field:  # fmt: skip
-    """Declare one single-precision register pair for each element, all with the same range."""
-    return Field(Kind.F32, description, "", low, high, elements, units, finite=finite)
 
 
 Numbers: TypeAlias = tuple[float, ...]
@@ -181,7 +167,7 @@ def _of_each(
         each = getattr(process, signals)
         names, units = tuple(one.name for one in each), tuple(one.unit if unit is None else unit for one in each)
         least, largest = process.span_of_inputs if in_span else (low, high)
-        return f32_array(description, names, units, low=least, high=largest, finite=finite)
+        return f32(description, low=least, high=largest, elements=names, units=units, finite=finite)
 
     return declared
 

@@ -28,13 +28,13 @@ def _predicted(process: Process) -> reg.Field:
         for time in _ahead(process, PREDICTED_SAMPLES)
     ]
     names, each = zip(*fields, strict=True) if fields else ((), ())
-    return reg.Field(reg.Kind.F32, "Predicted output", elements=names, units=tuple(one.unit for one in each), each=each)
+    return reg.f32("Predicted output", elements=names, units=tuple(one.unit for one in each), each=each)
 
 
 def _planned(process: Process) -> reg.Field:
     """Declare the inputs that are planned."""
     names = tuple(f"{name}.{time}" for time in _ahead(process, INPUT_SAMPLES) for name in process.input_names)
-    return reg.f32_array("Planned input", names, process.input_units * len(INPUT_SAMPLES))
+    return reg.f32("Planned input", elements=names, units=process.input_units * len(INPUT_SAMPLES))
 
 
 class OptimizerSession(NamedTuple):

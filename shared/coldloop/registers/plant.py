@@ -144,7 +144,9 @@ class LoadAhead(NamedTuple):
     length: Annotated[int, reg.u16("Steps in use", low=1, high=AHEAD_STEPS)] = 1
     watts: Annotated[
         Numbers,
-        lambda process: reg.f32_array(f"{process.load.noun} of step", _STEPS, (process.load.unit,) * AHEAD_STEPS),
+        lambda process: reg.f32(
+            f"{process.load.noun} of step", elements=_STEPS, units=(process.load.unit,) * AHEAD_STEPS
+        ),
     ] = (0.0,) * AHEAD_STEPS
     ticks: Annotated[
         tuple[int, ...],
@@ -239,8 +241,8 @@ class StationAlarm(IntFlag):
     """The low pressure has stopped a compressor; held until that is switched off."""
 
 
-_WARM_SIGNALS: Final = reg.f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, finite=False)
-_WARM_VALVES: Final = reg.f32_array("Requested opening of valve", STATION_VALVE_NAMES, ("%",) * 4)
+_WARM_SIGNALS: Final = reg.f32("Warm signal", elements=STATION_SIGNAL_NAMES, units=STATION_SIGNAL_UNITS, finite=False)
+_WARM_VALVES: Final = reg.f32("Requested opening of valve", elements=STATION_VALVE_NAMES, units=("%",) * 4)
 
 
 class StationSample(NamedTuple):
