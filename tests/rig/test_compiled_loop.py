@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import coldloop_rig.cosim.compiled.portable  # noqa: F401 lets numba compile what is plain Python
+import coldloop_rig.cosim.compiled.loops  # noqa: F401 lets numba compile what is plain Python
 from coldloop.config import load_configuration
 from coldloop.kernels.compiled import kernel
 from coldloop.kernels.single_precision import neighbour, single

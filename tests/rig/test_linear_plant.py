@@ -8,11 +8,11 @@ import pytest
 from coldloop.errors import ConfigurationError
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
-from coldloop_rig.cosim.ideal_loop import LinearRig
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.results.recording import Recorder, Recording
 from coldloop_rig.settings import Settings
+from coldloop_studies.request import LinearRig
 from coldloop_studies.settings import settings_of
 
 pytestmark = pytest.mark.usefixtures("compiles")

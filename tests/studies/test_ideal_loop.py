@@ -10,7 +10,7 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
 from coldloop_optimizer_plc.qp.costs import augmented_cost
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
-from coldloop_rig.cosim.ideal_loop import Solved, run_ideal_loop
+from coldloop_rig.cosim.one_process import Solved, run_ideal_loop
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.results.recording import Recorder, Recording
 from coldloop_studies.request import Outcome, perform

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from coldloop.kernels.reach import is_decisive_module, reached
-from coldloop_rig.cosim.compiled.cold_box_plants import advance_box
+from coldloop_rig.cosim.compiled.plants import advance_box
 from coldloop_studies.request import Procedure, RunRequest, perform, programs, programs_digest
 
 ROOT = Path(__file__).parents[2]

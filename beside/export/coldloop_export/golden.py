@@ -37,7 +37,7 @@ from coldloop_optimizer_plc.settings import ProgramSettings
 from coldloop_optimizer_plc.solvers.interface import KERNELS, Answer, Costs, solve_by
 from coldloop_optimizer_plc.solvers.ode import OdeMethod, solve
 from coldloop_plant.load import find_load
-from coldloop_rig.cosim.compiled.portable import PORTABLE
+from coldloop_rig.cosim.compiled.loops import PORTABLE
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.results.recording import Recorder

@@ -1,7 +1,7 @@
 """Decision and constraint instants that a problem needs: sets compared by their cost in the loop and on a PLC.
 
-Each set is judged by the loop of an infinitely fast PLC (`ideal_loop`), so that the parametrisation alone is judged and
-not the time that its iterations take. The loss is J_BF over that of the fullest set tried.
+Each set is judged by the loop of an infinitely fast PLC (`run_ideal_loop`), so that the parametrisation alone is
+judged and not the time that its iterations take. The loss is J_BF over that of the fullest set tried.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.settings import ControlDesign
-from coldloop_rig.cosim.ideal_loop import run_ideal_loop
+from coldloop_rig.cosim.one_process import run_ideal_loop
 from coldloop_rig.figures.plot import COLOURS, DASHES, INK
 from coldloop_rig.plc_sizing.budget import counted_sizes, estimator_memory, footprint, problem_of
 from coldloop_rig.plc_sizing.intervals import ADAPTIVE, geometric_mean, loop_cost, require_costs

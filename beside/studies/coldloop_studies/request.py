@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.errors import UsageError
+from coldloop.errors import ConfigurationError, UsageError
 from coldloop.kernels.reach import digest
 from coldloop.process.cold_box import COLD_BOX, L1, STATION_SIGNAL_NAMES, T5, TICK_S
 from coldloop.process.load_profile import LoadProfile
@@ -25,8 +25,9 @@ from coldloop.process.lti_model import load as load_model
 from coldloop.service.start import main as start_service
 from coldloop.text import file_digest, parsed_json
 from coldloop_optimizer_plc.solvers import make_solver
-from coldloop_plant.kinds import GROUP
-from coldloop_rig.cosim.ideal_loop import LinearRig
+from coldloop_plant.kinds import GROUP, NO_MISMATCH, noise_of
+from coldloop_plant.own_plants import LinearPlant
+from coldloop_plant.settings import PlantKind
 from coldloop_rig.cosim.local_services import run_on_localhost
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
@@ -61,7 +62,23 @@ class Procedure(StrEnum):
     HARSH_PROBLEMS = "harsh problems"
     """Paired problems, of which only those with a guess far from the optimum count; all solvers begin at that guess."""
     LINEAR_PLANT = "linear plant"
-    """The optimiser and the control PLC with the linear model for a plant (`coldloop_rig.cosim.ideal_loop`)."""
+    """The optimiser and the control PLC with the linear model for a plant (`LinearRig`)."""
+
+
+class LinearRig(OneProcessRig):
+    """Control PLC and optimiser PLC with a linear plant; its loop is not compiled.
+
+    Raises:
+        ConfigurationError: The plant is to differ from its model.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        if settings.plant.kind is not PlantKind.COLD_BOX or settings.plant.mismatch != NO_MISMATCH:
+            raise ConfigurationError("plant: the linear plant is a cold box without mismatch")
+        super().__init__(settings, compiled=False)
+
+    def _plant(self, load: LoadProfile, seed: int) -> LinearPlant:
+        return LinearPlant(load_model(self._settings.model.file), load, noise_of(self._settings.plant.sensors, seed))
 
 
 @dataclass(frozen=True)

@@ -184,7 +184,12 @@ def write_site(out: Path, hosts: Sequence[str], days: int) -> tuple[int, Path]:
     pairs |= {name: authority.issue_client(name, role) for name, role in CLIENTS.items()}
     files = {f"{name}.crt": pair.certificate_pem for name, pair in pairs.items()}
     files |= {f"{name}.key": pair.key_pem for name, pair in pairs.items()}
-    files |= {REVOCATIONS: authority.revocation_list([], days), CONFIGURATION: _configuration(out.resolve()).encode()}
+    lines, folder = ["# Made by `coldloop certificates`: Modbus/TCP Security on all three servers."], out.resolve()
+    for section, owner in OWNERS.items():
+        names = {"certificate": f"{owner}.crt", "key": f"{owner}.key", "ca": "ca.crt", "crl": REVOCATIONS}
+        lines += ["", f"[{section}]"]
+        lines += [f"{key} = {json.dumps(str(folder / name), ensure_ascii=False)}" for key, name in names.items()]
+    files |= {REVOCATIONS: authority.revocation_list([], days), CONFIGURATION: ("\n".join(lines) + "\n").encode()}
     if present := next((name for name in files if (out / name).exists()), None):
         raise UsageError(f"{out / present} exists: name another folder with --out, or remove the old files")
     prepare_folder(out)
@@ -226,12 +231,3 @@ def _loaded(file: Path, remedy: str, load: Callable[[bytes], T]) -> T:
         return load(read_bytes(file, remedy))
     except (ValueError, TypeError) as error:
         raise UsageError(f"{file}: {error}; {remedy}") from None
-
-
-def _configuration(folder: Path) -> str:
-    lines = ["# Made by `coldloop certificates`: Modbus/TCP Security on all three servers."]
-    for section, owner in OWNERS.items():
-        files = {"certificate": f"{owner}.crt", "key": f"{owner}.key", "ca": "ca.crt", "crl": REVOCATIONS}
-        lines += ["", f"[{section}]"]
-        lines += [f"{key} = {json.dumps(str(folder / name), ensure_ascii=False)}" for key, name in files.items()]
-    return "\n".join(lines) + "\n"

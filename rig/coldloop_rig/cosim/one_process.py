@@ -1,7 +1,13 @@
-"""The three programs in one process, by direct calls; what would cross the bus is rounded as the bus would round it."""
+"""Loops in one process: the three programs, by direct calls, and one without a PLC's limits.
 
+What would cross the bus is rounded as the bus would round it.
+"""
+
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
 
 from coldloop.errors import LoadFileError
 from coldloop.kernels.cache import kernels_of
@@ -10,11 +16,18 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
 from coldloop.registers import Maps, maps_of
 from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import Update, Verdict
+from coldloop.registers.control_plc import SequenceRow, Update, Verdict, control_map
 from coldloop.registers.plant import LoadStep, Measurement, PlantSample, plant_map
+from coldloop_control_plc.output_limits import OutputGuard
 from coldloop_control_plc.program import ControlProgram
 from coldloop_control_plc.program import make_program as make_control_program
+from coldloop_optimizer_plc.computing_settings import EstimatorKind
+from coldloop_optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
 from coldloop_optimizer_plc.program import OptimizerProgram
+from coldloop_optimizer_plc.qp.linear_algebra import Array
+from coldloop_optimizer_plc.qp.prediction import prediction_of
+from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
+from coldloop_optimizer_plc.solvers.outside_libraries import DaqpSolver
 from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.program import PlantProgram
 from coldloop_plant.settings import PlantKind
@@ -140,3 +153,55 @@ class OneProcessRig:
             return None
         may_compile = self._compiled is True or ticks >= SHORT
         return CompiledStretches(plant, compiled, self.control, self.optimizer, load, may_compile=may_compile)
+
+
+Solved = Callable[[QuadraticProblem, Array, Array], None]
+"""Takes a problem, the guess that a solver would begin with (the shifted optimum of the last one), and its optimum."""
+
+
+def run_ideal_loop(
+    settings: Settings, scenario: Scenario, recorder: Recorder, ticks: int, solved: Solved | None = None
+) -> None:  # fmt: skip
+    """Run a scenario from the operating point in the loop of a PLC without limits: all problems are solved at once.
+
+    The inputs go through the control PLC's guard: bounds, rates and the slew limit hold as for everybody.
+
+    Args:
+        settings: Of plant, limits, model, estimator and design; solver, budget, rule, `outside` have no effect.
+        scenario: Its updating period has no effect.
+        recorder: Takes the samples; there are no updates.
+        ticks: From one instant to the next, 1 to 20.
+        solved: Called with each problem.
+    """
+    header, model = own_header(settings.model.file), load_model(settings.model.file)
+    program = settings.optimizer_plc.program
+    prediction = prediction_of(model, program.estimator.disturbed, program.design)
+    problem = PredictiveProblem(prediction, program.design, settings.limits)
+    kalman = program.estimator.model_copy(update={"kind": EstimatorKind.KALMAN})
+    estimator, belief = estimator_of(prediction, kalman), no_belief(prediction.n_states, len(prediction.y0))
+    solver = DaqpSolver(program.daqp)
+    plant = plant_maker(header, settings.plant)(scenario.load, scenario.seed)
+    applied = as_transmitted(SequenceRow(tuple(model.u0.tolist())), control_map(settings.process)).u
+    guard = OutputGuard(settings.limits, applied)
+    z = problem.hold(np.zeros(len(applied)))
+    recorder.begin()
+    for tick in range(scenario.ticks):
+        y, x, watts = plant.measure(), plant.state, plant.load
+        wanted = applied
+        instant = tick % ticks == 0
+        if instant:
+            correct(estimator, belief, np.array(applied), watts, np.array(y), np.array(x))
+            u = np.array(applied) - model.u0
+            parameters = QpParameters(belief.x.copy(), float(belief.numbers[0]["w"]), u, ticks)
+            qp, guess = problem.at(parameters), problem.shifted(z, ticks)
+            z = solver.solve(qp, guess, (1,)).z
+            if solved is not None:
+                solved(qp, guess, z)
+            wanted = tuple(problem.inputs(z, 1)[0].tolist())
+        applied = guard.admit(tick, wanted, update=instant)
+        if instant:
+            begin_prediction(belief)
+            predict(estimator, belief, np.array(applied) - model.u0, ticks)
+        plant.apply(applied)
+        recorder.sample(PlantSample(tick, watts, applied, y, x))
+        plant.advance()

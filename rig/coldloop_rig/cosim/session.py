@@ -505,25 +505,22 @@ async def save_session(rig: SessionClient) -> SavedSession | None:
     """Return the session of a rig if it runs in real time.
 
     Raises:
-        LinkError: A service does not answer.
+        LinkError: A service does not answer, or its load is invalid.
     """
     identity, pace = await rig.plant.read(Identity), await rig.plant.read(SessionPace)
     if not identity.session or not pace.realtime:
         return None
-    return SavedSession(pace, await rig.control.read(Operator), await _load_from(rig, identity.tick))
-
-
-async def _load_from(rig: SessionClient, now: int) -> LoadProfile:
-    """Return the load from now on: of the session's table, unless another client has written one since."""
+    operator, now = await rig.control.read(Operator), identity.tick
     status, asked = await rig.plant.read(plant.LoadStatus), await rig.plant.read(plant.PlantSession)
     steps: list[plant.LoadStep] = []
     if status.upcoming:
         steps = await rig.plant.read_rows(plant.LoadStep, 0, min(asked.load_steps, plant.LOAD_ROWS))
-    if not steps or steps[-1].tick != status.last_tick:
+    if not steps or steps[-1].tick != status.last_tick:  # another client has written a load since
         steps = []
     coming = [step for step in steps if step.tick > now]
     try:
-        return LoadProfile((0, *(step.tick - now for step in coming)), (status.watts, *(step.watts for step in coming)))
+        times, watts = (0, *(step.tick - now for step in coming)), (status.watts, *(step.watts for step in coming))
+        return SavedSession(pace, operator, LoadProfile(times, watts))
     except ValueError as error:
         raise LinkError(f"{rig.plant.peer}: its load is invalid: {error}") from None
 

@@ -27,6 +27,8 @@ QUIET_S: Final = 20.0
 """A run gives up a rig on which nothing happens, or a service that does not answer, for this long."""
 HOST: Final = "127.0.0.1"
 SERVICES: Final = ("plant", "control_plc", "optimizer_plc")
+PEERS: Final = {"control_plc": "plant", "optimizer_plc": "control_plc"}
+"""Services that are clients of another one, which their section has an endpoint of."""
 RETAINING: Final = ("plant", "control_plc")
 """Services that resume after a restart, from a state file."""
 START_PATIENCE_S: Final = 600.0
@@ -188,34 +190,17 @@ def retaining(settings: "Settings", folder: Path, *, always: bool) -> "Settings"
 
 def wired(settings: "Settings", endpoints: RigEndpoints, detours: Detours | None = None) -> "Settings":
     """Return the settings with the servers on these endpoints and the clients pointed at them, or at the detours."""
-
-    def client(endpoint: Endpoint, configured: Endpoint, detour: int | None) -> Endpoint:
-        port = endpoint.port if detour is None else detour
-        return endpoint.model_copy(update={"port": port, "timeout_s": configured.timeout_s, "tls": configured.tls})
-
-    def server(section: str, endpoint: Endpoint) -> object:
-        return getattr(settings, section).server.model_copy(update={"host": endpoint.host, "port": endpoint.port})
-
-    plant, control_plc = detours or (None, None)
+    sections: dict[str, object] = {}
+    for service, end in endpoints._asdict().items():
+        section = getattr(settings, service)
+        update = {"server": section.server.model_copy(update={"host": end.host, "port": end.port})}
+        if (peer := PEERS.get(service)) is not None:
+            there, own = getattr(endpoints, peer), getattr(section, peer)
+            port = there.port if detours is None else getattr(detours, peer)
+            update[peer] = there.model_copy(update={"port": port, "timeout_s": own.timeout_s, "tls": own.tls})
+        sections[service] = section.model_copy(update=update)
     telemetry, port = settings.telemetry, endpoints.plant.port
     if port != PLANT_PORT and telemetry.prefix == type(telemetry)().prefix:  # another rig may have the same broker
         telemetry = telemetry.model_copy(update={"prefix": f"{telemetry.prefix}/{port}"})
-    return settings.model_copy(
-        update={
-            "telemetry": telemetry,
-            "session": settings.session.model_copy(update={"autostart": False}),
-            "plant": settings.plant.model_copy(update={"server": server("plant", endpoints.plant)}),
-            "control_plc": settings.control_plc.model_copy(
-                update={
-                    "server": server("control_plc", endpoints.control_plc),
-                    "plant": client(endpoints.plant, settings.control_plc.plant, plant),
-                }
-            ),
-            "optimizer_plc": settings.optimizer_plc.model_copy(
-                update={
-                    "server": server("optimizer_plc", endpoints.optimizer_plc),
-                    "control_plc": client(endpoints.control_plc, settings.optimizer_plc.control_plc, control_plc),
-                }
-            ),
-        }
-    )
+    session = settings.session.model_copy(update={"autostart": False})
+    return settings.model_copy(update={**sections, "telemetry": telemetry, "session": session})

@@ -125,13 +125,15 @@ def draw_run(curves: RunCurves) -> Figure:
         for place, (name, label) in zip(axes, labels.items(), strict=False):
             if name not in NOT_CURVES:
                 word = process.load.name if name == process.load.column else name
-                _curve(place, time, curves.series[name], label, word)
+                place.plot(time, curves.series[name], color=INK, linewidth=1, label=word, drawstyle="steps-post")
+                place.set_ylabel(label)
             if (edges := curves.edges.get(name)) is not None:
                 what = "bounds" if name in process.input_names else "band"
                 limit(place, curves.series[name], edges, f"{what} {ends_text(*edges)} {units[name]}".rstrip())
         behind = len(labels) - len(NOT_CURVES)
         for place, (name, ends) in zip(axes[behind:], curves.pressures.items(), strict=False):
-            _curve(place, time, curves.series[name], f"{name} (bar)", name)
+            place.plot(time, curves.series[name], color=INK, linewidth=1, label=name, drawstyle="steps-post")
+            place.set_ylabel(f"{name} (bar)")
             limit(place, curves.series[name], ends, f"no alarm from {ends_text(*ends)} bar")
         behind += len(curves.pressures)
         place, tau_u = axes[behind], curves.series["tau_u_s"]
@@ -188,11 +190,6 @@ def legend_above(axes: Axes) -> None:
     handles, _ = axes.get_legend_handles_labels()
     if handles and axes.get_legend() is None:
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=len(handles), borderaxespad=0.1)
-
-
-def _curve(axes: Axes, time: Series, values: Series, label: str, name: str) -> None:
-    axes.plot(time, values, color=INK, linewidth=1, label=name, drawstyle="steps-post")
-    axes.set_ylabel(label)
 
 
 def limit(axes: Axes, values: Series, limits: tuple[float, float], label: str) -> None:
@@ -390,18 +387,14 @@ def compare(paths: Sequence[Path], out: Path) -> str:
     labels = names if len(set(names)) == len(names) else [str(path) for path in paths]
     with writing(out):
         save_figure(_draw_comparison(runs, labels), out)
-    return _comparison_table(runs, labels) + f"figure in {out}\n"
-
-
-def _comparison_table(runs: Sequence[RunFolder], labels: Sequence[str]) -> str:
-    summaries, process, rows = [run.summary for run in runs], runs[0].process, [["", *labels]]
+    summaries, rows = [run.summary for run in runs], [["", *labels]]
     shares = (f"{one.name}_outside_band_pct" for one in process.banded)
     figures = (*FIGURES, *shares, *excess_keys(process), "deadline_misses", "trace_sha256")
     rows += [[name, *(_cell(summary.get(name)) for summary in summaries)] for name in figures]
     keys = sorted({key for run in runs for key in run.configuration})
     different = [key for key in keys if len({repr(run.configuration.get(key)) for run in runs}) > 1]
     rows += [[key, *(_cell(run.configuration.get(key)) for run in runs)] for key in different]
-    return aligned(rows, numbers=True)
+    return f"{aligned(rows, numbers=True)}figure in {out}\n"
 
 
 def _cell(value: Any) -> str:  # noqa: ANN401 a value of a JSON document

@@ -53,14 +53,29 @@ class RecordedPage:
             self._causes = table["cause"].to_pylist()
             bits = cache(self._bits)
             self._bad_sensors = [bits(bad or "") for bad in table["bad_sensors"].to_pylist()]
-        self._since = _beginnings(self._modes)
-        self._station = self._read_station()
+        self._since: list[int] = []
+        """First tick of the mode of each tick."""
+        for tick, mode in enumerate(self._modes):
+            self._since.append(self._since[-1] if tick and mode == self._modes[tick - 1] else tick)
+        self._station: NDArray[np.float32] | None = None
+        """Signals, mode and alarms of the station, a row a tick; None of a cold box alone."""
+        if (folder.path / STATION).exists():
+            with folder.reading(STATION, MOST_IN_MEMORY) as file:
+                table = file.read(columns=[*STATION_SIGNAL_NAMES, "mode", "alarms"])
+            self._station = np.column_stack([column.to_numpy() for column in table.columns]).astype(np.float32)
         self.ticks = len(self._values)
         self.configuration: Mapping[str, Any] = folder.configuration
         with folder.reading("updates.parquet", MOST_LISTED) as file:
             rows = file.read().to_pylist()
-        self.updates: Sequence[Optimization] = [_optimization(row, self.process.tick_s) for row in rows]
-        entries = (_entry(row) for row in folder.events())
+        for row in rows:
+            row["tau_u"] = round(row["tau_u_s"] / self.process.tick_s)
+        values = ([0.0 if row[name] is None else row[name] for name in Optimization._fields] for row in rows)
+        self.updates: Sequence[Optimization] = [*map(Optimization._make, values)]
+        entries = []
+        for row in folder.events():
+            value = "" if row["value"] is None else f"{row['value']:.7g}"
+            text = EventText(row["kind"], row["subject"], row["cause"], value, row["unit"], row["who"])
+            entries.append(JournalEntry(row["service"], row["number"], row["boot"], row["utc"], row["tick"], text))
         self.events: Sequence[JournalEntry] = sorted(entries, key=lambda entry: entry.tick)
         settings = self._read_settings()
         program, limits = settings.optimizer_plc.program, settings.limits
@@ -70,16 +85,7 @@ class RecordedPage:
         bands = program.design.output_low, program.design.output_high
         self.limits = OperatingLimits(*bands, limits.low, limits.high, limits.rate)
 
-    def _read_station(self) -> NDArray[np.float32] | None:
-        """Return signals, mode and alarms of the station, a row a tick; None of a cold box alone."""
-        if not (self._folder.path / STATION).exists():
-            return None
-        with self._folder.reading(STATION, MOST_IN_MEMORY) as file:
-            table = file.read(columns=[*STATION_SIGNAL_NAMES, "mode", "alarms"])
-        return np.column_stack([column.to_numpy() for column in table.columns]).astype(np.float32)
-
     def _read_settings(self) -> OptimizerSettings:
-        """Return what the optimiser was configured with."""
         values = {key: value for key, value in self._folder.configuration.items() if key.split(".")[0] in SECTIONS}
         copy = self._folder.manifest["inputs"].get("model", {}).get("file")
         values["model.file"] = str(self._folder.held(copy)) if copy else "cold-box"
@@ -121,32 +127,11 @@ class RecordedPage:
         return found
 
     def _bits(self, names: str) -> int:
-        """Return the bits of outputs that are named in a text."""
         return sum(1 << self.process.output_names.index(name) for name in names.split())
 
     def alarms(self, events: Sequence[JournalEntry]) -> list[Alarm]:
         """Return the alarms after these events."""
-        return alarms_after(events, self._folder.process)
-
-
-def _beginnings(modes: Sequence[str]) -> list[int]:
-    """Return for each tick the one at which its mode began."""
-    found: list[int] = []
-    for tick, mode in enumerate(modes):
-        found.append(found[-1] if tick and mode == modes[tick - 1] else tick)
-    return found
-
-
-def _optimization(row: Mapping[str, Any], tick_s: float) -> Optimization:
-    names = [name for name in Optimization._fields if name != "tau_u"]
-    values: dict[str, Any] = {name: 0.0 if row[name] is None else row[name] for name in names}
-    return Optimization(**values, tau_u=round(row["tau_u_s"] / tick_s))
-
-
-def _entry(row: Mapping[str, Any]) -> JournalEntry:
-    value = "" if row["value"] is None else f"{row['value']:.7g}"
-    text = EventText(row["kind"], row["subject"], row["cause"], value, row["unit"], row["who"])
-    return JournalEntry(row["service"], row["number"], row["boot"], row["utc"], row["tick"], text)
+        return alarms_after(events, self.process)
 
 
 _KINDS: Final = {event.word: event for events in TRANSITIONS.values() for event in events}

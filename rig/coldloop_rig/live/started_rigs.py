@@ -215,14 +215,11 @@ class RunningRig(NamedTuple):
     """Whether its links can be cut; see `coldloop_rig.live.up`."""
 
     @classmethod
-    def of_this_process(cls, ports: Sequence[int], tls: str, services: Mapping[str, int], *, cuttable: bool) -> Self:
-        """Return the rig that this process keeps up, with the processes of its services."""
+    def write(cls, ports: Sequence[int], tls: str, services: Mapping[str, int], *, cuttable: bool) -> None:
+        """Write the state file, by which commands find the rig that this process keeps up, and its services."""
         processes = {service: ServiceProcess.of(pid) for service, pid in services.items()}
-        return cls(*ServiceProcess.of(os.getpid()), tuple(ports), tls, processes, cuttable)
-
-    def write(self) -> None:
-        """Write the state file, by which commands find this rig."""
-        write_own(state_folder(self.ports[0]) / STATE_FILE, json.dumps(self._asdict()) + "\n")
+        rig = cls(*ServiceProcess.of(os.getpid()), tuple(ports), tls, processes, cuttable)
+        write_own(state_folder(ports[0]) / STATE_FILE, json.dumps(rig._asdict()) + "\n")
 
     @classmethod
     def parsed(cls, text: str) -> Self:

@@ -1,7 +1,7 @@
 """Requests of commands to a running rig over Modbus: its status, or writes with the role of an operator."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterable, Iterator
+from collections.abc import Awaitable, Callable, Iterable
 from contextlib import AsyncExitStack, nullcontext
 from typing import Any, Final, NamedTuple
 
@@ -94,7 +94,6 @@ async def read_status(clients: Clients) -> RigStatus:
 
 
 async def _answer(read: Callable[[CommandClient], Awaitable[Any]], client: CommandClient) -> Any:  # noqa: ANN401 any
-    """Return what is read, or why a service does not answer."""
     try:
         async with answered_in_time("to read the status"):
             await client.connect(0.0)
@@ -143,33 +142,28 @@ def colour(status: RigStatus) -> Colour:
 
 def page(status: RigStatus) -> str:
     """Return the state as a page."""
-    state = colour(status)
-    shown = {"mode": state, "alarms": state, "absent": Colour.FAILED}
-    return "".join(
-        f"{name:8} {coloured(text, shown[name]) if name in shown else text}\n" for name, text in _rows(status)
-    )
-
-
-def _rows(status: RigStatus) -> Iterator[tuple[str, str]]:
     plant, control, process, tick_s = status.plant, status.control, status.process, status.process.tick_s
+    rows = []
     if plant is not None:
-        yield "session", f"{plant.identity.session}, {_pace(plant)}, {plant.identity.tick * tick_s:.2f} s"
+        rows.append(("session", f"{plant.identity.session}, {_pace(plant)}, {plant.identity.tick * tick_s:.2f} s"))
     if control is not None:
         mode, cause = Mode.word_of(control.ladder.mode), Cause.word_of(control.ladder.cause)
-        yield "mode", f"{mode} ({cause}) since {control.ladder.since * tick_s:g} s"
-        yield "operator", OperatorMode.word_of(control.operator.mode)
+        rows.append(("mode", f"{mode} ({cause}) since {control.ladder.since * tick_s:g} s"))
+        rows.append(("operator", OperatorMode.word_of(control.operator.mode)))
     if plant is not None and process.has_load:
         load, unit = plant.load, process.load.unit
         then = f", {value_text(load.next_watts, unit)} from {load.next_tick * tick_s:g} s" if load.upcoming else ""
-        yield "load", f"{value_text(load.watts, unit)}{then}"
+        rows.append(("load", f"{value_text(load.watts, unit)}{then}"))
     if control is not None:
         known = any(control.y)  # a control PLC that was started again shows nothing before its first scan
         for i, one in zip(process.controlled, process.banded, strict=True):
-            yield one.name, f"{control.y[i]:.3f} {one.unit}" if known else "-"
-    yield "tau_u", _tau_u(status)
+            rows.append((one.name, f"{control.y[i]:.3f} {one.unit}" if known else "-"))
+    rows.append(("tau_u", _tau_u(status)))
     if control is not None:
-        yield "alarms", "; ".join(control.alarms) or "none"
-    yield from (("absent", one) for one in status.silent)
+        rows.append(("alarms", "; ".join(control.alarms) or "none"))
+    rows += [("absent", one) for one in status.silent]
+    shown = {"mode": colour(status), "alarms": colour(status), "absent": Colour.FAILED}
+    return "".join(f"{name:8} {coloured(text, shown[name]) if name in shown else text}\n" for name, text in rows)
 
 
 def line(status: RigStatus) -> str:

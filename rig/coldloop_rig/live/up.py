@@ -307,7 +307,7 @@ class UpRig:
         """Write which processes there are, for the commands that ask for them."""
         tls = "" if self._tls is None else str(self._tls.resolve())
         pids = {service: process.pid for service, process in services.processes.items()}
-        started_rigs.RunningRig.of_this_process(self._ports, tls, pids, cuttable=self._links is not None).write()
+        started_rigs.RunningRig.write(self._ports, tls, pids, cuttable=self._links is not None)
 
     async def _keep(self, services: local_services.LocalServices, rig: SessionClient, page: PageProcess | None) -> None:
         def unwritten(error: LinkError) -> None:

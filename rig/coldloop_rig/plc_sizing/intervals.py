@@ -36,8 +36,7 @@ from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.settings import SolverName
 from coldloop_optimizer_plc.solvers import Solver, make_solver
 from coldloop_plant.load import HOURS, drawn, find_load
-from coldloop_rig.cosim.ideal_loop import run_ideal_loop
-from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.cosim.one_process import OneProcessRig, run_ideal_loop
 from coldloop_rig.cosim.scenario import Scenario, natural_ticks
 from coldloop_rig.progress import make_console
 from coldloop_rig.results.indicators import evaluate

@@ -94,7 +94,8 @@ async def _show_journal(options: argparse.Namespace) -> None:
     client = RegisterClient.at(maps_of(process).by_service[options.service], place)
     peer = client.peer
     reader = JournalReader(client, options.since.number, options.kind)
-    output = _CsvFile(options.csv, process) if options.csv else _Lines(process)
+    file = _CsvFile(options.csv, process) if options.csv else None
+    write = partial(_print_events, process) if file is None else file.write
     warned: set[str] = set()
     try:
         await client.connect(0)
@@ -108,33 +109,25 @@ async def _show_journal(options: argparse.Namespace) -> None:
                 if happened and warning not in warned:
                     warned.add(warning)
                     sys.stderr.write(f"coldloop: {warning}\n")
-            output.write([event for event in events if event.utc + event.milliseconds / 1000 >= options.since.utc])
+            write([event for event in events if event.utc + event.milliseconds / 1000 >= options.since.utc])
             if not options.follow:
                 return
             await asyncio.sleep(LOOK_AGAIN_S)
     finally:
         client.close()
-        output.close()
+        if file is not None:
+            file.close()
 
 
-class _Lines:
-    """Writes one line an event to standard output."""
+def _print_events(process: "Process", events: "Sequence[Event]") -> None:
+    from coldloop.service.journal import describe, utc_text
 
-    def __init__(self, process: "Process") -> None:
-        self._process = process
-
-    def write(self, events: "Sequence[Event]") -> None:
-        from coldloop.service.journal import describe, utc_text
-
-        for event in events:
-            sys.stdout.write(
-                f"{event.number:>7}  {utc_text(event)}  boot {event.boot}  tick {event.tick} "
-                f"({event.tick * self._process.tick_s:.2f} s)  {describe(event, self._process).sentence}\n"
-            )
-        sys.stdout.flush()
-
-    def close(self) -> None:
-        pass
+    for event in events:
+        sys.stdout.write(
+            f"{event.number:>7}  {utc_text(event)}  boot {event.boot}  tick {event.tick} "
+            f"({event.tick * process.tick_s:.2f} s)  {describe(event, process).sentence}\n"
+        )
+    sys.stdout.flush()
 
 
 class _CsvFile:

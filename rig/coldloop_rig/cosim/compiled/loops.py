@@ -6,15 +6,20 @@ the program concludes. Values that would cross the link are rounded as the link
 rounds them, through the rows of the trace.
 """
 
+from collections.abc import Callable
+from inspect import isfunction
 from typing import Any, Final
 
 import numpy as np
+from numba.extending import overload, register_jitable
 from numpy.typing import NDArray
 
-import coldloop_rig.cosim.compiled.portable  # noqa: F401 it lets kernels call what is plain Python
+from coldloop.kernels import single_precision
 from coldloop.kernels.compiled import inlined, kernel
 from coldloop.kernels.intrinsics import borrowed
+from coldloop.safety import watchdog
 from coldloop.safety.watchdog import trigger
+from coldloop_control_plc import alarms, output_limits, player, scan, sensors
 from coldloop_control_plc.output_limits import in_range, judge
 from coldloop_control_plc.player import accept, awaits_sequence, has_row, latch, latches, promise
 from coldloop_control_plc.scan import Scan, decide, observe
@@ -37,6 +42,26 @@ from coldloop_rig.cosim.compiled.records import (
 )
 
 Counts = NDArray[np.int64]
+
+PORTABLE: Final[tuple[Callable[..., Any], ...]] = (
+    single_precision.neighbour,
+    *(
+        function
+        for module in (alarms, output_limits, player, scan, sensors, watchdog)
+        for name, function in vars(module).items()
+        if isfunction(function) and function.__module__ == module.__name__ and not name.startswith("_")
+    ),
+)
+"""The control PLC's scan, which is plain Python (that PLC runs without numba): kernels call it, and exports have it."""
+
+for portable in PORTABLE:
+    register_jitable(error_model="numpy")(portable)
+
+
+@overload(single_precision.single, jit_options={"error_model": "numpy"}, strict=False)
+def _single(value: Any) -> Any:  # noqa: ANN401, ARG001 a type of numba
+    return lambda value: np.float64(np.float32(value))
+
 
 DONE: Final = 0
 OBSERVED: Final = 2

@@ -56,7 +56,10 @@ class CompiledStretches:
     ) -> None:
         self._plant, self._compiled, self._control, self._optimizer = plant, compiled, control_plc, optimizer_plc
         process = control_plc.alarm_settings.process
-        self._updates_too = _is_compiled(optimizer_plc)
+        ours = type(optimizer_plc) is OptimizerProgram  # a subclass may behave differently
+        others = optimizer_plc.plans_by_steps or process.forecasts
+        self._updates_too = ours and isinstance(optimizer_plc.solver, KernelSolver) and not others
+        """Whether the updates have a compiled form: solver, rule and estimator of our own, no forecast."""
         self._may_compile = may_compile
         self._is_there: dict[Callable[..., int], bool] = {}
         self._trace = records.empty_trace(process, STATION_COLUMNS if plant.station else 0)
@@ -107,7 +110,10 @@ class CompiledStretches:
         latched = self._give_back(first, ticks, outcome)
         load, u, y, x, station = (part[:ticks].copy() for part in self._trace)
         block = SampleBlock(first, load, u, y, x, station if station.size else NO_STATION)
-        return Stretch(block, _optimizations(self._reports, int(counts[records.SOLVED])), latched)
+        reported = (part[: counts[records.SOLVED]].tolist() for part in self._reports)
+        rows = ([*numbers, int(Verdict.ACCEPTED), *values] for numbers, values in zip(*reported, strict=True))
+        updates = [Optimization(*row) for row in rows]
+        return Stretch(block, updates, latched)
 
     def _run(self, loop: Callable[..., int], *arguments: Any) -> int:  # noqa: ANN401 arguments differ by loop
         """Run a loop and return how it ended; it may have to be compiled: whether it is there is asked once."""
@@ -139,17 +145,3 @@ class CompiledStretches:
     def _measurement(self, first: int, row: int) -> Measurement:
         u, y, x = (tuple(part[row].tolist()) for part in (self._trace.u, self._trace.y, self._trace.x))
         return Measurement(first + row, float(self._trace.load[row]), y, x, self._control.session, u)
-
-
-def _is_compiled(program: OptimizerProgram) -> bool:
-    """Tell whether the program's updates have a compiled form: solver, rule and estimator of our own, no forecast."""
-    if type(program) is not OptimizerProgram:  # a subclass may behave differently
-        return False
-    return isinstance(program.solver, KernelSolver) and not (program.plans_by_steps or program.process.forecasts)
-
-
-def _optimizations(reports: records.Reports, solved: int) -> list[Optimization]:
-    """Return what was reported, as the recorder takes it."""
-    counts, values = reports.counts[:solved].tolist(), reports.values[:solved].tolist()
-    rows = ([*row, int(Verdict.ACCEPTED), *of_row] for row, of_row in zip(counts, values, strict=True))
-    return [Optimization(*row) for row in rows]
