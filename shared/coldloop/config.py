@@ -96,16 +96,13 @@ class _Layers:
         for key, followers in decides.items():
             for follower in followers:
                 if self._layers.get(follower, 0) < self._layers.get(key, 0):
-                    self._drop(follower)
-
-    def _drop(self, key: str) -> None:
-        *sections, last = key.split(".")
-        place: Any = self.values
-        for section in sections:
-            place = place.get(section) if isinstance(place, dict) else None
-        if isinstance(place, dict):
-            place.pop(last, None)
-        self.sources.pop(key, None)
+                    *sections, last = follower.split(".")
+                    place: Any = self.values
+                    for section in sections:
+                        place = place.get(section) if isinstance(place, dict) else None
+                    if isinstance(place, dict):
+                        place.pop(last, None)
+                    self.sources.pop(follower, None)
 
 
 def load_configuration(

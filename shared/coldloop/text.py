@@ -112,11 +112,7 @@ def held_file(folder: Path, name: str, remedy: str, error: type[ColdloopError] =
 
 
 def decoded(data: bytes) -> str:
-    """Return the text that bytes hold.
-
-    Raises:
-        UnicodeDecodeError: They are not UTF-8, nor UTF-16 with a byte order mark.
-    """
+    """Return the text that bytes hold (UnicodeDecodeError: they are not UTF-8, nor UTF-16 with a byte order mark)."""
     return data.decode(next((coding for mark, coding in MARKS.items() if data.startswith(mark)), "utf-8"))
 
 

@@ -381,6 +381,11 @@ def trend_document(
     every = max(1, -(-len(shown) // EARLIER_PREDICTIONS))  # the newest, and of the earlier ones some
     quantities = ("tau_u",) if is_brief else tuple(QUANTITIES)
     limits = model.limits
+    begun = max((e.utc for e in model.events if e.service == "plant" and e.text.kind == BEGUN), default="")
+    known = [entry for entry in model.events if entry.utc >= begun]  # not of a session before
+    marked = MARKED.keys() - ({EventKind.LOAD.word} if not process.has_load else ())
+    found = [entry for entry in known if entry.text.kind in marked and start <= entry.tick <= end]
+    is_cut = len(found) > MOST_MARKS or (len(known) == model.events.maxlen and known[0].tick > start)
     return {
         "now_s": model.tick * tick_s,
         "time": times,
@@ -388,7 +393,11 @@ def trend_document(
         "updates": updates_document(model.updates, in_force, gaps, points, quantities, tick_s),
         "modes": [{"from": one.start, "to": one.end, "mode": Mode.word_of(one.mode)} for one in modes],
         "doubtful": {name: found for name, found in model.trends.doubtful(start, end).items() if name in names},
-        **_marks(model, start, end),
+        "marks": [
+            {"time": entry.tick * tick_s, "kind": MARKED[entry.text.kind], "text": entry.text.sentence}
+            for entry in found[-MOST_MARKS:]
+        ],
+        "marks_since_s": (found[-MOST_MARKS:] or known)[0].tick * tick_s if is_cut else None,
         "predictions": [prediction_document(one, process) for one in shown[::-1][::every][::-1]],
         "planned": model.is_planned,
         "gaps": [[max(gap.start, start) * tick_s, min(gap.end, end) * tick_s] for gap in gaps],
@@ -433,22 +442,6 @@ def _ranges(names: Sequence[str], low: Sequence[float], high: Sequence[float]) -
     return {name: list(ends) for name, *ends in zip(names, low, high, strict=True)}
 
 
-def _marks(model: image.Model, start: int, end: int) -> Document:
-    """Return the marks between two ticks, and since when they are all, s; None if there are no earlier ones."""
-    tick_s = model.process.tick_s
-    begun = max((e.utc for e in model.events if e.service == "plant" and e.text.kind == BEGUN), default="")
-    known = [entry for entry in model.events if entry.utc >= begun]  # not of a session before
-    marked = MARKED.keys() - ({EventKind.LOAD.word} if not model.process.has_load else ())
-    found = [entry for entry in known if entry.text.kind in marked and start <= entry.tick <= end]
-    is_cut = len(found) > MOST_MARKS or (len(known) == model.events.maxlen and known[0].tick > start)
-    since_s = (found[-MOST_MARKS:] or known)[0].tick * tick_s if is_cut else None
-    marks = [
-        {"time": entry.tick * tick_s, "kind": MARKED[entry.text.kind], "text": entry.text.sentence}
-        for entry in found[-MOST_MARKS:]
-    ]
-    return {"marks": marks, "marks_since_s": since_s}
-
-
 def page_families(model: image.Model, browsers: int) -> Iterator[Metric]:
     """Yield everything; of a service that is silent only that it is."""
     yield build_family()
@@ -463,38 +456,27 @@ def page_families(model: image.Model, browsers: int) -> Iterator[Metric]:
             record = model.sources[service].records.get(block.name)
             if record is not None and block.writer is None:
                 yield from block_families(service, block, record)
-    yield _qualities(model, live)
-    if "control_plc" in live:
-        yield from _alarms(model)
-    if "optimizer_plc" in live and model.updates:
-        fields = model.maps["optimizer_plc"].block_of(Optimization).fields
-        for (name, field), value in zip(fields.items(), model.updates[-1], strict=True):
-            unit = f" ({field.unit})" if field.unit else ""
-            yield gauge(f"coldloop_update_{name}", f"Last update: {field.description}{unit}", value)
-
-
-def _qualities(model: image.Model, live: list[str]) -> Metric:
-    """Return the quality of the outputs, wherever they are read, and of the last update, as page and API have them."""
     found, places = qualities(model.doubts, model.stale_prefixes(), model.process), ("control_plc.process.y.", *RAW)
-    names = [
-        f"{place}{name}" for place in places if place.partition(".")[0] in live for name in model.process.output_names
-    ]
-    if "optimizer_plc" in live and model.updates:
-        names.append("update")
+    read = [place for place in places if place.partition(".")[0] in live]
+    names = [f"{place}{name}" for place in read for name in model.process.output_names]
+    names += ["update"] if "optimizer_plc" in live and model.updates else []
     worst = dict.fromkeys(names, 0)
     for entry, quality in found.items():  # the worst is the last
         concerned = [name for name in names if name == entry or (entry[-1] == "." and name.startswith(entry))]
         worst.update(dict.fromkeys(concerned, list(image.Quality).index(quality)))
     description = ", ".join(f"{number} {quality}" for number, quality in enumerate(image.Quality))
-    return gauge("coldloop_quality", f"Quality of a value: {description}", worst, label="signal")
-
-
-def _alarms(model: image.Model) -> Iterator[Metric]:
-    rows = [(alarm_word(kind, model.process), alarm) for kind, alarm in enumerate(model.alarms)]
-    for name, description, values in (
-        ("coldloop_alarm_active", "1 while the condition of an alarm holds", [row.active for _, row in rows]),
-        ("coldloop_alarm_state", ", ".join(f"{state.value} {state.text}" for state in AlarmState),
-         [row.state for _, row in rows]),
-        ("coldloop_alarm_raised", "Times that an alarm was raised", [row.times for _, row in rows]),
-    ):  # fmt: skip
-        yield gauge(name, description, dict(zip([alarm for alarm, _ in rows], values, strict=True)), label="alarm")
+    yield gauge("coldloop_quality", f"Quality of a value: {description}", worst, label="signal")
+    if "control_plc" in live:
+        words, rows = [alarm_word(kind, model.process) for kind in range(len(model.alarms))], model.alarms
+        states = ", ".join(f"{state.value} {state.text}" for state in AlarmState)
+        for name, description, values in (
+            ("coldloop_alarm_active", "1 while the condition of an alarm holds", [row.active for row in rows]),
+            ("coldloop_alarm_state", states, [row.state for row in rows]),
+            ("coldloop_alarm_raised", "Times that an alarm was raised", [row.times for row in rows]),
+        ):
+            yield gauge(name, description, dict(zip(words, values, strict=True)), label="alarm")
+    if "optimizer_plc" in live and model.updates:
+        fields = model.maps["optimizer_plc"].block_of(Optimization).fields
+        for (name, field), value in zip(fields.items(), model.updates[-1], strict=True):
+            unit = f" ({field.unit})" if field.unit else ""
+            yield gauge(f"coldloop_update_{name}", f"Last update: {field.description}{unit}", value)

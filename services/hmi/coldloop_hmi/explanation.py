@@ -139,6 +139,15 @@ def explain(
     times = ComputingTimes(rule.slots, rule.preparation, rule.iteration, tick_s, process.ticks_per_sample)
     n_before = times.iterations(times.period(before.q)) if before is not None else 0
     increments = increments_of(update, n_before) if branch in DECIDED and before is not None else None
+    alternatives = []
+    if increments is not None and before is not None:
+        for q in (before.q - rule.delta, before.q, before.q + rule.delta):
+            if q >= 1:
+                period = times.period(q)
+                n = times.iterations(period)
+                K = update.contraction + (n - n_before) * increments.contraction
+                response = -n * times.iteration / math.log(K) if 0.0 < K < 1.0 else None
+                alternatives.append(Alternative(q, n, period * tick_s, K, response))
     needed = update.tau_u if branch is Branch.FIXED else times.period(update.q)
     answer, period_s = rule.preparation + update.iterations * rule.iteration, update.tau_u * tick_s
     return Explanation(
@@ -152,7 +161,7 @@ def explain(
         elapsed_s=(update.tick - before.tick) * tick_s if before is not None else None,
         period_s=period_s,
         increments=increments,
-        alternatives=_alternatives(update, before.q, increments, rule.delta, times) if increments and before else (),
+        alternatives=tuple(alternatives),
         budget=Budget(rule.preparation, answer, period_s, update.iterations, rule.iteration, period_s - answer),
         predicted=update.j_delivered,
         came=after.j_effective if after is not None and after.update == update.update + 1 else None,
@@ -208,22 +217,6 @@ def _why_not_played(update: Optimization, before: Optimization | None, rule: Upd
     if elapsed != before.tau_u and update.q == rule.q_first != before.q:
         return Branch.BEGUN_AGAIN
     return Branch.LATE
-
-
-def _alternatives(
-    update: Optimization, q_before: int, increments: Increments, delta: int, times: ComputingTimes
-) -> tuple[Alternative, ...]:
-    found = []
-    n_before = times.iterations(times.period(q_before))
-    for q in (q_before - delta, q_before, q_before + delta):
-        if q < 1:
-            continue
-        period = times.period(q)
-        n = times.iterations(period)
-        K = update.contraction + (n - n_before) * increments.contraction
-        response = -n * times.iteration / math.log(K) if 0.0 < K < 1.0 else None
-        found.append(Alternative(q, n, period * times.tick_s, K, response))
-    return tuple(found)
 
 
 def deviation(found: ModelDeviation, process: Process, suspects: int = 0) -> str:

@@ -101,21 +101,18 @@ class Connections:
         now = self._now()
         connected = [one for one in server.connections if one.transport is not None]
         self._uses = {one: self._uses.get(one) or Use(now) for one in connected}
-        if len(connected) >= self._most and not self._make_room(now):
-            return _Refused()
-        return server()
-
-    def _make_room(self, now: float) -> bool:
+        if len(connected) < self._most:
+            return server()
         addresses = {one: str(one.peername[0]) if isinstance(one.peername, tuple) else "" for one in self._uses}
         crowd = Counter(addresses.values())
         ranks = {one: rank for one, use in self._uses.items() if (rank := use.rank(now)) is not None}
         if not ranks:
-            return False
+            return _Refused()
         first = min(ranks, key=lambda one: (ranks[one], -crowd[addresses[one]], self._uses[one].since))
         if first.transport is not None:
             first.transport.abort()  # do not wait for unread data
         first.force_close()
-        return True
+        return server()
 
     @contextmanager
     def serving(self, request: web.Request, *, is_stream: bool, has_session: bool) -> Iterator[None]:
@@ -496,11 +493,7 @@ class LongReads:
 
     @asynccontextmanager
     async def turn(self, *, has_session: bool) -> AsyncIterator[None]:
-        """Wait for a turn; it ends with the context.
-
-        Raises:
-            HTTPServiceUnavailable: Too many wait already.
-        """
+        """Wait for a turn; it ends with the context (HTTPServiceUnavailable: too many wait already)."""
         queue = self._queues[has_session]
         if queue.waiting >= MOST_WAITING:
             raise web.HTTPServiceUnavailable(reason="too many requests for trends and tables: wait a little")

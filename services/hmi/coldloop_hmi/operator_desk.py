@@ -337,11 +337,7 @@ class Commanding:
 
 
 async def _document(request: web.Request) -> dict[str, Any]:
-    """Return the JSON object of a request.
-
-    Raises:
-        HTTPBadRequest: It has none.
-    """
+    """Return the JSON object of a request (HTTPBadRequest: it has none)."""
     try:
         document = await request.json(loads=parsed_json)
     except (ValueError, LookupError):  # no JSON, or no such character set

@@ -168,27 +168,21 @@ class Reading:
         guards.add_headers(answer)
         await answer.prepare(request)
         await answer.write(",".join(["time_s", *names, "quality"]).encode() + b"\n")
+        trends = self._model.trends
         with suppress(ConnectionError, TimeoutError):  # the client has gone
             while start <= end:
                 async with self._turn(request):
-                    rows, start = self._trend_rows(names, start, end)
+                    text, every = io.StringIO(), trends.between(start, end)
+                    writer, rows = csv.writer(text, lineterminator="\n"), every[:ROWS_AT_ONCE]
+                    for row, *values in zip(rows, *(trends.column(name, rows) for name in names), strict=True):
+                        doubts = trends.doubts_at(row)
+                        doubted = " ".join(f"{name}={one}" for name, one in doubts.items() if name in names)
+                        numbers = ("" if math.isnan(value) else f"{value:.7g}" for value in values)
+                        writer.writerow([trends.ticks[row] * self._tick_s, *numbers, doubted])
+                    start = end + 1 if len(every) <= ROWS_AT_ONCE else trends.ticks[every[ROWS_AT_ONCE]]
                 async with asyncio.timeout(STALLED_S):
-                    await answer.write(rows)
+                    await answer.write(text.getvalue().encode())
         return answer
-
-    def _trend_rows(self, names: list[str], start: int, end: int) -> tuple[bytes, int]:
-        """Return some rows from tick `start` on, and the tick that the next ones begin with: after `end` at the end."""
-        trends = self._model.trends
-        rows = trends.between(start, end)
-        following = end + 1 if len(rows) <= ROWS_AT_ONCE else trends.ticks[rows[ROWS_AT_ONCE]]
-        rows = rows[:ROWS_AT_ONCE]
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        for row, *values in zip(rows, *(trends.column(name, rows) for name in names), strict=True):
-            doubts = " ".join(f"{name}={one}" for name, one in trends.doubts_at(row).items() if name in names)
-            numbers = ("" if math.isnan(value) else f"{value:.7g}" for value in values)
-            writer.writerow([trends.ticks[row] * self._tick_s, *numbers, doubts])
-        return text.getvalue().encode(), following
 
     async def explanation(self, request: web.Request) -> web.Response:
         """Answer with the explanation of an updating period."""
@@ -208,11 +202,7 @@ class Reading:
         return compressed_answer(request, encoded({"alarms": documents.alarms_document(self._model)}))
 
     def _events(self, query: Mapping[str, str]) -> list[JournalEntry]:
-        """Return the events that a search finds, the newest first.
-
-        Raises:
-            HTTPBadRequest: Its times are not numbers.
-        """
+        """Return the events that a search finds, the newest first (HTTPBadRequest: its times are not numbers)."""
         wanted, service = query.get("search", "").lower(), query.get("service", "")
         try:
             first, last = (float(query.get(name) or end) for name, end in (("from", -math.inf), ("to", math.inf)))

@@ -405,7 +405,6 @@ class Model:
                 each.moved = self.now()
 
     def _identity(self, service: str, identity: Identity) -> None:
-        source = self.sources[service]
         if service == "control_plc" and identity.session:  # one that was started again looks for its session first
             if identity.session != self._session or identity.tick + STEP_BACK < self.trends.last_tick:
                 self._session = identity.session
@@ -413,7 +412,7 @@ class Model:
                     drawn.clear()  # nothing that was drawn belongs to another session
                 self.changed |= {"updates", "prediction"}
         elif service == "plant":
-            self._moved(source, identity.tick)
+            self._moved(self.sources[service], identity.tick)
 
     def _moved(self, source: Source, tick: int) -> None:
         if tick != source.tick:

@@ -132,7 +132,10 @@ def find_cache_folder(name: str = NAME) -> Path:
             folder.mkdir(mode=0o755, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()
             closed = _is_closed(root, sticky=True) and _is_closed(folder)
-            if closed and _lets_others_write():
+            with _MASK:  # it is read by setting it
+                mask = os.umask(0o077)
+                os.umask(mask)
+            if closed and not mask & stat.S_IWOTH:
                 folder.chmod(0o700)
         except OSError as error:
             if chosen:
@@ -148,14 +151,6 @@ def find_cache_folder(name: str = NAME) -> Path:
                 "folder of your own, or take the permission away (chmod -R go-w)"
             )
     return Path(tempfile.mkdtemp(prefix=f"coldloop-{name}-"))
-
-
-def _lets_others_write() -> bool:
-    """Return whether everyone can write to new files of this process."""
-    with _MASK:  # it is read by setting it
-        mask = os.umask(0o077)
-        os.umask(mask)
-    return not mask & stat.S_IWOTH
 
 
 def _is_closed(folder: Path, *, sticky: bool = False) -> bool:
@@ -241,22 +236,15 @@ def load_numba_alone() -> None:
 
     Others may have kernels that need it: this is for processes that are Coldloop's alone.
     """
-    with _hidden(*TAKEN_ALONG):
+    hidden = [name for name in TAKEN_ALONG if name not in sys.modules]
+    sys.modules.update(dict.fromkeys(hidden))  # type: ignore[arg-type] # None is a module that cannot be had
+    try:
         import numba  # noqa: F401, PLC0415
 
         with contextlib.suppress(ImportError, AttributeError):  # elsewhere: the first kernel does it
             from numba.core.registry import cpu_target  # noqa: PLC0415
 
             cpu_target.target_context.refresh()
-
-
-@contextlib.contextmanager
-def _hidden(*packages: str) -> Iterator[None]:
-    """Let imports of packages that are not loaded yet fail."""
-    names = [name for name in packages if name not in sys.modules]
-    sys.modules.update(dict.fromkeys(names))  # type: ignore[arg-type] # None is a module that cannot be had
-    try:
-        yield
     finally:
-        for name in names:
+        for name in hidden:
             del sys.modules[name]

@@ -172,8 +172,10 @@ class KernelCache:
         name = self._names.get(sig)
         if name is None:
             arguments, returned = sigutils.normalize_signature(sig)  # type: ignore[no-untyped-call]
+            parts = dict.fromkeys(each for kind in arguments for each in _parts(kind))
             decided_by = (
-                digest(self._dispatcher), [_text(each) for each in (*arguments, returned)], _digest_of(arguments),
+                digest(self._dispatcher), [_text(each) for each in (*arguments, returned)],
+                digest(*parts, compiled=True),  # with what they reach
                 VERSIONS, codegen.magic_tuple(), numba.config.OPT, numba.config.BOUNDSCHECK,  # type: ignore[attr-defined]
             )  # fmt: skip
             plain = label(self._dispatcher.py_func).replace("<", "").replace(">", "")[:LONGEST_NAME]
@@ -221,12 +223,8 @@ def _text(kind: Any) -> str:  # noqa: ANN401 a type of numba
     return str(kind)
 
 
-def _digest_of(arguments: Iterable[Any]) -> str:
-    """Return a digest of the classes and kernels among the types of arguments, with what they reach."""
-    return digest(*dict.fromkeys(each for kind in arguments for each in _parts(kind)), compiled=True)
-
-
 def _parts(kind: Any) -> Iterator[Any]:  # noqa: ANN401
+    """Yield the classes and kernels in the type of an argument."""
     if isinstance(kind, types.Dispatcher):
         yield kind.dispatcher
     elif hasattr(kind, "instance_class"):  # of a named tuple, or of a member of an enumeration

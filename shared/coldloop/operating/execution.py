@@ -232,11 +232,7 @@ async def set_mode(clients: Clients, command: commands.SetMode) -> str:
 
 
 def check_bounds(command: commands.SetSetpoint, low: float, high: float) -> None:
-    """Check a setpoint against the bounds of its input.
-
-    Raises:
-        UsageError: It is beyond them.
-    """
+    """Check a setpoint against the bounds of its input (UsageError: it is beyond them)."""
     unit = command.unit
     if not low <= command.value <= high:
         span = f"{value_text(low)} to {value_text(high, unit)}"
@@ -244,11 +240,7 @@ def check_bounds(command: commands.SetSetpoint, low: float, high: float) -> None
 
 
 async def check_manual(client: RegisterClient) -> Operator:
-    """Return what the operator has written, if manual drives.
-
-    Raises:
-        UsageError: It does not.
-    """
+    """Return what the operator has written, if manual drives (UsageError: it does not)."""
     operator = await client.read(Operator)
     if operator.mode != OperatorMode.MANUAL:
         raise UsageError("setpoints apply in manual mode only: take over in manual first")
@@ -296,52 +288,37 @@ async def set_load(clients: Clients, command: commands.SetLoad) -> str:
 
 
 async def play_load(clients: Clients, command: commands.PlayLoad) -> str:
-    """Write a load file at once.
-
-    Raises:
-        LinkError: The plant has no room for all of it.
-    """
-    stream, begin = await _stream(clients["plant"], command.profile, 0)
-    taken = await stream.fill()
-    if not stream.done:
-        raise LinkError(f"the plant has room for {taken} steps of {stream.steps}: it holds the last of them")
-    return await _streamed(clients["plant"], stream, begin)
+    """Write a load file at once (LinkError: the plant has no room for all of it)."""
+    return await stream_load(clients, command.profile, 0, None)
 
 
-async def stream_load(clients: Clients, load: LoadProfile, tick: int, say: Callable[[str], None]) -> str:
+async def stream_load(clients: Clients, load: LoadProfile, tick: int, say: Callable[[str], None] | None) -> str:
     """Write a load of any length from a tick on (0 is now), as fast as the plant can store it.
 
     Raises:
         UsageError: It is to begin at a tick that has passed, or the plant has no session.
+        LinkError: Another client has overwritten it; or the plant has no room for all of it, and nobody to `say` so to.
     """
     plant = clients["plant"]
-    stream, begin = await _stream(plant, load, tick)
+    identity, tick_s = await plant.read(Identity), plant.process.tick_s
+    if not identity.session:
+        raise UsageError("the plant has no session")
+    if 0 < tick <= identity.tick:
+        raise UsageError(f"plant time is {identity.tick * tick_s:g} s already: name a later one")
+    begin = tick or identity.tick + lead_ticks(await plant.read(SessionPace), tick_s)
+    stream = LoadStream(plant, identity.session, load, begin=begin)
     taken = await stream.fill()
     if not stream.done:
+        if say is None:
+            raise LinkError(f"the plant has room for {taken} steps of {stream.steps}: it holds the last of them")
         say(f"the plant has taken {taken} steps of {stream.steps}: the rest is written as it takes them")
     while not stream.done:
         await asyncio.sleep(LOOK_S)
         if await stream.was_replaced():
             raise LinkError("another client has overwritten the load: the rest of the file is not written")
         await stream.fill()
-    return await _streamed(plant, stream, begin)
-
-
-async def _stream(plant: RegisterClient, load: LoadProfile, tick: int) -> tuple[LoadStream, int]:
-    """Return what feeds the plant with a load, and the tick at which it begins."""
-    identity = await plant.read(Identity)
-    if not identity.session:
-        raise UsageError("the plant has no session")
-    if 0 < tick <= identity.tick:
-        raise UsageError(f"plant time is {identity.tick * plant.process.tick_s:g} s already: name a later one")
-    begin = tick or identity.tick + lead_ticks(await plant.read(SessionPace), plant.process.tick_s)
-    return LoadStream(plant, identity.session, load, begin=begin), begin
-
-
-async def _streamed(plant: RegisterClient, stream: LoadStream, begin: int) -> str:
-    status, tick_s = await plant.read(registers.LoadStatus), plant.process.tick_s
-    times = f"{begin * tick_s:g} s to {status.last_tick * tick_s:g} s"
-    return f"load of {stream.steps} steps from {times}; its last value is held"
+    end = (await plant.read(registers.LoadStatus)).last_tick
+    return f"load of {stream.steps} steps from {begin * tick_s:g} s to {end * tick_s:g} s; its last value is held"
 
 
 def lead_ticks(pace: SessionPace, tick_s: float) -> int:
@@ -350,7 +327,12 @@ def lead_ticks(pace: SessionPace, tick_s: float) -> int:
 
 
 async def treat_alarm(clients: Clients, command: TreatAlarm) -> str:
-    """Write what is done with alarms; wait until their states say that it was."""
+    """Write what is done with alarms; wait until their states say that it was.
+
+    Raises:
+        UsageError: None is as the operator has seen it.
+        NotTakenError: Nothing of the command took effect.
+    """
     client, action = clients["control_plc"], AlarmAction(command.action)
     kinds = list(alarms_of(command.process)) if command.alarm == ALL_ALARMS else [command.alarm]
     raised_again: list[int] = []
@@ -362,30 +344,21 @@ async def treat_alarm(clients: Clients, command: TreatAlarm) -> str:
             if not kinds:
                 return "no alarm waits to be acknowledged"
     else:
-        kinds, raised_again = _seen(before, kinds, command)
+        words, seen = {kind: alarm_word(kind, command.process) for kind in kinds}, command.seen
+        waiting = [kind for kind in kinds if words[kind] in seen or before[kind].state in WAITING]
+        kinds = [kind for kind in waiting if seen.get(words[kind]) == before[kind].times]
+        raised_again = [kind for kind in waiting if kind not in kinds]
+        if not waiting:
+            raise UsageError("no alarm waits for an acknowledgement any more")
+        if not kinds:
+            again = _names(raised_again, command.process)
+            raise UsageError(f"raised again since it was shown: {again}; look at it first")
         for kind in kinds:
             await client.write(AlarmCommand(kind, action, command.time_s))
     rows = await _read_until(
         lambda: read_alarms(client), lambda rows: all(_is_done(action, rows[kind].state) for kind in kinds)
     )
     return _treated(command, rows, kinds, raised_again)
-
-
-def _seen(rows: Sequence[Alarm], kinds: Sequence[int], command: TreatAlarm) -> tuple[list[int], list[int]]:
-    """Return the alarms that are as the operator has seen them, and those that were raised again since.
-
-    Raises:
-        UsageError: None is as it was seen.
-    """
-    process, seen = command.process, command.seen or {}
-    waiting = [kind for kind in kinds if alarm_word(kind, process) in seen or rows[kind].state in WAITING]
-    same = [kind for kind in waiting if seen.get(alarm_word(kind, process)) == rows[kind].times]
-    again = [kind for kind in waiting if kind not in same]
-    if not waiting:
-        raise UsageError("no alarm waits for an acknowledgement any more")
-    if not same:
-        raise UsageError(f"raised again since it was shown: {_names(again, process)}; look at it first")
-    return same, again
 
 
 def _is_done(action: AlarmAction, state: int) -> bool:
@@ -397,11 +370,6 @@ def _is_done(action: AlarmAction, state: int) -> bool:
 
 
 def _treated(command: TreatAlarm, rows: Sequence[Alarm], kinds: Sequence[int], raised_again: Sequence[int]) -> str:
-    """Return what has become of alarms.
-
-    Raises:
-        NotTakenError: Nothing of the command took effect.
-    """
     action, process = AlarmAction(command.action), command.process
     left = [kind for kind in kinds if not _is_done(action, rows[kind].state)]
     if len(left) == len(kinds):

@@ -206,11 +206,7 @@ class UpdateReader:
         return found
 
     async def read_until(self, ticks: int, last: int, patience_s: float) -> None:
-        """Read on until update `last` is there, and one that reaches beyond the run.
-
-        Raises:
-            LinkError: It does not come.
-        """
+        """Read on until update `last` is there, and one that reaches beyond the run (LinkError: it does not come)."""
         deadline = time.monotonic() + patience_s
         while self._last is None or self._last.update < last or self._last.tick + self._last.tau_u < ticks:
             if time.monotonic() > deadline:

@@ -56,11 +56,7 @@ class ModelDescription:
 
     @property
     def declared(self) -> Process:
-        """The process that the plant is.
-
-        Raises:
-            KeyError, TypeError, ValueError: The file says something else there.
-        """
+        """The process that the plant is (KeyError, TypeError, ValueError: the file says something else there)."""
         return Process.model_validate(self.process) if self.process else THE_COLD_BOX
 
     def short_digest_of(self, digest: str) -> int:

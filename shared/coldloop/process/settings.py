@@ -242,11 +242,7 @@ class RootSettings(ProcessSettings):
 
 
 def process_of(path: Path) -> Process:
-    """Return the process of a model file.
-
-    Raises:
-        ModelFileError: The file cannot be read, or its process is none.
-    """
+    """Return the process of a model file (ModelFileError: the file cannot be read, or its process is none)."""
     if path in SHIPPED_MODELS.values():
         return COLD_BOX
     found = path.stat() if path.exists() else None

@@ -84,11 +84,7 @@ class TelemetrySettings(BaseModel, frozen=True, extra="forbid"):
         return self
 
     def password(self) -> str | None:
-        """Return the password, if one is set.
-
-        Raises:
-            ConfigurationError: The file cannot be read.
-        """
+        """Return the password, if one is set (ConfigurationError: the file cannot be read)."""
         if self.password_file is None:
             return None
         return read_text(self.password_file, "telemetry.password_file names it", ConfigurationError).rstrip("\r\n")
@@ -171,11 +167,7 @@ class MetricsServer:
         self._kept_until = 0.0
 
     async def run(self) -> None:
-        """Serve until cancelled; return at once where it is off.
-
-        Raises:
-            PortInUseError: Another program listens there.
-        """
+        """Serve until cancelled; return at once where it is off (PortInUseError: another program listens there)."""
         host, port = self._settings.host, self._settings.port
         if not port:
             return
