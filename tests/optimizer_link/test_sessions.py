@@ -17,7 +17,7 @@ from coldloop.registers.common import Event, EventKind, JournalAnswer, JournalPa
 from coldloop.registers.declaration import Role
 from coldloop.registers.optimizer_plc import OperatingLimits, OptimizerSession
 from coldloop_optimizer_plc.computing_settings import BudgetSettings, PlcBudget
-from coldloop_optimizer_plc.publication import OptimizerPublication
+from coldloop_optimizer_plc.runtime import OptimizerPublication
 from tests.harness.records import OPTIMIZER_MAP
 
 if TYPE_CHECKING:

@@ -15,7 +15,6 @@ from coldloop.errors import (
     UntrustedPeerError,
 )
 from coldloop.registers.common import EventKind
-from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
 from coldloop.service.journal import Journal
 from coldloop_optimizer_plc.control_link import REPEAT_S, ControlLink
@@ -92,12 +91,12 @@ def test_a_foreign_link_stays_foreign_while_it_tries_again_and_then_waits() -> N
 
 def test_each_thing_that_goes_wrong_has_its_counter() -> None:
     link = Watched().up()
-    link.computes()
-    link.interrupted()
-    link.computes()
+    link.go(S.COMPUTING)
+    link.go(S.WAITING, interrupted=1)
+    link.go(S.COMPUTING)
     link.damaged()
-    link.delivers()
-    link.acknowledged(Verdict.LATE)
+    link.go(S.DELIVERING)
+    link.go(S.WAITING, rejected=1)
     link.failed(DAMAGED)
     assert link.registers() == ControlLinkStatus(S.SEARCHING, 0xABCD, breaks=1, damaged=2, rejected=1, interrupted=1)
 
@@ -105,7 +104,7 @@ def test_each_thing_that_goes_wrong_has_its_counter() -> None:
 def test_steps_that_make_no_sense_are_errors_of_the_program() -> None:
     link = Watched().up()
     with pytest.raises(RuntimeError, match="WAITING to DELIVERING"):
-        link.delivers()
+        link.go(S.DELIVERING)
 
 
 @pytest.mark.parametrize(("error", "pause_s"), [(GONE, 0.2), (BUSY, 1.0), (OTHER_MODEL, 1.0)])
@@ -146,12 +145,12 @@ def test_reasons_that_always_differ_do_not_fill_the_memory() -> None:
 CALLS: list[Callable[[ControlLink], None]] = [
     ControlLink.answered,
     ControlLink.introduced,
-    ControlLink.computes,
-    ControlLink.delivers,
-    ControlLink.interrupted,
+    lambda link: link.go(S.COMPUTING),
+    lambda link: link.go(S.DELIVERING),
+    lambda link: link.go(S.WAITING, interrupted=1),
     ControlLink.damaged,
-    lambda link: link.acknowledged(Verdict.ACCEPTED),
-    lambda link: link.acknowledged(Verdict.LATE),
+    lambda link: link.go(S.WAITING),
+    lambda link: link.go(S.WAITING, rejected=1),
     lambda link: link.failed(GONE),
     lambda link: link.failed(BUSY),
     lambda link: link.failed(OTHER_MODEL),

@@ -193,7 +193,8 @@ def fast_gradient_step(Phi: NDArray[np.float64], Gamma: NDArray[np.float64], gam
     momentum = fast_gradient.Momentum(z.copy(), counted(np.ones(1)))
     constant, steps = costs.matrices_of(qp), counted(np.full(n, 1e-6))
     Counted.done = 0
-    fast_gradient.descend(constant, qp, z, momentum, steps, Counted(1.0), True, 1)  # type: ignore[arg-type]  # noqa: FBT003
+    method = fast_gradient.FastGradientMethod(constant, steps, Counted(1.0), adaptive_restart=True)  # type: ignore[arg-type]
+    fast_gradient.descend(method, qp, z, momentum, 1)
     return Counted.done
 
 

@@ -12,7 +12,7 @@ from coldloop.registers.control_plc import Status
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, Optimization
 from coldloop.registers.safety import AlarmState
 from coldloop_hmi.process_image import JournalEntry
-from coldloop_optimizer_plc.publication import NO_UPDATE
+from coldloop_optimizer_plc.runtime import NO_UPDATE
 from coldloop_rig.cosim.session import Lateness, state_of
 from coldloop_rig.live.recorded_page import alarms_after
 from coldloop_rig.results.recording import LinkStatistics

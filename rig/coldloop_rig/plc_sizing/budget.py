@@ -1,6 +1,7 @@
 """Budget of a PLC in an updating period, and whether its memory holds the problem, as tables and in a sentence."""
 
 from collections.abc import Callable
+from itertools import chain
 from math import floor
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop_optimizer_plc.computing_settings import Arithmetic, EstimatorKind, EstimatorSettings, PlcBudget
 from coldloop_optimizer_plc.estimator import check_detectability, stationary_gains
 from coldloop_optimizer_plc.plausibility import watched_output
-from coldloop_optimizer_plc.qp.linear_algebra import real_of
+from coldloop_optimizer_plc.qp.linear_algebra import real_of, rounded
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, prediction_of
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem
 from coldloop_optimizer_plc.settings import ProgramSettings, SolverName, Target, trivial_design
@@ -74,11 +75,9 @@ class Footprint(NamedTuple):
 def estimator_memory(prediction: PredictionModel, settings: EstimatorSettings, apart: int = 0) -> int:
     """Return the bytes of the estimator, with so many predictions beside the filter's."""
     real = real_of(Arithmetic.FLOAT32)
-    single = prediction.rounded(real)
-    gains = (array.astype(real) for array in stationary_gains(prediction, settings))
-    transitions = (M for step in single.transitions.values() for M in step)
+    steps = (*stationary_gains(prediction, settings), *prediction.outputs, *chain(*prediction.transitions.values()))
     states = WORD * apart * (2 * prediction.n_states + 1)
-    return states + sum(M.nbytes for M in (*gains, *transitions, single.C, single.D, single.G))
+    return states + sum(rounded(M, real).nbytes for M in steps)
 
 
 def footprint(problem: PredictiveProblem, estimator: int, solver: SolverName) -> Footprint:

@@ -1,4 +1,4 @@
-"""The state of the optimiser's link to the control PLC. Pure: no sockets, no clock.
+"""The optimiser's link to the control PLC: its state, and the requests, repeated when lost or damaged on the way.
 
 SEARCHING ──answers──> INTRODUCING ──ours, our model──> WAITING <───────────────────────┐
     ^                                                     │ update                      │ verdict
@@ -10,19 +10,35 @@ any state ──another model there──> WRONG_MODEL ──our model──> WA
 """
 
 import math
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Awaitable, Callable
+from typing import Final, TypeVar
 
-from coldloop.errors import BUSY, ColdloopError, DamagedAnswerError, ModelFileError, RequestRefusedError
-from coldloop.registers.common import EventKind
-from coldloop.registers.control_plc import Verdict
+from coldloop import errors
+from coldloop.errors import BUSY, DamagedAnswerError, ModelFileError, RequestRefusedError
+from coldloop.modbus.client import RegisterClient
+from coldloop.modbus.requests import MAX_READ_WRITE_WORDS
+from coldloop.modbus.settings import Endpoint
+from coldloop.registers import control_plc as registers
+from coldloop.registers.common import EventKind, Identity, SessionPace
+from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
+from coldloop.safety.writers import InputSequence
 from coldloop.service.journal import Journal
+from coldloop.session import TimeBase
+
+T = TypeVar("T")
 
 REPEAT_S: Final = 10.0
 """The same reason is logged at most once in this real time."""
 MOST_REASONS: Final = 32
 """Different reasons that are remembered for that."""
+ATTEMPTS: Final = 3
+"""Attempts of a request whose data arrive damaged: on the way there (exception 03, bad CRC), or back."""
+ILLEGAL_VALUE: Final = 3
+DAMAGED_THERE: Final = (registers.Verdict.BAD_CRC, registers.Verdict.WRONG_LENGTH)
+"""Verdicts on a sequence that is not as it was sent; its number may not be either."""
+LONGEST_WAIT_S: Final = 1.0
+"""The control PLC answers a request that waits for an update after this real time at the latest."""
 
 _S = ControlLinkState
 _NEXT: Final = {
@@ -68,8 +84,6 @@ class ControlLink:
         """Return what the registers show."""
         return ControlLinkStatus(self.state, self.holder, **self._counts)
 
-    # -- what happens --------------------------------------------------------------------------------------------------
-
     def attempt(self, now: float) -> None:
         """An attempt to reach the control PLC begins at `now`, s."""
         self._attempted_at = now
@@ -77,34 +91,18 @@ class ControlLink:
     def answered(self) -> None:
         """The control PLC answers, with our register map."""
         if self.state is _S.SEARCHING:
-            self._go(_S.INTRODUCING)
+            self.go(_S.INTRODUCING)
 
     def introduced(self) -> None:
         """The control PLC has our model and has granted us its lease."""
         self.was_up = True
-        self._go(_S.WAITING)
-
-    def computes(self) -> None:
-        """An update has arrived."""
-        self._go(_S.COMPUTING)
-
-    def delivers(self) -> None:
-        """The answer to the update is ready."""
-        self._go(_S.DELIVERING)
-
-    def acknowledged(self, verdict: Verdict) -> None:
-        """The control PLC has judged the sequence."""
-        self._go(_S.WAITING, rejected=int(verdict is not Verdict.ACCEPTED))
-
-    def interrupted(self) -> None:
-        """The computation was given up for a newer update."""
-        self._go(_S.WAITING, interrupted=1)
+        self.go(_S.WAITING)
 
     def damaged(self) -> None:
         """An answer arrived with a broken seal, or without one."""
         self._set(self.state, damaged=1)
 
-    def failed(self, error: ColdloopError) -> None:
+    def failed(self, error: errors.ColdloopError) -> None:
         """An attempt, or the link, has failed."""
         state = _S.SEARCHING
         if isinstance(error, ModelFileError):
@@ -130,7 +128,8 @@ class ControlLink:
 
     # -- transitions ---------------------------------------------------------------------------------------------------
 
-    def _go(self, state: ControlLinkState, **counts: int) -> None:
+    def go(self, state: ControlLinkState, **counts: int) -> None:
+        """Go to a state that may follow, and add to counters: `rejected` sequences, computations `interrupted`."""
         if state not in _NEXT[self.state]:
             raise RuntimeError(f"the link does not go from {self.state.name} to {state.name}")
         self._set(state, **counts)
@@ -145,3 +144,184 @@ class ControlLink:
             self._noted = shown
             self._journal.note(self.tick, EventKind.CONTROL_LINK, shown)
             self._tell()
+
+
+class ControlClient:
+    """The control PLC, as the optimiser uses it.
+
+    Every request raises `LinkError` when the link fails, and `RequestRefusedError` with code 6 when another optimiser
+    holds the lease.
+
+    Args:
+        register_map: Of the control PLC, for the process.
+        endpoint: Where it is.
+        link: Counts damaged answers, and of the steps of an introduction.
+        model_digest: Of our model.
+        model_name: Of our model, for messages.
+
+    Raises:
+        ConfigurationError: The files for TLS cannot be used.
+    """
+
+    def __init__(
+        self, register_map: RegisterMap, endpoint: Endpoint, link: ControlLink, model_digest: int, model_name: str
+    ) -> None:
+        self._map = register_map
+        header, row = (
+            register_map.block_of(record).row_words for record in (registers.SequenceHeader, registers.SequenceRow)
+        )
+        self._rows_with_header = (MAX_READ_WRITE_WORDS - header) // row
+        """Rows that fit into one request with the header that commits them: 18 of three inputs."""
+        self._endpoint = endpoint
+        self._link = link
+        self._model_digest = model_digest
+        self._model_name = model_name
+        self._client = RegisterClient.at(self._map, endpoint)
+        self._beats = 0
+
+    def close(self) -> None:
+        """Close the connection; the next request opens another."""
+        self._client.close()
+
+    def reload_certificates(self) -> None:
+        """Start over with the present files for TLS: they may have been renewed.
+
+        Raises:
+            ConfigurationError: They cannot be used.
+        """
+        if self._endpoint.tls is not None:
+            self._client.close()
+            self._client = RegisterClient.at(self._map, self._endpoint)
+
+    # -- who is there --------------------------------------------------------------------------------------------------
+
+    async def introduce(self) -> None:
+        """Connect, send our number and the digest of our model, and check that the control PLC has the same model.
+
+        Raises:
+            ModelFileError: It has another.
+        """
+        await self._client.connect(0.0)
+        self._link.answered()
+        if self._link.state is ControlLinkState.WRONG_MODEL:  # a heartbeat would keep the right optimiser out
+            await self._check_model()
+        await self._beat()
+        await self._check_model()
+        self._link.introduced()
+
+    async def _check_model(self) -> None:
+        theirs = (await self._client.read(Identity)).model_digest
+        if theirs == self._model_digest:
+            return
+        if (await self._client.read(Identity)).model_digest != theirs:  # this block is not sealed
+            raise DamagedAnswerError(f"{self._client.peer}: its identity arrived damaged")
+        raise ModelFileError(
+            f"{self._client.peer} runs model {theirs:08x}, this optimiser {self._model_digest:08x} "
+            f"({self._model_name}): give both PLCs the same model.file"
+        )
+
+    def _heartbeat(self) -> registers.Heartbeat:
+        self._beats = (self._beats + 1) & 0xFFFF
+        return registers.Heartbeat(self._beats, self._model_digest, self._link.holder)
+
+    async def pace(self, session: int) -> TimeBase | None:
+        """Return the time base of a session; None where the control PLC is in another, or shows none that can be."""
+
+        async def twice() -> SessionPace:  # this block is not sealed, and what it says is not asked for again
+            one, other = await self._client.read(SessionPace), await self._client.read(SessionPace)
+            if one != other:
+                raise DamagedAnswerError(f"{self._client.peer}: its pace arrived damaged")
+            return one
+
+        shown = await self._again(twice)
+        try:
+            return shown.of(session) if shown.session == session else None
+        except ValueError:
+            return None
+
+    # -- updates -------------------------------------------------------------------------------------------------------
+
+    async def next_update(self, wanted: registers.AwaitUpdate) -> registers.Update:
+        """Wait for an update; after `LONGEST_WAIT_S` return the last one there was, or an empty one."""
+        patience_s = self._endpoint.timeout_s + LONGEST_WAIT_S
+
+        async def waiting() -> registers.Update:
+            try:
+                return await self._client.exchange(wanted, registers.Update, patience_s=patience_s)
+            except DamagedAnswerError:
+                self._link.damaged()
+                return await self._client.read(registers.Update)  # it is latched: asking to wait again could give it up
+
+        return await self._again(waiting)
+
+    async def plan(self, plan: registers.Plan) -> None:
+        """Send the updating period."""
+        await self._again(lambda: self._client.write(plan))
+
+    async def newest(self) -> registers.LatchedUpdate:
+        """Give a sign of life; return which update is the newest."""
+        return await self._again(lambda: self._client.exchange(self._heartbeat(), registers.LatchedUpdate))
+
+    # -- sequences -----------------------------------------------------------------------------------------------------
+
+    async def deliver(self, sequence: InputSequence, plan: registers.Plan | None = None) -> registers.Verdict:
+        """Send a sequence, the header that commits it last; return the verdict of the control PLC.
+
+        Args:
+            sequence: The answer to an update.
+            plan: Its updating period, where it has not been sent: it goes first, in the same segment.
+        """
+        for attempt in range(1, ATTEMPTS + 1):
+            answer = await self._again(lambda: self._commit(sequence, plan))
+            if answer.verdict not in DAMAGED_THERE or attempt == ATTEMPTS:
+                break
+        if answer.number != sequence.header.number or answer.verdict not in registers.Verdict.__members__.values():
+            raise errors.LinkError(
+                f"{self._client.peer} acknowledges sequence {answer.number} with verdict {answer.verdict} after "
+                f"sequence {sequence.header.number}: look for a second optimiser"
+            )
+        return registers.Verdict(answer.verdict)
+
+    async def _commit(self, sequence: InputSequence, plan: registers.Plan | None) -> registers.Acknowledgement:
+        header, rows = sequence.header, list(map(registers.SequenceRow, sequence.rows))
+        await self._client.write_rows(rows[self._rows_with_header :], start=self._rows_with_header)
+        try:
+            return await self._client.exchange(
+                header, registers.Acknowledgement, rows=rows[: self._rows_with_header], before=plan
+            )
+        except DamagedAnswerError:  # the sequence has been judged, and may have been accepted
+            self._link.damaged()
+            return await self._again(lambda: self._client.read(registers.Acknowledgement))
+
+    async def verdict_on(self, sequence: InputSequence) -> registers.Verdict | None:
+        """Return the verdict on a sequence whose acknowledgement was lost; None when it has not arrived."""
+        answer = await self._again(lambda: self._client.read(registers.Acknowledgement))
+        known = answer.number == sequence.header.number and answer.verdict in registers.Verdict.__members__.values()
+        return registers.Verdict(answer.verdict) if known else None
+
+    # -- again ---------------------------------------------------------------------------------------------------------
+
+    async def _again(self, request: Callable[[], Awaitable[T]]) -> T:
+        """Make a request; a connection opened since the introduction introduces itself and tries again."""
+        try:
+            return await self._undamaged(request)
+        except RequestRefusedError as error:
+            if error.exception_code != BUSY:
+                raise
+        await self._beat()
+        return await self._undamaged(request)
+
+    async def _beat(self) -> None:
+        await self._undamaged(lambda: self._client.write(self._heartbeat()))
+
+    async def _undamaged(self, request: Callable[[], Awaitable[T]]) -> T:
+        """Make a request, up to `ATTEMPTS` times when it arrives damaged there (exception 03), or its answer here."""
+        for _ in range(ATTEMPTS - 1):
+            try:
+                return await request()
+            except DamagedAnswerError:
+                self._link.damaged()
+            except RequestRefusedError as error:
+                if error.exception_code != ILLEGAL_VALUE:
+                    raise
+        return await request()

@@ -34,23 +34,21 @@ AFTER_A_STEP: Final = -2
 
 
 class Latched(NamedTuple):
-    """An update, in physical units and the on-line type."""
+    """An update, in physical units and the on-line type, while the sequence with the number `playing` is played.
+
+    u_before (3,) are the inputs until this tick, u (3,) those from it on, y (22,) the outputs, NaN where a reading is
+    bad, x (28,) the states, for state feedback only, ahead what is forecast, as the last states of the model.
+    """
 
     update: int
     tick: int
     playing: int
-    """Number of the sequence being played."""
     load: float
     u_before: Array
-    """Inputs until this tick, shape (3,)."""
     u: Array
-    """Inputs from it on."""
     y: Array
-    """Outputs, shape (22,); not a number where a reading is bad."""
     x: Array
-    """States, shape (28,), which only state feedback looks at."""
     ahead: Array
-    """Forecast, as the last states of the model."""
 
 
 class Starts(NamedTuple):
@@ -129,37 +127,6 @@ def limit_of_feed(c: Constants, m: OptimizerState, y: Array) -> float:
 
 
 @kernel
-def plan(
-    c: Constants, rule: UpdatingRule, m: OptimizerState, wanted: int, update: int, tick: int, u_before: Array,
-    load: float, y: Array, x: Array,
-) -> None:  # fmt: skip
-    """Take the update latched at `tick`, in physical units and the on-line type; decide the updating period.
-
-    `wanted` is its q, or BY_THE_RULE where what is played is the answer to the update before, in time. The program does
-    the same step by step where estimator or rule are not ours.
-    """
-    end_period(m)
-    correct(c.estimator, m.belief, u_before, load, y, x)
-    effective = judge_played(c, m, load, y)
-    if wanted == BY_THE_RULE:
-        o, a = assess_period(c, m, effective)
-        wanted = decide_by(rule, m.rule, o, a)
-    begin_period(c, m, wanted, update, tick, load, effective)
-
-
-@kernel
-def end_period(m: OptimizerState) -> None:
-    """Note the answer of the period that ends; nothing is known of how it went."""
-    now, real = m.numbers[0], m.belief.x.dtype.type
-    if now.solved:
-        now.sequences = max(now.sequences, m.sent.numbers[0].number)
-        now.guessed_before, now.delivered_before = m.sent.numbers[0].hot_start, m.sent.numbers[0].delivered
-        now.solved = False
-    now.efficiency = now.mismatch = now.contraction = real(1.0)
-    now.gamma = real(0.0)
-
-
-@kernel
 def judge_played(c: Constants, m: OptimizerState, load: float, y: Array) -> float:
     """Return J of what is played at the state that is estimated now, and find limits and target there."""
     now, played, real = m.numbers[0], m.playing.numbers[0], m.belief.x.dtype.type
@@ -192,16 +159,22 @@ def assess_period(c: Constants, m: OptimizerState, effective: float) -> tuple[Ob
 
 
 @kernel
-def begin_period(
-    c: Constants, m: OptimizerState, wanted: int, update: int, tick: int, load: float, effective: float
-) -> None:  # fmt: skip
-    """Begin the period of a q, step (5): its length, and what fits; then step (2), what was sent is played."""
-    now = m.numbers[0]
+def begin_period(c: Constants, rule: UpdatingRule, m: OptimizerState, wanted: int, latched: Latched) -> None:
+    """Begin the period of a q, step (5): its length, and what fits; then step (2), what was sent is played.
+
+    Where q is BY_THE_RULE, what is played is the answer to the update before, in time.
+    """
+    now, effective = m.numbers[0], judge_played(c, m, latched.load, latched.y)
+    if wanted == BY_THE_RULE:
+        o, a = assess_period(c, m, effective)
+        wanted = decide_by(rule, m.rule, o, a)
     now.q = max(min(wanted, c.most), 1)  # costs that are no numbers lead a rule anywhere
     adaptive = min(c.periods[now.q] + now.allowance, c.fitting.shape[0] - 1)
     now.ticks = c.fixed_ticks if c.fixed_ticks > 0 else adaptive
     now.iterations = c.fitting[max(now.ticks - now.allowance, 0)]  # where a period cannot grow, they are fewer
-    now.update, now.tick, now.load, now.effective, now.planned = update, tick, load, effective, True
+    now.update, now.tick, now.load, now.effective, now.planned = (
+        latched.update, latched.tick, latched.load, effective, True
+    )  # fmt: skip
 
 
 @kernel
@@ -216,23 +189,28 @@ def begin_session(c: Constants, m: OptimizerState) -> None:
 
 @kernel
 def take_update(c: Constants, rule: UpdatingRule, starts: Starts, m: OptimizerState, latched: Latched) -> float:
-    """Take an update and begin its updating period; return the load step that ends it, W, or 0."""
+    """Take an update and begin its updating period; return the load step that ends it, W, or 0.
+
+    The program does the same step by step where estimator or rule are not ours.
+    """
     wanted, load_step = follow(c, m, latched), c.load_step
     if wanted == FIRST:
         wanted = starts.first
     elif wanted == AFTER_A_STEP:
         wanted = starts.after_step
         load_step = m.u.dtype.type(0.0)  # a load that keeps moving must not keep the control PLC waiting for ever
-    plan(
-        c, rule, m, wanted, latched.update, latched.tick, latched.u_before, latched.load, latched.y, latched.x
-    )  # fmt: skip
+    correct(c.estimator, m.belief, latched.u_before, latched.load, latched.y, latched.x)
+    begin_period(c, rule, m, wanted, latched)
     return load_step
 
 
 @kernel
 def follow(c: Constants, m: OptimizerState, latched: Latched) -> int:
-    """Find out what is played from an update on; return its q, `BY_THE_RULE`, `FIRST` or `AFTER_A_STEP`."""
-    now, u = m.numbers[0], latched.u - c.estimator.u0
+    """Find out what is played from an update on, and end the period before.
+
+    Returns the q of the next one, `BY_THE_RULE`, `FIRST` or `AFTER_A_STEP`.
+    """
+    now, u, real = m.numbers[0], latched.u - c.estimator.u0, m.u.dtype.type
     failed = now.solved and m.sent.numbers[0].length == 0
     if failed:
         forget_failure(m)
@@ -247,6 +225,11 @@ def follow(c: Constants, m: OptimizerState, latched: Latched) -> int:
     now.sequences = max(now.sequences, latched.playing)
     m.u[:] = u
     m.belief.predicted[m.belief.predicted.shape[0] - latched.ahead.shape[0] :] = latched.ahead
+    if now.solved:
+        now.guessed_before, now.delivered_before = m.sent.numbers[0].hot_start, m.sent.numbers[0].delivered
+        now.sequences, now.solved = max(now.sequences, m.sent.numbers[0].number), False
+    now.efficiency = now.mismatch = now.contraction = real(1.0)  # nothing is known of how the period went
+    now.gamma = real(0.0)
     if not now.planned:
         return FIRST
     if interrupted:

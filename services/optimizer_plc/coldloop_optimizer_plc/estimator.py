@@ -33,12 +33,13 @@ UNDETECTABLE: Final = 1e-9
 
 
 class StationaryGains(NamedTuple):
-    """Gains of a stationary Kalman filter after periods of 1, 2, ... ticks."""
+    """Kalman gains after periods of 1, 2, ... ticks, transposed, shape (ticks, n_y, n + 1): the load mismatch is last.
+
+    Inverse covariances are those of the innovation, shape (ticks, n_y, n_y).
+    """
 
     gains: Array
-    """Transposed, shape (ticks, n_y, n + 1); the load mismatch comes last."""
     inverse_covariances: Array
-    """Inverses of the covariance of the innovation, shape (ticks, n_y, n_y)."""
 
 
 class Estimator(NamedTuple):
@@ -46,40 +47,37 @@ class Estimator(NamedTuple):
 
     The Kalman filter is stationary, on the LTI model with one slow load-mismatch state; a load that is known is fed in.
     State feedback takes the simulated state as its estimate; it has an offset, since it does not estimate model errors.
+    steps are the transitions over 1, 2, ... ticks, stacked, outputs C, D and G, all transposed. kalman: or else state
+    feedback.
     """
 
     steps: Transition
-    """Transitions over 1, 2, ... ticks, stacked, each matrix transposed."""
     outputs: Transition
-    """C, D, G, transposed."""
     x0: Array
     u0: Array
     y0: Array
     w0: float
     tick_s: float
     kalman: bool
-    """Kalman filter, or else state feedback."""
     load_known: bool
     stationary: StationaryGains
-    """Gains of the Kalman filter."""
     plausible: Plausibility
 
 
 class Belief(NamedTuple):
-    """Estimates, as deviations from the operating point; kernels overwrite them."""
+    """Estimates, as deviations from the operating point; kernels overwrite them.
+
+    numbers is a record, shape (1,): `w`, the load (W); `mismatch`, the share of it that no sensor saw; `since`, the
+    ticks predicted over since the last measurement. x (n,) is the state there, predicted (n,) that predicted since.
+    surprise (n_y,): how far each output was from what the prediction and the other outputs say, over the standard
+    deviation that the filter expects, mean square over about `MEMORY_TICKS`. readings (n_y,) are `READING` records.
+    """
 
     numbers: Any
-    """A record, shape (1,): `w`, the load (W); `mismatch`, the share of it that no sensor saw; `since`, the ticks
-    predicted over since the last measurement."""
     x: Array
-    """State at the last measurement, shape (n,)."""
     predicted: Array
-    """State predicted since, shape (n,)."""
     surprise: Array
-    """How far each output was from what the prediction and the other outputs say, over the standard deviation that the
-    filter expects: mean square over about `MEMORY_TICKS`, shape (n_y,)."""
     readings: Any
-    """Records, shape (n_y,): which of them are believed, and since when."""
     apart: Apart
 
 
@@ -100,17 +98,17 @@ def estimator_of(
             "optimizer_plc.program.estimator.kind=state-feedback: the model has more states than the plant reports; "
             "use kalman"
         )
-    m = prediction.rounded(real)
     stationary = stationary_gains(prediction, settings) if kalman else StationaryGains(*np.zeros((2, 1, 1, 1)))
-    return Estimator(
-        Transition(*map(np.array, zip(*(step.transposed() for step in m.transitions.values()), strict=True))),
-        m.outputs.transposed(), np.array(m.x0), np.array(m.u0), np.array(m.y0), m.w0, real(process.tick_s), kalman,
-        settings.load_known,
-        StationaryGains(*(array.astype(real, copy=False) for array in stationary)),
-        check.plausibility_of(
-            plausible, prediction, settings.sensors, len(prediction.transitions) * process.tick_s, real
-        ),
+    steps = Transition(
+        *map(np.array, zip(*(step.transposed() for step in prediction.transitions.values()), strict=True))
+    )
+    longest_s = len(prediction.transitions) * process.tick_s
+    found = Estimator(
+        steps, prediction.outputs.transposed(), np.array(prediction.x0), np.array(prediction.u0),
+        np.array(prediction.y0), prediction.w0, process.tick_s, kalman, settings.load_known, stationary,
+        check.plausibility_of(plausible, prediction, settings.sensors, longest_s, DOUBLE),
     )  # fmt: skip
+    return la.rounded(found, real)
 
 
 def no_belief(n_states: int, n_outputs: int, real: Real = DOUBLE) -> Belief:
@@ -167,8 +165,7 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
     b = belief.numbers[0]
     known = load - c.w0 if c.load_known else belief.x.dtype.type(0.0)
     if not c.kalman:
-        for i in range(x.shape[0]):
-            belief.x[i] = x[i] - c.x0[i]
+        belief.x[:] = x - c.x0
         b.w, b.mismatch = known, belief.x.dtype.type(0.0)
         return
     real, period, maps = belief.x.dtype.type, min(b.since, c.stationary.gains.shape[0]) - 1, c.outputs
@@ -203,9 +200,7 @@ def begin_prediction(belief: Belief) -> None:
     """Predict from the last measurement on."""
     belief.predicted[:] = belief.x
     if belief.apart.watch[0].age_s >= 0.0:
-        for which in range(belief.apart.x.shape[0]):
-            for i in range(belief.x.size):
-                belief.apart.predicted[which, i] = belief.apart.x[which, i]
+        belief.apart.predicted[:] = belief.apart.x
     belief.numbers[0].since = 0
 
 
@@ -479,39 +474,35 @@ def _joint_gain(columns: Array, C: Array) -> Array:
 
 
 class PlantModel(NamedTuple):
-    """x' = A x + B u + F w over a tick, y = C x + D u + G w, as deviations from the operating point.
+    """x' = A x + B u + F w over a tick, y = C x + D u + G w, as deviations from the operating point; w has shape (1,).
 
-    The last states are the constants that `estimator.disturbances` names: nothing moves them, and C adds them.
+    The last `constants` states are those that `estimator.disturbances` names: nothing moves them, and C adds them.
+    noise (n_y,) are the standard deviations of the sensors, walks (n + 1,) the process noise of the states and, last,
+    of the load's mismatch, per square root of a tick.
     """
 
     A: Array
     B: Array
     F: Array
-    """Shape (n, 1)."""
     C: Array
     D: Array
     G: Array
-    """Shape (n_y, 1)."""
     tick_s: float
     constants: int
-    """How many of the states are constants."""
     noise: Array
-    """Standard deviation of each sensor, shape (n_y,)."""
     walks: Array
-    """Process noise of the states and, last, of the load's mismatch, per square root of a tick; shape (n + 1,)."""
 
 
 class Measured(NamedTuple):
-    """Measurement at an updating instant, as deviations from the operating point."""
+    """Measurement at an updating instant, as deviations from the operating point, ticks after the last one.
+
+    Inputs u (m,) were applied until now; load is 0 where it is not measured, y (n_y,) NaN where a reading is bad.
+    """
 
     ticks: int
-    """Since the last measurement."""
     u: Array
-    """Inputs applied until now, shape (m,)."""
     load: float
-    """Load that is measured; 0 where it is not."""
     y: Array
-    """Outputs, shape (n_y,); not a number where a reading is bad."""
 
 
 class OutsideCorrection(Protocol):

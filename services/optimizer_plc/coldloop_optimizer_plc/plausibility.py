@@ -47,39 +47,36 @@ long one that is used has been left out as a spike."""
 
 
 class Plausibility(NamedTuple):
-    """Limits of the plausibility check, in the on-line floating-point type."""
+    """Limits of the plausibility check, in the on-line floating-point type; those of `PlausibilitySettings`, and more.
+
+    allowance, constants, low, high and noise have shape (n_y,). in_all: largest quadratic form of the innovations that
+    the outputs which are left may have. longest_period_s: that inverse covariances are for. constants: state that is
+    the bias of each output, below 0: it has none. low, high: outputs whose prediction is outside are not judged. noise:
+    standard deviation of each sensor. watched: output that is judged by predictions without it, or -1. origin: its
+    reading at the operating point. movement: integral of the square of that prediction about its trend from which on
+    the reading must move, squared unit times s. restart_s: time after which the prediction begins again where the
+    reading moves; longer than a frozen one goes unnoticed.
+    """
 
     sigmas: float
-    """Largest residual over its standard deviation; 0: any is plausible."""
     allowance: Array
-    """Allowance for a residual of a plant that differs from its model, shape (n_y,)."""
     in_all: float
-    """Largest quadratic form of the innovations that the outputs which are left may have."""
     longest_period_s: float
-    """Longest period that inverse covariances are for, s."""
     settled_s: float
     agreeing_s: float
     longest_s: float
     most: int
     model_sigmas: float
-    """Largest residual over its standard deviation, root mean square, while the model holds."""
     constants: NDArray[np.int64]
-    """State that is the bias of each output; below 0: it has none. Shape (n_y,)."""
     spike_s: float
     forgetting: float
     low: Array
-    """Outputs whose prediction is outside of these are not judged, shape (n_y,)."""
     high: Array
     noise: Array
-    """Standard deviation of each sensor, shape (n_y,)."""
     watched: int
-    """Output that is judged by predictions without it, or -1."""
     origin: float
-    """Value of its reading at the operating point."""
     movement: float
-    """Integral of the square of that about its trend from which on the reading must move, squared unit times s."""
     restart_s: float
-    """After which such a prediction begins again where the reading moves; longer than a frozen one goes unnoticed."""
     longest_watch_s: float
 
 
@@ -96,16 +93,16 @@ def plausibility_of(
             constants[signal] = place
     spread = 2.0 / (9.0 * n_y)  # Wilson and Hilferty: the quantile of chi-square at so many sigmas
     in_all = n_y * (1.0 - spread + settings.sigmas * math.sqrt(spread)) ** 3
-    low, high = np.array(settings.spans, real).T
+    low, high = np.array(settings.spans).T
     watched = watched_output(settings, prediction)
     movement = (settings.movement_sigmas * noise[watched]) ** 2 * settings.settled_s
-    return Plausibility(
-        real(settings.sigmas), np.array(settings.allowances, real), real(in_all), real(longest_period_s),
-        real(settings.settled_s), real(settings.agreeing_s), real(settings.longest_s), settings.most,
-        real(settings.model_sigmas), constants, real(settings.spike_s), real(FORGETTING), low.copy(), high.copy(),
-        np.array(noise, real), watched, real(prediction.y0[watched]), real(movement),
-        real(RESTART * settings.settled_s), real(LONGEST_WATCH * settings.settled_s),
+    found = Plausibility(
+        settings.sigmas, np.array(settings.allowances), in_all, longest_period_s, settings.settled_s,
+        settings.agreeing_s, settings.longest_s, settings.most, settings.model_sigmas, constants, settings.spike_s,
+        FORGETTING, low, high, np.array(noise), watched, prediction.y0[watched], movement,
+        RESTART * settings.settled_s, LONGEST_WATCH * settings.settled_s,
     )  # fmt: skip
+    return la.rounded(found, real)
 
 
 def watched_output(settings: PlausibilitySettings, prediction: PredictionModel) -> int:
@@ -388,16 +385,16 @@ of what that predicted, and its covariance with the age."""
 
 
 class Apart(NamedTuple):
-    """Predictions without the watched reading."""
+    """Predictions without the watched reading, the younger and the older one, as deviations.
+
+    x (2, n) are their states at the last measurement, predicted (2, n) those predicted from there as often as it is
+    begun, mismatch (2,) their load mismatches, W; watch (1,) is a `WATCH` record.
+    """
 
     x: Array
-    """States of the younger and the older one at the last measurement, deviations, shape (2, n)."""
     predicted: Array
-    """The same predicted from there, as often as it is begun."""
     mismatch: Array
-    """Their load mismatches, W, shape (2,)."""
     watch: Any
-    """`WATCH`, a record, shape (1,)."""
 
 
 def none_apart(n_states: int, real: Real) -> Apart:
@@ -449,8 +446,8 @@ def watch(
 def begin_younger(belief: Any) -> None:  # noqa: ANN401 a belief
     """Let the younger prediction become the older one, and one that begins at the estimate the younger."""
     w, a, zero = belief.apart.watch[0], belief.apart, belief.x.dtype.type(0.0)
-    for i in range(belief.x.size):
-        a.x[OLDER, i], a.x[YOUNGER, i] = a.x[YOUNGER, i], belief.x[i]
+    a.x[OLDER] = a.x[YOUNGER]
+    a.x[YOUNGER] = belief.x
     a.mismatch[OLDER], a.mismatch[YOUNGER] = a.mismatch[YOUNGER], belief.numbers[0].mismatch
     w.age_s, w.count, w.mean, w.spread, w.weight_s = zero, zero, zero, zero, zero
     w.when_s, w.span, w.expected, w.movement, w.trend = zero, zero, zero, zero, zero
@@ -486,8 +483,7 @@ def correct_apart(
             innovation[i] = np.nan
     correction = np.zeros(belief.x.size + 1, y.dtype)
     la.add_transposed_product(K, imputed(innovation, J), correction)
-    for i in range(belief.x.size):
-        a.x[which, i] = a.predicted[which, i] + correction[i]
+    a.x[which] = a.predicted[which] + correction[:-1]
     a.mismatch[which] += correction[belief.x.size]
     should: float = expected[p.watched]
     return should
@@ -498,9 +494,7 @@ def predict_apart(A: Array, B: Array, F: Array, belief: Any, u: Array) -> None: 
     """Predict over a step (A, B, F, transposed) under the input deviation u (3,), with the load that is measured."""
     b, a = belief.numbers[0], belief.apart
     for which in range(a.x.shape[0]):
-        later = la.respond(A, B, F, a.predicted[which], u, b.w - b.mismatch + a.mismatch[which])
-        for i in range(later.size):
-            a.predicted[which, i] = later[i]
+        a.predicted[which] = la.respond(A, B, F, a.predicted[which], u, b.w - b.mismatch + a.mismatch[which])
 
 
 @kernel

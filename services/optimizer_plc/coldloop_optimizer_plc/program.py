@@ -12,7 +12,7 @@ import numpy as np
 
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.cache import kernels_of
-from coldloop.kernels.compiled import entry_of
+from coldloop.kernels.compiled import entry_of, python_of
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.settings import InputLimits
@@ -26,7 +26,7 @@ from coldloop_optimizer_plc.estimator import OutsideEstimator, correct, estimato
 from coldloop_optimizer_plc.qp.linear_algebra import Array, real_of
 from coldloop_optimizer_plc.qp.prediction import prediction_of, rest_map, target_search
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
-from coldloop_optimizer_plc.rules import OutsideRule, UpdatingRule, decide_by, make_rule
+from coldloop_optimizer_plc.rules import OutsideRule, UpdatingRule, make_rule
 from coldloop_optimizer_plc.scheme import empty_state
 from coldloop_optimizer_plc.settings import ProgramSettings
 from coldloop_optimizer_plc.solvers import KernelSolver, make_solver
@@ -146,15 +146,11 @@ class OptimizerProgram:
             wanted = self.rule.first
         elif wanted == decisions.AFTER_A_STEP:
             wanted, load_step = self.rule.after_interruption(), 0.0
-        decisions.end_period(m)
         if self._estimator is None:
             correct(c.estimator, m.belief, latched.u_before, latched.load, latched.y, latched.x)
         else:
             self._estimator.correct(c.estimator, m.belief, latched.u_before, latched.load, latched.y)
-        effective = decisions.judge_played(c, m, latched.load, latched.y)
-        if wanted == decisions.BY_THE_RULE:
-            wanted = decide_by(self.rule, m.rule, *decisions.assess_period(c, m, effective))
-        decisions.begin_period(c, m, wanted, latched.update, latched.tick, latched.load, effective)
+        (python_of(decisions.begin_period) or decisions.begin_period)(c, self.rule, m, wanted, latched)
         return load_step
 
     # -- step (3): during the updating period -------------------------------------------------------------------------

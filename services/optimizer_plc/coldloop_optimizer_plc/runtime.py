@@ -1,40 +1,37 @@
 """The optimiser PLC on the bus: client of the control PLC, server of its own diagnostics.
 
-The state of the link is kept by `control_link.py`; what is asked again when it gets lost, by `control_client.py`. Here
-are the clock, and the order of things.
+State and requests of the link are in `control_link.py`. Here are the registers, the clock, and the order of things.
 """
 
 import asyncio
 import logging
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple, TypeAlias
 
-from coldloop import __version__
+from coldloop import __version__, errors
 from coldloop.config import selected
-from coldloop.errors import (
-    ColdloopError,
-    ConfigurationError,
-    LinkError,
-    ModelFileError,
-    RequestRefusedError,
-    UnfitValueError,
-)
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.settings import InputLimits
-from coldloop.registers import maps_of
-from coldloop.registers.common import publish_configuration
+from coldloop.process.updating_periods import SHORTEST_TICKS
+from coldloop.registers import common, maps_of
+from coldloop.registers import optimizer_plc as registers
+from coldloop.registers.bank import Caller, IllegalValueError, RegisterBank
+from coldloop.registers.codec import WordOrder, blank
+from coldloop.registers.common import EventKind, SessionPace
 from coldloop.registers.control_plc import AwaitUpdate, Plan, Update, Verdict
-from coldloop.registers.optimizer_plc import ControlLinkState, ModelDeviation
+from coldloop.registers.declaration import Block, RegisterMap
+from coldloop.registers.optimizer_plc import ControlLinkState
 from coldloop.safety.writers import InputSequence
+from coldloop.service.journal import Journal, JournalPublication
 from coldloop.service.monitoring import MetricsServer, Telemetry
 from coldloop.service.start import SERVING
 from coldloop.session import TimeBase, TimeMode
-from coldloop_optimizer_plc.control_client import ControlClient
+from coldloop_optimizer_plc.computing_settings import PlcBudget
+from coldloop_optimizer_plc.control_link import ControlClient, ControlLink
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.publication import OptimizerPublication
 from coldloop_optimizer_plc.settings import SHOWN, OptimizerSettings, ProgramSettings
 
 log = logging.getLogger("coldloop.optimizer_plc")
@@ -52,6 +49,131 @@ SHORTEST_WAIT_S: Final = 0.02
 """An answer without a new update that comes sooner, in real time, is followed by a pause: it should have waited."""
 FRESH_UPDATE: Final = AwaitUpdate(session=0, update=0)
 """Asks for a fresh update, whatever the session."""
+NO_UPDATE: Final = registers.Optimization(*(0,) * len(registers.Optimization._fields))
+
+
+class OptimizerPublication:
+    """Registers and journal of the optimiser PLC.
+
+    Args:
+        register_map: Of this service, for the process.
+        order: Word order of the registers.
+        budget: Decides which updating periods can be asked for in real time.
+        limits: Bands, bounds and rates of the problem.
+        model_digest: Of our model.
+        holder: Number that this optimiser gives itself.
+    """
+
+    def __init__(
+        self, register_map: RegisterMap, order: WordOrder, budget: PlcBudget, limits: registers.OperatingLimits,
+        model_digest: int, holder: int,
+    ) -> None:  # fmt: skip
+        self.bank = RegisterBank(register_map, order)
+        self.bank.put(limits)
+        self.bank.put_sealed(blank(registers.Prediction, self.bank.map))
+        self.bank.judged_by(self._judge, registers.OptimizerSession)
+        self.bank.judged_by(self._judge_pace, SessionPace)
+        self.pace = TimeBase(realtime=False, factor=1.0)
+        """Time base of the session under way."""
+        self._budget = budget
+        self._model_digest = model_digest
+        self._journal = Journal()
+        self._shown = JournalPublication(self._journal, self.bank)
+        self._asked_by = ""
+        self._last: registers.Optimization | None = None
+        self._session = self._tick = 0
+        self._predict: Callable[[], registers.Prediction] | None = None
+        """Computes the prediction that is to be shown; None when the registers have it."""
+        self._journal.note(0, EventKind.BOOT)
+        self._shown.show()
+        self.link = ControlLink(holder, self._journal, self._shown.show)
+        self.bank.keep_fresh(registers.ControlLinkStatus, self.link.registers)
+        self.bank.keep_fresh(common.Identity, self._identity)
+        self.bank.keep_fresh(registers.Prediction, self._prediction)
+
+    def _judge(self, asked: registers.OptimizerSession, _row: int, _caller: Caller) -> None:
+        """Refuse an updating period that there is not, or whose answers would never be there in time."""
+        ticks = asked.updating_period
+        if 0 < ticks < SHORTEST_TICKS:
+            raise IllegalValueError(
+                f"session.updating_period = {ticks}: give {SHORTEST_TICKS} or more, or 0 (adaptive)"
+            )
+        if ticks and asked.realtime and not self._budget.is_enough(ticks):
+            period_s = ticks * self._budget.times.tick_s
+            raise IllegalValueError(
+                f"session.updating_period = {ticks}: in real time no answer is there within {period_s:g} s, one "
+                f"iteration takes {self._budget.answer_after_s(1):g} s with its preparation: give more, or 0 (adaptive)"
+            )
+
+    def _judge_pace(self, asked: SessionPace, _row: int, _caller: Caller) -> None:
+        try:
+            asked.of(self._session)
+        except ValueError as error:
+            raise IllegalValueError(f"pace: {error}") from None
+
+    def on_write(self, block: Block, caller: Caller) -> None:
+        """Answer a query of the journal; the settings of a session are taken when it begins."""
+        if block.record is common.JournalQuery:
+            self._shown.answer(self.bank.get(common.JournalQuery))
+        elif block.record is registers.OptimizerSession:
+            self._asked_by = caller.name
+        elif block.record is SessionPace:
+            before, pace = self.pace, self.bank.get(SessionPace).of(self._session)
+            self.bank.put(SessionPace.shown(self._session, pace))
+            if pace == before:
+                return
+            self.pace = pace
+            self._journal.note(
+                self.link.tick, EventKind.PACE, common.pace_subject(pace), value=pace.factor, who=caller.name
+            )
+            self._shown.show()
+
+    def asked_for(self, session: int) -> registers.OptimizerSession | None:
+        """Return the settings that an operator has written for a session."""
+        asked = self.bank.get(registers.OptimizerSession)
+        return asked if asked.session == session else None
+
+    # -- what is shown -------------------------------------------------------------------------------------------------
+
+    def session_started(self, session: int, pace: TimeBase, rule: registers.UpdatingRuleStatus) -> None:
+        """Show that a session has begun."""
+        who = self._asked_by if self.asked_for(session) is not None else ""
+        self._session, self._tick, self._last = session, 0, None
+        for row in range(registers.HISTORY_ROWS):  # the updates of another session are not those of this one
+            self.bank.put(NO_UPDATE, row)
+        self._journal.note(self.link.tick, EventKind.SESSION, int(pace.realtime), value=pace.factor, who=who)
+        self.pace = pace
+        self.bank.put(SessionPace.shown(session, pace))
+        self.bank.put(rule)
+        self._predict = None
+        self.bank.put_sealed(blank(registers.Prediction, self.bank.map))
+        self._shown.show()
+
+    def optimised(self, tick: int, done: registers.Optimization) -> None:
+        """Show what was done with the update latched at `tick`."""
+        self._tick, self._last = tick, done
+        self.bank.put(done, done.update % registers.HISTORY_ROWS)
+
+    def predicted(self, predict: Callable[[], registers.Prediction]) -> None:
+        """Show what a delivered sequence is expected to lead to: it is computed when it is read."""
+        self._predict = predict
+
+    def _prediction(self) -> registers.Prediction | None:
+        predict, self._predict = self._predict, None
+        return None if predict is None else predict()
+
+    def _identity(self) -> common.Identity:
+        return common.Identity(
+            map_digest=self.bank.map.digest, map_version=self.bank.map.version,
+            state=common.ServiceState.RUNNING if self._session else common.ServiceState.READY,
+            model_digest=self._model_digest, session=self._session, tick=self._tick,
+            heartbeat=(self._last.update + 1 if self._last else 0) & 0xFFFF,
+        )  # fmt: skip
+
+    def snapshot(self) -> Mapping[str, object]:
+        """Return what telemetry publishes."""
+        shown = {"session": self._session, "link": self.link.state.name.lower()}
+        return {**shown, **(self._last._asdict() if self._last else {})}
 
 
 class _Answer(NamedTuple):
@@ -89,8 +211,8 @@ class OptimizerPlc:
         self.publication = OptimizerPublication(
             maps.optimizer_plc, section.word_order, self._program.budget, self._program.operating_limits, digest, holder
         )
-        self.publication.bank.keep_fresh(ModelDeviation, self._program.model_deviation)
-        publish_configuration(self.publication.bank, selected(settings, SHOWN))
+        self.publication.bank.keep_fresh(registers.ModelDeviation, self._program.model_deviation)
+        common.publish_configuration(self.publication.bank, selected(settings, SHOWN))
         self._link = self.publication.link
         self._control = ControlClient(
             maps.control_plc, section.control_plc, self._link, digest, str(settings.model.file)
@@ -121,28 +243,28 @@ class OptimizerPlc:
                     log.info("control PLC found")
                 await self._resume()
                 await self._serve_updates()
-            except ModelFileError as error:
+            except errors.ModelFileError as error:
                 if not self._link.was_up:
                     raise
                 self._lose(error)
-            except LinkError as error:
+            except errors.LinkError as error:
                 self._lose(error)
 
-    def _lose(self, error: ColdloopError) -> None:
+    def _lose(self, error: errors.ColdloopError) -> None:
         """Note why the link is lost, and prepare the next attempt."""
         was_foreign = self._link.state is ControlLinkState.OTHER_MASTER
         self._link.failed(error)
         state, reason = self._link.state, str(error)
         if state is not ControlLinkState.OTHER_MASTER:  # its connection may stay: nothing is wrong with it
             self._control.close()
-        if isinstance(error, (RequestRefusedError, UnfitValueError)):
+        if isinstance(error, (errors.RequestRefusedError, errors.UnfitValueError)):
             self._session = 0  # its state leads to rejected sequences: restart the session
         if state is not ControlLinkState.SEARCHING:  # others may have had the lease meanwhile
             self._wanted, self._kept = FRESH_UPDATE, None
         else:
             try:
                 self._control.reload_certificates()
-            except ConfigurationError as unusable:
+            except errors.ConfigurationError as unusable:
                 reason = f"{reason}; {unusable}"
         still_foreign = was_foreign and state is ControlLinkState.OTHER_MASTER
         if not still_foreign and self._link.is_worth_logging(reason, time.monotonic()):
@@ -154,11 +276,11 @@ class OptimizerPlc:
         if answer is None:
             return
         verdict = await self._control.verdict_on(answer.sequence)
-        self._link.computes()
+        self._link.go(ControlLinkState.COMPUTING)
         if verdict is None:
             await self._finish(answer._replace(resumed=True))
         else:
-            self._link.delivers()
+            self._link.go(ControlLinkState.DELIVERING)
             await self._conclude(answer.update, verdict)
 
     # -- updates -------------------------------------------------------------------------------------------------------
@@ -205,7 +327,7 @@ class OptimizerPlc:
         self._link.tick = update.tick
         if update.session != self._session:
             await self._start(update.session)
-        self._link.computes()
+        self._link.go(ControlLinkState.COMPUTING)
         plan = program.plan(update)
         realtime = self.publication.pace.realtime
         if realtime:  # the next scan does not wait for it
@@ -218,10 +340,10 @@ class OptimizerPlc:
         """Deliver an answer when it is ready; keep it, once, should the link be lost meanwhile."""
         self._kept = None if answer.resumed else answer
         if self.publication.pace.realtime and not await self._is_computed(answer):
-            self._link.interrupted()
+            self._link.go(ControlLinkState.WAITING, interrupted=1)
             await self._conclude(answer.update, Verdict.NONE)
             return
-        self._link.delivers()
+        self._link.go(ControlLinkState.DELIVERING)
         plan = None if answer.planned else answer.plan
         await self._conclude(answer.update, await self._control.deliver(answer.sequence, plan))
 
@@ -229,7 +351,7 @@ class OptimizerPlc:
         """Take the verdict, Verdict.NONE of an answer that was given up, and decide which update to ask for next."""
         self._kept = None
         if verdict is not Verdict.NONE:
-            self._link.acknowledged(verdict)
+            self._link.go(ControlLinkState.WAITING, rejected=int(verdict is not Verdict.ACCEPTED))
         if verdict not in (Verdict.NONE, Verdict.ACCEPTED):
             log.warning("sequence rejected", extra={"update": update.update, "verdict": verdict.name.lower()})
         self.publication.optimised(update.tick, self._program.report(verdict))

@@ -18,7 +18,7 @@ from coldloop_optimizer_plc.estimator import Belief, Estimator, begin_prediction
 from coldloop_optimizer_plc.plausibility import are_finite
 from coldloop_optimizer_plc.qp import problem as problems
 from coldloop_optimizer_plc.qp.costs import predicted_indicators
-from coldloop_optimizer_plc.qp.linear_algebra import Array, Real
+from coldloop_optimizer_plc.qp.linear_algebra import Array, Real, rounded
 from coldloop_optimizer_plc.qp.prediction import TargetSearch
 from coldloop_optimizer_plc.qp.problem import Maps, OutputMaps, PredictiveProblem, QuadraticProblem
 from coldloop_optimizer_plc.rules import MEMORY
@@ -36,33 +36,30 @@ MOST_BITS: Final = 31
 
 
 class TurbineWatch(NamedTuple):
-    """Test for a turbine at standstill; its indices are parameters, since kernels are shared by processes."""
+    """Test for a turbine at standstill; its indices are parameters, since kernels are shared by processes.
+
+    valve: input before the turbine; -1: neither speed nor pressures are measured. speed, before, behind: outputs that
+    are its speed and the pressures before and behind it. slow: speed below which it may stand. ratio: of the pressures,
+    below which nothing flows. bit: of the valve in the mask of suspects, after those of the outputs.
+    """
 
     valve: int
-    """Input before the turbine; -1: neither speed nor pressures are measured."""
     speed: int
-    """Output, ..."""
     before: int
-    """... and those of the pressures before ..."""
     behind: int
-    """... and behind it."""
     slow: float
-    """Speed below which it may stand."""
     ratio: float
-    """Ratio of the pressures, below which nothing flows."""
     bit: int
-    """Bit of the valve in the mask of suspects: it follows those of the outputs."""
 
 
-def turbine_watch(process: Process, y0: Array, real: Real) -> TurbineWatch:
+def turbine_watch(process: Process, y0: Array) -> TurbineWatch:
     """Return how the turbine of the process is watched, by its outputs (n_y,) at the operating point."""
     bath, outputs = process.bath, process.output_names
     if bath is None or not bath.turbine_speed or len(outputs) + len(process.inputs) > MOST_BITS:
-        return TurbineWatch(-1, 0, 0, 0, real(-math.inf), real(STANDSTILL_RATIO), 0)
+        return TurbineWatch(-1, 0, 0, 0, -math.inf, STANDSTILL_RATIO, 0)
     valve, speed = process.input_names.index(bath.turbine_valve), outputs.index(bath.turbine_speed)
     before, behind = map(outputs.index, bath.turbine_pressures)
-    bit = 1 << (len(outputs) + valve)
-    return TurbineWatch(valve, speed, before, behind, real(SLOW * y0[speed]), real(STANDSTILL_RATIO), bit)
+    return TurbineWatch(valve, speed, before, behind, SLOW * y0[speed], STANDSTILL_RATIO, 1 << (len(outputs) + valve))
 
 
 @kernel
@@ -103,36 +100,35 @@ those of the outputs comes the bit of an input that has no effect."""
 
 
 class Delivery(NamedTuple):
-    """A profile, the parameters it was computed for, and its rows for the control PLC."""
+    """A profile z (n,), the parameters it was computed for, and its rows for the control PLC.
+
+    numbers (1,) is a `DELIVERY` record; the state x (n_x,) and the input before the first knot u_before (3,) are
+    deviations; rows (240, 3) are the inputs as the link carries them, a row a tick.
+    """
 
     numbers: Any
-    """`DELIVERY`, shape (1,)."""
     x: Array
-    """State of the problem, as a deviation, shape (n_x,)."""
     u_before: Array
-    """Input before the first knot, as a deviation, shape (3,)."""
     z: Array
-    """Shape (n,)."""
     rows: NDArray[np.float32]
-    """Inputs as the link carries them, a row a tick, shape (240, 3)."""
 
 
 class OptimizerState(NamedTuple):
-    """State of the optimiser between two updates, and between a plan and its answer."""
+    """State of the optimiser between two updates, and between a plan and its answer.
+
+    numbers (1,) is a `PERIOD` record. The control PLC plays the sequence `playing`; `sent` is the last answer, which
+    may be computed again from the same state, with the same bits. u (3,) is the input applied at the update under way,
+    a deviation, played on where no sequence is; target (3,) are the inputs that the plant should come to rest at,
+    scaled deviations; rule (1,) is the memory of the rule of the updating period.
+    """
 
     numbers: Any
-    """`PERIOD`, shape (1,)."""
     belief: Belief
     playing: Delivery
-    """Sequence that the control PLC plays."""
     sent: Delivery
-    """The last answer. An answer may be computed again from the same state, with the same bits."""
     u: Array
-    """Input applied at the update under way, as a deviation, shape (3,): played on where no sequence is."""
     target: Array
-    """Inputs that the plant should come to rest at, scaled deviations, shape (3,)."""
     rule: Array
-    """Memory of the rule of the updating period, shape (1,)."""
 
 
 def empty_state(n_states: int, n_inputs: int, n_outputs: int, size: int, real: Real) -> OptimizerState:
@@ -157,7 +153,7 @@ LARGEST: Final = 1e38
 
 
 class Constants(NamedTuple):
-    """Constants of an optimiser in one session, in the on-line floating-point type."""
+    """Constants of an optimiser in one session, in the on-line floating-point type; loads are deviations, W."""
 
     estimator: Estimator
     target: TargetSearch
@@ -181,34 +177,30 @@ class Constants(NamedTuple):
     """Share of the rate limit after 0, 1, ... ticks, shape (ticks + 1,)."""
     n_inputs: int
     alpha: float
-    """Penalty weight."""
     floor: float
     """Constant added to J."""
     least_load: float
-    """Least load that can be held, as a deviation, W."""
     largest_load: float
+    """Least and largest load that can be held."""
     reserve: float
-    """Reserve kept below the largest load that the model holds, W."""
+    """Reserve kept below the largest load that the model holds."""
     least_load_error: float
     """Taken off the model's least load with the turbine's outlet in its band: it is too high until the bias
-    of that has followed, W."""
+    of that has followed."""
     approach: float
-    """How much warmer than the bath helium before the feed is at which that is opened no further, K; infinite is any.
-    """
     following_s: float
-    """Time constant with which the limit of the feed follows that."""
+    """How much warmer than the bath helium before the feed is at which that is opened no further, K, infinite is any;
+    time constant with which the limit of the feed follows that."""
     level: int
-    """Index of the output that is the level of the bath, ..."""
     temperature: int
-    """... which its temperature, ..."""
     feed_temperature: int
-    """... and which that before its feed."""
+    """Outputs that are level and temperature of the bath, and the temperature before its feed."""
     opening_per_k: float
     opening_from: float
     """A deviation, %."""
     turbine: TurbineWatch
     load_step: float
-    """Change of the load at which an updating period is interrupted, W; 0 is never."""
+    """Change of the load at which an updating period is interrupted; 0 is never."""
     sequence_ticks: int
     fixed_ticks: int
     """Fixed updating period; 0 is adaptive."""
@@ -225,26 +217,27 @@ def constants_of(
     budget: PlcBudget, rest: Array,
 ) -> Constants:  # fmt: skip
     """Return the constants of a session with adaptive periods."""
-    real, process, every = problem.Phi.dtype.type, settings.process, range(budget.longest_ticks + 1)
-    bath, level, temperature, feed_temperature, end = process.bath, 0, 0, 0, settings.cold_end
+    process, every, end = settings.process, range(budget.longest_ticks + 1), settings.cold_end
+    bath, level, temperature, feed_temperature = process.bath, 0, 0, 0
     if bath is not None:
         named = bath.level, bath.temperature, bath.feed_temperature
         level, temperature, feed_temperature = map(process.output_names.index, named)
-    return Constants(
+    found = Constants(
         estimator=estimator, target=target, Phi=problem.Phi, Gamma=problem.Gamma, maps=problem.maps,
         shifts=problem.shifts, knots=problem.knots, rest=rest, predicted=problem.predicted,
         weights=problem.knots_to_samples, input_scale=problem.input_scale, rate=problem.rate,
-        scaled_rate=problem.scaled_rate, n_inputs=problem.n_inputs, alpha=real(alpha),
-        rate_shares=np.array([problem.limits.rate_share(ticks) for ticks in every], real),
-        floor=real(settings.adaptive.cost_floor), least_load=real(settings.holdable_load_w[0] - estimator.w0),
-        largest_load=real(settings.holdable_load_w[1] - estimator.w0), reserve=real(settings.capacity_reserve_w),
-        least_load_error=real(bath.least_load_error if bath else 0.0), approach=real(end.approach_k or np.inf),
-        following_s=real(end.following_s), level=level, temperature=temperature, feed_temperature=feed_temperature,
-        opening_per_k=real(end.opening_per_k), opening_from=real(end.opening_from - estimator.u0[target.feed]),
-        turbine=turbine_watch(process, estimator.y0, real), load_step=real(settings.interrupting_load_step_w),
+        scaled_rate=problem.scaled_rate, n_inputs=problem.n_inputs, alpha=alpha,
+        rate_shares=np.array([problem.limits.rate_share(ticks) for ticks in every]),
+        floor=settings.adaptive.cost_floor, least_load=settings.holdable_load_w[0] - estimator.w0,
+        largest_load=settings.holdable_load_w[1] - estimator.w0, reserve=settings.capacity_reserve_w,
+        least_load_error=bath.least_load_error if bath else 0.0, approach=end.approach_k or math.inf,
+        following_s=end.following_s, level=level, temperature=temperature, feed_temperature=feed_temperature,
+        opening_per_k=end.opening_per_k, opening_from=end.opening_from - estimator.u0[target.feed],
+        turbine=turbine_watch(process, estimator.y0), load_step=settings.interrupting_load_step_w,
         sequence_ticks=shortest_sequence(settings, budget), fixed_ticks=0, most=len(budget.ladder),
         periods=np.array([0, *budget.ladder]), fitting=np.array([budget.iterations(ticks) for ticks in every]),
     )  # fmt: skip
+    return rounded(found, problem.Phi.dtype.type)
 
 
 def shortest_sequence(settings: ProgramSettings, budget: PlcBudget) -> int:

@@ -53,14 +53,14 @@ def positive_squares(excess: Array) -> float:
 
 
 class Matrices(NamedTuple):
-    """The constant matrices of a problem, stored for products without the zeros at the ends of columns and rows."""
+    """The constant matrices of a problem, stored for products without the zeros at the ends of columns and rows.
+
+    Phi (n, n), Gamma (m, n), and Gamma transposed: the rows of Gamma as columns.
+    """
 
     Phi: Columns
-    """Shape (n, n)."""
     Gamma: Columns
-    """Shape (m, n)."""
     rows: Columns
-    """Gamma transposed: the rows of Gamma as columns."""
 
 
 def matrices_of(qp: QuadraticProblem) -> Matrices:
@@ -113,14 +113,15 @@ def gradient(
 
 
 class ProfileCosts(NamedTuple):
-    """Predicted costs and violation of a profile."""
+    """Predicted deviation and violation cost of a profile over the horizon, and its largest violated row.
+
+    j_cst is that of the predicted outputs and never of the slacks, which may lie; the violation is
+    max(Gamma p - gamma, 0), in the units of the row (%, K, or input units).
+    """
 
     j_dev: float
-    """Deviation cost over the horizon."""
     j_cst: float
-    """Violation cost over the horizon, from the predicted outputs and never from the slacks, which may lie."""
     violation: float
-    """Largest violated row, max(Gamma p - gamma, 0), in the units of the row (%, K, or input units)."""
 
 
 def indicators(problem: PredictiveProblem, qp: QuadraticProblem, z: Array, parameters: QpParameters) -> ProfileCosts:
@@ -171,32 +172,30 @@ CONTACT = 1e-7
 
 
 class Solution(NamedTuple):
-    """A profile z, judged for min J_0(z) = z' Phi z + z' phi under Gamma z <= gamma and low <= z <= high.
+    """A profile z (n,), judged for min J_0(z) = z' Phi z + z' phi under Gamma z <= gamma and low <= z <= high.
 
-    Costs are without the problem's constant. At an optimum both residuals and the gap are zero; a minimiser of the
-    augmented cost J keeps a primal residual, and a gap of twice its penalty.
+    Costs are without the problem's constant: base_cost J_0, and cost J_0 + alpha sum max(Gamma z - gamma, 0)^2.
+    multipliers lambda (m,) are those of the rows, >= 0. violation: largest violated row, in the scaled units of the
+    rows; primal_residual: that of a row or of the box; dual_residual: largest component of the Lagrangian's gradient
+    that no bound of the box holds up; gap: complementarity, |lambda' (Gamma z - gamma)|. At an optimum both residuals
+    and the gap are zero; a minimiser of the augmented cost J keeps a primal residual, and a gap of twice its penalty.
     """
 
     z: Array
-    """Shape (n,)."""
     multipliers: Array
-    """Multipliers of the rows, lambda >= 0, shape (m,)."""
     base_cost: float
-    """J_0."""
     cost: float
-    """J = J_0 + alpha sum max(Gamma z - gamma, 0)^2."""
     violation: float
-    """Largest violated row, max(Gamma z - gamma, 0), in the scaled units of the rows."""
     primal_residual: float
-    """Largest violation of a row or of the box."""
     dual_residual: float
-    """Largest component of the Lagrangian's gradient that no bound of the box holds up."""
     gap: float
-    """Complementarity: |lambda' (Gamma z - gamma)|."""
 
 
 def judge(problem: QuadraticProblem, z: Array, alpha: float, multipliers: Array) -> Solution:
-    """Return z (n,) with its judgement; `multipliers` (m,) are those of the rows, the box's are the best there are."""
+    """Return z (n,) with its judgement; `multipliers` (m,) are those of the rows, the box's are the best there are.
+
+    Without any, (0,), they are those of a penalty method.
+    """
     excess = problem.Gamma @ z - problem.gamma
     violation = float(np.max(excess, initial=0.0))
     outside = float(np.max(np.maximum(problem.low - z, z - problem.high), initial=0.0))

@@ -8,7 +8,7 @@ order of any sum. Constants and sums have the type of the arrays: a double const
 Indices that begin elsewhere than at 0 are unsigned: numba then knows that they do not count from the end.
 """
 
-from typing import NamedTuple, TypeAlias, cast
+from typing import NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,21 @@ Real: TypeAlias = type[np.float64]
 DOUBLE: Real = np.float64
 Array = NDArray[np.float64]
 Indices = NDArray[np.uint64]
+T = TypeVar("T")
 
 
 def real_of(arithmetic: Arithmetic) -> Real:
     """Return the scalar type of an arithmetic."""
     return cast("Real", np.float32) if arithmetic is Arithmetic.FLOAT32 else DOUBLE
+
+
+def rounded(value: T, real: Real) -> T:
+    """Return a float, an array of floats, or a named tuple of these and others, in a type; arrays are contiguous."""
+    if isinstance(value, tuple):
+        return cast("T", type(value)(*(rounded(part, real) for part in value)))
+    if isinstance(value, np.ndarray):
+        return cast("T", np.ascontiguousarray(value, real if value.dtype.kind == "f" else None))
+    return cast("T", real(value) if isinstance(value, float | np.floating) else value)
 
 
 class Columns(NamedTuple):

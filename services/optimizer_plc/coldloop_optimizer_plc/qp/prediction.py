@@ -23,7 +23,7 @@ from coldloop.kernels.compiled import kernel
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.sections import Bath
 from coldloop.process.settings import InputLimits
-from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Array, Real, multiply
+from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Array, Real, multiply, rounded
 from coldloop_optimizer_plc.settings import ControlDesign, Target
 
 
@@ -74,7 +74,6 @@ class PredictionModel:
         self.C, self.D, self.G = np.array(model.C), np.array(model.D), np.array(model.G[:, None])
         self.x0, self.u0, self.y0 = model.x0, model.u0, model.y0
         self.w0 = DOUBLE(model.w0)
-        self.real = DOUBLE
         self.disturbances: tuple[int, ...] = ()
         """Signals whose constants are states."""
         self.ahead: tuple[Ahead, ...] = ()
@@ -84,18 +83,6 @@ class PredictionModel:
         self.transitions = {1: tick}
         for ticks in range(2, self.process.ticks_per_sample + 1):
             self.transitions[ticks] = self.transitions[ticks - 1].then(tick)
-
-    def rounded(self, real: Real) -> "PredictionModel":
-        """Return this model in another floating-point type, rounded once."""
-        twin = copy(self)
-        twin.C, twin.D, twin.G, twin.x0, twin.u0, twin.y0 = (
-            M.astype(real, copy=False) for M in (self.C, self.D, self.G, self.x0, self.u0, self.y0)
-        )
-        twin.w0, twin.real = real(self.w0), real
-        twin.transitions = {
-            ticks: Transition(*(M.astype(real, copy=False) for M in step)) for ticks, step in self.transitions.items()
-        }
-        return twin
 
     def with_disturbances(self, signals: Sequence[int]) -> "PredictionModel":
         """Return this model with a constant disturbance of each of these signals as a further state.
@@ -232,7 +219,7 @@ def rest_map(prediction: PredictionModel, real: Real = DOUBLE) -> Array:
     process = prediction.process
     if process.bath is None:
         found[moved] = np.linalg.pinv(np.eye(len(moved)) - A) @ np.hstack([B, F, zeros])
-        return found.astype(real, copy=False)
+        return rounded(found, real)
     level = [process.output_names.index(process.bath.level)]
     C, D, G = (M[level] for M in (prediction.C, prediction.D, prediction.G))
     left = np.block([[np.eye(len(moved)) - A, -F], [C[:, moved], G]])
@@ -243,7 +230,7 @@ def rest_map(prediction: PredictionModel, real: Real = DOUBLE) -> Array:
         raise ConfigurationError(
             "model.file: with constant inputs no load lets the model's states and the level rest; name another model"
         ) from error
-    return found.astype(real, copy=False)
+    return rounded(found, real)
 
 
 TOLERANCES = {8: 1e-8, 4: 1e-4}
@@ -314,7 +301,13 @@ def target_search(
     """Return what targets of this problem are found with."""
     process = prediction.process
     if process.bath is None:
-        return no_target_search(design.n_inputs, real)
+        inputs, rows, n = np.zeros(design.n_inputs), np.zeros(design.n_inputs + 1), design.n_inputs
+        nothing = TargetSearch(
+            followed=False, limited=False, of_load=0.0, held=inputs, cheapest=inputs, plane=np.zeros((n, 2)),
+            rows=np.zeros((n + 1, 2)), temperature=inputs, low=rows, high=rows, margin=0.0,
+            constants=np.full(n + 1, -1), scale=rows, tolerance=0.0, feed=0,
+        )  # fmt: skip
+        return rounded(nothing, real)
     outlet, feed = process.output_names.index(process.bath.turbine_outlet), process.input_names.index(process.bath.feed)
     rest, n, scale = rest_of(prediction, design, process.bath), len(prediction.model.x0), np.array(design.input_scale)
     held, states = rest.states[:, -1], rest.states[:, :n]
@@ -322,37 +315,21 @@ def target_search(
     inverse = np.linalg.inv(cost)
     across = np.linalg.svd(held[None])[2][1:].T
     root = np.linalg.cholesky(across.T @ cost @ across)
-    plane = np.ascontiguousarray(np.linalg.solve(root, across.T).T)
+    plane = np.linalg.solve(root, across.T).T
     band = process.controlled.index(outlet)
     y0, margin, u0 = float(prediction.y0[outlet]), design.band_margin[band], np.array(prediction.u0)
     places = {signal: n + place for place, signal in enumerate(prediction.disturbances)}
     signals = (*range(len(prediction.y0), len(prediction.y0) + design.n_inputs), outlet)
-    arrays = {
-        "held": held,
-        "cheapest": inverse @ held / (held @ inverse @ held),
-        "plane": plane,
-        "rows": np.vstack([plane, rest.temperature @ plane]),
-        "temperature": rest.temperature,
-        "low": np.array([*(limits.low - u0) / scale, design.output_low[band] + margin - y0]),
-        "high": np.array([*(limits.high - u0) / scale, design.output_high[band] - margin - y0]),
-        "scale": np.array([*scale, 1.0]),
-    }
-    return TargetSearch(
-        followed=design.target is not Target.OPERATING_POINT, limited=True, of_load=real(design.target is Target.LOAD),
-        margin=real(margin), constants=np.array([places.get(signal, -1) for signal in signals]),
-        tolerance=real(TOLERANCES[np.dtype(real).itemsize]), feed=feed,
-        **{name: np.ascontiguousarray(array).astype(real, copy=False) for name, array in arrays.items()},
+    found = TargetSearch(
+        followed=design.target is not Target.OPERATING_POINT, limited=True,
+        of_load=float(design.target is Target.LOAD), held=held, cheapest=inverse @ held / (held @ inverse @ held),
+        plane=plane, rows=np.vstack([plane, rest.temperature @ plane]), temperature=rest.temperature,
+        low=np.array([*(limits.low - u0) / scale, design.output_low[band] + margin - y0]),
+        high=np.array([*(limits.high - u0) / scale, design.output_high[band] - margin - y0]), margin=margin,
+        constants=np.array([places.get(signal, -1) for signal in signals]), scale=np.array([*scale, 1.0]),
+        tolerance=TOLERANCES[np.dtype(real).itemsize], feed=feed,
     )  # fmt: skip
-
-
-def no_target_search(n_inputs: int, real: Real) -> TargetSearch:
-    """Return the search of a process that has no target but its operating point."""
-    inputs, rows = np.zeros(n_inputs, real), np.zeros(n_inputs + 1, real)
-    return TargetSearch(
-        followed=False, limited=False, of_load=real(0.0), held=inputs, cheapest=inputs,
-        plane=np.zeros((n_inputs, 2), real), rows=np.zeros((n_inputs + 1, 2), real), temperature=inputs, low=rows,
-        high=rows, margin=real(0.0), constants=np.full(n_inputs + 1, -1), scale=rows, tolerance=real(0.0), feed=0,
-    )  # fmt: skip
+    return rounded(found, real)
 
 
 @kernel

@@ -15,7 +15,7 @@ import numpy as np
 
 from coldloop.kernels.compiled import kernel
 from coldloop.process.settings import InputLimits, settings_of
-from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Array, Real, add_transposed_product, multiply
+from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Array, Real, add_transposed_product, multiply, rounded
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, rest_of, state_cost
 from coldloop_optimizer_plc.settings import ControlDesign, PenaltySettings, Target
 
@@ -185,39 +185,24 @@ class OutputMaps(NamedTuple):
     """Factors that the rows of Gamma were multiplied by, shape (m,)."""
 
 
-class OutputRows(NamedTuple):
-    """Rows -y_j - s <= -low and y_j - s <= high at each constraint instant, output by output."""
+class Rows(NamedTuple):
+    """Rows of Gamma z <= gamma, multiplied by gains."""
 
     Gamma: Array
     """Shape (rows, n)."""
     bounds: Array
-    """gamma at the operating point, shape (rows,)."""
-    states: Array
-    """Derivative of gamma with respect to s = (x, w), shape (n_x + 1, rows)."""
+    """gamma at the operating point, with no input before, shape (rows,)."""
+    moved: Array
+    """Derivative of gamma with respect to s = (x, w), or to the input before, shape (n_x + 1 or inputs, rows)."""
     gains: Array
-    """Factors that the rows were multiplied by, shape (rows,): 1 for the output of the larger rho."""
+    """Shape (rows,): 1 for the output of the larger rho."""
 
 
-class RateRows(NamedTuple):
-    """Rows +-(u_b - u_a) <= (b - a) rate for each interval between decision instants, unless always true.
+def output_rows(condensed: Condensed, design: ControlDesign, weights: Array, y0: Array) -> Rows:
+    """Return the rows -y_j - s <= -low and y_j - s <= high at each constraint instant, output by output.
 
-    The first interval starts at the input applied before the first knot.
+    `weights` (N, knots) are those of the knots, `y0` the outputs at rest.
     """
-
-    Gamma: Array
-    """Shape (rows, n)."""
-    bounds: Array
-    """gamma with no input before, shape (rows,)."""
-    first: Array
-    """1.0 for the rows of the first interval, shape (rows,)."""
-    before: Array
-    """Derivative of gamma with respect to the input before, shape (inputs, rows)."""
-    gains: Array
-    """Factors that the rows were multiplied by, shape (rows,)."""
-
-
-def output_rows(condensed: Condensed, design: ControlDesign, weights: Array, y0: Array) -> OutputRows:
-    """Return the rows of the bands; `weights` (N, knots) are those of the knots, `y0` the outputs at rest."""
     rho = np.array(design.violation_weight)
     rows, states, bounds, gains = [], [], [], []
     for instant in design.constraint_instants:
@@ -232,19 +217,19 @@ def output_rows(condensed: Condensed, design: ControlDesign, weights: Array, y0:
             bounds += [-low, high]
             gains += 2 * [np.sqrt(rho[output] / rho.max())]
     gain = np.array(gains)
-    return OutputRows(
-        Gamma=np.array(rows) * gain[:, None], bounds=np.array(bounds) * gain,
-        states=np.ascontiguousarray((np.array(states) * gain[:, None]).T), gains=gain,
-    )  # fmt: skip
+    return Rows(np.array(rows) * gain[:, None], np.array(bounds) * gain, (np.array(states) * gain[:, None]).T, gain)
 
 
-def rate_rows(design: ControlDesign, limits: InputLimits, penalties: PenaltySettings) -> RateRows:
-    """Return the rows of the rates, scaled by what breaking them costs; there may be none."""
+def rate_rows(design: ControlDesign, limits: InputLimits, penalties: PenaltySettings) -> Rows:
+    """Return the rows +-(u_b - u_a) <= (b - a) rate of each interval between decision instants, unless always true.
+
+    The first interval starts at the input before the first knot. Gains are what breaking the rows costs.
+    """
     ranges = np.asarray(limits.high) - np.asarray(limits.low)
     n_inputs = design.n_inputs
     size = (n_inputs + design.n_slacks) * len(design.decision_instants)
     gains_of_inputs = np.sqrt(penalties.rate_rows) / np.array(design.input_scale)
-    rows, bounds, before, first, gained = [], [], [], [], []
+    rows, bounds, before, gained = [], [], [], []
     starts = (design.decision_instants[0] - 1, *design.decision_instants[:-1])
     for knot, (start, end) in enumerate(zip(starts, design.decision_instants, strict=True)):
         for i in range(n_inputs):
@@ -258,14 +243,11 @@ def rate_rows(design: ControlDesign, limits: InputLimits, penalties: PenaltySett
             for sign in (1.0, -1.0):
                 rows.append(sign * row)
                 bounds.append(limit)
-                first.append(float(knot == 0))
                 before.append(sign * np.eye(n_inputs)[i] * (knot == 0))
                 gained.append(gains_of_inputs[i])
     gains = np.array(gained)
-    return RateRows(
-        Gamma=np.reshape(rows, (-1, size)) * gains[:, None], bounds=np.array(bounds) * gains, first=np.array(first),
-        before=np.ascontiguousarray((np.reshape(before, (-1, n_inputs)) * gains[:, None]).T), gains=gains,
-    )  # fmt: skip
+    moved = (np.reshape(before, (-1, n_inputs)) * gains[:, None]).T
+    return Rows(np.reshape(rows, (-1, size)) * gains[:, None], np.array(bounds) * gains, moved, gains)
 
 
 class Maps(NamedTuple):
@@ -320,8 +302,7 @@ def instance(
     """
     zero, one, half = x.dtype.type(0.0), x.dtype.type(1.0), x.dtype.type(0.5)
     s = np.empty(x.shape[0] + 1, x.dtype)
-    for i in range(x.shape[0]):
-        s[i] = x[i]
+    s[:-1] = x
     s[x.shape[0]] = w
     deviation = s.copy()
     add_transposed_product(maps.rest, -target, deviation)
@@ -331,8 +312,7 @@ def instance(
     add_transposed_product(maps.holding, -target, phi)
     outputs, rates = maps.output_bounds.shape[0], maps.rate_bounds.shape[0]
     gamma = np.empty(outputs + rates, x.dtype)
-    for r in range(outputs):
-        gamma[r] = maps.output_bounds[r]
+    gamma[:outputs] = maps.output_bounds
     for r in range(rates):
         gamma[outputs + r] = maps.rate_bounds[r] * (share if maps.rate_first[r] > zero else one)
     add_transposed_product(maps.outputs, s, gamma[:outputs])
@@ -412,55 +392,34 @@ class PredictiveProblem:
         y0 = prediction.model.y0[list(prediction.constrained)]
         condensed = condense(prediction, design, weights)
         outputs, rates = output_rows(condensed, design, weights, y0), rate_rows(design, limits, penalties)
-        n_states = prediction.n_states
-        self.Phi = self._rounded(condensed.Phi)
-        self.Gamma = self._rounded(np.ascontiguousarray(np.vstack([outputs.Gamma, rates.Gamma])))
-        scaled_rate = np.asarray(limits.rate) / np.asarray(design.input_scale)
-        first_rate = scaled_rate if penalties.first_knot_in_box else np.full(design.n_inputs, np.inf)
-        u0 = np.array(prediction.model.u0)
-        rest = np.zeros((0, n_states + 1))
-        bath = prediction.process.bath
+        n_states, scale, u0 = prediction.n_states, np.asarray(design.input_scale), np.array(prediction.model.u0)
+        rate, rest, bath = np.asarray(limits.rate), np.zeros((0, n_states + 1)), prediction.process.bath
         if bath is not None and design.target is not Target.OPERATING_POINT:
             rest = rest_of(prediction, design, bath).states
-        self.maps = Maps(*map(self._rounded, self._maps(condensed, outputs, rates, u0, first_rate, rest)))
-        self.scaled_rate = self._rounded(scaled_rate)
-        self.knots = np.array(design.decision_instants, real)
-        self.knots_to_samples = self._rounded(weights)
-        instants = np.array(design.decision_instants, DOUBLE)
-        self.shifts = self._rounded(
-            np.array([shift(instants, ticks / self.longest_ticks) for ticks in range(self.longest_ticks + 1)])
-        )
+        low_u, high_u = ((np.asarray(bounds) - u0) / scale for bounds in (limits.low, limits.high))
+        slacks = np.zeros(self.size - self.n_inputs)
+        held = np.tile(np.eye(len(rest), design.n_inputs), self.n_knots)  # profiles that hold an input of the target
+        maps = Maps(
+            phi=condensed.phi_map, constant=condensed.constant_map, outputs=outputs.moved,
+            output_bounds=outputs.bounds, rate_bounds=rates.bounds, rate_first=1.0 * np.any(rates.moved, axis=0),
+            rate_before=rates.moved, low=np.concatenate([np.tile(low_u, self.n_knots), slacks]),
+            high=np.concatenate([np.tile(high_u, self.n_knots), slacks + np.inf]),
+            first_rate=rate / scale if penalties.first_knot_in_box else np.full(design.n_inputs, np.inf),
+            input_scale=scale, rest=rest, holding=2.0 * held @ condensed.Phi[: self.n_inputs],
+        )  # fmt: skip
         stacked = condensed.outputs_s.reshape(-1, n_states + 1)
         predicted = OutputMaps(
-            np.tile(y0, design.horizon), transposed(condensed.outputs_z.reshape(-1, self.size)),
-            transposed(stacked[:, :n_states]), np.array(stacked[:, n_states]),
-            np.array([design.output_low, design.output_high, design.violation_weight]),
+            np.tile(y0, design.horizon), condensed.outputs_z.reshape(-1, self.size).T, stacked[:, :n_states].T,
+            stacked[:, n_states], np.array([design.output_low, design.output_high, design.violation_weight]),
             np.concatenate([outputs.gains, rates.gains]),
         )  # fmt: skip
-        self.predicted = OutputMaps(*map(self._rounded, predicted))
-        self.input_scale = self._rounded(np.asarray(design.input_scale))
-        self.rate = self._rounded(np.asarray(limits.rate))
-        self._u0 = self._rounded(u0)
-
-    def _rounded(self, values: Array) -> Array:
-        return values.astype(self._real, copy=False)
-
-    def _maps(
-        self, condensed: Condensed, outputs: OutputRows, rates: RateRows, u0: Array, first_rate: Array, rest: Array
-    ) -> Maps:  # fmt: skip
-        scale = np.asarray(self.design.input_scale)
-        low_u, high_u = (np.asarray(self.limits.low) - u0) / scale, (np.asarray(self.limits.high) - u0) / scale
-        slacks = self.design.n_slacks * self.n_knots
-        held = np.tile(
-            np.eye(len(rest), self.design.n_inputs), self.n_knots
-        )  # profiles that hold an input of the target
-        return Maps(
-            phi=condensed.phi_map, constant=condensed.constant_map, outputs=outputs.states,
-            output_bounds=outputs.bounds, rate_bounds=rates.bounds, rate_first=rates.first, rate_before=rates.before,
-            low=np.concatenate([np.tile(low_u, self.n_knots), np.zeros(slacks)]),
-            high=np.concatenate([np.tile(high_u, self.n_knots), np.full(slacks, np.inf)]), first_rate=first_rate,
-            input_scale=scale, rest=rest, holding=np.ascontiguousarray(2.0 * held @ condensed.Phi[: self.n_inputs]),
-        )  # fmt: skip
+        instants, ticks = np.array(design.decision_instants, DOUBLE), range(self.longest_ticks + 1)
+        self.maps, self.predicted = rounded(maps, real), rounded(predicted, real)
+        self.Phi, self.Gamma = rounded(condensed.Phi, real), rounded(np.vstack([outputs.Gamma, rates.Gamma]), real)
+        self.knots, self.knots_to_samples = rounded(instants, real), rounded(weights, real)
+        self.shifts = rounded(np.array([shift(instants, each / self.longest_ticks) for each in ticks]), real)
+        self.input_scale, self.rate = rounded(scale, real), rounded(rate, real)
+        self.scaled_rate, self._u0 = rounded(rate / scale, real), rounded(u0, real)
 
     # -- instances ---------------------------------------------------------------------------------------------------
 

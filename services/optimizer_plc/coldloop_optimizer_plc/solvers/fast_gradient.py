@@ -99,35 +99,25 @@ def step_sizes(Phi: Array, Gamma: Array, alpha: float) -> Array:
 
 
 @kernel
-def descend(
-    constant: Matrices,
-    qp: QuadraticProblem,
-    z: Array,
-    momentum: Momentum,
-    steps: Array,
-    alpha: float,
-    adaptive_restart: bool,  # noqa: FBT001 a kernel takes its arguments by position
-    count: int,
-) -> None:
+def descend(c: FastGradientMethod, qp: QuadraticProblem, z: Array, momentum: Momentum, count: int) -> None:
     """Move z and its momentum by `count` iterations."""
     n, half, one, four = z.shape[0], z.dtype.type(0.5), z.dtype.type(1), z.dtype.type(4)
     point, t, slope, moved = momentum.extrapolated, momentum.t, np.empty_like(z), np.empty_like(z)
     active = np.empty_like(qp.gamma)
     for _ in range(count):
-        gradient(constant, qp, point, excess_by_columns(constant, qp, point), alpha, slope, active)
+        gradient(c.matrices, qp, point, excess_by_columns(c.matrices, qp, point), c.alpha, slope, active)
         uphill = z.dtype.type(0)
         for i in range(n):
-            reached = min(max(point[i] - steps[i] * slope[i], qp.low[i]), qp.high[i])
+            reached = min(max(point[i] - c.steps[i] * slope[i], qp.low[i]), qp.high[i])
             moved[i] = reached - z[i]
-            uphill += (point[i] - reached) / steps[i] * moved[i]
+            uphill += (point[i] - reached) / c.steps[i] * moved[i]
             z[i] = reached
-        if adaptive_restart and uphill > 0:
+        if c.adaptive_restart and uphill > 0:
             t[0] = 1
         t_next = half * (one + np.sqrt(one + four * t[0] * t[0]))
         weight = (t[0] - one) / t_next
         t[0] = t_next
-        for i in range(n):
-            point[i] = z[i] + weight * moved[i]
+        point[:] = z + weight * moved
 
 
 @solves_by(FastGradientMethod)
@@ -143,7 +133,7 @@ def solve(
     points, costs = np.empty((counts.shape[0], z.shape[0]), z.dtype), np.empty(counts.shape[0], z.dtype)
     done = 0
     for k in range(counts.shape[0]):
-        descend(c.matrices, qp, z, momentum, c.steps, c.alpha, c.adaptive_restart, counts[k] - done)
+        descend(c, qp, z, momentum, counts[k] - done)
         done = counts[k]
         points[k], costs[k] = z, augmented_cost(qp, z, c.alpha)
     return Answer(guessed, points, costs, counts.copy(), np.empty(0, z.dtype))

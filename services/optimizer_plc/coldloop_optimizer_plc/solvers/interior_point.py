@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from coldloop.kernels.compiled import kernel
 from coldloop_optimizer_plc.computing_settings import InteriorPointSettings
 from coldloop_optimizer_plc.qp.costs import augmented_cost
-from coldloop_optimizer_plc.qp.linear_algebra import Array, cholesky, cholesky_solve
+from coldloop_optimizer_plc.qp.linear_algebra import Array, cholesky, cholesky_solve, rounded
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.interface import Answer, Costs, KernelSolver, solves_by
 
@@ -62,9 +62,10 @@ class Point(NamedTuple):
     """Multipliers of the upper bounds, shape (n,); 0 where there is none."""
 
 
-class Path(NamedTuple):
-    """Constants of the method, in the floating-point type of the problem."""
+class InteriorPointMethod(NamedTuple):
+    """Constants of the solver, the same for all problems, in their floating-point type."""
 
+    structure: Structure
     alpha: float
     softness: float
     """Softness of the rows, 1 / (2 alpha)."""
@@ -77,22 +78,14 @@ class Path(NamedTuple):
     """mu below which there is nothing left to win."""
 
 
-class InteriorPointMethod(NamedTuple):
-    """Constants of the solver, the same for all problems."""
-
-    structure: Structure
-    path: Path
-
-
 def method_of(settings: InteriorPointSettings, problem: QuadraticProblem) -> InteriorPointMethod:
     """Return the method for problems with these matrices, in their floating-point type."""
     real = problem.phi.dtype.type
-    path = Path(
-        alpha=real(settings.alpha), softness=real(0.5 / settings.alpha), first_mu=real(settings.first_mu),
-        least_mu=real(settings.least_mu), margin=real(settings.margin),
-        size=real(len(problem.phi) + len(problem.gamma)), finest=real(FINEST * np.finfo(real).eps),
+    method = InteriorPointMethod(
+        structure_of(problem), settings.alpha, 0.5 / settings.alpha, settings.first_mu, settings.least_mu,
+        settings.margin, float(len(problem.phi) + len(problem.gamma)), float(FINEST * np.finfo(real).eps),
     )  # fmt: skip
-    return InteriorPointMethod(structure_of(problem), path)
+    return rounded(method, real)
 
 
 def interior_point_solver(settings: InteriorPointSettings) -> KernelSolver:
@@ -113,8 +106,9 @@ def structure_of(problem: QuadraticProblem) -> Structure:
 
 
 @kernel
-def multiply_rows(constant: Structure, z: Array, result: Array) -> None:
-    """Write Gamma z into `result` (m,)."""
+def multiply_rows(constant: Structure, z: Array) -> Array:
+    """Return Gamma z, shape (m,)."""
+    result = np.empty(constant.Gamma.shape[0], z.dtype)
     for r in range(result.shape[0]):
         total = z.dtype.type(0.0)
         for j in constant.columns[r]:
@@ -122,6 +116,7 @@ def multiply_rows(constant: Structure, z: Array, result: Array) -> None:
                 break
             total += constant.Gamma[r, j] * z[j]
         result[r] = total
+    return result
 
 
 @kernel
@@ -136,28 +131,26 @@ def add_columns(constant: Structure, weights: Array, result: Array) -> None:
 
 @kernel
 def descend(
-    constant: Structure, qp: QuadraticProblem, path: Path, point: Point, best: Array, rows: Array, cost: float,
-    count: int,
-) -> tuple[int, float, Point]:  # fmt: skip
+    c: InteriorPointMethod, qp: QuadraticProblem, point: Point, best: Array, rows: Array, cost: float, count: int
+) -> tuple[int, float, Point]:
     """Take `count` steps from a point, or fewer once the products are as small as rounding.
 
     `best` (n,), its cost and its multipliers `rows` (m,) are those of the cheapest point so far. Returns how many
     steps were taken, the cost of `best`, and the point reached.
     """
-    order = constant.order
+    order = c.structure.order
     phi, low, high = qp.phi[order], qp.low[order], qp.high[order]
     for done in range(count):
-        point, moved = step(constant, phi, qp.gamma, low, high, point, path.softness, path.finest)
+        point, moved = step(c.structure, phi, qp.gamma, low, high, point, c.softness, c.finest)
         if not moved:
             return done, cost, point
         z = np.empty_like(best)
         for i in range(z.shape[0]):
             z[order[i]] = point.z[i]
-        reached = augmented_cost(qp, z, path.alpha)
+        reached = augmented_cost(qp, z, c.alpha)
         if reached < cost:
             cost = reached
-            best[:] = z
-            rows[:] = point.rows
+            best[:], rows[:] = z, point.rows
     return count, cost, point
 
 
@@ -168,7 +161,7 @@ def near(
     """Return a point near the guess: inside the box, and on each row on the central path for mu."""
     real = guess.dtype.type
     zero, one, two = real(0.0), real(1.0), real(2.0)
-    z, of_low, of_high, rows = np.empty_like(guess), np.empty_like(guess), np.zeros_like(guess), np.empty_like(gamma)
+    z, of_low, of_high = np.empty_like(guess), np.empty_like(guess), np.zeros_like(guess)
     for i in range(z.shape[0]):
         bounded = np.isfinite(high[i])
         width = high[i] - low[i] if bounded else one
@@ -178,7 +171,7 @@ def near(
             z[i] = min(z[i], high[i] - inside) if width > two * inside else low[i] + width / two
             of_high[i] = mu / max(high[i] - z[i], real(1e-6))
         of_low[i] = mu / max(z[i] - low[i], real(1e-6))
-    multiply_rows(constant, z, rows)
+    rows = multiply_rows(constant, z)
     for r in range(rows.shape[0]):
         excess = rows[r] - gamma[r]  # w lambda = mu and w = lambda / (2 alpha) - excess
         root = np.sqrt(excess * excess + two * two * softness * mu)
@@ -200,10 +193,7 @@ class Distances(NamedTuple):
 @kernel
 def distances(constant: Structure, gamma: Array, low: Array, high: Array, point: Point, softness: float) -> Distances:
     """Return the distances of a point."""
-    w = np.empty_like(gamma)
-    multiply_rows(constant, point.z, w)
-    for r in range(w.shape[0]):
-        w[r] = gamma[r] - w[r] + softness * point.rows[r]
+    w = gamma - multiply_rows(constant, point.z) + softness * point.rows
     return Distances(w, point.z - low, high - point.z)
 
 
@@ -269,49 +259,40 @@ def newton_step(
     products: Distances, softness: float,
 ) -> tuple[Point, Distances]:  # fmt: skip
     """Return the Newton step that changes the products by `products`, and how the distances change with it."""
-    dz, of_rows, d_low, d_high = -slope, products.rows.copy(), products.low.copy(), products.high.copy()
-    for r in range(of_rows.shape[0]):
-        of_rows[r] /= away.rows[r] + softness * point.rows[r]
+    dz, d_low, d_high = -slope, products.low / away.low, products.high.copy()
+    of_rows = products.rows / (away.rows + softness * point.rows)
     add_columns(constant, -of_rows, dz)
     for i in range(dz.shape[0]):
-        d_low[i] /= away.low[i]
         dz[i] += d_low[i]
         if point.high[i] > 0:
             d_high[i] /= away.high[i]
             dz[i] -= d_high[i]
     cholesky_solve(U, skyline, dz)
-    d_away = np.empty_like(of_rows)
-    multiply_rows(constant, dz, d_away)
-    for r in range(of_rows.shape[0]):
-        of_rows[r] += point.rows[r] * d_away[r] / (away.rows[r] + softness * point.rows[r])
-        d_away[r] = softness * of_rows[r] - d_away[r]
+    moved = multiply_rows(constant, dz)
+    of_rows += point.rows * moved / (away.rows + softness * point.rows)
+    d_low -= point.low * dz / away.low
     for i in range(dz.shape[0]):
-        d_low[i] -= point.low[i] * dz[i] / away.low[i]
         if point.high[i] > 0:
             d_high[i] += point.high[i] * dz[i] / away.high[i]
-    return Point(dz, of_rows, d_low, d_high), Distances(d_away, dz, -dz)
+    return Point(dz, of_rows, d_low, d_high), Distances(softness * of_rows - moved, dz, -dz)
 
 
 @kernel
 def towards_zero(point: Point, away: Distances) -> Distances:
     """Return by how much the products are to change to vanish."""
-    rows, low, high = np.empty_like(point.rows), np.empty_like(point.z), np.zeros_like(point.z)
-    for r in range(rows.shape[0]):
-        rows[r] = -(away.rows[r] * point.rows[r])
-    for i in range(low.shape[0]):
-        low[i] = -(away.low[i] * point.low[i])
+    high = np.zeros_like(point.z)
+    for i in range(high.shape[0]):
         if point.high[i] > 0:
             high[i] = -(away.high[i] * point.high[i])
-    return Distances(rows, low, high)
+    return Distances(-(away.rows * point.rows), -(away.low * point.low), high)
 
 
 @kernel
 def correct(products: Distances, mu: float, point: Point, change: Point, moved: Distances) -> None:
     """Let the products become mu, and make up for what a change adds to them in second order."""
-    for r in range(products.rows.shape[0]):
-        products.rows[r] += mu - moved.rows[r] * change.rows[r]
+    products.rows[:] += mu - moved.rows * change.rows
+    products.low[:] += mu - moved.low * change.low
     for i in range(products.low.shape[0]):
-        products.low[i] += mu - moved.low[i] * change.low[i]
         if point.high[i] > 0:
             products.high[i] += mu - moved.high[i] * change.high[i]
 
@@ -325,17 +306,6 @@ def longest(point: Point, away: Distances, change: Point, moved: Distances, shar
 
 
 @kernel
-def gradient(constant: Structure, phi: Array, point: Point) -> Array:
-    """Return the gradient of the Lagrangian, shape (n,)."""
-    slope = phi - point.low + point.high
-    for i in range(slope.shape[0]):
-        for j in range(slope.shape[0]):
-            slope[j] += constant.hessian[i, j] * point.z[i]
-    add_columns(constant, point.rows, slope)
-    return slope
-
-
-@kernel
 def step(
     constant: Structure, phi: Array, gamma: Array, low: Array, high: Array, point: Point, softness: float, finest: float
 ) -> tuple[Point, bool]:
@@ -346,7 +316,11 @@ def step(
     mu = mean_product(point, away)
     if not mu > finest:
         return point, False
-    slope = gradient(constant, phi, point)
+    slope = phi - point.low + point.high  # of the Lagrangian
+    for i in range(slope.shape[0]):
+        for j in range(slope.shape[0]):
+            slope[j] += constant.hessian[i, j] * point.z[i]
+    add_columns(constant, point.rows, slope)
     U = newton_matrix(constant, point, away, softness)
     skyline = cholesky(U)
     products = towards_zero(point, away)
@@ -369,16 +343,14 @@ def solve(
     best, rows, order = np.empty_like(qp.phi), np.zeros_like(qp.gamma), c.structure.order
     for i in range(best.shape[0]):
         best[i] = min(max(guess[i], qp.low[i]), qp.high[i])
-    guessed = augmented_cost(qp, best, c.path.alpha)
-    mu = best.dtype.type(max(c.path.least_mu, c.path.first_mu / c.path.size * (guessed + qp.constant)))
-    point = near(
-        c.structure, qp.gamma, qp.low[order], qp.high[order], best[order], c.path.softness, mu, c.path.margin
-    )  # fmt: skip
+    guessed = augmented_cost(qp, best, c.alpha)
+    mu = best.dtype.type(max(c.least_mu, c.first_mu / c.size * (guessed + qp.constant)))
+    point = near(c.structure, qp.gamma, qp.low[order], qp.high[order], best[order], c.softness, mu, c.margin)
     points, costs = np.empty((counts.shape[0], best.shape[0]), best.dtype), np.empty(counts.shape[0], best.dtype)
     iterations = np.empty_like(counts)
     cost, done = guessed, 0
     for k in range(counts.shape[0]):
-        more, cost, point = descend(c.structure, qp, c.path, point, best, rows, cost, counts[k] - done)
+        more, cost, point = descend(c, qp, point, best, rows, cost, counts[k] - done)
         done += more
         points[k], costs[k], iterations[k] = best, cost, done
     return Answer(guessed, points, costs, iterations, rows)

@@ -15,7 +15,7 @@ from coldloop.kernels.compiled import kernel
 from coldloop_optimizer_plc.computing_settings import OdeSettings
 from coldloop_optimizer_plc.qp import costs
 from coldloop_optimizer_plc.qp.costs import Matrices, matrices_of
-from coldloop_optimizer_plc.qp.linear_algebra import Array, Real, cholesky, cholesky_solve
+from coldloop_optimizer_plc.qp.linear_algebra import Array, Real, cholesky, cholesky_solve, rounded
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.settings import PenaltySettings
 from coldloop_optimizer_plc.solvers.interface import Answer, Costs, KernelSolver, solves_by
@@ -50,12 +50,12 @@ class Flow(NamedTuple):
 
 def flow_in(settings: OdeSettings, penalties: PenaltySettings | None, real: Real) -> Flow:
     """Return the constants as scalars of a floating-point type."""
-    return Flow(
-        alpha=real(settings.alpha), cost_scale=real(settings.cost_scale), tolerance=real(settings.tolerance),
-        growth=real(settings.growth), rejection=real(settings.rejection),
-        box=real((penalties or PenaltySettings()).box * settings.alpha), look_ahead_rows=settings.look_ahead_rows,
-        hold_at_bounds=settings.hold_at_bounds, longest=real(np.sqrt(np.finfo(real).max)),
+    box = (penalties or PenaltySettings()).box * settings.alpha
+    flow = Flow(
+        settings.alpha, settings.cost_scale, settings.tolerance, settings.growth, settings.rejection, box,
+        settings.look_ahead_rows, settings.hold_at_bounds, longest=np.sqrt(np.finfo(real).max),
     )  # fmt: skip
+    return rounded(flow, real)
 
 
 class OdeMethod(NamedTuple):
@@ -220,10 +220,7 @@ def step(
     reached = costs.cost_with_excess(constant, qp, candidate, excess, flow.alpha)
     if not reached <= cost:
         return dt * flow.rejection, cost
-    for i in range(n):
-        z[i], v[i] = candidate[i], v1[i]
-    for r in range(active.shape[0]):
-        active[r] = active_ahead[r]
+    z[:], v[:], active[:] = candidate, v1, active_ahead
     wanted = (flow.tolerance / max(error, real(1e-12))) ** real(1.0 / 3.0)
     return min(dt * min(flow.growth, max(flow.rejection, wanted)), flow.longest), reached
 

@@ -14,7 +14,6 @@ is judged by what was minimised.
   with a status of failure the answer is the guess.
 """
 
-import importlib
 import io
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -22,7 +21,7 @@ from contextlib import redirect_stdout
 from functools import cache
 from importlib import import_module
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
+from typing import Any, ClassVar, Final, Generic, NamedTuple, TypeVar
 
 import daqp
 import numpy as np
@@ -38,13 +37,55 @@ FIRST_SOLVE_LIMIT = 10_000
 """Steps after which the first problem of a chain is given up; it takes some tens."""
 
 
+def are_numbers(problem: QuadraticProblem) -> bool:
+    """Return whether phi and gamma of a problem are finite."""
+    return bool(np.isfinite(problem.phi).all() and np.isfinite(problem.gamma).all())
+
+
 def is_well_posed(problem: QuadraticProblem) -> bool:
-    """Return whether the vectors of a problem are finite, and no lower bound is above the upper one."""
-    vectors = (problem.phi, problem.gamma, problem.low)
-    return all(np.isfinite(vector).all() for vector in vectors) and bool((problem.low <= problem.high).all())
+    """Return whether its low bounds are finite, too, and none is above the upper one."""
+    return are_numbers(problem) and bool((np.isfinite(problem.low) & (problem.low <= problem.high)).all())
 
 
-class QpoasesSolver:
+S = TypeVar("S", QpoasesSettings, OsqpSettings, DaqpSettings)
+
+
+class BorrowedSolver(ABC, Generic[S]):
+    """A solver of another project: its iterates are put into the box."""
+
+    def __init__(self, settings: S) -> None:
+        self.settings: S = settings
+        self.alpha, self.tau_1_s = settings.alpha, settings.tau_1_s
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget earlier problems: a session begins."""
+
+    def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
+        """Return the answer after each count: the guess until the first iteration, and where there is no other."""
+        self.problem, self.guess = problem, np.clip(guess, problem.low, problem.high)
+        z, multipliers, done = self.guess, np.zeros_like(problem.gamma), 0
+        usable, points, iterations = self.begin(), list[Array](), list[int]()
+        for count in counts:
+            if usable and count > done:
+                more, found = self.advance(count - done)
+                done += more
+                if found is not None:
+                    z, multipliers = np.clip(found[0], problem.low, problem.high), np.maximum(found[1], 0.0)
+            points.append(z)
+            iterations.append(done)
+        return collected(problem, self.alpha, self.guess, points, iterations, multipliers)
+
+    @abstractmethod
+    def begin(self) -> bool:
+        """Take `problem` and `guess` (n,); return whether the data can be used."""
+
+    @abstractmethod
+    def advance(self, count: int) -> tuple[int, tuple[Array, Array] | None]:
+        """Iterate up to `count` times; return how often, point (n,) and multipliers (m,), or None after a failure."""
+
+
+class QpoasesSolver(BorrowedSolver[QpoasesSettings]):
     """Throttled qpOASES (Ferreau et al., 2014): the online active-set method, cut off after q working-set changes.
 
     qpOASES moves along the line from the previous problem to the present one and stops where the working set changes.
@@ -62,47 +103,35 @@ class QpoasesSolver:
     """
 
     def __init__(self, settings: QpoasesSettings) -> None:
-        self.alpha = settings.alpha
-        self.tau_1_s = settings.tau_1_s
+        super().__init__(settings)
         self._casadi = load_casadi()
-        self._chain: _Chain | None = None
 
     def reset(self) -> None:
         """Drop the chain: the next problem begins a new one."""
-        self._chain = None
+        self._chain: _Chain | None = None
 
-    def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
-        """Go along the homotopy to this problem, or up to its end; the guess is the answer until the first step."""
-        guess = np.clip(guess, problem.low, problem.high)
-        z, multipliers, done = guess, np.zeros_like(problem.gamma), 0
-        status = ON_THE_WAY if is_well_posed(problem) else "ill-posed data"
-        if status == ON_THE_WAY:  # other data never reach the chain, which they would end
-            self._begin_or_continue(problem)
-        points, iterations = [], []
-        for count in counts:
-            before = done
-            while done < count and self._chain is not None and status == ON_THE_WAY:
-                status = self._chain.step()
-                done += 1
-            if self._chain is not None and done > before:
-                if status in (SOLVED, ON_THE_WAY):
-                    z = np.clip(self._chain.z, problem.low, problem.high)
-                    multipliers = np.maximum(self._chain.multipliers, 0.0)
-                else:  # a chain that broke stays broken; the answer is the last one that was good
-                    self._chain = None
-            points.append(z)
-            iterations.append(done)
-        return collected(problem, self.alpha, guess, points, iterations, multipliers)
+    def begin(self) -> bool:
+        """Let the homotopy lead to this problem; ill-posed data never reach the chain, which they would end."""
+        if not is_well_posed(self.problem):
+            return False
+        first = self._chain is None
+        chain = self._chain = self._chain or _Chain(self._casadi, self.problem)
+        chain.set_target(self.problem)
+        for _ in range(FIRST_SOLVE_LIMIT * first):
+            if chain.step() != ON_THE_WAY:
+                break
+        self._status = ON_THE_WAY
+        return True
 
-    def _begin_or_continue(self, problem: QuadraticProblem) -> None:
-        fresh = self._chain is None
-        if self._chain is None:
-            self._chain = _Chain(self._casadi, problem)
-        self._chain.set_target(problem)
-        if fresh:
-            for _ in range(FIRST_SOLVE_LIMIT):
-                if self._chain.step() != ON_THE_WAY:
-                    break
+    def advance(self, count: int) -> tuple[int, tuple[Array, Array] | None]:
+        """Go along the homotopy, or up to its end."""
+        done = 0
+        while self._chain is not None and done < count and self._status == ON_THE_WAY:
+            self._status = self._chain.step()
+            done += 1
+        if self._status not in (SOLVED, ON_THE_WAY):
+            self._chain = None  # a chain that broke stays broken; the answer is the last one that was good
+        return done, (self._chain.z, self._chain.multipliers) if self._chain else None
 
 
 class _Chain:
@@ -146,7 +175,7 @@ def load_casadi() -> ModuleType:
         ConfigurationError: It is not installed, or has no qpOASES.
     """
     try:
-        casadi = importlib.import_module("casadi")
+        casadi = import_module("casadi")
     except ImportError:
         raise ConfigurationError(
             "optimizer_plc.program.solver: qpoases needs CasADi, which is not installed here: "
@@ -160,15 +189,11 @@ def load_casadi() -> ModuleType:
     return casadi
 
 
-if TYPE_CHECKING:
-    from osqp import OSQP
-
-
 NEVER = 1e-15
 """Tolerance that does not end the iterations: they are counted."""
 
 
-class OsqpSolver:
+class OsqpSolver(BorrowedSolver[OsqpSettings]):
     """OSQP (Stellato et al., 2020): the alternating direction method of multipliers, cut off after q iterations.
 
     The matrices are scaled and factorised once, with a fixed rho; from problem to problem only vectors change.
@@ -179,61 +204,42 @@ class OsqpSolver:
       monotonic (Definition 1 of the paper): see `docs/solvers.md`.
     """
 
-    def __init__(self, settings: OsqpSettings) -> None:
-        self.alpha = settings.alpha
-        self.tau_1_s = settings.tau_1_s
-        self._settings = settings
-        self._osqp: OSQP | None = None
-
     def reset(self) -> None:
         """Drop the object with its factors and multipliers."""
-        self._osqp = None
+        self._osqp: Any = None
 
-    def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
-        """Iterate from the guess and the last multipliers."""
-        guess = np.clip(guess, problem.low, problem.high)
-        z, multipliers, done = guess, np.zeros_like(problem.gamma), 0
-        osqp = self._prepared(problem, guess)
-        points, iterations = [], []
-        for count in counts:
-            if osqp is not None and count > done:
-                osqp.update_settings(max_iter=count - done)
-                result = osqp.solve(raise_error=False)
-                z, done = np.clip(result.x, problem.low, problem.high), count
-                multipliers = np.maximum(result.y[len(z) :], 0.0)
-            points.append(z)
-            iterations.append(done)
-        return collected(problem, self.alpha, guess, points, iterations, multipliers)
-
-    def _prepared(self, problem: QuadraticProblem, guess: Array) -> "OSQP | None":
-        """Return the object with the next problem; None if its data are no numbers, which it would never forget."""
-        if not (np.isfinite(problem.phi).all() and np.isfinite(problem.gamma).all()):
-            return None
-        lower = np.concatenate([problem.low, np.full(len(problem.gamma), -np.inf)])
-        upper = np.concatenate([problem.high, problem.gamma])
-        if self._osqp is None:
-            self._osqp = self._set_up(problem, lower, upper)
-        else:
-            self._osqp.update(q=problem.phi, l=lower, u=upper)
-        self._osqp.warm_start(x=guess)
-        return self._osqp
-
-    def _set_up(self, problem: QuadraticProblem, lower: Array, upper: Array) -> "OSQP":
+    def begin(self) -> bool:
+        """Set the next problem and its guess; data that are no numbers it would never forget."""
         from osqp import OSQP  # noqa: PLC0415 with scipy.sparse, a fifth of what the optimiser loads at its start
         from scipy import sparse  # noqa: PLC0415
 
-        solver = OSQP()
-        P = sparse.csc_matrix(np.triu(2.0 * problem.Phi))
-        A = sparse.csc_matrix(np.vstack([np.eye(len(problem.phi)), problem.Gamma]))
-        solver.setup(
-            P, problem.phi, A, lower, upper,
-            rho=self._settings.rho, alpha=self._settings.relaxation, adaptive_rho=False, check_termination=0,
-            eps_abs=NEVER, eps_rel=0.0, eps_prim_inf=NEVER, eps_dual_inf=NEVER, verbose=False,
-        )  # fmt: skip
-        return solver
+        problem = self.problem
+        if not are_numbers(problem):
+            return False
+        lower = np.concatenate([problem.low, np.full(len(problem.gamma), -np.inf)])
+        upper = np.concatenate([problem.high, problem.gamma])
+        if self._osqp is None:
+            self._osqp = OSQP()
+            P = sparse.csc_matrix(np.triu(2.0 * problem.Phi))
+            A = sparse.csc_matrix(np.vstack([np.eye(len(problem.phi)), problem.Gamma]))
+            self._osqp.setup(
+                P, problem.phi, A, lower, upper,
+                rho=self.settings.rho, alpha=self.settings.relaxation, adaptive_rho=False, check_termination=0,
+                eps_abs=NEVER, eps_rel=0.0, eps_prim_inf=NEVER, eps_dual_inf=NEVER, verbose=False,
+            )  # fmt: skip
+        else:
+            self._osqp.update(q=problem.phi, l=lower, u=upper)
+        self._osqp.warm_start(x=self.guess)
+        return True
+
+    def advance(self, count: int) -> tuple[int, tuple[Array, Array] | None]:
+        """Iterate on from the last point and multipliers."""
+        self._osqp.update_settings(max_iter=count)
+        result = self._osqp.solve(raise_error=False)
+        return count, (result.x, result.y[len(self.guess) :])
 
 
-class DaqpSolver:
+class DaqpSolver(BorrowedSolver[DaqpSettings]):
     """DAQP (Arnstrom et al., 2022): a dual active-set method that solves the problem exactly. An oracle, and an option.
 
     - An iteration is a complete solve, always from cold: the iterates of a dual method are infeasible until the last,
@@ -243,37 +249,24 @@ class DaqpSolver:
       little to its advantage, J may rise (Definition 1 of the paper does not hold to the letter).
     """
 
-    def __init__(self, settings: DaqpSettings) -> None:
-        self.alpha = settings.alpha
-        self.tau_1_s = settings.tau_1_s
-        self._tolerance = settings.primal_tolerance
+    def begin(self) -> bool:
+        """Take a problem that is still to be solved."""
+        self._is_solved = False
+        return are_numbers(self.problem)
 
-    def reset(self) -> None:
-        """Nothing is kept from one problem to the next."""
-
-    def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
-        """Solve the problem, once; the guess is the answer until then, and if there is no optimum."""
-        guess = np.clip(guess, problem.low, problem.high)
-        z, multipliers = guess, np.zeros_like(problem.gamma)
-        solvable = bool(np.isfinite(problem.phi).all() and np.isfinite(problem.gamma).all())
-        if solvable and max(counts) > 0:
-            z, multipliers = self._optimum(problem, guess)
-        points, done = [z if count else guess for count in counts], [int(solvable and count > 0) for count in counts]
-        return collected(problem, self.alpha, guess, points, done, multipliers)
-
-    def _optimum(self, qp: QuadraticProblem, guess: Array) -> tuple[Array, Array]:
-        """Return the optimum and the multipliers of its rows; the guess and zeros if there is none."""
-        n = len(guess)
-        lower = np.full(n + len(qp.gamma), -UNBOUNDED)
-        lower[:n] = np.maximum(qp.low, -UNBOUNDED)
-        upper = np.minimum(np.concatenate([qp.high, qp.gamma]), UNBOUNDED)
+    def advance(self, count: int) -> tuple[int, tuple[Array, Array] | None]:
+        """Solve the problem, once."""
+        if self._is_solved:
+            return 0, None
+        self._is_solved, problem, n = True, self.problem, len(self.guess)
+        lower = np.full(n + len(problem.gamma), -UNBOUNDED)
+        lower[:n] = np.maximum(problem.low, -UNBOUNDED)
+        upper = np.minimum(np.concatenate([problem.high, problem.gamma]), UNBOUNDED)
         z, _, flag, info = daqp.solve(
-            2.0 * qp.Phi, qp.phi.copy(), qp.Gamma, upper, lower, np.zeros(len(upper), np.int32),
-            primal_tol=self._tolerance,
+            2.0 * problem.Phi, problem.phi.copy(), problem.Gamma, upper, lower, np.zeros(len(upper), np.int32),
+            primal_tol=self.settings.primal_tolerance,
         )  # fmt: skip
-        if flag != 1:
-            return guess, np.zeros_like(qp.gamma)
-        return np.clip(z, qp.low, qp.high), np.maximum(info["lam"][n:], 0.0)
+        return min(count, 1), (z, info["lam"][n:]) if flag == 1 else None
 
 
 UNBOUNDED: Final = 1e30
