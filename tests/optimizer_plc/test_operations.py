@@ -35,6 +35,8 @@ class Counted:
         return self._binary(self.value + float(other))
 
     def __sub__(self, other: SupportsFloat) -> "Counted":
+        if isinstance(other, np.ndarray):
+            return NotImplemented  # element by element
         return self._binary(self.value - float(other))
 
     def __rsub__(self, other: SupportsFloat) -> "Counted":

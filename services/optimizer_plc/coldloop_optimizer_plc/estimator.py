@@ -165,7 +165,8 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
     b = belief.numbers[0]
     known = load - c.w0 if c.load_known else belief.x.dtype.type(0.0)
     if not c.kalman:
-        belief.x[:] = x - c.x0
+        for i in range(x.shape[0]):
+            belief.x[i] = x[i] - c.x0[i]
         b.w, b.mismatch = known, belief.x.dtype.type(0.0)
         return
     real, period, maps = belief.x.dtype.type, min(b.since, c.stationary.gains.shape[0]) - 1, c.outputs

@@ -14,12 +14,12 @@ is judged by what was minimised.
   with a status of failure the answer is the guess.
 """
 
+import importlib
 import io
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from functools import cache
-from importlib import import_module
 from types import ModuleType
 from typing import Any, ClassVar, Final, Generic, NamedTuple, TypeVar
 
@@ -175,7 +175,7 @@ def load_casadi() -> ModuleType:
         ConfigurationError: It is not installed, or has no qpOASES.
     """
     try:
-        casadi = import_module("casadi")
+        casadi = importlib.import_module("casadi")
     except ImportError:
         raise ConfigurationError(
             "optimizer_plc.program.solver: qpoases needs CasADi, which is not installed here: "
@@ -308,7 +308,7 @@ class Library(ABC):
     def __init__(self) -> None:
         self.alpha = PENALTY_WEIGHT
         try:
-            self.library: Any = import_module(self.name)
+            self.library: Any = importlib.import_module(self.name)
         except ModuleNotFoundError:
             raise ConfigurationError(
                 f"optimizer_plc.program.outside.solver: the library of {self.name} is not installed here: "
