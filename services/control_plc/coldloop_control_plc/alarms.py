@@ -268,12 +268,7 @@ def watch_bands(c: AlarmConstants, a: AlarmConditions, tick: int, y: Numbers, co
 
 
 class AlarmPanel(AlarmConditions):
-    """All alarms.
-
-    Args:
-        journal: Where each transition is noted.
-        settings: Priorities, delays, shelving; without them nothing is delayed.
-    """
+    """All alarms; each transition is noted in the journal. Without settings nothing is delayed."""
 
     def __init__(self, journal: Journal, settings: AlarmSettings | None = None) -> None:
         without_delay = {"capacity": RuleSettings(on_delay_s=0.0)}
@@ -482,12 +477,9 @@ class ScanSummary(NamedTuple):
 
 
 class ProcessAlarms:
-    """Raises and returns the alarms that depend on the process and on the ladder.
+    """Raises and returns the alarms of a panel that depend on the process, with so many outputs, and on the ladder.
 
-    Args:
-        panel: Whose alarms they are.
-        journal: Where sensors that became bad or good are noted.
-        outputs: How many the process has.
+    Sensors that became bad or good are noted in the journal.
     """
 
     def __init__(self, panel: AlarmPanel, journal: Journal, outputs: int) -> None:
@@ -498,12 +490,9 @@ class ProcessAlarms:
         self.reported: ScanSummary | None = None
 
     def watch(self, tick: int, scan: ScanSummary, shortage: float) -> None:
-        """Look at everything after a scan.
+        """Look at everything after the scan of a tick.
 
-        Args:
-            tick: Of the scan.
-            scan: What was found.
-            shortage: What the load is above what can be held, in W; negative: below what is needed.
+        `shortage`: what the load is above what can be held, in W; negative: below what is needed.
         """
         for kind in self._panel.constants.bands:
             if self._panel.since[kind] != NOT:

@@ -142,11 +142,7 @@ TRACKED: Final = 1e-4
 class Clients:
     """Takes what clients write; `changed` is set with everything that a scan may have waited for.
 
-    Args:
-        program: What is written to.
-        limits: What setpoints may be.
-        publication: Shows what has changed in the registers.
-        sessions: The session under way, and its time base.
+    Setpoints have to be within `limits`; the publication shows what has changed in the registers.
     """
 
     def __init__(

@@ -329,12 +329,9 @@ class OutputGuard:
         return self.applied
 
     def judge(self, rows: Sequence[Inputs], first_tick: int, meanwhile: Sequence[Inputs | None]) -> Verdict:
-        """Judge a sequence as it would be played: the guard would let all of it pass, or it is refused.
+        """Judge a sequence, one row a tick, as it would be played: the guard would pass all of it, or it is refused.
 
-        Args:
-            rows: One row a tick.
-            first_tick: Tick of the first one.
-            meanwhile: What will be played in the ticks before, where something will be: rows of one sequence in a row.
+        `meanwhile` is played in the ticks before the first, where something will be: rows of one sequence in a row.
         """
         played = [row for row in meanwhile if row is not None]
         waiting = next((k for k, row in enumerate(meanwhile) if row is not None), 0)

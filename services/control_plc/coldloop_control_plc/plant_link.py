@@ -51,12 +51,9 @@ REFUSED_OUTPUTS: Final[Mapping[int, tuple[PlantLinkState, LinkCause]]] = {
 
 
 class PlantLink:
-    """State, cause and counters of the link.
+    """State, cause and counters of the link, with its alarms; changes of state are noted in the journal.
 
-    Args:
-        alarms: Where the alarms of the link are raised and returned; it also knows the present tick.
-        journal: Where changes of state are noted.
-        holder: Number that this control PLC has given itself, not 0.
+    The panel of alarms also knows the present tick; `holder` is the number of this control PLC, not 0.
     """
 
     def __init__(self, alarms: AlarmPanel, journal: Journal, holder: int) -> None:
@@ -139,12 +136,10 @@ class PlantLink:
             self._enter(PlantLinkState.JOINING, LinkCause.TIME_BASE)
 
     def compare(self, reading: Measurement, session: int, now: float | None) -> None:
-        """Note whether a reading without a write confirms the one before.
+        """Note whether a reading without a write, its seal intact, confirms the one before.
 
-        Args:
-            reading: What the rack answered, its seal intact.
-            session: Ours; in another one the rack may have another time base, and its ticks say nothing.
-            now: Real time, in ticks from any beginning; None in lock-step.
+        In another session than ours the rack may have another time base, and its ticks say nothing. `now` is real time,
+        in ticks from any beginning; None in lock-step.
         """
         before, self._read = self._read, (reading, now)
         if before is None:

@@ -231,9 +231,7 @@ class SequencePlayer(PlayerState):
     def continue_from(self, rows: Any, update: Update | None) -> None:  # noqa: ANN401 an array of who has numpy
         """Continue after updates that were done with the state alone.
 
-        Args:
-            rows: Rows of the sequences, a table a slot.
-            update: The last update, if another than before.
+        `rows` are those of the sequences, a table a slot; `update` is the last update, if another than before.
         """
         self.update = update or self.update
         for slot, number in enumerate(self.numbers):

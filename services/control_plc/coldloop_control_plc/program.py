@@ -79,11 +79,7 @@ class ControlProgram:
     def recall(self, operator: Operator, alarms: Sequence[Alarm], watchdog: int, tick: int) -> None:
         """Take over what operators had said before a restart, and the alarms; the session is resumed later.
 
-        Args:
-            operator: Operating mode and setpoints.
-            alarms: All alarms.
-            watchdog: Time-out of the optimiser's watchdog, in ticks.
-            tick: The last one.
+        `watchdog` is the time-out of the optimiser's watchdog, in ticks; `tick` the last one.
         """
         self.operator = operator
         self.watchdog.set(watchdog, tick)
@@ -101,17 +97,11 @@ class ControlProgram:
         playing: InputSequence | None = None,
         cool_down: CoolDownStep = CoolDownStep.FINISHED,
     ) -> None:
-        """Resume a session after a restart.
+        """Resume a session after a restart, at the tick and the applied outputs of the rack.
 
-        Args:
-            session: Its number.
-            tick: Where the rack is.
-            applied: Its applied outputs.
-            updates: Number of the next update.
-            operator: What operators have said.
-            playing: What was being played. Its rest is played on, if what the rack applies is of it: a state that was
-                retained some ticks before the end may hold the sequence before.
-            cool_down: Its step then.
+        `updates` is the number of the next update, `operator` what operators have said, `cool_down` its step then. The
+        rest of what was being `playing` is played on, if what the rack applies is of it: a state that was retained some
+        ticks before the end may hold the sequence before.
         """
         self.operator = operator
         self._begin(session, tick, tuple(applied), Mode.HOLD, Cause.RESTARTED, updates=updates, cool_down=cool_down)
@@ -249,8 +239,6 @@ class ControlProgram:
             player.shortage < 0.0, self.bad_sensors, player.suspects,
         )  # fmt: skip
 
-    # -- scans that are done with `scan` alone -------------------------------------------------------------------------
-
     @property
     def is_ordinary(self) -> bool:
         """Whether the scans to come do nothing beside `scan`, for as long as `decide` and `observe` tell nothing."""
@@ -293,15 +281,12 @@ class ControlProgram:
         self._in_scan = False
 
     def rejoin(self, tick: int, applied: Sequence[float], passed: int | None = None) -> None:
-        """Continue at another tick: the rack was away, or time has jumped.
+        """Continue at another tick, that of the next scan: the rack was away, or time has jumped.
 
         Forward, all timers count the time that has passed. Back by a little, they begin at the present tick at the
         latest; back by more than a sampling period, sequences are dropped too, and the optimiser is invited again.
-
-        Args:
-            tick: Tick of the next scan.
-            applied: What the rack applies, read back from it.
-            passed: Ticks since the last scan by our own clock; None in lock-step.
+        `applied` is read back from the rack; `passed` are the ticks since the last scan by our own clock, None in
+        lock-step.
         """
         if tick < self.tick:
             if self.tick - tick > self._limits.process.ticks_per_sample:

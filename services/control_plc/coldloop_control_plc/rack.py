@@ -92,10 +92,8 @@ class SkewEstimator:
 class RackClock:
     """Schedule of our scans, which follows the rack.
 
-    Args:
-        factor: Seconds of plant time in a second of real time, nominally.
-        now: The present time, s: tick 0 is due then, until the rack is heard of.
-        tick_s: Length of a tick, s of plant time.
+    `factor` is the seconds of plant time in a second of real time, nominally; `now` the present time, s, when tick 0 is
+    due until the rack is heard of; `tick_s` the length of a tick, s of plant time.
     """
 
     def __init__(self, factor: float, now: float, tick_s: float) -> None:
@@ -136,15 +134,10 @@ class RackClock:
         self._position, self._at, self.offset = position, at, 0.0
 
     def observe(self, position: float, at: float, uncertainty_s: float = SUREST_S) -> None:
-        """Take where the rack was.
+        """Take where the rack was, its tick and the share of it that had passed, at `at` by our clock, s.
 
-        Further than `LEAP` from the expected tick its clock has jumped, or it is wrong: the schedule follows by
-        no more than the bound, and nothing is learnt about the rate.
-
-        Args:
-            position: Its tick, and the share of it that had passed.
-            at: When, by our clock, s.
-            uncertainty_s: How well that is known: half the time that the exchange took.
+        `uncertainty_s` is half the time that the exchange took. Further than `LEAP` from the expected tick its clock
+        has jumped, or it is wrong: the schedule follows by no more than the bound, and learns nothing about the rate.
         """
         step_s = at - self._at
         expected = self.position_at(at)
@@ -175,12 +168,9 @@ def cause_of(error: errors.LinkError) -> LinkCause:
 
 
 class ScanCycle:
-    """Program and link to the rack, put together.
+    """Program, which decides the outputs, and link to the rack, which decides whether they may be written.
 
-    Args:
-        program: Decides the outputs.
-        link: Decides whether they may be written.
-        adopt: Takes a reading of a rack in another session; returns whether the program has changed to that session.
+    `adopt` takes a reading of a rack in another session; returns whether the program has changed to that session.
     """
 
     def __init__(self, program: ControlProgram, link: PlantLink, adopt: Callable[[Measurement], bool]) -> None:
@@ -209,11 +199,9 @@ class ScanCycle:
         self._link.unanswered(cause_of(error))
 
     def answered(self, answer: Measurement, now: float | None) -> Update | None:
-        """Process the rack's answer; return the update if one was latched.
+        """Process the rack's answer, its seal intact; return the update if one was latched.
 
-        Args:
-            answer: The measurement, its seal intact.
-            now: Real time, in ticks from any beginning; None in lock-step.
+        `now` is real time, in ticks from any beginning; None in lock-step.
         """
         sent, self._sent = self._sent, None
         if sent is None:
@@ -254,14 +242,9 @@ AT_ONCE: Final = 2
 
 
 class RackFinder:
-    """Looks at the rack.
+    """Looks at the rack; the clock goes by it from the reading on that brings the link into step.
 
-    Args:
-        rack: Client of the rack.
-        link: The link to it.
-        cycle: Takes what is read, and what fails.
-        clock: Goes by the rack from the reading on that brings the link into step.
-        power_up_s: A rack that has not answered since our start counts as lost after so long, in real time.
+    `power_up_s`: a rack that has not answered since our start counts as lost after so long, in real time.
     """
 
     def __init__(
@@ -293,9 +276,7 @@ class RackFinder:
     async def look(self, changed: asyncio.Event, patience_s: float | None) -> bool:
         """Read what the rack applies, once; return whether it has answered and has no other master.
 
-        Args:
-            changed: What ends the pause between two looks.
-            patience_s: How long it may take in real time; None in lock-step.
+        `changed` ends the pause between two looks. It may take `patience_s` in real time; None in lock-step.
         """
         if self._looks >= AT_ONCE:
             await self.pause(changed)

@@ -320,10 +320,7 @@ def lacks_output(c: SensorConstants, s: SensorState, ticks: int) -> bool:
 class SensorMonitor(SensorState):
     """Looks at every measurement. Scans can be missed.
 
-    Args:
-        settings: Ranges of sensors.
-        initial: The outputs at rest.
-        moves: How far an input must have moved for something to be seen of it.
+    `initial` are the outputs at rest; `moves` is how far each input must have moved for something to be seen of it.
     """
 
     def __init__(self, settings: SensorCheckSettings, initial: Sequence[float], moves: Sequence[float] = ()) -> None:

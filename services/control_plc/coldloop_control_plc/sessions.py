@@ -181,13 +181,7 @@ SEEN_FOR_S: Final = 10.0
 
 
 class Sessions:
-    """Puts the program into sessions.
-
-    Args:
-        program: What is to run in them.
-        configured: Time base, and whether sessions of the rack are adopted.
-        recalled: State of before a restart.
-    """
+    """Puts the program into sessions, of the configured time base; `recalled` is the state of before a restart."""
 
     def __init__(
         self, program: ControlProgram, configured: SessionSettings, recalled: RetainedControlState | None

@@ -61,14 +61,8 @@ class Transport:
     it sends the next request (Modbus Messaging on TCP/IP V1.0b, section 4.4.1.3; 1 to 16 transactions at a time are
     usual). pymodbus' client has one request under way at a time.
 
-    Args:
-        service: Name of the peer's service.
-        host: Where it is.
-        port: Its TCP port.
-        timeout_s: How long connecting may take.
-        tls: For Modbus/TCP Security; plain Modbus/TCP without.
-
-    Neither retries nor reconnects in the background: a request fails within its time.
+    Connecting may take `timeout_s`; `tls` is for Modbus/TCP Security, plain Modbus/TCP without. Neither retries nor
+    reconnects in the background: a request fails within its time.
     """
 
     def __init__(self, service: str, host: str, port: int, timeout_s: float, tls: ssl.SSLContext | None) -> None:

@@ -37,11 +37,9 @@ REFUSALS: Final = ServerStatistics._fields[3:]
 
 
 class RefusalLog:
-    """Counts each refusal and logs at most one line of a kind in `LOG_INTERVAL_S`, so that no client floods the log.
+    """Counts each refusal of a service and logs at most one line of a kind in `LOG_INTERVAL_S`, against floods.
 
-    Args:
-        service: Whose refusals these are.
-        on_refusal: Called with the kind of every one.
+    `on_refusal` is called with the kind of every one.
     """
 
     def __init__(self, service: str, on_refusal: Callable[[str], None] | None = None) -> None:

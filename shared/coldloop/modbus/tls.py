@@ -31,11 +31,7 @@ _logger = logging.getLogger("coldloop.modbus")
 
 
 def server_context(settings: TlsSettings, name: str) -> ssl.SSLContext:
-    """Return the context of a server that asks every client for its certificate.
-
-    Args:
-        settings: The files.
-        name: Whose they are, for messages.
+    """Return the context of a server that asks every client for its certificate; `name` is for messages.
 
     Raises:
         ConfigurationError: A file cannot be used.
@@ -182,14 +178,9 @@ PAUSE_S: Final = 0.1
 
 
 class TlsListener:
-    """Sockets that are listened on, and the handshakes under way.
+    """Sockets that are listened on, and the handshakes under way, so many at most; `refusals` takes those that fail.
 
-    Args:
-        sockets: Listening sockets.
-        context: Of a server.
-        make_protocol: Makes what serves a connection that is secure.
-        limit: How many handshakes may be under way.
-        refusals: Takes those that fail.
+    `make_protocol` makes what serves a connection that is secure, by the context of a server.
     """
 
     def __init__(

@@ -99,23 +99,19 @@ class RegisterBank:
         self._read_spans: dict[tuple[int, int], list[Callable[[], None]]] = {}
         """The same for the words that clients read."""
         for block in register_map.blocks:
-            self._declare(block)
+            size, codec = block.end - block.address, codec_of(block, order)
+            self._places[block.record] = block, codec
+            if block.writer is not None:
+                self._writable[block.address : block.end] = b"\1" * size
+            elif block.sealed:  # no seal is damage to those who read, also before there is anything
+                self.put_sealed(codec.decode(bytes(2 * size)))
+            for row in range(block.rows):
+                for register, (_, field) in zip(block.registers(row), block.elements, strict=True):
+                    if register.kind.words == 2:
+                        self._halves[register.address : register.address + 2] = bytes((FIRST_HALF, SECOND_HALF))
+                    if block.writer is not None:
+                        self._checks.append((register.address, register.kind, field, f"{block.name}.{register.name}"))
         self._check_addresses = [address for address, *_ in self._checks]
-
-    def _declare(self, block: Block) -> None:
-        size = block.end - block.address
-        self._places[block.record] = block, codec_of(block, self.order)
-        if block.writer is not None:
-            self._writable[block.address : block.end] = b"\1" * size
-        if block.sealed and block.writer is None:  # no seal is damage to those who read, also before there is anything
-            self.put_sealed(codec_of(block, self.order).decode(bytes(2 * size)))
-        for row in range(block.rows):
-            for register, (_, field) in zip(block.registers(row), block.elements, strict=True):
-                if register.kind.words == 2:
-                    self._halves[register.address] = FIRST_HALF
-                    self._halves[register.address + 1] = SECOND_HALF
-                if block.writer is not None:
-                    self._checks.append((register.address, register.kind, field, f"{block.name}.{register.name}"))
 
     def get(self, record: type[R], row: int = 0) -> R:
         """Return a row of the block that holds `record`."""
@@ -201,12 +197,7 @@ class RegisterBank:
         return found
 
     def write(self, address: int, data: bytes, caller: Caller = ANYBODY) -> list[Block]:
-        """Judge and store words from `address` on; return the blocks that they fall in.
-
-        Args:
-            address: Of the first word.
-            data: The words, high byte first.
-            caller: Who writes.
+        """Judge and store words, high byte first, from `address` on; return the blocks that they fall in.
 
         Raises:
             IllegalAddressError: A register does not exist or is read-only.

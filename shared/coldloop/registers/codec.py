@@ -35,12 +35,7 @@ class _Run(NamedTuple):
 
 
 class Domain:
-    """The ranges of a run of registers.
-
-    Args:
-        fields: Declaration of each register, one for each element of an array.
-        names: Of the same registers, for messages.
-    """
+    """The ranges of a run of registers: one field for each, also of an array; their names are for messages."""
 
     def __init__(self, fields: Sequence[Field], names: Sequence[str]) -> None:
         self._fields = fields

@@ -11,7 +11,6 @@ import logging
 import os
 import stat
 import threading
-import time
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -82,12 +81,10 @@ def _description(content: bytes, owner: str, digest: int) -> bytes:
 
 
 class RetainedFile:
-    """The retained state of one program.
+    """The retained state of one program, in a file.
 
-    Args:
-        path: Where it is.
-        owner: Name of the program and version of its state, without spaces.
-        digest: 32 bits of what the state belongs to: the model.
+    `owner` is the name of the program and the version of its state, without spaces; `digest` are 32 bits of what the
+    state belongs to: the model.
     """
 
     def __init__(self, path: Path, owner: str, digest: int) -> None:
@@ -98,10 +95,8 @@ class RetainedFile:
     def save(self, state: Mapping[str, Any], *, synced: bool = True) -> None:
         """Replace the state.
 
-        Args:
-            state: The new one.
-            synced: Wait until the disk has it: milliseconds, or much longer on a slow disk. Without, the state survives
-                the end of the process, but not that of the machine.
+        `synced` waits until the disk has it: milliseconds, or much longer on a slow disk. Without, the state survives
+        the end of the process, but not that of the machine.
 
         Raises:
             RetainedStateError: The file cannot be written.
@@ -167,19 +162,12 @@ class RetainedStateWriter:
     """Writes the newest state to a file, whenever there is a newer one than that on the disk.
 
     A failure is logged once, and so is the first write after it that succeeds; until then the newest state is tried
-    again and again.
-
-    Args:
-        file: Where to.
-        pause_s: Time between writes.
-        retry_s: Time between writes that fail.
-
-    Attributes:
-        failed: Why the newest state is not on the disk, when the last write failed; else None. Any thread may read it.
+    again and again. Writes are `pause_s` apart, `retry_s` where one has failed.
     """
 
     def __init__(self, file: RetainedFile, *, pause_s: float = PAUSE_S, retry_s: float = RETRY_S) -> None:
         self.failed: str | None = None
+        """Why the newest state is not on the disk, when the last write failed; any thread may read it."""
         self._file = file
         self._pause_s = pause_s
         self._retry_s = retry_s
@@ -204,11 +192,8 @@ class RetainedStateWriter:
 
     def flush(self, within_s: float = CLOSING_S) -> bool:
         """Wait until the newest state is on the disk; return whether it is, in time."""
-        end = time.monotonic() + within_s
         with self._changed:
-            while self._written < self._kept and not self._ended:
-                if not self._changed.wait(end - time.monotonic()):
-                    return False
+            self._changed.wait_for(lambda: self._written == self._kept or self._ended, within_s)
             return self._written == self._kept
 
     def close(self, within_s: float = CLOSING_S) -> bool:

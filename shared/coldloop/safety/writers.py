@@ -37,12 +37,9 @@ REPEATED_AFTER_S: Final = 10.0
 class WriterLease:
     """Who may write in a role; notes who gets the lease, who is refused, and when it ends.
 
-    Args:
-        what: What the lease is of, for messages.
-        silence_s: Returns how long, in real time, a holder may be silent; 0 is for ever.
-        note: Takes the events, with the name of the client.
-        now: A clock, s.
-        shared: Whether a holder with a number may write over several connections in turn.
+    `what` the lease is of is for messages. A holder may be silent for `silence_s()` of real time, 0 is for ever, by the
+    clock `now`, s. `note` takes the events, with the name of the client. `shared`: a holder with a number may write
+    over several connections in turn.
     """
 
     def __init__(
