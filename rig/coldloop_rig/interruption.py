@@ -19,8 +19,6 @@ SIGNALS: Final = tuple(
 )
 LISTENS_S: Final = 2.0
 """A run in one process that has not taken a signal after so long is in code that does not return."""
-SHOW_CURSOR: Final = b"\r\033[?25h\n"
-"""A progress bar on a terminal hides the cursor."""
 
 
 class Interruption:
@@ -100,7 +98,7 @@ def end_at_once(number: int) -> NoReturn:
     """End the process with the exit code of a signal; its services end with their standard input."""
     with contextlib.suppress(OSError):  # the terminal may have gone
         if sys.stderr is not None and sys.stderr.isatty() and not os.environ.get("NO_COLOR"):
-            os.write(2, SHOW_CURSOR)
+            os.write(2, b"\r\033[?25h\n")  # shows the cursor, which a progress bar hides
         os.write(2, b"coldloop: interrupted\n")
     os._exit(128 + number)
 

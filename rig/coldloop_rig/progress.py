@@ -12,8 +12,6 @@ from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
 from coldloop_rig.results.recording import Sink
 
-SHOWN_OUTPUTS: Final = 3
-"""Outputs of which the bar shows the value, at most."""
 REFRESH_S: Final = 0.1
 NARROW: Final = 72
 """Columns that the bar with speed and remaining time needs."""
@@ -80,20 +78,14 @@ class RunProgress(PlantTimeBar, Sink):
         if self._done % 8 and not last:
             return
         now = time.monotonic()
-        if now - self._shown >= REFRESH_S or last:
-            self._shown = now
-            self._show(sample, now - self._began)
-
-    def _show(self, sample: PlantSample, elapsed_s: float) -> None:
+        if now - self._shown < REFRESH_S and not last:
+            return
+        self._shown = now
         self._bar.start()  # not before there is something to show: an error is then shown alone
         seconds = self._done * self._process.tick_s
-        values = zip(self._process.banded[:SHOWN_OUTPUTS], self._process.controlled, strict=False)
+        values = zip(self._process.banded[:3], self._process.controlled, strict=False)
         outputs = "  ".join(f"{one.name} {sample.y[place]:.2f} {one.unit}".rstrip() for one, place in values)
-        self._bar.update(
-            self._task,
-            completed=self._done,
-            clock=clock(seconds),
-            speed=f"{seconds / max(elapsed_s, 1e-9):,.0f} x real time",
-            line=f"{outputs}{self._updating}",
-        )
+        speed = f"{seconds / max(now - self._began, 1e-9):,.0f} x real time"
+        line = f"{outputs}{self._updating}"
+        self._bar.update(self._task, completed=self._done, clock=clock(seconds), speed=speed, line=line)
         self._bar.refresh()

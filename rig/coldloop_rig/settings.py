@@ -61,13 +61,12 @@ def configured(
     if not isinstance(process, str | Path | None):
         raise UsageError(f"process: a path of a process file or a model file, not {type(process).__name__}")
     model: Path | None = None
-    told: list[str] = []
     if process is not None:
         from coldloop_rig.process_file.reading import model_file_of  # noqa: PLC0415 it is made with these settings
 
         model, told = model_file_of(Path(process))
-    for line in told:
-        warnings.warn(f"{process}: {line}", stacklevel=3)
+        for line in told:
+            warnings.warn(f"{process}: {line}", stacklevel=3)
     arguments: dict[str, tuple[object, str]] = {
         "model.file": (model and str(model), "process"),
         "plant.load": (None if load is None else str(load), "load"),

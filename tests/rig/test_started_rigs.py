@@ -20,11 +20,11 @@ from coldloop_rig.cosim.wiring import RigEndpoints
 from coldloop_rig.live.started_rigs import (
     LOCK_FILE,
     STATE_FILE,
-    RigLock,
     RunningRig,
     ServiceProcess,
     base_folder,
     identity_of,
+    lock_rig,
     make_private,
     new_own,
     pause,
@@ -233,7 +233,7 @@ def test_every_command_takes_the_same_options(coldloop: "Coldloop", other: Proce
 
 
 def test_the_folder_is_closed_to_others(runtime: Path) -> None:
-    os.close(RigLock(FIRST).descriptor)
+    os.close(lock_rig(FIRST))
     for folder in (runtime / "coldloop", runtime / "coldloop" / str(FIRST)):
         assert folder.stat().st_mode & 0o777 == 0o700
 
@@ -292,7 +292,7 @@ def test_nothing_is_followed(tmp_path: Path) -> None:
     make_private(base_folder())
     make_private(state_folder(FIRST)).joinpath(LOCK_FILE).symlink_to(precious)
     with pytest.raises(UsageError, match="remove it"):
-        RigLock(FIRST)
+        lock_rig(FIRST)
 
 
 @pytest.mark.parametrize("kind", ["fifo", "folder", "socket"])
@@ -316,13 +316,13 @@ def test_what_is_no_file_is_not_waited_for(kind: str, coldloop: "Coldloop", monk
 
 
 def test_a_second_rig_that_is_started_at_the_same_time_is_refused(coldloop: "Coldloop") -> None:
-    first = RigLock(FIRST)
+    first = lock_rig(FIRST)
     for words in (("--detach",), ()):
         outcome = coldloop("up", "--port-base", str(FIRST), *words)
         assert (outcome.code, len(outcome.complaints)) == (2, 1)
         assert f"is being started here: wait for it, or end it (process {os.getpid()})" in outcome.complaints[0]
-    os.close(first.descriptor)
-    os.close(RigLock(FIRST).descriptor)
+    os.close(first)
+    os.close(lock_rig(FIRST))
 
 
 @pytest.mark.usefixtures("realtime")

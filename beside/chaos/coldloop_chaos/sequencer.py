@@ -108,7 +108,7 @@ class Injector:
             await self.services.stop(faults.SERVICE_OF[fault.process], signal.SIGTERM)
         elif isinstance(fault, faults.Pause | faults.Clock):
             for service in filter(fault.processes.__contains__, SERVICES):
-                self.services.pause(service)
+                self.services.send(service, signal.SIGSTOP)
         elif isinstance(fault, faults.Sensor):
             await self._set_sensor(fault.output, SensorFault(_SHOWN[fault.shows], fault.value or 0.0))
         elif isinstance(fault, faults.BoundaryFault):
@@ -130,7 +130,7 @@ class Injector:
             return service
         elif isinstance(fault, faults.Pause | faults.Clock):
             for service in filter(fault.processes.__contains__, SERVICES):
-                self.services.resume(service)
+                self.services.send(service, signal.SIGCONT)
         elif isinstance(fault, faults.Sensor):
             await self._set_sensor(fault.output, SensorFault(SensorFaultKind.NONE, 0.0))
         elif isinstance(fault, faults.BoundaryFault):

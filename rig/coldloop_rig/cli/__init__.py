@@ -148,8 +148,6 @@ BROKEN: Final = "commands that cannot be loaded"
 """Group in `coldloop --help` of commands whose package is damaged, or for another version."""
 MODULE_OF: Final = {name: module for module, names in MODULES.items() for name in names}
 """Modules of `coldloop_rig.cli.commands`: `_declare_NAME` declares a command's options, `execute_NAME` does it."""
-QUESTION: Final = """Can this predictive controller run on that PLC, and how often should it update?
-A networked PLC rig for fast MPC."""
 VERSION: Final = f"coldloop {__version__} (Python {platform.python_version()})"
 EXTRAS: Final = {
     "CoolProp": "tables", "aiohttp": "hmi", "casadi": "qpoases", "distributed": "studies", "fmpy": "fmu",
@@ -158,11 +156,8 @@ EXTRAS: Final = {
 """The extra that brings a package which not every command needs."""
 OF_THE_OUTPUT: Final = (errno.ENOSPC, errno.EIO, errno.EBADF, errno.EDQUOT, errno.EFBIG)
 """Errors of writing."""
-INTERRUPTED = 130
 OF_THE_COLD_BOX: Final = ("study", "reproduce", "model", "exergy")
 """Commands that are about its equations, its loads or the paper's figures."""
-OF_ANY_PROCESS: Final = ("periods", "compare")
-"""Studies that are not."""
 
 
 USES: Final = {"read": Path, "name": str, "folder": Path, "export": str, "write": Path, "into": Path}
@@ -186,8 +181,9 @@ def make_parser(chosen: str | None) -> argparse.ArgumentParser:
     """Return the parser of all commands, with the options of the chosen one; other commands are not imported."""
     known = chosen in COMMANDS or chosen in _beside()
     parser = OneLineParser(
-        prog="coldloop", description=QUESTION, epilog="" if known else _by_group(),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        prog="coldloop", epilog="" if known else _by_group(), formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Can this predictive controller run on that PLC, and how often should it update?\n"
+        "A networked PLC rig for fast MPC.",
     )  # fmt: skip
     parser.add_argument("--version", action="version", version=VERSION)
     parser.add_argument(OPTION, metavar="FILE", help="another process than the cold box: a process file, or a"
@@ -296,7 +292,8 @@ def _execute(parser: argparse.ArgumentParser, given: Sequence[str]) -> int:
         parser.prog = " ".join([parser.prog, *given[: options.execute is not None]])
         parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     named = given[1] if len(given) > 1 else None
-    if given and given[0] in OF_THE_COLD_BOX and named not in OF_ANY_PROCESS and is_another():
+    studies_of_any = ("periods", "compare")
+    if given and given[0] in OF_THE_COLD_BOX and named not in studies_of_any and is_another():
         sys.stderr.write(f"coldloop: {given[0]}: of the cold box alone; leave out {OPTION} and unset {VARIABLES[0]}\n")
         return UsageError.exit_code
     if options.execute is None:
@@ -316,7 +313,7 @@ def _execute(parser: argparse.ArgumentParser, given: Sequence[str]) -> int:
         return UsageError.exit_code
     except KeyboardInterrupt:
         sys.stderr.write("coldloop: interrupted\n")
-        return INTERRUPTED
+        return 130
 
 
 def _complete() -> NoReturn:

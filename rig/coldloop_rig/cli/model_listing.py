@@ -2,7 +2,7 @@
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -22,25 +22,14 @@ from coldloop_plant.settings import StationSettings
 DEFAULT_CONTROL: Final = StationSettings()
 HORIZON_S = 100.0
 """Time after which the gains are given: the level integrates, so there are no final ones."""
-TWO_SIDED = 1e-3
-"""Difference of the derivatives from central ones from which on the plant has a kink there."""
-GRID = 21, 3
-"""Openings of CV155 and of CV156 at which it is tried which loads the plant holds."""
-
-
-class Description(NamedTuple):
-    """The model of a plant file, and what is said of it."""
-
-    model: LtiModel
-    text: str
-    box: ColdBox
-    """Cold box with the temperature after the pre-cooler that it has at steady state."""
 
 
 def describe_model(
     in_use: Path, plant: PlantFile, design: ControlDesign, control: StationSettings = DEFAULT_CONTROL
-) -> Description:
+) -> tuple[LtiModel, str, ColdBox]:
     """Solve for the operating point and linearise there; return the model and its description.
+
+    The cold box with them has the temperature after the pre-cooler that it has at steady state.
 
     Args:
         in_use: Model file that is configured, which is compared by its digest.
@@ -71,13 +60,13 @@ def describe_model(
         f"derivatives within {error:.1e} of extrapolated central differences (scaled)",
         *(f"after {HORIZON_S:g} s of +1 {unit} {name}: L1 {effects[L1, i]:+.5f} %, T5 {effects[T5, i]:+.5f} K"
           for i, (name, unit) in enumerate(signals)),
-        *([kink] if error >= TWO_SIDED else []), *_band_lines(rest, design), f"model      sha256 {model.digest}",
+        *([kink] if error >= 1e-3 else []), *_band_lines(rest, design), f"model      sha256 {model.digest}",
     ]  # fmt: skip
     with suppress(ModelFileError):  # the command then says what is wrong with it
         configured = load(in_use)
         lines.append(f"in use     sha256 {configured.digest} ({in_use})")
         lines += [f"           {printable(configured.note)}"] if configured.note else []
-    return Description(model, "\n".join(lines) + "\n", box)
+    return model, "\n".join(lines) + "\n", box
 
 
 def _equilibrium_lines(model: LtiModel, rest: cold_box.Equilibrium) -> list[str]:
@@ -94,7 +83,7 @@ def _equilibrium_lines(model: LtiModel, rest: cold_box.Equilibrium) -> list[str]
 
 def held_line(box: ColdBox, level: float, design: ControlDesign, limits: InputLimits) -> str:
     """Return which loads are held with L1 as in its file and T5 within its band: some seconds of computing."""
-    openings = [np.linspace(limits.low[k], limits.high[k], count) for k, count in zip((0, 2), GRID, strict=True)]
+    openings = [np.linspace(limits.low[k], limits.high[k], count) for k, count in ((0, 21), (2, 3))]  # CV155, CV156
     heater, warmth = (limits.low[1], limits.high[1]), (design.output_low[1], design.output_high[1])
     try:
         with np.errstate(all="ignore"):

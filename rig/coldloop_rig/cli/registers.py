@@ -118,8 +118,6 @@ def mbpoll_line(service: str, block: Block) -> str:
 FORMATS: Final = {"table": as_table, "markdown": as_markdown, "csv": as_csv, "json": as_json}
 
 
-WIDTH: Final = 24
-"""Width of a dashboard, in Grafana's units."""
 UNITS: Final = {"%": "percent", "K": "kelvin", "W": "watt"}
 """Grafana's names of units; others are in the title of the panel."""
 DATASOURCE: Final = {"type": "prometheus", "uid": "${datasource}"}
@@ -190,7 +188,7 @@ def _of_process(process: Process) -> Iterable[Panel]:
 
 def _laid_out(panels: Sequence[Panel], kind: str, top: int, across: int, height: int) -> Iterable[dict[str, Any]]:
     """Yield panels in rows of so many."""
-    width = WIDTH // across
+    width = 24 // across  # in Grafana's units
     for place, panel in enumerate(panels):
         yield {
             "type": kind, "title": panel.title,

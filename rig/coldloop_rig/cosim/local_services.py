@@ -224,15 +224,8 @@ class LocalServices:
         """Return whether a service has ended by itself."""
         return self.processes[service].returncode is not None
 
-    def pause(self, service: str) -> None:
-        """Let a process stand still."""
-        self._signal(service, signal.SIGSTOP)
-
-    def resume(self, service: str) -> None:
-        """Resume it."""
-        self._signal(service, signal.SIGCONT)
-
-    def _signal(self, service: str, number: signal.Signals) -> None:
+    def send(self, service: str, number: signal.Signals) -> None:
+        """Send a signal to one of them, unless it has ended."""
         with contextlib.suppress(ProcessLookupError):
             self.processes[service].send_signal(number)
 

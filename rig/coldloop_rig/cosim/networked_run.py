@@ -1,7 +1,7 @@
 """A run over the bus: on services that are started for it, or on a rig that is up, with what that really runs."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -182,7 +182,24 @@ def drive(job: Job, recorder: Recorder, folder: Path, stop: StopRequest) -> None
     Raises:
         ColdloopError: It is not complete.
     """
-    run_event_loop(lambda: _stoppable(_run(job, recorder, folder), stop))
+
+    async def run() -> int:
+        task = asyncio.ensure_future(_run(job, recorder, folder))
+        loop = asyncio.get_running_loop()
+        stop.cancel = lambda: loop.call_soon_threadsafe(task.cancel)
+        try:
+            if stop.error is not None:
+                task.cancel()
+            await task
+        except asyncio.CancelledError:
+            if stop.error is None:
+                raise
+            raise stop.error from None
+        finally:
+            stop.cancel = None
+        return 0
+
+    run_event_loop(run)
 
 
 async def _run(job: Job, recorder: Recorder, folder: Path) -> None:
@@ -201,31 +218,9 @@ async def _run(job: Job, recorder: Recorder, folder: Path) -> None:
         try:
             await rig.run(scenario, recorder)
         finally:
-            await _to_its_end(session.restore_session(rig, saved, rig.session))
-
-
-async def _stoppable(run: Awaitable[None], stop: StopRequest) -> int:
-    task = asyncio.ensure_future(run)
-    loop = asyncio.get_running_loop()
-    stop.cancel = lambda: loop.call_soon_threadsafe(task.cancel)
-    try:
-        if stop.error is not None:
-            task.cancel()
-        await task
-    except asyncio.CancelledError:
-        if stop.error is None:
-            raise
-        raise stop.error from None
-    finally:
-        stop.cancel = None
-    return 0
-
-
-async def _to_its_end(work: Coroutine[Any, Any, None]) -> None:
-    """Do all of it, also when this task is cancelled meanwhile."""
-    task = asyncio.ensure_future(work)
-    try:
-        await asyncio.shield(task)
-    except asyncio.CancelledError:
-        await task
-        raise
+            restoring = asyncio.ensure_future(session.restore_session(rig, saved, rig.session))
+            try:
+                await asyncio.shield(restoring)
+            except asyncio.CancelledError:  # all of it is done
+                await restoring
+                raise

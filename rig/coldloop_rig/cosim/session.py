@@ -162,7 +162,25 @@ class SessionClient:
         """
         await self.begin(scenario, recorder)
         try:
-            await self._follow()
+            quiet_since, lockstep = time.monotonic(), not scenario.realtime
+            pause_s = SHORTEST_PAUSE_S if lockstep else min(20 * self._tick_s / scenario.factor, LONGEST_PAUSE_S)
+            while (done := recorder.next_tick) < scenario.ticks:
+                await self.grant(scenario.ticks)
+                await self.look()
+                ticks, now = recorder.next_tick - done, time.monotonic()
+                if ticks > 0:
+                    quiet_since = now
+                elif now - quiet_since > max(QUIET_S, 4 * self._tick_s / scenario.factor):
+                    raise LinkError(
+                        f"{self.plant.peer} has been at tick {done} for {now - quiet_since:.0f} s: "
+                        "see the logs of the control PLC and of the optimiser"
+                    )
+                if lockstep and ticks > 2 * BATCH:  # the rig must not come to the end of its grant, ...
+                    pause_s /= 2
+                elif lockstep and ticks < BATCH:  # ... and each look asks all three services, so it is worth some ticks
+                    pause_s = min(pause_s * 1.5, LONGEST_LOCKSTEP_PAUSE_S)
+                pause_s = max(pause_s, SHORTEST_PAUSE_S)
+                await asyncio.sleep(pause_s)
             await self.conclude()
         finally:
             await self.last_look()
@@ -264,29 +282,6 @@ class SessionClient:
                 await self._events.read(PLANT)
 
     # -- in the session ----------------------------------------------------------------------------------------------
-
-    async def _follow(self) -> None:
-        scenario, recorder = self._scenario, self._recorder
-        quiet_since = time.monotonic()
-        pause_s = min(20 * self._tick_s / scenario.factor, LONGEST_PAUSE_S) if scenario.realtime else SHORTEST_PAUSE_S
-        while (done := recorder.next_tick) < scenario.ticks:
-            await self.grant(scenario.ticks)
-            await self.look()
-            now = time.monotonic()
-            if recorder.next_tick > done:
-                quiet_since = now
-            elif now - quiet_since > max(QUIET_S, 4 * self._tick_s / scenario.factor):
-                raise LinkError(
-                    f"{self.plant.peer} has been at tick {done} for {now - quiet_since:.0f} s: "
-                    "see the logs of the control PLC and of the optimiser"
-                )
-            ticks = recorder.next_tick - done
-            if not scenario.realtime and ticks > 2 * BATCH:  # the rig must not come to the end of its grant, ...
-                pause_s /= 2
-            elif not scenario.realtime and ticks < BATCH:  # ... and each look asks all three services
-                pause_s = min(pause_s * 1.5, LONGEST_LOCKSTEP_PAUSE_S)
-            pause_s = max(pause_s, SHORTEST_PAUSE_S)
-            await asyncio.sleep(pause_s)
 
     async def grant(self, until: int) -> None:
         """Advance the rig to a tick, limited by the known load and by the length of the plant's history."""

@@ -6,7 +6,7 @@ from functools import cache
 from io import BytesIO
 from itertools import cycle
 from pathlib import Path
-from string import ascii_lowercase, ascii_uppercase
+from string import ascii_letters
 from threading import RLock
 from typing import Any, Final, NamedTuple
 
@@ -70,14 +70,10 @@ NOT_CURVES: Final = ("tau_u_s", "stage_cost")
 """The last of these columns, which are drawn in their own ways."""
 LEAST_COST: Final = 1e-6
 """Least stage cost that is drawn: at steady state the cost is rounding."""
-NARROWEST: Final = 1 / 2000
-"""Share of the whole time that can be seen."""
 SMOOTHING_S: Final = 60.0
 """Window of the mean of tau_u: adaptive periods change at nearly every update."""
 PANELS: Final = {"left": 0.083, "right": 0.993, "top": 0.962, "bottom": 0.048, "hspace": 0.3}
 """Places of the panels, in shares of the figure. Matplotlib's layout engine would draw the figure three times more."""
-LETTERS: Final = ascii_lowercase + ascii_uppercase
-"""Letters of the panels."""
 LABEL_AT: Final = -0.068
 """Place of letters and labels of panels, in widths of a panel: beside numbers of six characters."""
 
@@ -150,7 +146,7 @@ def draw_run(curves: RunCurves) -> Figure:
             place.set_yscale("log")
         if curves.events:
             _ribbons(axes[-1], curves.events, scale_s, float(time[-1]))
-        for place, letter in zip(axes, LETTERS, strict=False):
+        for place, letter in zip(axes, ascii_letters, strict=False):
             legend_above(place)
             place.text(LABEL_AT, 1.03, f"({letter})", transform=place.transAxes, fontsize=8, ha="center")
             place.yaxis.set_label_coords(LABEL_AT, 0.5)
@@ -260,7 +256,7 @@ def _ribbons(axes: Axes, events: Sequence[Mapping[str, Any]], scale_s: float, en
         axes.broken_barh([(begin, max(until - begin, 0.0))], (0.55, 0.4), color=MODE_COLOURS.get(mode, BAND))
     for begin, until in alarm_times(events, scale_s, end):
         axes.broken_barh([(begin, until - begin)], (0.05, 0.4), color="#b3261e", alpha=0.5)
-    seen = {mode for (begin, mode), until in zip(modes, ends, strict=False) if until - begin > NARROWEST * end}
+    seen = {mode for (begin, mode), until in zip(modes, ends, strict=False) if until - begin > end / 2000}
     present = [Patch(color=colour, label=mode) for mode, colour in MODE_COLOURS.items() if mode in seen]
     axes.set_yticks([0.25, 0.75], ["alarms", "mode"])
     axes.set_ylim(0, 1)
@@ -282,8 +278,6 @@ def alarm_times(events: Sequence[Mapping[str, Any]], scale_s: float, end: float)
 
 
 DPI: Final = 130
-LEAST_PIXELS: Final = 900
-"""Width of a figure that is narrow on paper."""
 
 
 def plot_run(folder: Path, formats: Sequence[str]) -> list[Path]:
@@ -310,7 +304,7 @@ def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure in the format of the file's name; nothing in it depends on the time of day."""
     extension = path.suffix.removeprefix(".")
     metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(extension)
-    dpi = max(DPI, LEAST_PIXELS / figure.get_figwidth())
+    dpi = max(DPI, 900 / figure.get_figwidth())  # so many pixels across where it is narrow on paper
     with styled():
         whole_file(path, lambda draft: figure.savefig(draft, dpi=dpi, format=extension, metadata=metadata))
 

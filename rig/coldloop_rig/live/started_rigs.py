@@ -320,8 +320,8 @@ def require_rig(first_port: int | None) -> RunningRig:
     return rig
 
 
-class RigLock:
-    """Keeps a second rig from being started on the same ports; an open file that is locked until it is closed.
+def lock_rig(first_port: int, inherited: int | None = None) -> int:
+    """Keep a second rig from being started on the same ports; return a file that is locked until it is closed.
 
     Args:
         first_port: Of the rig.
@@ -330,15 +330,8 @@ class RigLock:
     Raises:
         UsageError: A rig is up on these ports or is being started, or its folder is not ours.
     """
-
-    def __init__(self, first_port: int, inherited: int | None = None) -> None:
-        folder = make_own_folder(str(first_port))
-        self.descriptor = self._locked(folder / LOCK_FILE, first_port) if inherited is None else inherited
-        with suppress(OSError):  # our number, for those who come later; the disk may be full
-            os.ftruncate(self.descriptor, 0)
-            os.pwrite(self.descriptor, str(os.getpid()).encode(), 0)
-
-    def _locked(self, file: Path, first_port: int) -> int:
+    file, descriptor = make_own_folder(str(first_port)) / LOCK_FILE, inherited
+    if descriptor is None:
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         try:
             descriptor = os.open(file, flags, mode=0o600)
@@ -348,18 +341,21 @@ class RigLock:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             os.close(descriptor)
-            raise UsageError(f"port {first_port}: {self._holder(first_port)}, or give another --port-base") from None
-        return descriptor
+            raise UsageError(f"port {first_port}: {_holder(first_port)}, or give another --port-base") from None
+    with suppress(OSError):  # our number, for those who come later; the disk may be full
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, str(os.getpid()).encode(), 0)
+    return descriptor
 
-    @staticmethod
-    def _holder(first_port: int) -> str:
-        if (rig := running_rig(first_port)) is not None:
-            return f"a rig is up here (process {rig.pid}): end it with `coldloop down`"
-        try:
-            number = int(read_own(state_folder(first_port) / LOCK_FILE))
-        except (OSError, ValueError):
-            return "a rig is being started here: wait for it"
-        return f"a rig is being started here: wait for it, or end it (process {number})"
+
+def _holder(first_port: int) -> str:
+    if (rig := running_rig(first_port)) is not None:
+        return f"a rig is up here (process {rig.pid}): end it with `coldloop down`"
+    try:
+        number = int(read_own(state_folder(first_port) / LOCK_FILE))
+    except (OSError, ValueError):
+        return "a rig is being started here: wait for it"
+    return f"a rig is being started here: wait for it, or end it (process {number})"
 
 
 # -- ports -------------------------------------------------------------------------------------------------------------
@@ -404,12 +400,12 @@ def require_listener(port: int) -> None:
 # -- start, end and faults ---------------------------------------------------------------------------------------------
 
 
-def detached(ports: Sequence[int], lock: RigLock) -> int:
+def detached(ports: Sequence[int], lock: int) -> int:
     """Start the same command in a background process; return 0 when the rig is up, 130 when Ctrl-C has ended it.
 
     Args:
         ports: Of the rig.
-        lock: Which the other process is to hold.
+        lock: Descriptor of the lock, which the other process is to hold.
 
     Raises:
         ColdloopError: It has ended.
@@ -421,8 +417,8 @@ def detached(ports: Sequence[int], lock: RigLock) -> int:
     ended_by: list[signal.Signals] = []
     with new_own(output) as log, INTERRUPTION.passed_to(ended_by.append):
         process = subprocess.Popen(  # noqa: S603 our own command
-            [*PYTHON, "-m", "coldloop_rig", *sys.argv[1:], "--locked", str(lock.descriptor)],
-            stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, pass_fds=[lock.descriptor],
+            [*PYTHON, "-m", "coldloop_rig", *sys.argv[1:], "--locked", str(lock)],
+            stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, pass_fds=[lock],
         )  # fmt: skip
         bound_log(process.pid)
         while process.poll() is None and not ended_by:

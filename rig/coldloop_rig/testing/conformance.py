@@ -58,11 +58,6 @@ class Requirement(NamedTuple):
     failures: int
     cases: int
 
-    @property
-    def outcome(self) -> str:
-        """Yes, or how often not."""
-        return "yes" if not self.failures else f"NO, in {self.failures} of {self.cases}"
-
 
 def counted(cases: Iterable[Mapping[str, object]]) -> list[Requirement]:
     """Return the requirements of cases, which have for each whether it was kept."""
@@ -266,21 +261,8 @@ def problems_of(settings: Settings, count: int = PROBLEMS) -> Iterator[Quadratic
         yield problem.at(QpParameters(random.normal(size=len(moves)) * moves, float(random.normal()), u))
 
 
-class Report(NamedTuple):
-    """Result of the conformance test of a part."""
-
-    kept: list[Requirement]
-    more: str = ""
-
-    @property
-    def passes(self) -> bool:
-        """Whether it keeps what it has to."""
-        return not any(one.failures for one in self.kept)
-
-    @property
-    def text(self) -> str:
-        """All of it, in lines."""
-        return f"{aligned([(one.text, one.outcome) for one in self.kept])}\n{self.more}"
+Report = tuple[list[Requirement], str]
+"""Result of the conformance test of a part, and further lines."""
 
 
 def of_solver(name: str) -> Report:
@@ -292,13 +274,13 @@ def of_solver(name: str) -> Report:
     ])  # fmt: skip
     monotone = "never" if not rises else f"in {100 * rises:.0f} % of the steps"
     more = f"{table}\nthe cost rises {monotone} between these counts\n"
-    return Report(requirements(made(Part.SOLVER, name), problems), more)
+    return requirements(made(Part.SOLVER, name), problems), more
 
 
 REPORTS: Final[Mapping[Part, Callable[[str], Report]]] = {
     Part.SOLVER: of_solver,
-    Part.RULE: lambda name: Report(rule_requirements(partial(made, Part.RULE, name))),
-    Part.ESTIMATOR: lambda name: Report(estimator_requirements(partial(made, Part.ESTIMATOR, name), Settings())),
+    Part.RULE: lambda name: (rule_requirements(partial(made, Part.RULE, name)), ""),
+    Part.ESTIMATOR: lambda name: (estimator_requirements(partial(made, Part.ESTIMATOR, name), Settings()), ""),
 }
 
 
@@ -309,12 +291,13 @@ def main() -> int:
         sys.stderr.write(f"usage: python -m coldloop_rig.testing.conformance NAME [{'|'.join(Part)}]\n")
         return 2
     try:
-        report = REPORTS[Part(part)](name)
+        kept, more = REPORTS[Part(part)](name)
     except ColdloopError as error:
         sys.stderr.write(f"{error}\n")
         return 1
-    sys.stdout.write(report.text)
-    return 0 if report.passes else 1
+    rows = [(one.text, f"NO, in {one.failures} of {one.cases}" if one.failures else "yes") for one in kept]
+    sys.stdout.write(f"{aligned(rows)}\n{more}")
+    return int(any(one.failures for one in kept))
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple, TextIO
+from typing import TYPE_CHECKING, Final, TextIO
 
 from coldloop.errors import ResultsError, UsageError
 from coldloop_rig.cli.commands import options as common
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 
 COLUMNS: Final = ("number", "boot", "utc", "tick", "plant_time_s", "kind", "subject", "cause", "value", "who")
-LOOK_AGAIN_S: Final = 1.0
-"""Interval at which the journal is polled with --follow, s."""
 
 
 def _declare_events(parser: argparse.ArgumentParser) -> None:
@@ -34,19 +32,11 @@ def _declare_events(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--service", choices=common.SERVICES, default="control_plc", help="default: control_plc")
     parser.add_argument("--kind", type=_kinds, default=(), metavar="KIND,...",
                         help="only events of these kinds, such as alarm-raised,mode")  # fmt: skip
-    parser.add_argument("--since", type=_since, default=Since(1, 0.0), metavar="NUMBER|TIME",
+    parser.add_argument("--since", type=_since, default=(1, 0.0), metavar="NUMBER|TIME",
                         help="from this event on, or from this time (UTC, such as 2026-11-22T01:30)")  # fmt: skip
     parser.add_argument("--follow", action="store_true", help="print new events until interrupted")
     parser.add_argument("--csv", type="write", metavar="FILE", help="write a CSV file instead of lines")
     parser.add_argument("--force", action="store_true", help="overwrite that file")
-
-
-class Since(NamedTuple):
-    """Place from which on the journal is read."""
-
-    number: int
-    utc: float
-    """Seconds since 1970."""
 
 
 def _kinds(text: str) -> tuple[int, ...]:
@@ -59,16 +49,17 @@ def _kinds(text: str) -> tuple[int, ...]:
         raise argparse.ArgumentTypeError(f"unknown kind {error}; choose from {', '.join(known)}") from None
 
 
-def _since(text: str) -> Since:
+def _since(text: str) -> tuple[int, float]:
+    """Return the number of an event and a time (s since 1970) from which on the journal is read."""
     if text.isdecimal() and 0 < int(text) < 2**32:
-        return Since(int(text), 0.0)
+        return int(text), 0.0
     try:
         time = datetime.fromisoformat(text)
     except ValueError:
         raise argparse.ArgumentTypeError(
             f"'{text}' is neither the number of an event nor a time such as 2026-11-22T01:30"
         ) from None
-    return Since(1, (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp())
+    return 1, (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
 
 
 def execute_events(options: argparse.Namespace) -> int:
@@ -93,7 +84,8 @@ async def _show_journal(options: argparse.Namespace) -> None:
     place: Endpoint = getattr(common.rig_endpoints(options, settings), options.service)
     client = RegisterClient.at(maps_of(process).by_service[options.service], place)
     peer = client.peer
-    reader = JournalReader(client, options.since.number, options.kind)
+    first, since = options.since
+    reader = JournalReader(client, first, options.kind)
     file = _CsvFile(options.csv, process) if options.csv else None
     write = partial(_print_events, process) if file is None else file.write
     warned: set[str] = set()
@@ -109,10 +101,10 @@ async def _show_journal(options: argparse.Namespace) -> None:
                 if happened and warning not in warned:
                     warned.add(warning)
                     sys.stderr.write(f"coldloop: {warning}\n")
-            write([event for event in events if event.utc + event.milliseconds / 1000 >= options.since.utc])
+            write([event for event in events if event.utc + event.milliseconds / 1000 >= since])
             if not options.follow:
                 return
-            await asyncio.sleep(LOOK_AGAIN_S)
+            await asyncio.sleep(1.0)
     finally:
         client.close()
         if file is not None:

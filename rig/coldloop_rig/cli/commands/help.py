@@ -12,7 +12,6 @@ from coldloop.service.command_line import add_configuration_options
 from coldloop_rig.cli.commands.options import configuration
 
 HEADING: Final = re.compile(r"^(#+) +(.+)$")
-FENCE: Final = "```"
 INSTALLED: Final = Path(__file__).parents[2] / "pages"
 """Folder of the pages in a wheel."""
 CHECKOUT: Final = Path(__file__).parents[4] / "docs"
@@ -67,7 +66,7 @@ def headings(text: str) -> Iterator[tuple[int, int, str]]:
     """Yield line, level and words of each heading."""
     in_code = False
     for number, line in enumerate(text.splitlines()):
-        in_code ^= line.startswith(FENCE)
+        in_code ^= line.startswith("```")
         if not in_code and (found := HEADING.match(line)):
             yield number, len(found[1]), found[2]
 

@@ -48,7 +48,7 @@ def _declare_up(parser: argparse.ArgumentParser) -> None:
 def execute_up(options: argparse.Namespace) -> int:
     """The rig on fixed ports, in real time, until Ctrl-C."""
     common.check_load(options.load)
-    from coldloop_rig.live.started_rigs import RigLock, check_ports, detached, ports_from
+    from coldloop_rig.live.started_rigs import check_ports, detached, lock_rig, ports_from
     from coldloop_rig.runs.running import check_certificates, remarks
 
     effective = common.configuration(options)
@@ -59,7 +59,7 @@ def execute_up(options: argparse.Namespace) -> int:
     told = [] if options.without else remarks(effective)
     optimizer = common.exported(options.optimizer, effective.settings)
     ports = ports_from(options.port_base)
-    lock = RigLock(ports[0], options.locked)
+    lock = lock_rig(ports[0], options.locked)
     check_ports(ports)
     page = options.page or options.page_port is not None
     if page:

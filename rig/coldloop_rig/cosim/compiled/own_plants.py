@@ -13,9 +13,10 @@ from coldloop_plant.own_plants import (
     advance_lags,
     advance_linear,
 )
-from coldloop_plant.program import PlantProgram
-from coldloop_rig.cosim.compiled.plants import CompiledPlant, advances
+from coldloop_rig.cosim.compiled.plants import advances
 from coldloop_rig.cosim.compiled.records import Array
+
+Linear = LinearPlant | TransferFunctionPlant
 
 
 class OwnState(NamedTuple):
@@ -56,7 +57,7 @@ def advance_delayed(c: LagTable, plant: OwnState, u: Array, load: float, row: in
 class CompiledOwn:
     """The program of either."""
 
-    def __init__(self, program: LinearPlant | TransferFunctionPlant) -> None:
+    def __init__(self, program: Linear) -> None:
         self._program = program
         self.constants = program.constants
 
@@ -70,8 +71,3 @@ class CompiledOwn:
     def restore(self, state: OwnState, tick: int, u: Array) -> None:
         """Resume the program at `tick`, up to which the inputs `u` were held."""
         self._program.take_over(tick, state.x, u, state.y)
-
-
-def of_process(program: PlantProgram) -> CompiledPlant | None:
-    """Return a program as the loop takes it; None where the plant is not linear."""
-    return CompiledOwn(program) if isinstance(program, LinearPlant | TransferFunctionPlant) else None

@@ -124,6 +124,6 @@ def compiled_plant(program: PlantProgram) -> CompiledPlant | None:
         return own
     if program.process.has_station:  # not where it is mismatched beside its box, or linear
         return CompiledBox(program) if type(program) is ColdBoxProgram else None
-    from coldloop_rig.cosim.compiled.own_plants import of_process  # noqa: PLC0415 a cold box starts without it
+    from coldloop_rig.cosim.compiled import own_plants  # noqa: PLC0415 a cold box starts without it
 
-    return of_process(program)
+    return own_plants.CompiledOwn(program) if isinstance(program, own_plants.Linear) else None

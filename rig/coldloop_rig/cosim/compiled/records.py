@@ -8,7 +8,6 @@ from typing import Any, Final, NamedTuple, get_args, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.declaration import Process
 from coldloop_control_plc.output_limits import Limits
 from coldloop_control_plc.scan import Scan, ScanConstants
 from coldloop_optimizer_plc.decisions import Latched, Starts
@@ -143,15 +142,3 @@ class Reports(NamedTuple):
     """Update, tick, tau_u, q, iterations."""
     values: NDArray[np.float32]
     """The numbers of `Optimization` from `j_effective` on."""
-
-
-def empty_trace(process: Process, station: int) -> Trace:
-    """Return room for a block, with so many columns of the station."""
-    sizes = len(process.inputs), len(process.outputs), len(process.states), station
-    rooms = (np.empty((BLOCK_TICKS, size), np.float32) for size in sizes)
-    return Trace(np.empty(BLOCK_TICKS, np.float32), *rooms)
-
-
-def empty_reports() -> Reports:
-    """Return room for the updates of a block."""
-    return Reports(np.empty((BLOCK_TICKS, 5), np.int64), np.empty((BLOCK_TICKS, 11), np.float32))

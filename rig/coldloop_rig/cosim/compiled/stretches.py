@@ -62,15 +62,15 @@ class CompiledStretches:
         """Whether the updates have a compiled form: solver, rule and estimator of our own, no forecast."""
         self._may_compile = may_compile
         self._is_there: dict[Callable[..., int], bool] = {}
-        self._trace = records.empty_trace(process, STATION_COLUMNS if plant.station else 0)
-        self._reports = records.empty_reports()
+        ticks, sizes = records.BLOCK_TICKS, [len(part) for part in (process.inputs, process.outputs, process.states)]
+        rooms = (np.empty((ticks, size), np.float32) for size in (*sizes, STATION_COLUMNS if plant.station else 0))
+        self._trace = records.Trace(np.empty(ticks, np.float32), *rooms)
+        self._reports = records.Reports(np.empty((ticks, 5), np.int64), np.empty((ticks, 11), np.float32))
         self._rows = np.zeros((2, SEQUENCE_ROWS, len(process.inputs)))
         self._scans = records.scan_records(control_plc.scan)
         self._pause_until = 0
         real = optimizer_plc.state.u.dtype
-        u_before, u, y, x, ahead = (
-            np.zeros(len(part), real) for part in (process.inputs, process.inputs, process.outputs, process.states, ())
-        )
+        u_before, u, y, x, ahead = (np.zeros(size, real) for size in (sizes[0], *sizes, 0))
         self._latched = Latched(0, 0, 0, real.type(0.0), u_before, u, y, x, ahead)
         self._world = records.World(
             compiled.constants, plant.biases, plant.deviations, np.array(load.times), np.array(load.watts),
