@@ -23,6 +23,7 @@ TRACE, UPDATES, EVENTS = "trace.parquet", "updates.parquet", "events.parquet"
 STATION: Final = "station.parquet"
 """Only where the plant is a refrigerator."""
 FILES: Final = (TRACE, UPDATES, EVENTS, STATION)
+REAL, WHOLE, LONG, TEXT = pa.float32(), pa.int32(), pa.int64(), pa.string()
 
 
 class Column(NamedTuple):
@@ -56,85 +57,75 @@ class RunFile(NamedTuple):
 @cache
 def files_of(process: Process) -> dict[str, RunFile]:
     """Return the files of a run of a process, by name."""
-    maps, tick = maps_of(process), process.tick_unit
+    maps = maps_of(process)
+    updates = "One row an update that no load step cut off; `verdict` says whether it was played"
+    station = "One row a tick: compression station and nitrogen; only where the plant is a refrigerator"
+    sample = maps.plant.block_of(StationSample).fields
+    signals = zip(STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, strict=True)
+    station_columns = (
+        *_when(process),
+        *(Column(name, REAL, unit, sample["signals"].description) for name, unit in signals),
+        Column("mode", WHOLE, "1", sample["mode"].description, StationMode),
+        Column("alarms", WHOLE, "1", sample["alarms"].description),
+    )
     return {
-        TRACE: RunFile(f"One row a tick of {tick}", _trace(process, maps)),
-        UPDATES: RunFile(
-            "One row an update that no load step cut off; `verdict` says whether it was played", _updates(process, maps)
-        ),
+        TRACE: RunFile(f"One row a tick of {process.tick_unit}", _trace(process, maps)),
+        UPDATES: RunFile(updates, _updates(process, maps)),
         EVENTS: RunFile("One row an event of the journals: modes, alarms, commands", _events(process, maps)),
-        STATION: RunFile(
-            "One row a tick: compression station and nitrogen; only where the plant is a refrigerator",
-            _station(process, maps),
-        ),
+        STATION: RunFile(station, station_columns),
     }
 
 
 def _when(process: Process) -> tuple[Column, Column]:
     return (
-        Column("tick", pa.int64(), "1", f"Tick since the start of the session, of {process.tick_unit}"),
+        Column("tick", LONG, "1", f"Tick since the start of the session, of {process.tick_unit}"),
         Column("time_s", pa.float64(), "s", "Plant time since the start of the session"),
     )
 
 
 _TAU_U: Final = Column("tau_u_s", pa.float64(), "s", "Updating period t_{i+1} - t_i")
 _DRIVING: Final = (
-    Column("mode", pa.string(), "", "Mode of the fail-safe ladder: mpc, rest, hold, classical, manual"),
-    Column("cause", pa.string(), "", "Why the control PLC is in this mode"),
-    Column("driver", pa.string(), "", "Whose inputs are applied: optimizer, loops, operator, or nobody (held)"),
-    Column("bad_sensors", pa.string(), "", "Outputs whose measurement the control PLC substitutes; empty when none"),
+    Column("mode", TEXT, "", "Mode of the fail-safe ladder: mpc, rest, hold, classical, manual"),
+    Column("cause", TEXT, "", "Why the control PLC is in this mode"),
+    Column("driver", TEXT, "", "Whose inputs are applied: optimizer, loops, operator, or nobody (held)"),
+    Column("bad_sensors", TEXT, "", "Outputs whose measurement the control PLC substitutes; empty when none"),
     Column("stage_cost", pa.float64(), "1", "Stage cost of what was reached: deviations and violations of the bands"),
 )
 """Columns of the control PLC's operating state, from its events, and of the stage cost."""
 
 
-def _physical(process: Process, maps: Maps) -> tuple[Column, ...]:
-    """Return load, inputs, outputs and states, in the order of the digest of a trace; then what sensors showed."""
-    load = maps.plant.block_of(PlantSample).fields["load"].description
-    return (
-        Column(process.load.column, pa.float32(), process.load.unit or "1", load),
-        *(
-            Column(one.name, pa.float32(), one.unit, f"{one.description}; applied from this tick on")
-            for one in process.inputs
-        ),
-        *(
-            Column(one.name, pa.float32(), one.unit,
-                   f"Output {one.name}: with the noise of its sensor, without a sensor fault")
-            for one in process.outputs
-        ),
-        *(Column(f"x_{one.name}", pa.float32(), one.unit, f"Simulated state {one.name}") for one in process.states),
-        *(
-            Column(f"{one.name}_measured", pa.float32(), one.unit,
-                   f"What the sensor of {one.name} showed, with its faults; null when it was no number")
-            for one in process.banded
-        ),
-    )  # fmt: skip
-
-
 def _trace(process: Process, maps: Maps) -> tuple[Column, ...]:
+    """Return load, inputs, outputs and states in the order of the digest; what sensors showed; mode and update."""
+    load = maps.plant.block_of(PlantSample).fields["load"].description
     update = maps.optimizer_plc.block_of(Optimization).fields
     outside = maps.plant.block_of(ModelRangeStatus).fields["outside"].description
+    output = "Output {}: with the noise of its sensor, without a sensor fault"
+    measured = "What the sensor of {} showed, with its faults; null when it was no number"
     return (
         *_when(process),
-        *_physical(process, maps),
+        Column(process.load.column, REAL, process.load.unit or "1", load),
+        *(Column(one.name, REAL, one.unit, f"{one.description}; applied from this tick on") for one in process.inputs),
+        *(Column(one.name, REAL, one.unit, output.format(one.name)) for one in process.outputs),
+        *(Column(f"x_{one.name}", REAL, one.unit, f"Simulated state {one.name}") for one in process.states),
+        *(Column(f"{one.name}_measured", REAL, one.unit, measured.format(one.name)) for one in process.banded),
         *_DRIVING,
-        Column("update", pa.int64(), "1", "Last update whose sequence was played; null before the first"),
+        Column("update", LONG, "1", "Last update whose sequence was played; null before the first"),
         _TAU_U,
-        Column("iterations", pa.int32(), "1", update["iterations"].description),
-        Column("J", pa.float32(), "1", update["j_effective"].description),
-        Column("model_range", pa.int32(), "1", outside),
+        Column("iterations", WHOLE, "1", update["iterations"].description),
+        Column("J", REAL, "1", update["j_effective"].description),
+        Column("model_range", WHOLE, "1", outside),
     )
 
 
 def _updates(process: Process, maps: Maps) -> tuple[Column, ...]:
     tick, time = _when(process)
     return (
-        Column("update", pa.int64(), "1", "Number of the update"),
+        Column("update", LONG, "1", "Number of the update"),
         tick._replace(description="Tick of the updating instant t_i"),
         time._replace(description="Plant time of the updating instant t_i"),
         _TAU_U,
         *(
-            Column(name, pa.float32() if field.kind.label == "float32" else pa.int32(), field.unit or "1",
+            Column(name, REAL if field.kind.label == "float32" else WHOLE, field.unit or "1",
                    field.description, Verdict if name == "verdict" else None)
             for name, field in maps.optimizer_plc.block_of(Optimization).fields.items()
             if name not in ("update", "tick", "tau_u")
@@ -145,32 +136,17 @@ def _updates(process: Process, maps: Maps) -> tuple[Column, ...]:
 def _events(process: Process, maps: Maps) -> tuple[Column, ...]:
     event = maps.control_plc.block_of(Event).fields
     return (
-        Column("service", pa.string(), "", "Whose journal: control_plc or plant"),
-        Column("number", pa.int64(), "1", event["number"].description),
-        Column("boot", pa.int32(), "1", event["boot"].description),
-        Column("utc", pa.string(), "", "UTC, ISO 8601 with milliseconds"),
+        Column("service", TEXT, "", "Whose journal: control_plc or plant"),
+        Column("number", LONG, "1", event["number"].description),
+        Column("boot", WHOLE, "1", event["boot"].description),
+        Column("utc", TEXT, "", "UTC, ISO 8601 with milliseconds"),
         *_when(process),
-        Column("kind", pa.string(), "", "What happened: mode, alarm raised, setpoint, ..."),
-        Column("subject", pa.string(), "", "The new mode, the alarm, the input, ...: depends on the kind"),
-        Column("cause", pa.string(), "", "Why; empty when there is no cause"),
-        Column("value", pa.float32(), "", "A value; null when the kind has none"),
-        Column("unit", pa.string(), "", "Unit of the value; empty when it has none"),
-        Column(
-            "who", pa.string(), "", "Client that made the request: address, role, certificate; empty if there is none"
-        ),
-    )
-
-
-def _station(process: Process, maps: Maps) -> tuple[Column, ...]:
-    fields = maps.plant.block_of(StationSample).fields
-    return (
-        *_when(process),
-        *(
-            Column(name, pa.float32(), unit, fields["signals"].description)
-            for name, unit in zip(STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, strict=True)
-        ),
-        Column("mode", pa.int32(), "1", fields["mode"].description, StationMode),
-        Column("alarms", pa.int32(), "1", fields["alarms"].description),
+        Column("kind", TEXT, "", "What happened: mode, alarm raised, setpoint, ..."),
+        Column("subject", TEXT, "", "The new mode, the alarm, the input, ...: depends on the kind"),
+        Column("cause", TEXT, "", "Why; empty when there is no cause"),
+        Column("value", REAL, "", "A value; null when the kind has none"),
+        Column("unit", TEXT, "", "Unit of the value; empty when it has none"),
+        Column("who", TEXT, "", "Client that made the request: address, role, certificate; empty if there is none"),
     )
 
 
@@ -211,20 +187,14 @@ def number_array(values: ArrayLike, kind: pa.DataType, unknown: NDArray[np.bool_
 def text_array(texts: Sequence[str | None], places: NDArray[np.int64] | None = None) -> pa.Array:
     """Return texts as an array; null where there is none.
 
-    Args:
-        texts: All texts that there are.
-        places: For each row which of them it has, in long runs; by default each is a row.
+    `places` are for each row which of the texts it has; by default each is a row.
     """
-    chosen = np.arange(len(texts)) if places is None else places
     raw = [(text or "").encode() for text in texts]
-    offsets = np.zeros(len(chosen) + 1, np.int32)
-    np.cumsum(np.array([len(text) for text in raw], int)[chosen], out=offsets[1:])
-    starts = np.flatnonzero(np.diff(chosen, prepend=-1))
-    lengths = np.diff(starts, append=len(chosen))
-    data = b"".join([raw[chosen[start]] * length for start, length in zip(starts, lengths, strict=True)])
-    known = np.array([text is not None for text in texts], bool)[chosen]
-    buffers = [pa.py_buffer(part) for part in (np.packbits(known, bitorder="little"), offsets, data)]
-    return pa.Array.from_buffers(pa.string(), len(chosen), buffers)
+    offsets = np.cumsum([0, *map(len, raw)], dtype=np.int32)
+    known = np.packbits(np.array([text is not None for text in texts], bool), bitorder="little")
+    buffers = [pa.py_buffer(part) for part in (known, offsets, b"".join(raw))]
+    array = pa.Array.from_buffers(pa.string(), len(raw), buffers)
+    return array if places is None else array.take(number_array(places, pa.int64()))
 
 
 def numbers_of(column: pa.Array) -> NDArray[np.float64]:

@@ -11,10 +11,9 @@ import tempfile
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Mapping, Sequence
-from functools import partial
 from io import FileIO
 from pathlib import Path
-from typing import Any, BinaryIO, Final, Generic, NamedTuple, TypeVar
+from typing import Any, BinaryIO, ClassVar, Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -104,12 +103,15 @@ GROUP_ROWS: Final = 16_384
 class _FileSink(Sink, Generic[T]):
     """Writes a file of a run, with the columns that are declared for its name, in row groups of `enough` rows."""
 
-    def __init__(self, path: Path, reserve: DiskReserve, process: Process, enough: int) -> None:
-        self._file = ReservedFile(path, reserve)
-        self._path, self._reserve, self._process, self._enough = path, reserve, process, enough
+    name: ClassVar[str]
+    enough: ClassVar[int] = GROUP_ROWS
+
+    def __init__(self, folder: Path, reserve: DiskReserve, process: Process) -> None:
+        self._file = ReservedFile(folder / self.name, reserve)
+        self._folder, self._reserve, self._process = folder, reserve, process
         self._taken: list[T] = []
         self._rows = 0
-        schema = files_of(process)[path.name].schema
+        schema = files_of(process)[self.name].schema
         self._writer = pq.ParquetWriter(
             pa.PythonFile(self._file, mode="w"), schema, compression="zstd", write_statistics=SEARCHED,
             use_dictionary=[field.name for field in schema if pa.types.is_string(field.type)],
@@ -124,10 +126,10 @@ class _FileSink(Sink, Generic[T]):
         """
         self._taken.append(part)
         self._rows += rows
-        if self._rows >= self._enough:
+        if self._rows >= self.enough:
             self._writer.write_table(self._table(self._group()))
             if self._reserve.released:
-                raise ResultsError(f"{self._path.parent}: the disk is full; what was recorded before is kept")
+                raise ResultsError(f"{self._folder}: the disk is full; what was recorded before is kept")
 
     def _group(self) -> list[T]:
         """Return what is written now."""
@@ -152,8 +154,11 @@ class _FileSink(Sink, Generic[T]):
 class TraceSink(_FileSink[SampleBlock]):
     """Writes `trace.parquet`."""
 
+    name = TRACE
+    enough = GROUP_TICKS + HELD_BACK_TICKS
+
     def __init__(self, folder: Path, reserve: DiskReserve, cost: StageCost) -> None:
-        super().__init__(folder / TRACE, reserve, cost.process, GROUP_TICKS + HELD_BACK_TICKS)
+        super().__init__(folder, reserve, cost.process)
         self._cost = cost
         self._driving = DrivingHistory(cost.process)
         self._updates: deque[Optimization] = deque()
@@ -185,38 +190,25 @@ class TraceSink(_FileSink[SampleBlock]):
         return table
 
 
-class _StationFile(_FileSink[SampleBlock]):
+class StationSink(_FileSink[SampleBlock]):
+    """Writes `station.parquet`; only for a plant that has a station."""
+
+    name = STATION
+    enough = GROUP_TICKS
+
     def block(self, block: SampleBlock) -> None:
-        self._take(block, len(block.load))
+        """Take ticks, if the station was read in them."""
+        if block.station.size:
+            self._take(block, len(block.load))
 
     def _table(self, parts: list[SampleBlock]) -> pa.Table:
         return station_table(joined(parts), self._process)
 
 
-class StationSink(Sink):
-    """Writes `station.parquet`, if there is a station."""
-
-    def __init__(self, folder: Path, reserve: DiskReserve, process: Process) -> None:
-        self._make = partial(_StationFile, folder / STATION, reserve, process, GROUP_TICKS)
-        self._file: _StationFile | None = None
-
-    def block(self, block: SampleBlock) -> None:
-        """Take ticks."""
-        if block.station.size:
-            self._file = self._file or self._make()
-            self._file.block(block)
-
-    def close(self) -> None:
-        """Write the rest."""
-        if self._file is not None:
-            self._file.close()
-
-
 class UpdatesSink(_FileSink[Optimization]):
     """Writes `updates.parquet`."""
 
-    def __init__(self, folder: Path, reserve: DiskReserve, process: Process) -> None:
-        super().__init__(folder / UPDATES, reserve, process, GROUP_ROWS)
+    name = UPDATES
 
     def update(self, update: Optimization) -> None:
         """Take an update."""
@@ -229,8 +221,7 @@ class UpdatesSink(_FileSink[Optimization]):
 class EventsSink(_FileSink[tuple[str, Event]]):
     """Writes `events.parquet`."""
 
-    def __init__(self, folder: Path, reserve: DiskReserve, process: Process) -> None:
-        super().__init__(folder / EVENTS, reserve, process, GROUP_ROWS)
+    name = EVENTS
 
     def event(self, service: str, event: Event) -> None:
         """Take an event."""
@@ -305,7 +296,11 @@ class DrivingHistory:
         """Return mode, cause, driver and bad sensors at these ticks, which are in a row."""
         starts = [state.tick for state in self._states[1:]]
         places = np.searchsorted(starts, ticks, side="right")
-        texts = [_texts(state, self.process.output_names) for state in self._states]
+        texts: list[tuple[str | None, ...]] = []
+        for _, mode, cause, outputs in self._states:
+            bad = " ".join(self.process.output_names[output] for output in sorted(outputs))
+            words = (None,) * 3 if mode is None else (Mode.word_of(mode), Cause.word_of(cause), DRIVERS.get(mode))
+            texts.append((*words, bad))
         return [text_array(each, places) for each in zip(*texts, strict=True)]
 
     def measured(self, ticks: NDArray[np.int64], y: NDArray[np.float32]) -> list[pa.Array]:
@@ -313,23 +308,20 @@ class DrivingHistory:
 
         `y` are outputs without faults, shape (N, outputs).
         """
-        shown = [self._shown(output, ticks, y[:, output].copy()) for output in self._faults]
-        return [number_array(column, pa.float32(), np.isnan(column)) for column in shown]
-
-    def _shown(self, output: int, ticks: NDArray[np.int64], values: NDArray[np.float32]) -> NDArray[np.float32]:
         first, end = int(ticks[0]), int(ticks[-1]) + 1
-        faults = self._faults[output]
-        for place, fault in enumerate(faults):
-            until = faults[place + 1].tick if place + 1 < len(faults) else end
-            begin = min(max(fault.tick - first, 0), len(values))
-            stop = min(max(until - first, 0), len(values))
-            if fault.kind == SensorFaultKind.FROZEN and first <= fault.tick < end:
-                # the value shown then: the output itself, or that of the previous fault
-                before = faults[place - 1] if place else None
-                self._held[output] = _shown_by(before, values[fault.tick - first], self._held[output])
-            if fault.kind and begin < stop:
-                values[begin:stop] = _shown_by(fault, 0.0, self._held[output])
-        return values
+        columns = []
+        for output, faults in self._faults.items():
+            values, before = y[:, output].copy(), None
+            for fault, until in zip(faults, [*(later.tick for later in faults[1:]), end], strict=False):
+                begin, stop = np.clip([fault.tick - first, until - first], 0, len(values))
+                if fault.kind == SensorFaultKind.FROZEN and first <= fault.tick < end:
+                    # the value shown then: the output itself, or that of the previous fault
+                    self._held[output] = _shown_by(before, values[fault.tick - first], self._held[output])
+                if fault.kind and begin < stop:
+                    values[begin:stop] = _shown_by(fault, 0.0, self._held[output])
+                before = fault
+            columns.append(number_array(values, pa.float32(), np.isnan(values)))
+        return columns
 
     def forget(self, tick: int) -> None:
         """Forget what concerns ticks before `tick` only."""
@@ -337,14 +329,6 @@ class DrivingHistory:
         del self._states[:keep]
         for faults in self._faults.values():
             del faults[: max(0, bisect_right([fault.tick for fault in faults], tick) - 1)]
-
-
-def _texts(state: Driving, output_names: Sequence[str]) -> tuple[str | None, ...]:
-    """Return mode, cause, driver and bad sensors."""
-    bad = " ".join(output_names[output] for output in sorted(state.bad))
-    if state.mode is None:
-        return None, None, None, bad
-    return Mode.word_of(state.mode), Cause.word_of(state.cause), DRIVERS.get(state.mode), bad
 
 
 def _shown_by(fault: SensorFaultRecord | None, true: float, held: float) -> float:
@@ -422,11 +406,9 @@ def events_table(events: Sequence[tuple[str, Event]], process: Process) -> pa.Ta
 
 
 def _of_rows(rows: Sequence[dict[str, Any]], file: RunFile) -> pa.Table:
-    return pa.table([_array([row[column.name] for row in rows], column.kind) for column in file.columns], file.schema)
-
-
-def _array(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
-    if pa.types.is_string(kind):
-        return text_array(values)
-    unknown = np.array([value is None for value in values], bool)
-    return number_array([0 if value is None else value for value in values], kind, unknown)
+    columns: list[Any] = []
+    for column in file.columns:
+        values, is_text = [row[column.name] for row in rows], pa.types.is_string(column.kind)
+        unknown = np.array([value is None for value in values], bool)
+        columns.append(text_array(values) if is_text else ([value or 0 for value in values], unknown))
+    return _of_arrays(columns, file)

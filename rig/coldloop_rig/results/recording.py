@@ -7,7 +7,7 @@ show a line, or keep all in memory.
 import hashlib
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from functools import partial
 from itertools import islice
@@ -70,15 +70,6 @@ class SampleBlock(NamedTuple):
     station: FloatArray = NO_STATION
     """Signals, mode and alarms of the compression station, shape (N, 21); (0, 0) for a cold box alone."""
 
-    @classmethod
-    def of(cls, samples: Sequence[PlantSample]) -> "SampleBlock":
-        """Return samples that follow each other as a block."""
-        pending = PendingTicks(samples[0].tick)
-        pending.extend(len(samples), samples[0])
-        for sample in samples:
-            pending.put(sample, None)
-        return pending.take(len(samples))
-
     def split(self, ticks: int) -> tuple["SampleBlock", "SampleBlock"]:
         """Return the first `ticks` ticks, and the rest."""
         parts = self[1:]
@@ -104,10 +95,10 @@ class SampleBlock(NamedTuple):
 class PendingTicks:
     """The newest ticks of a run, in a row, which may still be replaced; `first` is the oldest of them."""
 
-    def __init__(self, first: int = 0) -> None:
+    def __init__(self) -> None:
         self._parts: list[FloatArray] = []
         self._has_station = False
-        self.first, self.count = first, 0
+        self.first, self.count = 0, 0
 
     def extend(self, ticks: int, like: PlantSample | SampleBlock) -> None:
         """Add ticks of which nothing is known, of as many signals as a sample or a block has."""
@@ -381,21 +372,16 @@ class Recorder:
 
     def _settle(self) -> None:
         """Pass on the updates of which it is known that their sequence was played."""
-        for update in self._settled():
-            _all(*(partial(sink.update, update) for sink in self._sinks))
-
-    def _settled(self) -> Iterator[Optimization]:
-        done = self.next_tick
         while self._unsettled:
             update, *following = tuple(islice(self._unsettled, 2))
             end = update.tick + update.tau_u
             cut_off = bool(following) and following[0].tick < end
-            played = end < done and (bool(following) or self._closed or done >= end + SETTLED_TICKS)
-            if not cut_off and not played:
+            latest = end if following or self._closed else end + SETTLED_TICKS - 1
+            if not cut_off and self.next_tick <= latest:
                 return
             self._unsettled.popleft()
             if not cut_off:
-                yield update
+                _all(*(partial(sink.update, update) for sink in self._sinks))
 
 
 def _all(*calls: Callable[[], None]) -> None:

@@ -44,8 +44,6 @@ GONE: Final = frozenset(
 TAU_U: Final = "tau_u_s"
 DRAWN_TICKS: Final = 60_000
 """A longer trace is drawn by the least and the largest value of many ticks."""
-
-
 BANDS: Final = ("optimizer_plc.program.design.output_low", "optimizer_plc.program.design.output_high")
 BOUNDS: Final = ("limits.low", "limits.high")
 """Keys that have a number for each output with a band, and for each input."""
@@ -171,10 +169,14 @@ class RunFolder:
         Raises:
             UsageError: It cannot be read, or is larger than a run of so many ticks makes it, or has other types.
         """
-        path = self.held(name)
+        path, kinds = self.held(name), {one.name: one.kind for one in files_of(self.process)[name].columns}
         try:
             file = pq.ParquetFile(path)
-            wrong = self._excess(name, file.metadata, most) or self._other_type(name, file.schema_arrow)
+            wrong = self._excess(name, file.metadata, most)
+            for field in () if wrong else file.schema_arrow:
+                if field.type not in ({kinds[field.name]} if field.name in kinds else {*kinds.values()}):
+                    wrong = f"{printable(field.name[:MOST_TEXT])} is {str(field.type)[:80]}"
+                    break
             if not wrong and _has_long_text(path, file.schema_arrow):
                 wrong = f"a text of more than {MOST_TEXT} bytes"
         except (OSError, pa.ArrowException) as error:
@@ -195,14 +197,6 @@ class RunFolder:
             return f"{rows} rows; {most} at most are read into memory"
         if footer.num_columns > MOST_COLUMNS or size > SPARE_BYTES + ROW_BYTES * rows:
             return f"{footer.num_columns} columns of {size} bytes in {rows} rows"
-        return ""
-
-    def _other_type(self, name: str, schema: pa.Schema) -> str:
-        """Return which column has another type than in our file, or one that no column of it has."""
-        kinds = {column.name: column.kind for column in files_of(self.process)[name].columns}
-        for field in schema:
-            if field.type not in ({kinds[field.name]} if field.name in kinds else {*kinds.values()}):
-                return f"{printable(field.name[:MOST_TEXT])} is {str(field.type)[:80]}"
         return ""
 
     @cached_property
@@ -236,19 +230,23 @@ class RunFolder:
             raise UsageError(f"{self.path / name}: damaged, or of something else: {reason}") from None
 
     def series(self, columns: Sequence[str], longest: int = DRAWN_TICKS, file_name: str = TRACE) -> Curves:
-        """Return columns of the trace, or of another file with a row a tick, for drawing: `time_s` and these.
+        """Return columns of the trace, or of another file with a row a tick, for drawing, in constant memory.
 
-        It takes constant memory.
-
-        The updating period is drawn while it was in force: in other modes than MPC it is NaN.
-
+        They are `time_s` and those named. The updating period is NaN in other modes than MPC, where it is not in force.
         A trace of more than `longest` ticks is reduced to two points for each of `longest / 2` intervals.
         """
         names = ["time_s", *columns]
         with self.reading(file_name) as file:
             every = max(1, math.ceil(file.metadata.num_rows / (longest / 2))) if file.metadata.num_rows > longest else 1
             batches = file.iter_batches(batch_size=every * 4096, columns=[*names, "mode"] if TAU_U in names else names)
-            parts = [_reduced(_in_force(batch, names), every) for batch in batches]
+            parts = []
+            for part in (_in_force(batch, names) for batch in batches):
+                if every > 1:  # the least and the largest value of each interval
+                    starts = np.arange(0, len(part["time_s"]), every)
+                    for name, values in part.items():
+                        ends = np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
+                        part[name] = np.column_stack(ends).ravel()
+                parts.append(part)
             series = {name: np.concatenate([part[name] for part in parts] or [np.empty(0)]) for name in names}
             if not np.isfinite(series["time_s"]).all() or (np.diff(series["time_s"]) < 0).any():
                 raise ValueError("time_s does not rise")
@@ -293,17 +291,6 @@ def batch_series(batch: pa.RecordBatch) -> Curves:
     return {name: numbers_of(batch[name]) for name in batch.schema.names}
 
 
-def _reduced(series: Curves, every: int) -> Curves:
-    """Return for each interval of so many ticks the least and the largest value of each column."""
-    if every == 1:
-        return series
-    starts = np.arange(0, len(series["time_s"]), every)
-    return {
-        name: np.stack([np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)], axis=1).ravel()
-        for name, values in series.items()
-    }
-
-
 def export(run: Path, kind: str, out: Path, *, force: bool) -> list[Path]:
     """Write a run as `csv`, `mat` or `hdf5` into a folder; return the files.
 
@@ -328,6 +315,8 @@ def export(run: Path, kind: str, out: Path, *, force: bool) -> list[Path]:
 
 Writers = dict[str, Callable[[Path], object]]
 """Functions that write a file, by the file's name."""
+ABOUT: Final = ("complete", "started_utc", "coldloop", "way")
+"""Keys of the manifest that a MATLAB or HDF5 file has, too."""
 
 
 def _tables(run: RunFolder, most: int = LONGEST_TICKS) -> dict[str, pq.ParquetFile]:
@@ -361,7 +350,7 @@ def _mat(run: RunFolder) -> Writers:
             name: {column: shown(table[column]) for column in table.column_names} for name, table in tables.items()
         }
         content["units"] = {name: units_of(table.schema) for name, table in tables.items()}
-        content["run"] = {name: run.manifest[name] for name in ("complete", "started_utc", "coldloop", "way")}
+        content["run"] = {name: run.manifest[name] for name in ABOUT}
         with path.open("wb") as file:
             savemat(file, content, do_compression=True, long_field_names=True, oned_as="column")
 
@@ -377,30 +366,25 @@ def _hdf5(run: RunFolder) -> Writers:
 
     def write(path: Path) -> None:
         with h5py.File(path, "w") as target:
-            for name in ("complete", "started_utc", "coldloop", "way"):
+            for name in ABOUT:
                 target.attrs[name] = run.manifest[name]
             for name, file in _tables(run).items():
-                _fill(h5py, target.create_group(name), file)
+                for field in file.schema_arrow:
+                    fill(target.require_group(name), file, field)
 
-    return {"run.h5": write}
-
-
-def _fill(h5py: Any, group: Any, file: pq.ParquetFile) -> None:  # noqa: ANN401 h5py has no types
-    schema, rows = file.schema_arrow, file.metadata.num_rows
-    for field in schema:
-        kind = h5py.string_dtype() if pa.types.is_string(field.type) else field.type.to_pandas_dtype()
+    def fill(group: Any, file: pq.ParquetFile, field: pa.Field) -> None:  # noqa: ANN401 h5py has no types
+        kind = h5py.string_dtype() if (is_text := pa.types.is_string(field.type)) else field.type.to_pandas_dtype()
         if field.name in ("update", "iterations"):  # whole numbers that may be missing become numbers with NaN
             kind = np.float64
-        dataset = group.create_dataset(field.name, shape=(rows,), dtype=kind)
-        dataset.attrs["unit"] = field.metadata[b"unit"].decode()
-        dataset.attrs["description"] = field.metadata[b"description"].decode()
-    first = 0
-    for batch in file.iter_batches():
-        for field in schema:
-            values = batch[field.name]
-            column = (values.fill_null("") if pa.types.is_string(field.type) else values).to_numpy(zero_copy_only=False)
-            group[field.name][first : first + len(column)] = column
-        first += batch.num_rows
+        dataset, first = group.create_dataset(field.name, shape=(file.metadata.num_rows,), dtype=kind), 0
+        for key in ("unit", "description"):
+            dataset.attrs[key] = field.metadata[key.encode()].decode()
+        for batch in file.iter_batches(columns=[field.name]):
+            values = batch[field.name].fill_null("") if is_text else batch[field.name]
+            dataset[first : first + len(values)] = values.to_numpy(zero_copy_only=False)
+            first += len(values)
+
+    return {"run.h5": write}
 
 
 def units_of(schema: pa.Schema) -> dict[str, str]:

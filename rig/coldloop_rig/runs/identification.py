@@ -106,14 +106,10 @@ def read_record(run: RunFolder, model: LtiModel) -> Record:
 
 
 def responses(model: LtiModel, inputs: RealArray) -> RealArray:
-    """Return what each input and the load alone do to the outputs, from rest: means over samples of 5 s.
+    """Return what each input and the load alone do to the p outputs, from rest, as means over samples of 5 s.
 
-    Args:
-        model: n states, m inputs, p outputs.
-        inputs: Inputs and load applied from each tick on, shape (N, m + 1).
-
-    Returns:
-        Shape (N ticks in samples, p, m + 1), in the outputs' units.
+    `inputs` are the m inputs and the load applied from each of N ticks on, shape (N, m + 1). The result is in the
+    outputs' units, shape (N ticks in samples, p, m + 1).
     """
     moves = inputs - np.append(model.u0, model.w0)
     gains, feedthrough = np.column_stack([model.B_tick, model.F_tick]), np.column_stack([model.D, model.G])
@@ -135,16 +131,16 @@ def identify(model: LtiModel, record: Record) -> Identification:
     half = len(changes) // 2
     fit, held = slice(half), slice(half + window, None)  # no sample is in the windows of both
     spread = np.maximum(changes[fit].std(axis=0), record.sensors)
-    effects_fit, changes_fit = _centred(effects[fit]) / spread[:, np.newaxis], _centred(changes[fit]) / spread
+    effects_fit = (effects[fit] - effects[fit].mean(axis=0)) / spread[:, np.newaxis]
+    changes_fit = (changes[fit] - changes[fit].mean(axis=0)) / spread
     blocks = zip(np.array_split(effects_fit, BLOCKS), np.array_split(changes_fit, BLOCKS), strict=True)
     moments = [(np.einsum("kpi,kpj->ij", z, z), np.einsum("kpi,kp->i", z, y)) for z, y in blocks]
     reach = (np.abs(effects[fit]) / record.sensors[:, np.newaxis]).max(axis=(0, 1))
     begin, end = skipped * ticks, (skipped + half) * ticks
     moved = np.ptp(record.inputs[begin:end], axis=0)
     factors = _factors(model, moments, reach, moved)
-    errors = [_centred(changes[held] - effects[held] @ values) for values in (
-        np.ones(len(factors)), np.array([factor.value for factor in factors]))]  # fmt: skip
-    before, after = (np.sqrt((error**2).mean(axis=0)) for error in errors)
+    both = np.ones(len(factors)), np.array([factor.value for factor in factors])
+    before, after = ((changes[held] - effects[held] @ values).std(axis=0) for values in both)
     improved = bool(((after / spread) ** 2).sum() < ((before / spread) ** 2).sum())
     return Identification(factors, before, after, improved)
 
@@ -164,20 +160,13 @@ def _samples(rows: RealArray, ticks: int) -> RealArray:
     return np.asarray(rows[: count * ticks].reshape(count, ticks, -1).mean(axis=1))
 
 
-def _centred(rows: RealArray) -> RealArray:
-    return np.asarray(rows - rows.mean(axis=0))
-
-
 def _factors(
     model: LtiModel, moments: list[tuple[RealArray, RealArray]], reach: RealArray, moved: RealArray
 ) -> tuple[Factor, ...]:
     """Fit all identifiable factors; the least certain one is fixed at 1 first, which makes the others more certain.
 
-    Args:
-        model: Names inputs and load.
-        moments: Matrix (q, q) and right side (q,) of the normal equations of each block.
-        reach: Largest change by each input, over the sensor's standard deviation, shape (q,).
-        moved: By how much each moved, shape (q,).
+    `moments` are matrix (q, q) and right side (q,) of the normal equations of each block; `reach` (q,) is the largest
+    change by each input over the sensor's standard deviation, `moved` (q,) how far each moved.
     """
     names, units = (*model.input_names, model.load_name), (*model.input_units, model.load_unit)
     free = reach >= 1.0

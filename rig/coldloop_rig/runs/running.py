@@ -84,11 +84,12 @@ def json_digest(content: object) -> str:
 
 
 def _changed_inputs(manifest: dict[str, Any], folder: Path) -> list[str]:
-    copies = {name: entry for name, entry in manifest["inputs"].items() if entry and entry["file"] is not None}
     changed = [
         f"{folder / entry['file']}: is not the {name} that the run read"
-        for name, entry in copies.items()
-        if file_digest(held_file(folder, entry["file"], RESTORE), RESTORE) != entry.get("sha256")
+        for name, entry in manifest["inputs"].items()
+        if entry
+        and entry["file"] is not None
+        and file_digest(held_file(folder, entry["file"], RESTORE), RESTORE) != entry.get("sha256")
     ]
     if json_digest(manifest["configuration"]) != manifest["hashes"]["configuration_sha256"]:
         changed.append(f"{folder / 'manifest.json'}: the configuration is not the one that the run had")
@@ -101,7 +102,6 @@ DEPENDENCIES: Final = (
 
 
 def _now_utc() -> str:
-    """Return the time in ISO 8601, such as 2026-03-01T12:00:00.000Z."""
     return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
@@ -154,8 +154,7 @@ class RunFiles:
             if file.is_file() and file.resolve().is_relative_to((folder / INPUTS).resolve()):
                 raise UsageError(f"{file}: the run replaces what is in {folder}; name another --out")
         model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
-        process = settings.process
-        self.folder = folder
+        process, self.folder = settings.process, folder
         self._evaluation = RunEvaluation(model, design)
         self._discard()
         self._reserve = DiskReserve(folder)
@@ -167,12 +166,10 @@ class RunFiles:
             write_json(folder / "manifest.json", self._manifest)
             is_whole = settings.plant.kind is PlantKind.REFRIGERATOR
             write_json(folder / "schema.json", schema_document(process, station=is_whole))
-            files = (
-                TraceSink(folder, self._reserve, StageCost(model, design)),
-                UpdatesSink(folder, self._reserve, process),
-                EventsSink(folder, self._reserve, process),
-                StationSink(folder, self._reserve, process),
-            )
+            made = folder, self._reserve, process
+            trace = TraceSink(folder, self._reserve, StageCost(model, design))
+            files: list[Sink] = [trace, UpdatesSink(*made), EventsSink(*made)]
+            files += [StationSink(*made)] if is_whole else []
             failed.pop_all()
         self.recorder = Recorder(scenario.ticks, [self._evaluation, *files, *sinks])
 
@@ -249,7 +246,6 @@ class _FirstTick(Sink):
     """Lets a signal end a run in good order from its first tick on."""
 
     def sample(self, _: PlantSample) -> None:
-        """Take a tick."""
         INTERRUPTION.begun()
 
 
@@ -257,14 +253,9 @@ def make_scenario(settings: Settings, ticks: int | None = None) -> Scenario:
     """Return the scenario of a configuration; without a length it is that of the load."""
     name = settings.plant.load
     load = find_load(name, load_model(settings.model.file).w0, settings.process)
-    return Scenario(
-        ticks=ticks or natural_ticks(name, load),
-        load=load,
-        updating_period_s=settings.optimizer_plc.program.updating_period_s,
-        seed=settings.plant.seed,
-        realtime=settings.session.mode is TimeMode.REALTIME,
-        factor=settings.session.factor,
-    )
+    period_s, session = settings.optimizer_plc.program.updating_period_s, settings.session
+    realtime = session.mode is TimeMode.REALTIME
+    return Scenario(ticks or natural_ticks(name, load), load, period_s, settings.plant.seed, realtime, session.factor)
 
 
 def check_certificates(settings: Settings) -> None:
@@ -363,9 +354,8 @@ def _recorded_configuration(run: RunFolder) -> Configuration[Settings]:
             values.pop(key, None)
         elif key in values and named_families(str(values[key])) is None:
             raise UsageError(f"{run.path / 'manifest.json'}: {key}: the folder has no copy of it")
-    return load_configuration(
-        Settings, environment={}, options={key: (value, "manifest") for key, value in values.items()}
-    )
+    options = {key: (value, "manifest") for key, value in values.items()}
+    return load_configuration(Settings, environment={}, options=options)
 
 
 def _repeated_trace(effective: Configuration[Settings], scenario: Scenario, out: Path | None, *, force: bool) -> str:
@@ -409,7 +399,7 @@ def remarks(effective: Configuration[Settings]) -> list[str]:
         UsageError: In real time no answer would ever be there in time.
     """
     program, realtime = effective.settings.optimizer_plc.program, effective.settings.session.mode is TimeMode.REALTIME
-    process, budget = effective.settings.process, _budget(program)
+    process, (budget, _) = effective.settings.process, _budget(program)
     ticks = round(program.updating_period_s / process.tick_s)
     if realtime and ticks and not budget.is_enough(ticks):
         raise UsageError(
@@ -434,7 +424,7 @@ def remarks(effective: Configuration[Settings]) -> list[str]:
 
 def too_slow(program: ProgramSettings) -> str:
     """Return the remark that the PLC is too slow for the simulated controller; empty where it is fast enough."""
-    why = _budget(program).too_slow(round(program.updating_period_s / program.process.tick_s))
+    why = _budget(program)[0].too_slow(round(program.updating_period_s / program.process.tick_s))
     return why and (
         f"this PLC (P = {program.budget.power:g}) cannot do what is simulated: with {program.solver_name} {why}; "
         "one iteration is granted all the same (--enforce: not)"
@@ -447,12 +437,12 @@ def certificate(settings: Settings, *, only_lost: bool = False) -> str:
     Where it is adaptive or too short for the PLC it is the PLC's shortest. With `only_lost` it is empty where held.
     """
     limits, program, process, more = settings.limits, settings.optimizer_plc.program, settings.process, ""
-    reach, shortest_s = np.array([limits.low, limits.high, limits.rate]), _shortest_s(program)
+    reach, (budget, shortest_s) = np.array([limits.low, limits.high, limits.rate]), _budget(program)
     needs = waiting(load_model(settings.model.file), process, reach, limits.rate_share)
     fixed_s = program.updating_period_s
     rule = "adaptive.contraction" if program.adaptive.rule is RuleName.CONTRACTION else "adaptive"
     most = program.adaptive.contraction.q_max if rule == "adaptive.contraction" else program.adaptive.q_max
-    period_s, longest_s = max(fixed_s, shortest_s), _budget(program).times.period(most) * process.tick_s
+    period_s, longest_s = max(fixed_s, shortest_s), budget.times.period(most) * process.tick_s
     if not needs or (only_lost and period_s <= needs.limit_s):
         return ""
     if not fixed_s and longest_s > needs.longest_s >= shortest_s:
@@ -474,8 +464,8 @@ def enforced(effective: Configuration[Settings]) -> Configuration[Settings]:
         UsageError: The longest updating period is too short for the PLC, or the shortest too long for the plant.
     """
     program, tick_s = effective.settings.optimizer_plc.program, effective.settings.process.tick_s
-    shortest_s = _shortest_s(program)
-    if why := _budget(program).too_slow():
+    budget, shortest_s = _budget(program)
+    if why := budget.too_slow():
         raise UsageError(
             f"--enforce: with {program.solver_name} {why}; take a faster PLC "
             "(optimizer_plc.program.budget.power), another solver, or a longer sampling period"
@@ -488,10 +478,7 @@ def enforced(effective: Configuration[Settings]) -> Configuration[Settings]:
     return replace(effective, settings=settings, sources={**effective.sources, PERIOD: "--enforce"})
 
 
-def _shortest_s(program: ProgramSettings) -> float:
-    times = _budget(program).times
-    return shortest_period_s(times.slots + times.iteration, times.tick_s)
-
-
-def _budget(program: ProgramSettings) -> PlcBudget:
-    return PlcBudget(program.budget, program.iteration_s)
+def _budget(program: ProgramSettings) -> tuple[PlcBudget, float]:
+    """Return the budget of the PLC, and the shortest updating period that it takes, s."""
+    budget = PlcBudget(program.budget, program.iteration_s)
+    return budget, shortest_period_s(budget.times.slots + budget.times.iteration, budget.times.tick_s)
