@@ -435,8 +435,7 @@ def shipped_plans() -> list[ChaosPlan]:
 def find_plan(name: str, changes: dict[str, Any]) -> ChaosPlan:
     """Return a shipped plan, or that of a file, with some of its values changed.
 
-    Raises:
-        UsageError: There is no such plan, or something in it is wrong; one line that says what.
+    Raises UsageError: there is no such plan, or something in it is wrong; one line that says what.
     """
     shipped = SHIPPED / f"{name}.toml"
     if "/" not in name and shipped.is_file():
@@ -449,8 +448,7 @@ def find_plan(name: str, changes: dict[str, Any]) -> ChaosPlan:
 def find_link_plan(name: str, changes: dict[str, Any]) -> LinkPlan:
     """Return the plan of a proxy's link that a file holds, with some of its values changed.
 
-    Raises:
-        UsageError: There is no such file, or something in it is wrong; one line that says what.
+    Raises UsageError: there is no such file, or something in it is wrong; one line that says what.
     """
     return parsed_plan(LinkPlan, read_text(Path(name), REMEDY), name, changes)
 

@@ -270,10 +270,8 @@ def reset(writer: asyncio.StreamWriter) -> None:
 async def disturb(plan: LinkPlan, listen: tuple[str, int], target: Endpoint, say: Callable[[str], object]) -> None:
     """Pass frames on to a server, under the faults of a plan, until it is cancelled.
 
-    `say` is called with lines: where the proxy listens, faults that begin and end, refused connections.
-
-    Raises:
-        UsageError: It cannot listen at the address and port `listen`.
+    `say` is called with lines: where the proxy listens, faults that begin and end, refused connections. Raises
+    UsageError: it cannot listen at the address and port `listen`.
     """
     host, port = listen
     loop = asyncio.get_running_loop()

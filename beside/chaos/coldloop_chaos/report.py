@@ -152,11 +152,8 @@ def perform(
 ) -> Experiment:  # fmt: skip
     """Run a plan into a folder that is claimed, and the same without faults; a run that fails is evaluated as it is.
 
-    The values of the plan are recorded in the place of those of the configuration.
-
-    Raises:
-        LoadFileError: The load of the plan cannot be had.
-        ColdloopError: The run was interrupted, or failed before its first tick.
+    The values of the plan are recorded in the place of those of the configuration. Raises LoadFileError: the load of
+    the plan cannot be had; ColdloopError: the run was interrupted, or failed before its first tick.
     """
     settings = plan.with_plant(effective.settings)
     scenario = plan.scenario(load_model(settings.model.file).w0)

@@ -80,8 +80,7 @@ class Injector:
     def prepared(self, kind: str, parameters: Mapping[str, object], model: Path) -> faults.AnyFault:
         """Return a fault whose times the caller decides, and write the wrong model that it may need for this one.
 
-        Raises:
-            UsageError: There is no such fault, or a parameter is missing or wrong.
+        Raises UsageError: there is no such fault, or a parameter is missing or wrong.
         """
         if of_plan := [name for name in ("at_s", "duration_s", "offset_ms") if name in parameters]:
             raise UsageError(
@@ -462,8 +461,7 @@ async def conduct(
 ) -> None:  # fmt: skip
     """Run a plan on three services started for it; `trace`, a sink of the recorder, has what there was.
 
-    Raises:
-        LinkError: A service ended by itself, plant time stopped, or the run took too long.
+    Raises LinkError: a service ended by itself, plant time stopped, or the run took too long.
     """
     schedule, speed = plan.schedule(), plan.factor / 2 if plan.realtime else SLOWEST
     patience_s = 300.0 + plan.duration_s / speed + sum(60.0 + fault.duration_s / speed for fault in schedule)

@@ -358,10 +358,7 @@ def adaptive_gain(
 def over_best_fixed(costs: Array) -> tuple[int, Interval]:
     """Return which row is the best fixed period, and the cost of the first row, the adaptive one, over its.
 
-    Costs have a row for each period, a column for each load.
-
-    Raises:
-        StudyError: A loop costs nothing.
+    Costs have a row for each period, a column for each load. Raises StudyError: a loop costs nothing.
     """
     require_costs(costs)
     best = min(range(1, len(costs)), key=lambda which: geometric_mean(costs[which]))

@@ -128,8 +128,7 @@ class PlcProfile(BaseModel, frozen=True, extra="forbid", use_attribute_docstring
     def flops_per_s(self, length: float) -> float:
         """Return its speed in loops of this length.
 
-        Raises:
-            ConfigurationError: The file of the factorisations cannot be read.
+        Raises ConfigurationError: the file of the factorisations cannot be read.
         """
         if self.factorisations is not None:
             return fitted(*_times(self.factorisations)).flops_per_s(length)
@@ -144,8 +143,7 @@ def shipped_profiles() -> list[str]:
 def find_profile(name: str) -> PlcProfile:
     """Return a shipped profile, or that of a file.
 
-    Raises:
-        UsageError: There is none of this name, or something in it is wrong; one line that says what.
+    Raises UsageError: there is none of this name, or something in it is wrong; one line that says what.
     """
     if name in shipped_profiles():
         with as_file(SHIPPED) as folder:
@@ -244,11 +242,7 @@ class ExportCost(BaseModel, frozen=True, extra="ignore"):
 
 
 def read_cost(folder: Path) -> ExportCost:
-    """Return what an export needs, from its folder.
-
-    Raises:
-        UsageError: It is no export.
-    """
+    """Return what an export needs, from its folder. Raises UsageError: it is no export."""
     try:
         return ExportCost.model_validate(parsed_json(read_bytes(held_file(folder, MANIFEST, ""), "", most=MOST_BYTES)))
     except (UsageError, ValueError, ValidationError):
@@ -297,10 +291,7 @@ def misfits(cost: ExportCost, profile: PlcProfile) -> list[str]:
 def profile_of(cost: ExportCost, total_us: float) -> str:
     """Return the profile of a PLC that took so long for the iterations of the self-test, as TOML.
 
-    Its name and memory are for the user to fill in.
-
-    Raises:
-        UsageError: The export has no self-test of the solver.
+    Its name and memory are for the user to fill in. Raises UsageError: the export has no self-test of the solver.
     """
     if not cost.self_test:
         raise UsageError("--took: this export has no self-test of the solver alone; name the folder above it")

@@ -74,8 +74,7 @@ class Request(NamedTuple):
 def record_of(request: Request) -> tuple[str, list[str]]:
     """Return a record as CSV text, and what was assumed, done and dropped.
 
-    Raises:
-        UsageError: No record can be made of it; one line that says why.
+    Raises UsageError: no record can be made of it; one line that says why.
     """
     table = read_table(request.path, TIMES | TAGS | {*request.names}, "name the export of a historian")
     said = [f"read       {table.where}: {', '.join((f'{len(table.rows)} lines', *table.notes))}"]

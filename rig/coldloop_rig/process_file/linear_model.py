@@ -92,11 +92,7 @@ def with_disturbances(file: Process, found: Linearised) -> Linearised:
 
 
 def given_outputs(file: Process) -> Array:
-    """Return the outputs at the operating point, which the file gives.
-
-    Raises:
-        UsageError: It does not.
-    """
+    """Return the outputs at the operating point, which the file gives. Raises UsageError: it does not."""
     missing = next((one.name for one in file.outputs if one.at is None), None)
     if missing is not None:
         raise UsageError(f"outputs: {missing} needs at, its value at the operating point: this plant has no equations")
@@ -106,10 +102,8 @@ def given_outputs(file: Process) -> Array:
 def from_matrices(file: Process, folder: Path, given: str) -> Linearised:
     """Return the model whose matrices are given: dx/dt = A x + B u + F w, y = C x + D u + G w.
 
-    `given` is an NPZ or JSON file in the folder, or `file.py:NAME`, a state space.
-
-    Raises:
-        ColdloopError: It cannot be read, or does not fit the signals.
+    `given` is an NPZ or JSON file in the folder, or `file.py:NAME`, a state space. Raises ColdloopError: it cannot be
+    read, or does not fit the signals.
     """
     M = _of_state_space(file, folder, given) if ":" in given else _of_file(folder / given)
     missing = {"A", "B", "C"} - set(M)
@@ -183,11 +177,8 @@ def _of_state_space(file: Process, folder: Path, given: str) -> dict[str, Array]
 def realised(transfer: Any) -> dict[str, Array]:  # noqa: ANN401 types of python-control or SciPy
     """Return the matrices of transfer functions, with numerators and denominators as python-control or SciPy has them.
 
-    Inputs that act on an output with the same denominator share states: the observable companion form shows all of
-    them in that output (Kailath, Linear Systems, section 2.1).
-
-    Raises:
-        ValueError: One is not proper.
+    Inputs that act on an output with the same denominator share states: the observable companion form shows all of them
+    in that output (Kailath, Linear Systems, section 2.1). Raises ValueError: one is not proper.
     """
     from scipy.linalg import block_diag  # noqa: PLC0415 only what needs it loads it
 
@@ -214,8 +205,7 @@ def realised(transfer: Any) -> dict[str, Array]:  # noqa: ANN401 types of python
 def from_equations(file: Process, place: str, source: str, name: str) -> Linearised:
     """Return the model of a class with equations, where they rest, by central differences.
 
-    Raises:
-        ColdloopError: The class cannot be made, or does not rest: one line.
+    Raises ColdloopError: the class cannot be made, or does not rest: one line.
     """
     equations = plants.equations_of(source, name, place)
     u, w = operating_point(file)

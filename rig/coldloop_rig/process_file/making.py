@@ -59,11 +59,7 @@ class Made:
 
 
 def made_from(path: Path) -> Made:
-    """Return the model of a process file.
-
-    Raises:
-        ColdloopError: One line that names file, key and remedy.
-    """
+    """Return the model of a process file. Raises ColdloopError: one line that names file, key and remedy."""
     said = reading.read_process_file(path)
     file = with_units(said, path.parent)
     linear = linearised(file, path.parent)
@@ -91,8 +87,7 @@ def made_from(path: Path) -> Made:
 def linearised(file: Process, folder: Path) -> Linearised:
     """Return the model of a process whose file is in a folder.
 
-    Raises:
-        ColdloopError: The plant cannot be read, does not rest, or does not fit the signals: one line.
+    Raises ColdloopError: the plant cannot be read, does not rest, or does not fit the signals: one line.
     """
     plant = file.plant
     if plant.python is not None:
@@ -233,8 +228,7 @@ def _sizes(file: Process, states: int) -> ProblemSizes:
 def _check_fits(process: Process, linear: Linearised) -> None:
     """Check that the link exchanges a scan and an update in one request, and that sensors show the plant at rest.
 
-    Raises:
-        UsageError: One line that says what does not fit.
+    Raises UsageError: one line that says what does not fit.
     """
     inputs, outputs, states = len(process.inputs), len(process.outputs), len(process.states)
     words = {
@@ -300,8 +294,7 @@ MOST_FINDINGS: Final = 5
 def with_units(file: Process, folder: Path) -> Process:
     """Return a process file with units from its FMU's description where it gives none.
 
-    Raises:
-        ModelFileError: The FMU cannot be read, or a signal is no variable of it.
+    Raises ModelFileError: the FMU cannot be read, or a signal is no variable of it.
     """
     if file.plant.fmu is None:
         return file
@@ -320,8 +313,7 @@ def with_units(file: Process, folder: Path) -> Process:
 def from_fmu(file: Process, folder: Path, name: str) -> Linearised:
     """Return the linear model of an FMU at steady state: by its derivatives, by differences, or from a step test of it.
 
-    Raises:
-        ColdloopError: It cannot be run, or does not come to rest.
+    Raises ColdloopError: it cannot be run, or does not come to rest.
     """
     fmu = Fmu(folder / name)
     simulation, wiring = _at_rest(file, fmu, _wiring(file, fmu))
@@ -402,8 +394,7 @@ def _sample(file: Process, simulation: FmuSimulation) -> Array:
 def _at_rest(file: Process, fmu: Fmu, wiring: Wiring) -> tuple[FmuSimulation, Wiring]:
     """Return the FMU at rest with the inputs of the operating point, and how it gets there.
 
-    Raises:
-        UsageError: It does not.
+    Raises UsageError: it does not.
     """
     u, w = operating_point(file)
     simulation = FmuSimulation(fmu, wiring, file.tick_s)
@@ -430,8 +421,7 @@ def _at_rest(file: Process, fmu: Fmu, wiring: Wiring) -> tuple[FmuSimulation, Wi
 def _differentiated(file: Process, fmu: Fmu, wiring: Wiring, simulation: FmuSimulation) -> tuple[Array, str] | None:
     """Return derivatives of the states' rates and the outputs by states, inputs and load, and how; None without states.
 
-    Raises:
-        ModelFileError: It says that it has, and fails.
+    Raises ModelFileError: it says that it has, and fails.
     """
     names = [*wiring.states, *wiring.inputs, wiring.load, *wiring.disturbances]
     outputs = [fmu.port(name) for name in wiring.outputs]

@@ -38,11 +38,7 @@ OWN: Final = ("plants", "shipped_mimic", "iterations", "forecasts", "drawing")
 
 
 def read_process_file(path: Path) -> Process:
-    """Return what a process file says.
-
-    Raises:
-        ConfigurationError: One line that names file, key and remedy.
-    """
+    """Return what a process file says. Raises ConfigurationError: one line that names file, key and remedy."""
     file = load_configuration(Process, file=path, environment={}, option="FILE", listing=LISTING).settings
     if wrong := _wrong(file):
         raise ConfigurationError(f"{path}: {wrong}")
@@ -77,11 +73,7 @@ GROUP: Final = "coldloop.plants"
 
 
 def source_of(folder: Path, place: str) -> tuple[str, str]:
-    """Return the text of the file that `file.py:NAME` names, and the name.
-
-    Raises:
-        UsageError: It cannot be read.
-    """
+    """Return the text of the file that `file.py:NAME` names, and the name. Raises UsageError: it cannot be read."""
     file, _, name = place.partition(":")
     data = read_bytes(folder / file, "a plant's file is looked for beside the process file")
     try:
@@ -93,8 +85,7 @@ def source_of(folder: Path, place: str) -> tuple[str, str]:
 def installed_source(name: str) -> tuple[str, str]:
     """Return the text of the module of an entry point, and the name of its class.
 
-    Raises:
-        UsageError: There is none, or it has no source.
+    Raises UsageError: there is none, or it has no source.
     """
     there = entry_points(group=GROUP)
     if name not in there.names:
@@ -116,8 +107,7 @@ def installed_source(name: str) -> tuple[str, str]:
 def courses_of(file: Process, folder: Path) -> dict[str, Any]:
     """Return what a model file says of the disturbances among the plant's parameters; nothing if there are none.
 
-    Raises:
-        UsageError: A course cannot be read, or leaves the span: one line.
+    Raises UsageError: a course cannot be read, or leaves the span: one line.
     """
     if not file.disturbances:
         return {}
@@ -132,11 +122,7 @@ def courses_of(file: Process, folder: Path) -> dict[str, Any]:
 
 
 def forecasts_of(file: Process, folder: Path) -> tuple[Forecast, ...]:
-    """Return what the optimiser expects.
-
-    Raises:
-        UsageError: A forecast cannot be read, or leaves the span: one line.
-    """
+    """Return what the optimiser expects. Raises UsageError: a forecast cannot be read, or leaves the span: one line."""
     return tuple(
         Forecast(name=one.name, ticks=tuple(ticks), values=tuple(values))
         for one in file.outside
@@ -165,8 +151,7 @@ def _steps(one: Load | Disturbance, path: Path, tick_s: float) -> tuple[list[int
 def text_of_child(path: Path, work: Callable[[], str], limit_s: int) -> str:
     """Return what a child process returns, which does this work on a process file.
 
-    Raises:
-        ColdloopError: As the work does; or the child has crashed, or has taken longer than the limit.
+    Raises ColdloopError: as the work does; or the child has crashed, or has taken longer than the limit.
     """
     import multiprocessing  # noqa: PLC0415 a model file is read without
 
@@ -209,10 +194,8 @@ def _work(work: Callable[[], str], limit_s: int, folder: str, sender: "Connectio
 def model_file_of(path: Path, *, in_child: bool = False) -> tuple[Path, list[str]]:
     """Return the model file of a process file or a model file, and warnings; that of a process file is made now.
 
-    With `in_child` the plant runs in a process of its own, which ends it when it takes too long.
-
-    Raises:
-        ColdloopError: There is no such file, or no model can be made of it.
+    With `in_child` the plant runs in a process of its own, which ends it when it takes too long. Raises ColdloopError:
+    there is no such file, or no model can be made of it.
     """
     if not path.is_file():
         raise UsageError(f"{path}: no such file; name a process file or a model file")
@@ -262,10 +245,8 @@ PREFIX: Final = "mimic-"
 def drawing_of(path: Path, signals: Collection[str]) -> str:
     """Return the drawing of an SVG file as it is in the model file; texts such as {h1} in it show these signals.
 
-    Whatever is not drawing is left out, where an editor has written it, or refused, where it would act.
-
-    Raises:
-        UsageError: One line that names file, element and remedy.
+    Whatever is not drawing is left out, where an editor has written it, or refused, where it would act. Raises
+    UsageError: one line that names file, element and remedy.
     """
     root = _parsed(path)
     named = {one.get("id"): one for one in root.iter()}

@@ -93,8 +93,7 @@ class _Fit(NamedTuple):
 def identified(record: Record, order: int = 0) -> Identified:
     """Return the model that predicts a record best, or that of an order.
 
-    Raises:
-        UsageError: It is too short, or its inputs do not move enough, or together.
+    Raises UsageError: it is too short, or its inputs do not move enough, or together.
     """
     y_mean, y_scale = record.outputs.mean(axis=0), record.outputs.std(axis=0)
     u_scale = record.inputs.std(axis=0)
@@ -293,11 +292,7 @@ EVEN: Final = 0.01
 
 
 def from_step_test(file: Process, path: Path) -> Linearised:
-    """Return the model that a step test shows.
-
-    Raises:
-        UsageError: One line that names file, line and remedy.
-    """
+    """Return the model that a step test shows. Raises UsageError: one line that names file, line and remedy."""
     record, moved, table = _recorded(file, path)
     found = identified(record)
     used = {table.place(name) for name in (TIME, PIECE, *record.input_names, *file.output_names)}

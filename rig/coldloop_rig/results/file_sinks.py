@@ -40,8 +40,7 @@ FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 class DiskReserve:
     """An invisible file of `RESERVED_BYTES`, which the system frees at the latest when the program ends.
 
-    Raises:
-        UsageError: There is less free space than that.
+    Raises UsageError: there is less free space than that.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -120,9 +119,8 @@ class _FileSink(Sink, Generic[T]):
     def _take(self, part: T, rows: int = 1) -> None:
         """Take rows.
 
-        Raises:
-            OSError: They cannot be written.
-            ResultsError: The disk is full; what was written is whole, and the file can be closed.
+        Raises OSError: they cannot be written; ResultsError: the disk is full; what was written is whole, and the file
+        can be closed.
         """
         self._taken.append(part)
         self._rows += rows

@@ -27,8 +27,7 @@ _LOCKED: Final[dict[tuple[int, int], int]] = {}
 def claim_folder(folder: Path, *, force: bool) -> None:
     """Make the folder of a run, new or empty unless `force` is set, and keep other processes from it to our end.
 
-    Raises:
-        UsageError: It has files in it, it cannot be written to, or another process has claimed it.
+    Raises UsageError: it has files in it, it cannot be written to, or another process has claimed it.
     """
     if not str(folder).isprintable():
         raise UsageError(f"{str(folder)!a}: a name that cannot be printed; choose another --out")
@@ -61,8 +60,7 @@ def claim_folder(folder: Path, *, force: bool) -> None:
 def claim_folder_of_now(parent: Path, name: str) -> Path:
     """Make and return a new folder named after what is run and when; of two that begin in one second each has its own.
 
-    Raises:
-        UsageError: It cannot be written to.
+    Raises UsageError: it cannot be written to.
     """
     prepare_folder(parent)
     of_now = f"{name}-{datetime.now():%Y%m%d-%H%M%S}"  # noqa: DTZ005 the user's clock
@@ -89,8 +87,7 @@ def prepare_folder(folder: Path) -> None:
 def writing(place: Path, remedy: str = "choose another --out") -> Iterator[None]:
     """Have files written in this context, and be told in a line of one that cannot be.
 
-    Raises:
-        ResultsError: A file cannot be written.
+    Raises ResultsError: a file cannot be written.
     """
     try:
         yield

@@ -282,9 +282,8 @@ class Recorder:
     def sample(self, sample: PlantSample) -> None:
         """Take the next tick; or a later one, and those before it are unknown; or one of the last ones that came again.
 
-        Raises:
-            LinkError: A tick came again that is older than `KEPT_TICKS`.
-            ColdloopError: The run is to stop; the tick is recorded.
+        Raises LinkError: a tick came again that is older than `KEPT_TICKS`; ColdloopError: the run is to stop; the tick
+        is recorded.
         """
         place = sample.tick - self._pending.first
         if place < 0:
@@ -303,8 +302,7 @@ class Recorder:
     def stretch(self, block: SampleBlock, updates: Sequence[Optimization]) -> None:
         """Take the next ticks at once, and the updates that were reported in them; sinks see the last tick of them.
 
-        Raises:
-            ColdloopError: The run is to stop; the ticks are recorded.
+        Raises ColdloopError: the run is to stop; the ticks are recorded.
         """
         for update in updates:
             self.update(update)
@@ -344,9 +342,7 @@ class Recorder:
     def close(self) -> None:
         """Pass on what is left, and close all sinks, each of them even if another one fails.
 
-        Raises:
-            OSError: A sink could not write.
-            ColdloopError: The disk is full.
+        Raises OSError: a sink could not write; ColdloopError: the disk is full.
         """
         if not self._closed:
             self._closed = True

@@ -121,8 +121,7 @@ class _Manifest(_Part):
 class RunFolder:
     """Results on disk, of the present format.
 
-    Raises:
-        UsageError: There are none, or they are of another version, or damaged.
+    Raises UsageError: there are none, or they are of another version, or damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -166,8 +165,7 @@ class RunFolder:
     def file(self, name: str, most: int = LONGEST_TICKS) -> pq.ParquetFile:
         """Return a Parquet file of the run, of `most` rows at most, after a look at its footer and at its texts.
 
-        Raises:
-            UsageError: It cannot be read, or is larger than a run of so many ticks makes it, or has other types.
+        Raises UsageError: it cannot be read, or is larger than a run of so many ticks makes it, or has other types.
         """
         path, kinds = self.held(name), {one.name: one.kind for one in files_of(self.process)[name].columns}
         try:
@@ -203,8 +201,7 @@ class RunFolder:
     def process(self) -> Process:
         """The process that was run, as it was then.
 
-        Raises:
-            UsageError: Its declaration is none that this version makes.
+        Raises UsageError: its declaration is none that this version makes.
         """
         place = f"{self.path / str(self.manifest['inputs']['model']['file'])}: process"
         return process_in(self.model.get("process", {}), place, "use the version of Coldloop that made this run")
@@ -219,8 +216,7 @@ class RunFolder:
     def reading(self, name: str, most: int = LONGEST_TICKS) -> Iterator[pq.ParquetFile]:
         """Open a Parquet file of the run; a damaged one is a one-line error.
 
-        Raises:
-            UsageError: It cannot be read, or has other columns.
+        Raises UsageError: it cannot be read, or has other columns.
         """
         try:
             with self.file(name, most) as file:
@@ -294,9 +290,7 @@ def batch_series(batch: pa.RecordBatch) -> Curves:
 def export(run: Path, kind: str, out: Path, *, force: bool) -> list[Path]:
     """Write a run as `csv`, `mat` or `hdf5` into a folder; return the files.
 
-    Raises:
-        UsageError: There is no run, a file exists, or h5py is not installed.
-        ResultsError: A file cannot be written.
+    Raises UsageError: there is no run, a file exists, or h5py is not installed; ResultsError: a file cannot be written.
     """
     folder = RunFolder(run)
     paths = {out / name: write for name, write in _WRITERS[kind](folder).items()}

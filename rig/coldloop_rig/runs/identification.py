@@ -78,8 +78,7 @@ class Identification(NamedTuple):
 def read_record(run: RunFolder, model: LtiModel) -> Record:
     """Return what a run has measured of the signals of a model.
 
-    Raises:
-        UsageError: There is no trace, it is too short or has gaps, or the model has other signals.
+    Raises UsageError: there is no trace, it is too short or has gaps, or the model has other signals.
     """
     process = run.process
     if (model.input_names, model.output_names) != (process.input_names, process.output_names):

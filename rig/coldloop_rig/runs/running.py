@@ -140,9 +140,8 @@ NAMES: Final = (
 class RunFiles:
     """Opens the files of a run in a folder, whose earlier run is replaced; `recorder` fills them, `finish` ends them.
 
-    Raises:
-        UsageError: The disk is nearly full, or an input of the run lies in the folder.
-        OSError: A file cannot be made.
+    Raises UsageError: the disk is nearly full, or an input of the run lies in the folder; OSError: a file cannot be
+    made.
     """
 
     def __init__(
@@ -176,8 +175,7 @@ class RunFiles:
     def finish(self, error: BaseException | None, figure: FigureProcess) -> dict[str, Any]:
         """Close the files, and write summary, manifest and figures of what was recorded; return the summary.
 
-        Raises:
-            ColdloopError: The run is not complete: `error` ended it early, or a file cannot be written.
+        Raises ColdloopError: the run is not complete: `error` ended it early, or a file cannot be written.
         """
         try:
             self.recorder.close()
@@ -276,8 +274,7 @@ def run_into(
 ) -> dict[str, Any]:
     """Do a run in a folder that is claimed; return its summary.
 
-    Raises:
-        ColdloopError: The run is not complete; what was recorded is in the folder.
+    Raises ColdloopError: the run is not complete; what was recorded is in the folder.
     """
     stop = StopRequest()
     with INTERRUPTION.passed_to(stop):
@@ -395,8 +392,7 @@ PERIOD = "optimizer_plc.program.updating_period_s"
 def remarks(effective: Configuration[Settings]) -> list[str]:
     """Return what a user should know before a run, a line each; usually nothing.
 
-    Raises:
-        UsageError: In real time no answer would ever be there in time.
+    Raises UsageError: in real time no answer would ever be there in time.
     """
     program, realtime = effective.settings.optimizer_plc.program, effective.settings.session.mode is TimeMode.REALTIME
     process, (budget, _) = effective.settings.process, _budget(program)
@@ -460,8 +456,7 @@ def certificate(settings: Settings, *, only_lost: bool = False) -> str:
 def enforced(effective: Configuration[Settings]) -> Configuration[Settings]:
     """Return a configuration whose fixed updating period is as long as the PLC takes; an adaptive one always is.
 
-    Raises:
-        UsageError: The longest updating period is too short for the PLC, or the shortest too long for the plant.
+    Raises UsageError: the longest updating period is too short for the PLC, or the shortest too long for the plant.
     """
     program, tick_s = effective.settings.optimizer_plc.program, effective.settings.process.tick_s
     budget, shortest_s = _budget(program)
