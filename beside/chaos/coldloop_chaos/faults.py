@@ -433,10 +433,7 @@ def shipped_plans() -> list[ChaosPlan]:
 
 
 def find_plan(name: str, changes: dict[str, Any]) -> ChaosPlan:
-    """Return a shipped plan, or that of a file, with some of its values changed.
-
-    Raises UsageError: there is no such plan, or something in it is wrong; one line that says what.
-    """
+    """Return a shipped plan, or that of a file, with changes. Raises UsageError: there is none, or it is wrong."""
     shipped = SHIPPED / f"{name}.toml"
     if "/" not in name and shipped.is_file():
         return parsed_plan(ChaosPlan, shipped.read_text(encoding="utf-8"), name, changes)
@@ -446,10 +443,7 @@ def find_plan(name: str, changes: dict[str, Any]) -> ChaosPlan:
 
 
 def find_link_plan(name: str, changes: dict[str, Any]) -> LinkPlan:
-    """Return the plan of a proxy's link that a file holds, with some of its values changed.
-
-    Raises UsageError: there is no such file, or something in it is wrong; one line that says what.
-    """
+    """Return the plan of a proxy's link in a file, with changes. Raises UsageError: there is none, or it is wrong."""
     return parsed_plan(LinkPlan, read_text(Path(name), REMEDY), name, changes)
 
 

@@ -15,8 +15,7 @@ from coldloop_chaos import faults
 from coldloop_chaos.faults import LinkPlan
 from coldloop_rig.cosim.wiring import Detours, ReservedPorts, RigEndpoints
 
-UNIT: Final = 6
-"""Place of the unit in a frame; the function code is the next byte."""
+UNIT: Final = 6  # place of the unit in a frame; the function code is the next byte
 
 
 class FrameAction(NamedTuple):
@@ -109,8 +108,7 @@ HOST: Final = "127.0.0.1"
 CHUNK: Final = 4096
 MOST_FROZEN: Final = 64
 """Connections that are kept while nothing passes: those who try again and again would take up all files."""
-HALF_CLOSED_S: Final = 60.0
-"""Longest time that one direction may stay open alone, s."""
+HALF_CLOSED_S: Final = 60.0  # longest time that one direction may stay open alone, s
 _LINGER_NOT: Final = struct.pack("ii", 1, 0)
 
 

@@ -204,8 +204,7 @@ class ChaosProgress(PlantTimeBar):
         self._bar.refresh()
 
 
-MANY_MODES: Final = 8
-"""More modes than this are not all named in a table."""
+MANY_MODES: Final = 8  # more modes than this are not all named in a table
 
 
 def table(rows: Sequence[Row], process: Process) -> str:
@@ -300,8 +299,7 @@ def _cells(rows: Sequence[Row], process: Process) -> list[list[str]]:
     return cells
 
 
-MANY: Final = 24
-"""More faults than this are marked, but not named."""
+MANY: Final = 24  # more faults than this are marked, but not named
 
 
 def plot_chaos(path: Path, experiment: Experiment) -> None:

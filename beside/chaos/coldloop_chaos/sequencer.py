@@ -29,10 +29,8 @@ from coldloop_chaos.proxy import LinkProxies
 from coldloop_plant.cold_box.model import find_equilibrium, linearise
 from coldloop_plant.helium import load_helium
 from coldloop_plant.kinds import box_of
-from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.cosim import local_services, session, wiring
 from coldloop_rig.cosim.scenario import Scenario, with_copied_load
-from coldloop_rig.cosim.session import CONTACT_S, SessionClient
-from coldloop_rig.cosim.wiring import SERVICES, START_PATIENCE_S, retaining
 from coldloop_rig.results.recording import CONTROL, LinkStatistics, Recorder, Recording, Sink
 from coldloop_rig.settings import Settings
 
@@ -40,8 +38,7 @@ WRONG_MODEL: Final = "wrong_model.json"
 """File of the wrong model in the folder of a run."""
 MOVED_INPUTS: Final = (-3.0, -15.0, 2.0)
 """Shift of the wrong model's inputs from those of the right one: CV155 %, NCR22_A W, CV156 %."""
-GAIN: Final = 0.9
-"""Gains of the wrong model of other processes, over those of the right one."""
+GAIN: Final = 0.9  # gains of the wrong model of other processes, over those of the right one
 
 
 def save_wrong_model(right: Path, wrong: Path) -> None:
@@ -71,7 +68,7 @@ _SHOWN: Final = {"nan": SensorFaultKind.NOT_A_NUMBER, "frozen": SensorFaultKind.
 class Injector:
     """Acts on the processes, the links and the plant's sensors of one run, in whose folder is a wrong model."""
 
-    services: LocalServices
+    services: local_services.LocalServices
     links: LinkProxies
     plant: RegisterClient
     folder: Path
@@ -106,7 +103,7 @@ class Injector:
         elif isinstance(fault, faults.Restart):
             await self.services.stop(faults.SERVICE_OF[fault.process], signal.SIGTERM)
         elif isinstance(fault, faults.Pause | faults.Clock):
-            for service in filter(fault.processes.__contains__, SERVICES):
+            for service in filter(fault.processes.__contains__, wiring.SERVICES):
                 self.services.send(service, signal.SIGSTOP)
         elif isinstance(fault, faults.Sensor):
             await self._set_sensor(fault.output, SensorFault(_SHOWN[fault.shows], fault.value or 0.0))
@@ -128,7 +125,7 @@ class Injector:
             await self.services.start(service)
             return service
         elif isinstance(fault, faults.Pause | faults.Clock):
-            for service in filter(fault.processes.__contains__, SERVICES):
+            for service in filter(fault.processes.__contains__, wiring.SERVICES):
                 self.services.send(service, signal.SIGCONT)
         elif isinstance(fault, faults.Sensor):
             await self._set_sensor(fault.output, SensorFault(SensorFaultKind.NONE, 0.0))
@@ -161,7 +158,7 @@ async def _insisted(request: Callable[[], Awaitable[T]], what: str) -> T:
     reason = "no answer in time"
     for _ in range(20):
         try:
-            async with asyncio.timeout(CONTACT_S):
+            async with asyncio.timeout(session.CONTACT_S):
                 return await request()
         except (PeerUnreachableError, RequestRefusedError) as error:
             reason = str(error)
@@ -296,7 +293,7 @@ class ChaosTrace(Sink):
         return Recording(load[:, 0], u, y, x, [], LinkStatistics())
 
 
-def resident_mb(services: LocalServices) -> dict[str, float]:
+def resident_mb(services: local_services.LocalServices) -> dict[str, float]:
     """Return the resident memory of the services that run, where the system reports it (Linux)."""
     sizes = {}
     for service, process in services.processes.items():
@@ -310,8 +307,7 @@ def resident_mb(services: LocalServices) -> dict[str, float]:
 ShowProgress = Callable[[int, LadderStatus | None, list[str]], None]
 """Takes the plant's tick, the state of the control PLC (None while it does not answer), and the faults that are on."""
 
-STANDSTILL_PATIENCE_S: Final = 60.0
-"""A rig that does not move for so long without a fault is given up."""
+STANDSTILL_PATIENCE_S: Final = 60.0  # a rig that does not move for so long without a fault is given up
 RESTART_PATIENCE_S: Final = 90.0
 PRESENCE_S: Final = 10.0
 """Longest real time after a fault, in lock-step, until the control PLC detects the optimiser, s."""
@@ -324,8 +320,8 @@ class FaultSequencer:
     """Takes a session from fault to fault."""
 
     plan: faults.ChaosPlan
-    services: LocalServices
-    client: SessionClient
+    services: local_services.LocalServices
+    client: session.SessionClient
     injector: Injector
     trace: ChaosTrace
     progress: ShowProgress
@@ -353,7 +349,7 @@ class FaultSequencer:
     def finish(self) -> None:
         """Record the state at the end, however the run ended."""
         self.trace.seconds = self._seconds
-        logs = {service: self.services.log(service).read_bytes() for service in SERVICES}
+        logs = {service: self.services.log(service).read_bytes() for service in wiring.SERVICES}
         self.trace.log_lines = {service: len(log.splitlines()) for service, log in logs.items()}
         self.trace.lost_contacts = self.client.lost_contacts
 
@@ -451,8 +447,7 @@ class FaultSequencer:
             await asyncio.sleep(LOOK_S)
 
 
-SLOWEST: Final = 20.0
-"""Seconds of plant time in a second that lock-step should reach with proxies and all."""
+SLOWEST: Final = 20.0  # seconds of plant time in a second that lock-step should reach with proxies and all
 
 
 async def conduct(
@@ -470,11 +465,11 @@ async def conduct(
     copied = with_copied_load(settings, scenario.load, folder)
     async with contextlib.AsyncExitStack() as stack:
         links = LinkProxies(str(plan.seed))
-        retained = retaining(copied, folder, always=True)
-        services = await stack.enter_async_context(LocalServices(retained, folder / "logs", links=links))
-        client = SessionClient(services.endpoints, settings, tolerant=True)
+        retained = wiring.retaining(copied, folder, always=True)
+        services = await stack.enter_async_context(local_services.LocalServices(retained, folder / "logs", links=links))
+        client = session.SessionClient(services.endpoints, settings, tolerant=True)
         stack.callback(client.close)
-        await services.during(client.connect(START_PATIENCE_S))
+        await services.during(client.connect(wiring.START_PATIENCE_S))
         await links.connect()
         await services.during(client.begin(scenario, recorder))
         injector = Injector(services, links, client.plant, folder)

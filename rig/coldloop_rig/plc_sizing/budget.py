@@ -92,8 +92,7 @@ def footprint(problem: PredictiveProblem, estimator: int, solver: SolverName) ->
 
 
 ROUNDING = 1e-9
-MANY = 1000
-"""Number of variables from which on it is not printed."""
+MANY = 1000  # number of variables from which on it is not printed
 
 
 class Capacity(NamedTuple):

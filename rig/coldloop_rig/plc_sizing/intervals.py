@@ -26,9 +26,7 @@ from numpy.typing import ArrayLike
 from scipy.special import betaincinv, stdtrit
 
 from coldloop.errors import ConfigurationError, StudyError
-from coldloop.process.declaration import Process
-from coldloop.process.lti_model import load
-from coldloop.process.updating_periods import SHORTEST_TICKS
+from coldloop.process import declaration, lti_model, updating_periods
 from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.qp.costs import augmented_cost
 from coldloop_optimizer_plc.qp.linear_algebra import Array
@@ -44,10 +42,8 @@ from coldloop_rig.results.recording import Recorder
 from coldloop_rig.settings import Settings
 from coldloop_rig.text_tables import aligned
 
-TAIL: Final = 0.025
-"""Probability on each side of an interval."""
-MOST_CHANGE: Final = 2.0
-"""Change of a logarithm when a draw is left out, up to which it is taken for smooth."""
+TAIL: Final = 0.025  # probability on each side of an interval
+MOST_CHANGE: Final = 2.0  # change of a logarithm when a draw is left out, up to which it is taken for smooth
 
 
 class Interval(NamedTuple):
@@ -173,8 +169,7 @@ FAMILIES: Final = "abcdef"
 SCENARIO_TICKS: Final = 3600
 LONGEST: Final = 200
 """Iterations after which a problem counts as not solved: those of 5 s at ten times the power of the PLC."""
-OWN_SEEDS: Final = 10**9
-"""First seed of the scenarios: no named load has one so large."""
+OWN_SEEDS: Final = 10**9  # first seed of the scenarios: no named load has one so large
 
 
 class Problem(NamedTuple):
@@ -227,7 +222,7 @@ def scenario_problems(settings: Settings, number: int) -> list[Problem]:
     draw = random.Random(OWN_SEEDS + number)  # noqa: S311 not for secrets; the one generator stable over versions
     hour = draw.choice(FAMILIES)
     family = HOURS[hour]._replace(seed=OWN_SEEDS + number)
-    profile = drawn(family, hour, load(settings.model.file).w0, settings.process)
+    profile = drawn(family, hour, lti_model.load(settings.model.file).w0, settings.process)
     problems: list[Problem] = []
     scenario = Scenario(SCENARIO_TICKS, profile, 0.0, number)
     run_ideal_loop(
@@ -304,7 +299,7 @@ ADAPTIVE: Final = 0.0
 
 def loop_cost(settings: Settings, name: str, period_s: float, run: Callable[[Scenario, Recorder], None]) -> float:
     """Return J_BF under a load, a named one or a file, with what runs a scenario."""
-    model = load(settings.model.file)
+    model = lti_model.load(settings.model.file)
     profile = find_load(name, model.w0, settings.process)
     scenario = Scenario(natural_ticks(name, profile), profile, period_s, settings.plant.seed)
     recorder = Recorder(scenario.ticks)
@@ -325,10 +320,10 @@ SHARES: Final = (0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
 """Updating periods that are compared unless one is given, as shares of the sampling period."""
 
 
-def fixed_periods(process: Process) -> tuple[float, ...]:
+def fixed_periods(process: declaration.Process) -> tuple[float, ...]:
     """Return the updating periods, s, that are compared."""
     ticks = sorted({round(share * process.ticks_per_sample) for share in SHARES})
-    return tuple(each * process.tick_s for each in ticks if each >= SHORTEST_TICKS)
+    return tuple(each * process.tick_s for each in ticks if each >= updating_periods.SHORTEST_TICKS)
 
 
 def adaptive_gain(

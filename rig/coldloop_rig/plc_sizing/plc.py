@@ -83,10 +83,8 @@ def slow_down(times: CholeskyTimes, size: float) -> float:
 
 LISTING: Final = "`coldloop docs keys` lists the keys"
 SHIPPED: Final = files("coldloop_rig.plc_sizing") / "profiles"
-FEWEST_SIZES: Final = 3
-"""Fewest sizes with a measured factorisation time, for a curve of three coefficients."""
-TIMES_HEADER: Final = ("size", "plc_ms")
-"""First columns of a file of factorisation times."""
+FEWEST_SIZES: Final = 3  # fewest sizes with a measured factorisation time, for a curve of three coefficients
+TIMES_HEADER: Final = ("size", "plc_ms")  # first columns of a file of factorisation times
 
 LARGEST_SIZE: Final = 10_000
 SHORTEST_MS, LONGEST_MS = 1e-6, 1e9
@@ -126,10 +124,7 @@ class PlcProfile(BaseModel, frozen=True, extra="forbid", use_attribute_docstring
         return self
 
     def flops_per_s(self, length: float) -> float:
-        """Return its speed in loops of this length.
-
-        Raises ConfigurationError: the file of the factorisations cannot be read.
-        """
+        """Return its speed in loops of this length. Raises ConfigurationError: the factorisations cannot be read."""
         if self.factorisations is not None:
             return fitted(*_times(self.factorisations)).flops_per_s(length)
         return 1e9 / self.overhead / (self.operation_ns or math.inf)  # one of both is given
@@ -141,10 +136,7 @@ def shipped_profiles() -> list[str]:
 
 
 def find_profile(name: str) -> PlcProfile:
-    """Return a shipped profile, or that of a file.
-
-    Raises UsageError: there is none of this name, or something in it is wrong; one line that says what.
-    """
+    """Return a shipped profile, or that of a file. Raises UsageError: there is none, or something in it is wrong."""
     if name in shipped_profiles():
         with as_file(SHIPPED) as folder:
             return _read(folder / f"{name}.toml")

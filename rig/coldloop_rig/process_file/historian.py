@@ -7,13 +7,12 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
 from coldloop.table import TIME, Table, is_good, plain, read_table
+from coldloop_rig.process_file.linear_model import Array
 from coldloop_rig.process_file.step_test import PIECE
 
-Array = NDArray[np.float64]
 Frame = Any
 """A table or column of pandas, which ships no complete types."""
 
@@ -39,20 +38,16 @@ UNITS: Final = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
 DAYS: Final = (20_000.0, 80_000.0)
 """Range of a spreadsheet's times, days since 1900, where they are closer to each other than DAY_STEP."""
 DAY_STEP: Final = 0.01
-GAP: Final = 5.0
-"""Periods without a reading beyond which a record is cut, unless another gap is given."""
+GAP: Final = 5.0  # periods without a reading beyond which a record is cut, unless another gap is given
 BY_CHANGE: Final = 2.0
 """Periods between the readings of an input beyond which they are its changes, so that no reading is missing."""
 MISSING: Final = 1.5
 """Usual periods of an input beyond which a reading is missing: if it steps there, it is not known when, ..."""
 STEP: Final = 0.1
 """... a step being so much of its standard deviation."""
-SNAP: Final = 0.01
-"""Part by which a usual period is off a number of two digits that is meant."""
-EARLY: Final = 1e-3
-"""Part of a period by which the time of a reading may be rounded up."""
-FEWEST: Final = 10
-"""Rows of a piece."""
+SNAP: Final = 0.01  # part by which a usual period is off a number of two digits that is meant
+EARLY: Final = 1e-3  # part of a period by which the time of a reading may be rounded up
+FEWEST: Final = 10  # rows of a piece
 
 
 class Request(NamedTuple):
@@ -72,10 +67,7 @@ class Request(NamedTuple):
 
 
 def record_of(request: Request) -> tuple[str, list[str]]:
-    """Return a record as CSV text, and what was assumed, done and dropped.
-
-    Raises UsageError: no record can be made of it; one line that says why.
-    """
+    """Return a record as CSV text, and what was assumed, done and dropped. Raises UsageError: none can be made."""
     table = read_table(request.path, TIMES | TAGS | {*request.names}, "name the export of a historian")
     said = [f"read       {table.where}: {', '.join((f'{len(table.rows)} lines', *table.notes))}"]
     readings = _good(_readings(table, request, said), table, request, said)
@@ -242,7 +234,6 @@ def _unit_s(numbers: Array, table: Table) -> float:
 
 
 def _record(signals: Mapping[str, tuple[Array, Array]], request: Request, said: list[str]) -> str:
-    """Return the record of signals, each with its times and values."""
     usual = {name: float(np.median(np.diff(times))) for name, (times, _) in signals.items()}
     longest = max(each for name, each in usual.items() if name not in request.inputs)
     meant = float(f"{longest:.2g}")

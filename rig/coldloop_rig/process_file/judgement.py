@@ -5,26 +5,21 @@ from math import log
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.sections import Bath, Input, Output
 from coldloop.text import ends_text, number_text
 from coldloop_rig.plc_sizing.holding import NOTHING, digits_last_s, leaves_its_band, shortest_period_s, waiting
+from coldloop_rig.process_file.linear_model import Array
 from coldloop_rig.process_file.making import Made
 from coldloop_rig.process_file.step_test import LEVEL, half_widths
 
-Array = NDArray[np.float64]
-
-ROUGH: Final = 1e-4
-"""Error of the derivatives from which on the plant has a kink, or noise, at its operating point."""
-SMALL: Final = 1e-6
-"""Singular value, over the largest, below which a direction counts as none."""
+ROUGH: Final = 1e-4  # error of the derivatives from which on the plant has a kink, or noise, at its operating point
+SMALL: Final = 1e-6  # singular value, over the largest, below which a direction counts as none
 SHARE: Final = 0.01
 """Largest step of a signal in single precision, over its rate or its band, with which it can be controlled."""
-INVERSE: Final = 0.1
-"""Inverse response, over the final change, from which on it is reported."""
+INVERSE: Final = 0.1  # inverse response, over the final change, from which on it is reported
 
 
 def described(made: Made) -> str:
@@ -166,7 +161,7 @@ def _unstable(made: Made, growth: float) -> list[str]:
 
 
 def _exchanged(model: LtiModel, bath: Bath, horizon_s: float) -> list[str]:
-    """Return what a control engineer would want to know of the outputs that are named, in words."""
+    """Return which outputs of a bath seem exchanged, in words."""
     values, modes = np.linalg.eig(model.A[np.ix_(model.moved, model.moved)])
     slowest = int(np.argmin(np.abs(values)))
     shown = np.abs(model.C[:, model.moved] @ modes[:, slowest])
@@ -179,7 +174,6 @@ def _exchanged(model: LtiModel, bath: Bath, horizon_s: float) -> list[str]:
 
 
 def _warnings(made: Made) -> list[str]:
-    """Return what a control engineer would want to know, in words."""
     m, process, found = made.model, made.process, list[str]()
     sample_s, tick_s, lags = process.sampling_period_s, process.tick_s, made.linear.parameters.get("lags", ())
     poles = np.linalg.eigvals(made.own_A)

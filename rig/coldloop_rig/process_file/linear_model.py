@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from io import BytesIO
 from math import factorial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 from zipfile import BadZipFile
 
 import numpy as np
@@ -19,16 +19,46 @@ from coldloop_plant import own_plants as plants
 from coldloop_plant.equilibrium import Linear, central_differences
 from coldloop_rig.process_file.reading import source_of
 
-if TYPE_CHECKING:
-    from coldloop_rig.process_file.step_test import Identified, Record
-
 Array = NDArray[np.float64]
 
 STEP: Final = 1e-5
 """Step of differences, over the size of the variable."""
-AT_REST: Final = 1e-8
-"""Largest change of a state in a sampling period, over its size, that still counts as rest."""
+AT_REST: Final = 1e-8  # largest change of a state in a sampling period, over its size, that still counts as rest
 REMEDY: Final = "write it with numpy.savez(A=..., ...), or as JSON"
+
+
+class Record(NamedTuple):
+    """Record of inputs and outputs at N equidistant times: each row's inputs hold until the next one."""
+
+    period_s: float
+    inputs: Array
+    """Shape (N, m)."""
+    outputs: Array
+    """Shape (N, p)."""
+    operating: Array
+    """Inputs at the operating point, shape (m,); what integrates does not move there."""
+    input_names: tuple[str, ...]
+    where: str
+    """Names it in messages."""
+    pieces: tuple[slice, ...] = (slice(None),)
+    """Rows without a gap between them, in order."""
+
+
+class Identified(NamedTuple):
+    """dx/dt = A x + B u, y = C x + constant, with u in deviations from the operating point."""
+
+    A: Array
+    """Shape (n, n), per second."""
+    B: Array
+    """Shape (n, m)."""
+    C: Array
+    """Shape (p, n)."""
+    constant: Array
+    """Outputs at rest at the operating point, if the plant rests: shape (p,)."""
+    rests: bool
+    """Whether all modes decay, within the length of the record."""
+    fit: Array
+    """Share of each output's variation on the data held back that is explained, 1 is all: 1 - rms error / deviation."""
 
 
 class Linearised(NamedTuple):
@@ -59,7 +89,7 @@ class Linearised(NamedTuple):
     """Error of the derivatives: difference from those with steps twice as wide, over the largest of each column."""
     notes: tuple[str, ...] = ()
     """Notes on how the model was found, one line each."""
-    record: "tuple[Record, Identified] | None" = None
+    record: tuple[Record, Identified] | None = None
     """Record from which it was identified, and the result; None if it was not identified."""
 
 
@@ -153,11 +183,8 @@ def _of_state_space(file: Process, folder: Path, given: str) -> dict[str, Array]
     space = plants.made_by(*source_of(folder, given), given)
     if getattr(space, "dt", None) not in (None, 0):
         raise UsageError(f"{given}: has a sampling time of {space.dt} s; give it in continuous time")
-    with foreign(
-        f"{given}: no state space with A, B, C and D",
-        "make one with control.ss(...), or SciPy's to_ss()",
-        kind=UsageError,
-    ):
+    remedy = "make one with control.ss(...), or SciPy's to_ss()"
+    with foreign(f"{given}: no state space with A, B, C and D", remedy, kind=UsageError):
         if not hasattr(space, "A") and (hasattr(space, "num") or hasattr(space, "to_tf")):
             M = realised(space if hasattr(space, "num") else space.to_tf())
         else:
@@ -203,10 +230,7 @@ def realised(transfer: Any) -> dict[str, Array]:  # noqa: ANN401 types of python
 
 
 def from_equations(file: Process, place: str, source: str, name: str) -> Linearised:
-    """Return the model of a class with equations, where they rest, by central differences.
-
-    Raises ColdloopError: the class cannot be made, or does not rest: one line.
-    """
+    """Return the model of a class where it rests, by central differences. Raises ColdloopError: it does not rest."""
     equations = plants.equations_of(source, name, place)
     u, w = operating_point(file)
     n, m, p = len(equations.states), len(u), len(file.outputs)
@@ -291,29 +315,23 @@ def from_lags(file: Process, plant: PlantSource) -> Linearised:
 
 
 def lag_model(lag: Lag) -> tuple[Array, Array, Array]:
-    """Return A (k, k), b (k,), c (k,) of one lag, its dead time by a Pade approximation, its state last."""
+    """Return A (k, k), b (k,), c (k,) of one lag, its dead time by a Pade approximation, its state last.
+
+    The diagonal approximation of exp(-delay s) is in companion form, scaled by time (Golub and Van Loan, Matrix
+    Computations, section 9.3).
+    """
     rate = 1.0 / lag.time_constant_s
     if lag.delay_s == 0.0:
         return np.array([[-rate]]), np.array([lag.gain * rate]), np.ones(1)
-    a, b, c, d = _dead_time(lag.delay_s)
-    k = len(a)
-    A = np.zeros((k + 1, k + 1))
-    A[:k, :k], A[k, :k], A[k, k] = a, lag.gain * rate * c, -rate
-    return A, np.array([*b, lag.gain * rate * d]), np.array([*np.zeros(k), 1.0])
-
-
-def _dead_time(delay_s: float) -> tuple[Array, Array, Array, float]:
-    """Return the state space of the diagonal Pade approximation of exp(-delay s), in companion form, scaled by time.
-
-    Golub and Van Loan, Matrix Computations, section 9.3.
-    """
     k = 2  # order of the approximation in the prediction model; the simulated plant has dead times exactly
     share = np.array([
         factorial(2 * k - j) * factorial(k) / (factorial(2 * k) * factorial(j) * factorial(k - j)) for j in range(k + 1)
     ])  # fmt: skip
     below = share / share[k]  # rising powers of s times the delay
     above = below * (-1.0) ** np.arange(k + 1)
-    d = above[k]
-    a = np.eye(k, k=1)
+    a, c, gain = np.eye(k, k=1), above[:k] - above[k] * below[:k], lag.gain * rate
     a[-1] = -below[:k]
-    return a / delay_s, np.array([*np.zeros(k - 1), 1.0]) / delay_s, above[:k] - d * below[:k], d
+    A = np.zeros((k + 1, k + 1))
+    A[:k, :k], A[k, :k], A[k, k] = a / lag.delay_s, gain * c, -rate
+    b = np.array([*np.zeros(k - 1), 1.0]) / lag.delay_s
+    return A, np.array([*b, gain * above[k]]), np.array([*np.zeros(k), 1.0])

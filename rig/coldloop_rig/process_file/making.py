@@ -3,13 +3,11 @@
 import hashlib
 import json
 import re
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coldloop.errors import ModelFileError, UsageError
 from coldloop.process.declaration import Process
@@ -21,10 +19,8 @@ from coldloop_plant.fmu import DOUBLE, Fmu, FmuSimulation, Wiring
 from coldloop_plant.own_plants import FMU, PYTHON
 from coldloop_rig.plc_sizing.operations import ProblemSizes, iteration_shares
 from coldloop_rig.process_file import linear_model, reading
-from coldloop_rig.process_file.linear_model import STEP, Linearised, operating_point
-from coldloop_rig.process_file.step_test import Record, from_step_test, identified, model_identified, record_compared
-
-Array = NDArray[np.float64]
+from coldloop_rig.process_file.linear_model import STEP, Array, Linearised, Record, operating_point
+from coldloop_rig.process_file.step_test import from_step_test, identified, model_identified, record_compared
 
 REGISTERS_OF_A_REQUEST: Final = 125
 """Registers of one Modbus read at most: the latched update, and the rack's measurement, are one read each."""
@@ -35,10 +31,8 @@ USUAL_WALK: Final = 0.01
 """Process noise of a state over what it moves by when each input makes its largest step, held for the horizon."""
 SINGULAR: Final = 1e-9
 """Least singular value over the largest, of equations with rows and columns of size 1, that still have a solution."""
-SEEN: Final = 0.1
-"""Gain over the largest of an output, from which on a record must show it."""
-ALIKE: Final = (0.5, 2.0)
-"""Gains of a record's model over those of the plant."""
+SEEN: Final = 0.1  # gain over the largest of an output, from which on a record must show it
+ALIKE: Final = (0.5, 2.0)  # gains of a record's model over those of the plant
 
 
 @dataclass(frozen=True)
@@ -63,11 +57,22 @@ def made_from(path: Path) -> Made:
     said = reading.read_process_file(path)
     file = with_units(said, path.parent)
     linear = linearised(file, path.parent)
-    file = _with_sensors(file, linear.y0.tolist())
+    sensors = (  # disturbances that are measured are the last outputs
+        Output(name=one.name, unit=one.unit, range=one.span, noise=one.noise)
+        for one in file.disturbances
+        if one.noise is not None
+    )
+    every = zip((*file.outputs, *sensors), linear.y0.tolist(), strict=True)
+    file = file.model_copy(update={"outputs": tuple(one.model_copy(update={"at": at}) for one, at in every)})
     shown = [*file.input_names, *file.output_names, *(["load"] if file.has_load else [])]
+    knots, outputs = len(file.prediction.decision_instants), len(file.outputs)
+    bands = sum(one.edges is not None for one in file.outputs)
+    ahead = knots * sum(one.forecast is not None for one in file.outside)
+    states = len(linear.states) + outputs + ahead  # as many outputs at most have a constant, and the load a mismatch
+    instants = len(file.prediction.constraint_instants)
     process = file.model_copy(update={
         "states": _states(file, linear), "constants": file.constants or _constants(file, linear),
-        "iterations": iteration_shares(_sizes(file, len(linear.states))),
+        "iterations": iteration_shares(ProblemSizes(knots, len(file.inputs), outputs, bands, instants, states)),
         "forecasts": reading.forecasts_of(file, path.parent),
         "drawing": reading.drawing_of(path.parent / file.mimic, shown) if file.mimic else "",
     })  # fmt: skip
@@ -85,10 +90,7 @@ def made_from(path: Path) -> Made:
 
 
 def linearised(file: Process, folder: Path) -> Linearised:
-    """Return the model of a process whose file is in a folder.
-
-    Raises ColdloopError: the plant cannot be read, does not rest, or does not fit the signals: one line.
-    """
+    """Return the model of the plant. Raises ColdloopError: it cannot be read, does not rest, or does not fit."""
     plant = file.plant
     if plant.python is not None:
         found = linear_model.from_equations(file, plant.python, *reading.source_of(folder, plant.python))
@@ -115,28 +117,23 @@ def linearised(file: Process, folder: Path) -> Linearised:
 
 
 def _by_record(file: Process, plant: Linearised, path: Path) -> Linearised:
-    """Return the model of a record, for a plant that hides its states."""
+    """Return the model of a record, for a plant that hides its states; warn where gains after the horizon differ."""
     model = from_step_test(file, path)
     hidden = dict(plant.parameters)
     if plant.kind == PYTHON:
         hidden["rest"] = plant.x0.tolist()
     elif plant.kind == FMU:
         hidden["wiring"] = {**hidden["wiring"], "states": ()}
-    compared = (*_gains_compared(file, plant, model), *record_compared(file, path, plant, model))
-    notes = (*plant.notes, *model.notes, *compared)
-    return model._replace(kind=plant.kind, parameters=hidden, digest=plant.digest, notes=notes)
-
-
-def _gains_compared(file: Process, plant: Linearised, model: Linearised) -> list[str]:
-    """Return which gains of a record's model, after the horizon, are far from those of the plant that it is for."""
     true, found = (one.C @ discretise(one.A, one.B, one.F[:, 0], file.horizon_s).B + one.D for one in (plant, model))
     seen = np.abs(true) > SEEN * np.abs(true).max(axis=1, keepdims=True)
-    return [
+    warnings = [
         f"warning    gain: of {file.outputs[i].name} by {file.inputs[j].name} {found[i, j]:.3g}, of the plant itself "
         f"{true[i, j]:.3g}; is the record of this plant, in the units of this file?"
         for i, j in np.argwhere(seen)
         if not ALIKE[0] <= found[i, j] / true[i, j] <= ALIKE[1]
     ]
+    notes = (*plant.notes, *model.notes, *warnings, *record_compared(file, path, plant, model))
+    return model._replace(kind=plant.kind, parameters=hidden, digest=plant.digest, notes=notes)
 
 
 def declaration_digest(file: Process, folder: Path) -> str:
@@ -155,21 +152,9 @@ def declaration_digest(file: Process, folder: Path) -> str:
     said = file.model_dump(mode="json")
     look(said)
     if file.plant.installed:
-        named[file.plant.installed] = hashlib.sha256(
-            reading.installed_source(file.plant.installed)[0].encode()
-        ).hexdigest()
+        source, _ = reading.installed_source(file.plant.installed)
+        named[file.plant.installed] = hashlib.sha256(source.encode()).hexdigest()
     return hashlib.sha256(json.dumps([said, named], sort_keys=True).encode()).hexdigest()
-
-
-def _with_sensors(file: Process, y0: Sequence[float]) -> Process:
-    """Return a file with the disturbances that are measured as its last outputs, and where outputs (n_y,) rest."""
-    sensors = tuple(
-        Output(name=one.name, unit=one.unit, range=one.span, noise=one.noise, at=one.at)
-        for one in file.disturbances
-        if one.noise is not None
-    )
-    every = zip((*file.outputs, *sensors), y0, strict=True)
-    return file.model_copy(update={"outputs": tuple(one.model_copy(update={"at": at}) for one, at in every)})
 
 
 def _states(file: Process, linear: Linearised) -> tuple[State, ...]:
@@ -213,16 +198,6 @@ def _constants(file: Process, linear: Linearised) -> tuple[str, ...]:
             modes = wider[best]
             found.append(left.pop(best))
     return tuple(file.outputs[place].name for place in sorted(found))
-
-
-def _sizes(file: Process, states: int) -> ProblemSizes:
-    bands = sum(output.edges is not None for output in file.outputs)
-    constants = len(file.outputs)  # as many at most have one, and the load a mismatch
-    ahead = len(file.prediction.decision_instants) * sum(one.forecast is not None for one in file.outside)
-    return ProblemSizes(
-        len(file.prediction.decision_instants), len(file.inputs), len(file.outputs), bands,
-        len(file.prediction.constraint_instants), states + constants + ahead,
-    )  # fmt: skip
 
 
 def _check_fits(process: Process, linear: Linearised) -> None:
@@ -285,17 +260,12 @@ HORIZONS_TO_REST: Final = 24
 """Horizons after which a plant counts as one without a steady state, unless the file says otherwise."""
 STEP_SIZE: Final = 0.01
 """Steps of the step test to both sides of the operating point, over the range of the input or the span of the load."""
-SAMPLES: Final = 400
-"""Least number of samples of the step test; ten horizons if that is more."""
-MOST_FINDINGS: Final = 5
-"""Largest number of violations of the standard in a model description that are reported."""
+SAMPLES: Final = 400  # least number of samples of the step test; ten horizons if that is more
+MOST_FINDINGS: Final = 5  # largest number of violations of the standard in a model description that are reported
 
 
 def with_units(file: Process, folder: Path) -> Process:
-    """Return a process file with units from its FMU's description where it gives none.
-
-    Raises ModelFileError: the FMU cannot be read, or a signal is no variable of it.
-    """
+    """Return a process file with units of its FMU where it gives none. Raises ModelFileError: it lacks a variable."""
     if file.plant.fmu is None:
         return file
     fmu = Fmu(folder / file.plant.fmu)
@@ -336,15 +306,16 @@ def from_fmu(file: Process, folder: Path, name: str) -> Linearised:
     else:
         u, w = operating_point(file)
         J, how = found
-        how_made = (f"model      by {how} of the FMU",)
-        model = Linearised(*Linear.of(J, len(x), len(u)), x, u, w, y, _named(fmu, wiring), FMU, {}, "", 0.0, how_made)
-    rest = (
-        f"rest       after {wiring.rest_ticks * file.tick_s:g} s from the FMU's start, which each session begins with"
-    )
-    parameters = {"file": str(fmu.path.resolve()), "wiring": asdict(wiring)}
-    return model._replace(
-        kind=FMU, parameters=parameters, digest=file_digest(fmu.path), notes=(rest, *model.notes, *notes)
-    )
+        names = [re.sub(r"[^A-Za-z0-9]", "_", name).strip("_") for name in wiring.states]  # as names of signals are
+        if len({name.lower() for name in names}) < len(names) or not all(name[:1].isalpha() for name in names):
+            names = [f"x{i}" for i in range(1, len(names) + 1)]
+        units = (fmu.variables[state].unit or "" for state in wiring.states)
+        states, how_made = dict(zip(names, units, strict=True)), (f"model      by {how} of the FMU",)
+        model = Linearised(*Linear.of(J, len(x), len(u)), x, u, w, y, states, FMU, {}, "", 0.0, how_made)
+    rest_s = wiring.rest_ticks * file.tick_s
+    rest = f"rest       after {rest_s:g} s from the FMU's start, which each session begins with"
+    parameters, notes = {"file": str(fmu.path.resolve()), "wiring": asdict(wiring)}, [rest, *model.notes, *notes]
+    return model._replace(kind=FMU, parameters=parameters, digest=file_digest(fmu.path), notes=tuple(notes))
 
 
 def _wiring(file: Process, fmu: Fmu) -> Wiring:
@@ -392,10 +363,7 @@ def _sample(file: Process, simulation: FmuSimulation) -> Array:
 
 
 def _at_rest(file: Process, fmu: Fmu, wiring: Wiring) -> tuple[FmuSimulation, Wiring]:
-    """Return the FMU at rest with the inputs of the operating point, and how it gets there.
-
-    Raises UsageError: it does not.
-    """
+    """Return the FMU at rest at the operating point, and how it gets there. Raises UsageError: it does not."""
     u, w = operating_point(file)
     simulation = FmuSimulation(fmu, wiring, file.tick_s)
     simulation.put(u, w)
@@ -446,14 +414,6 @@ def _differentiated(file: Process, fmu: Fmu, wiring: Wiring, simulation: FmuSimu
     if not (np.abs(evaluated(at)[-len(outputs) :] - simulation.outputs()) <= 1e-3 * spans).all():
         return None  # its start values are not its states
     return central_differences(evaluated, at, STEP * np.maximum(1.0, np.abs(at)))[0], "differences of start values"
-
-
-def _named(fmu: Fmu, wiring: Wiring) -> dict[str, str]:
-    """Return names and units of the states, as names of signals are."""
-    names = [re.sub(r"[^A-Za-z0-9]", "_", name).strip("_") for name in wiring.states]
-    told_apart = len({name.lower() for name in names}) == len(names) and all(name[:1].isalpha() for name in names)
-    unique = names if told_apart else [f"x{i}" for i in range(1, len(names) + 1)]
-    return {name: fmu.variables[state].unit or "" for name, state in zip(unique, wiring.states, strict=True)}
 
 
 def _step_tested(file: Process, simulation: FmuSimulation, where: str) -> Record:

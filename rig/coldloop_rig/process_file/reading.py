@@ -10,7 +10,7 @@ from importlib.util import decode_source, find_spec
 from itertools import islice, pairwise
 from keyword import iskeyword
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 from xml.etree import ElementTree as ET
 
 from coldloop.config import load_configuration
@@ -22,17 +22,12 @@ from coldloop.table import TIME, read_table
 from coldloop.text import read_bytes, read_text
 from coldloop_rig.interruption import SIGNALS
 
-if TYPE_CHECKING:
-    from multiprocessing.connection import Connection
-
 LISTING: Final = "`coldloop docs keys` lists all keys"
 RESERVED: Final = frozenset((
     "tick", "session", "holder", "generation", "crc", "mode", "update", "u", "time_s", "load", "load_w", "cause",
     "driver", "bad_sensors", "stage_cost", "tau_u_s", "iterations", "j", "model_range", "none", "no_load",
 ))  # fmt: skip
 """Fields of registers and columns of a trace, in small letters."""
-
-
 OWN: Final = ("plants", "shipped_mimic", "iterations", "forecasts", "drawing")
 """Keys of the cold box, and what is found with a model: no file of a user gives them."""
 
@@ -83,10 +78,7 @@ def source_of(folder: Path, place: str) -> tuple[str, str]:
 
 
 def installed_source(name: str) -> tuple[str, str]:
-    """Return the text of the module of an entry point, and the name of its class.
-
-    Raises UsageError: there is none, or it has no source.
-    """
+    """Return the text of an entry point's module, and the name of its class. Raises UsageError: there is no source."""
     there = entry_points(group=GROUP)
     if name not in there.names:
         known = ", ".join(sorted(there.names)) or "none is installed"
@@ -149,16 +141,24 @@ def _steps(one: Load | Disturbance, path: Path, tick_s: float) -> tuple[list[int
 
 
 def text_of_child(path: Path, work: Callable[[], str], limit_s: int) -> str:
-    """Return what a child process returns, which does this work on a process file.
-
-    Raises ColdloopError: as the work does; or the child has crashed, or has taken longer than the limit.
-    """
+    """Return what a child process returns that does this work. Raises ColdloopError: as the work, or it ends early."""
     import multiprocessing  # noqa: PLC0415 a model file is read without
 
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
     with tempfile.TemporaryDirectory(prefix="coldloop-") as folder:  # whatever ends the child, nothing is left
-        child = context.Process(target=_work, args=(work, limit_s, folder, sender))
+
+        def in_child() -> None:
+            tempfile.tempdir = folder
+            for number in (*SIGNALS, signal.SIGALRM):
+                signal.signal(number, signal.SIG_DFL)
+            signal.alarm(limit_s)  # it ends this process, whatever runs in it and whether its parent is still there
+            try:
+                sender.send(work())
+            except ColdloopError as error:
+                sender.send(error)
+
+        child = context.Process(target=in_child)
         child.start()
         sender.close()
         try:
@@ -178,17 +178,6 @@ def text_of_child(path: Path, work: Callable[[], str], limit_s: int) -> str:
     if isinstance(found, ColdloopError):
         raise found
     return found
-
-
-def _work(work: Callable[[], str], limit_s: int, folder: str, sender: "Connection") -> None:
-    tempfile.tempdir = folder
-    for number in (*SIGNALS, signal.SIGALRM):
-        signal.signal(number, signal.SIG_DFL)
-    signal.alarm(limit_s)  # it ends this process, whatever runs in it and whether its parent is still there
-    try:
-        sender.send(work())
-    except ColdloopError as error:
-        sender.send(error)
 
 
 def model_file_of(path: Path, *, in_child: bool = False) -> tuple[Path, list[str]]:
@@ -228,16 +217,11 @@ NAMED: Final = re.compile(r"\{(\w+)\}")
 OUTSIDE: Final = re.compile(r"\\|url\((?!\s*['\"]?#)|(?:src|image|image-set)\(", re.IGNORECASE)
 """Pattern of references to outside the drawing; a backslash may encode any of them."""
 INSIDE: Final = re.compile(r"url\(\s*(['\"]?)#([^'\")\s]*)\1\s*\)", re.IGNORECASE)
-LONGEST: Final = 500_000
-"""Characters: the drawing is in the model file."""
-DEEPEST: Final = 100
-"""Levels of elements within elements, and of what they use."""
-MOST_DRAWN: Final = 50_000
-"""Elements, each counted as often as it is used: more keep a browser busy for minutes."""
-VIEW_BOX: Final = 4
-"""Numbers: left, top, width, height."""
-QUOTED: Final = 60
-"""Characters of a value in a message."""
+LONGEST: Final = 500_000  # characters: the drawing is in the model file
+DEEPEST: Final = 100  # levels of elements within elements, and of what they use
+MOST_DRAWN: Final = 50_000  # elements, each counted as often as it is used: more keep a browser busy for minutes
+VIEW_BOX: Final = 4  # numbers: left, top, width, height
+QUOTED: Final = 60  # characters of a value in a message
 PREFIX: Final = "mimic-"
 """Prefix of the ids of its elements, which keeps them apart from those of the page."""
 

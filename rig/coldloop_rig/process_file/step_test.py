@@ -21,62 +21,21 @@ from coldloop.process.lti_model import discretise
 from coldloop.process.sections import Disturbance, Load
 from coldloop.table import TIME, Table, read_table
 from coldloop_plant.own_plants import LINEAR
-from coldloop_rig.process_file.linear_model import Linearised, operating_point
+from coldloop_rig.process_file.linear_model import Array, Identified, Linearised, Record, operating_point
 
-Array = NDArray[np.float64]
 Places = NDArray[np.intp]
 
 MOST_STATES: Final = 8
-HELD_BACK: Final = 1 / 3
-"""Share of the record, its end, that orders are compared on."""
-WORTH: Final = 1.1
-"""Error of a lower order over that of the best one, up to which the lower one is taken."""
-LONGEST_PAST: Final = 20
-"""Samples of the past that a prediction goes by, at most."""
-ROWS_PER_UNKNOWN: Final = 3
-"""Least number of rows per unknown of the autoregression."""
+HELD_BACK: Final = 1 / 3  # share of the record, its end, that orders are compared on
+WORTH: Final = 1.1  # error of a lower order over that of the best one, up to which the lower one is taken
+LONGEST_PAST: Final = 20  # samples of the past that a prediction goes by, at most
+ROWS_PER_UNKNOWN: Final = 3  # least number of rows per unknown of the autoregression
 FASTEST: Final = 1e-3
 """Least pole in the plane of z: one below, or on the negative real axis, has no continuous counterpart."""
-TOGETHER: Final = 0.98
-"""Correlation of two inputs from which on their effects cannot be identified separately."""
-EXACT: Final = 1e-6
-"""Error that no order improves on: the record has no noise."""
+TOGETHER: Final = 0.98  # correlation of two inputs from which on their effects cannot be identified separately
+EXACT: Final = 1e-6  # error that no order improves on: the record has no noise
 NOTHING: Final = 1e-13
 """Part of the largest singular value below which there is no state."""
-
-
-class Record(NamedTuple):
-    """Record of inputs and outputs at N equidistant times: each row's inputs hold until the next one."""
-
-    period_s: float
-    inputs: Array
-    """Shape (N, m)."""
-    outputs: Array
-    """Shape (N, p)."""
-    operating: Array
-    """Inputs at the operating point, shape (m,); what integrates does not move there."""
-    input_names: tuple[str, ...]
-    where: str
-    """Names it in messages."""
-    pieces: tuple[slice, ...] = (slice(None),)
-    """Rows without a gap between them, in order."""
-
-
-class Identified(NamedTuple):
-    """dx/dt = A x + B u, y = C x + constant, with u in deviations from the operating point."""
-
-    A: Array
-    """Shape (n, n), per second."""
-    B: Array
-    """Shape (n, m)."""
-    C: Array
-    """Shape (p, n)."""
-    constant: Array
-    """Outputs at rest at the operating point, if the plant rests: shape (p,)."""
-    rests: bool
-    """Whether all modes decay, within the length of the record."""
-    fit: Array
-    """Share of each output's variation on the data held back that is explained, 1 is all: 1 - rms error / deviation."""
 
 
 class _Fit(NamedTuple):
@@ -118,12 +77,6 @@ def identified(record: Record, order: int = 0) -> Identified:
         A, B / u_scale, whole.C * y_scale[:, np.newaxis], whole.constant * y_scale + y_mean, rests,
         1.0 - error,
     )  # fmt: skip
-
-
-def unexplained(A: Array, B: Array, C: Array, D: Array, record: Record) -> Array:
-    """Return what a model in continuous time leaves of a record: rms error of each output over its deviation."""
-    left = record.outputs - simulated(A, B, C, D, record)
-    return np.asarray(np.sqrt((left**2).mean(axis=0)) / np.maximum(record.outputs.std(axis=0), 1e-12))
 
 
 def simulated(A: Array, B: Array, C: Array, D: Array, record: Record) -> Array:
@@ -281,14 +234,12 @@ def half_widths(record: Record, found: Identified, horizon_s: float) -> Array:
 
 PIECE: Final = "piece"
 """Column whose number changes where a record has a gap."""
-POOR: Final = 0.5
-"""Share of an output's variation, explained of the data held back, below which a model is no good."""
+POOR: Final = 0.5  # share of an output's variation, explained of the data held back, below which a model is no good
 UNLIKE: Final = 0.3
 """Rms error of a plant on a record of it, over the deviation of the output, from which on it is told, ..."""
 FAR: Final = 3.0
 """... if it is so many times that of the model found in the record."""
-EVEN: Final = 0.01
-"""Largest deviation of an interval from the others, over their length."""
+EVEN: Final = 0.01  # largest deviation of an interval from the others, over their length
 
 
 def from_step_test(file: Process, path: Path) -> Linearised:
@@ -298,15 +249,12 @@ def from_step_test(file: Process, path: Path) -> Linearised:
     used = {table.place(name) for name in (TIME, PIECE, *record.input_names, *file.output_names)}
     left = ", ".join(name for place, name in enumerate(table.names) if name and place not in used)
     notes = [f"record     {path.name}: {note}" for note in (*table.notes, *([f"not used: {left}"] if left else []))]
-    notes += [
-        f"unknown    {path.name} has no column {one.name}: the model does not know what it does"
-        for one in file.outside
-        if one not in moved
-    ]
-    missing = next((one.name for one in file.outputs if one.at is None), None)
-    if not found.rests and missing is not None:
+    unknown = f"unknown    {path.name} has no column {{}}: the model does not know what it does"
+    notes += [unknown.format(one.name) for one in file.outside if one not in moved]
+    missing = [one.name for one in file.outputs if one.at is None]
+    if not found.rests and missing:
         raise UsageError(
-            f"outputs: {missing} needs at, its value at the operating point: by its record the plant does not rest"
+            f"outputs: {missing[0]} needs at, its value at the operating point: by its record the plant does not rest"
         )
     rest = zip(file.outputs, found.constant, strict=True)
     y0 = np.array([constant if one.at is None else one.at for one, constant in rest])
@@ -317,15 +265,15 @@ def from_step_test(file: Process, path: Path) -> Linearised:
 def record_compared(file: Process, path: Path, plant: Linearised, model: Linearised) -> list[str]:
     """Return which outputs of a record the plant that it is for explains by far worse than the model found in it."""
     record, moved, _ = _recorded(file, path)
-    places = _places(file, moved)
-    by_plant, by_model = (
-        unexplained(one.A, np.hstack([one.B, one.F[:, places]]), one.C, np.hstack([one.D, one.G[:, places]]), record)
-        for one in (plant, model)
-    )
+    places, deviations, unexplained = _places(file, moved), record.outputs.std(axis=0), []
+    for one in (plant, model):
+        B, D = np.hstack([one.B, one.F[:, places]]), np.hstack([one.D, one.G[:, places]])
+        left = record.outputs - simulated(one.A, B, one.C, D, record)
+        unexplained.append(np.sqrt((left**2).mean(axis=0)) / np.maximum(deviations, 1e-12))
     return [
         f"warning    {path.name}: of {one.name} the plant itself explains {100 * max(0.0, 1.0 - its):.0f} %, the model "
         f"found in it {100 * max(0.0, 1.0 - found):.0f} %; are its columns those of this plant?"
-        for one, its, found in zip(file.outputs, by_plant, by_model, strict=True)
+        for one, its, found in zip(file.outputs, *unexplained, strict=True)
         if its > max(UNLIKE, FAR * found)
     ]
 
@@ -340,7 +288,16 @@ def _recorded(file: Process, path: Path) -> tuple[Record, list[Load | Disturbanc
     number = np.zeros(len(rows)) if table.place(PIECE) is None else np.array(table.columns([PIECE])[0])
     pieces = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(number)) + 1)
     period_s = _period(table, rows[:, 0], pieces)
-    _check_readings(file, table.where, rows[:, 1 + len(names) :])
+    for signal, column in zip(file.outputs, rows[:, 1 + len(names) :].T, strict=True):
+        low, high = signal.range
+        wrong = column[(column < low) | (column > high)]
+        if wrong.size:
+            raise UsageError(
+                f"{table.where}: {signal.name} = {wrong[0]:g} is outside the range of its sensor, {low:g} to {high:g}; "
+                "give the record in the unit of the process file, without failed readings"
+            )
+        if np.ptp(column) == 0.0:
+            raise UsageError(f"{table.where}: {signal.name} never moves; what acts on it cannot be told")
     every = max(1, round(file.tick_s * file.ticks_per_sample / period_s))
     counts = [len(piece) // every for piece in pieces if len(piece) >= every]
     used = np.concatenate([piece[: len(piece) // every * every] for piece in pieces])
@@ -370,20 +327,6 @@ def model_identified(file: Process, found: Identified, y0: Array, moved: Sequenc
         {f"x{i}": "" for i in range(1, n + 1)}, LINEAR, {}, "", 0.0,
         (f"identified with {n} states; of the last third, held back, it explains  {fit}", *warning),
     )  # fmt: skip
-
-
-def _check_readings(file: Process, path: str, outputs: Array) -> None:
-    """Check that a record is in the units of the file's sensors, and that each output moves."""
-    for one, column in zip(file.outputs, outputs.T, strict=True):
-        low, high = one.range
-        wrong = column[(column < low) | (column > high)]
-        if wrong.size:
-            raise UsageError(
-                f"{path}: {one.name} = {wrong[0]:g} is outside the range of its sensor, {low:g} to {high:g}; "
-                "give the record in the unit of the process file, without failed readings"
-            )
-        if np.ptp(column) == 0.0:
-            raise UsageError(f"{path}: {one.name} never moves; what acts on it cannot be told")
 
 
 def _period(table: Table, times: Array, pieces: Sequence[Places]) -> float:

@@ -11,11 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from coldloop.process.cold_box import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS
 from coldloop.process.declaration import Process
-from coldloop.registers import Maps, maps_of
-from coldloop.registers.common import Event
-from coldloop.registers.control_plc import Verdict
-from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.plant import ModelRangeStatus, PlantSample, StationMode, StationSample
+from coldloop.registers import Maps, common, control_plc, maps_of, optimizer_plc, plant
 
 FORMAT: Final = 2
 """Version of the files of a run."""
@@ -60,12 +56,12 @@ def files_of(process: Process) -> dict[str, RunFile]:
     maps = maps_of(process)
     updates = "One row an update that no load step cut off; `verdict` says whether it was played"
     station = "One row a tick: compression station and nitrogen; only where the plant is a refrigerator"
-    sample = maps.plant.block_of(StationSample).fields
+    sample = maps.plant.block_of(plant.StationSample).fields
     signals = zip(STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, strict=True)
     station_columns = (
         *_when(process),
         *(Column(name, REAL, unit, sample["signals"].description) for name, unit in signals),
-        Column("mode", WHOLE, "1", sample["mode"].description, StationMode),
+        Column("mode", WHOLE, "1", sample["mode"].description, plant.StationMode),
         Column("alarms", WHOLE, "1", sample["alarms"].description),
     )
     return {
@@ -96,9 +92,9 @@ _DRIVING: Final = (
 
 def _trace(process: Process, maps: Maps) -> tuple[Column, ...]:
     """Return load, inputs, outputs and states in the order of the digest; what sensors showed; mode and update."""
-    load = maps.plant.block_of(PlantSample).fields["load"].description
-    update = maps.optimizer_plc.block_of(Optimization).fields
-    outside = maps.plant.block_of(ModelRangeStatus).fields["outside"].description
+    load = maps.plant.block_of(plant.PlantSample).fields["load"].description
+    update = maps.optimizer_plc.block_of(optimizer_plc.Optimization).fields
+    outside = maps.plant.block_of(plant.ModelRangeStatus).fields["outside"].description
     output = "Output {}: with the noise of its sensor, without a sensor fault"
     measured = "What the sensor of {} showed, with its faults; null when it was no number"
     return (
@@ -126,15 +122,15 @@ def _updates(process: Process, maps: Maps) -> tuple[Column, ...]:
         _TAU_U,
         *(
             Column(name, REAL if field.kind.label == "float32" else WHOLE, field.unit or "1",
-                   field.description, Verdict if name == "verdict" else None)
-            for name, field in maps.optimizer_plc.block_of(Optimization).fields.items()
+                   field.description, control_plc.Verdict if name == "verdict" else None)
+            for name, field in maps.optimizer_plc.block_of(optimizer_plc.Optimization).fields.items()
             if name not in ("update", "tick", "tau_u")
         ),
     )  # fmt: skip
 
 
 def _events(process: Process, maps: Maps) -> tuple[Column, ...]:
-    event = maps.control_plc.block_of(Event).fields
+    event = maps.control_plc.block_of(common.Event).fields
     return (
         Column("service", TEXT, "", "Whose journal: control_plc or plant"),
         Column("number", LONG, "1", event["number"].description),

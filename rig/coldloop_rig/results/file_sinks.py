@@ -91,12 +91,10 @@ T = TypeVar("T")
 
 GROUP_TICKS: Final = 32_768
 """Ticks of a row group of the trace, 2.3 h: its columns fit into 9 MB, and the index of 1,000 h into 4 MB."""
-HELD_BACK_TICKS: Final = 2048
-"""The newest ticks wait until it is known which of the updates were played."""
+HELD_BACK_TICKS: Final = 2048  # the newest ticks wait until it is known which of the updates were played
 SEARCHED: Final = ["tick", "time_s"]
 """Columns whose range is in the index; more would make it, and the memory of a long run, several times as large."""
-GROUP_ROWS: Final = 16_384
-"""Rows of a row group of updates and events."""
+GROUP_ROWS: Final = 16_384  # rows of a row group of updates and events
 
 
 class _FileSink(Sink, Generic[T]):
@@ -130,7 +128,6 @@ class _FileSink(Sink, Generic[T]):
                 raise ResultsError(f"{self._folder}: the disk is full; what was recorded before is kept")
 
     def _group(self) -> list[T]:
-        """Return what is written now."""
         taken, self._taken, self._rows = self._taken, [], 0
         return taken
 
@@ -138,7 +135,6 @@ class _FileSink(Sink, Generic[T]):
         raise NotImplementedError
 
     def close(self) -> None:
-        """Write the rest, and the index that makes the file readable."""
         try:
             if self._taken:
                 self._writer.write_table(self._table(self._taken))

@@ -85,10 +85,7 @@ def prepare_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def writing(place: Path, remedy: str = "choose another --out") -> Iterator[None]:
-    """Have files written in this context, and be told in a line of one that cannot be.
-
-    Raises ResultsError: a file cannot be written.
-    """
+    """Have files written in this context. Raises ResultsError, in a line: one cannot be written."""
     try:
         yield
     except OSError as error:

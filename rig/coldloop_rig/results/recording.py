@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ColdloopError, LinkError
 from coldloop.process.cold_box import STATION_SIGNAL_NAMES
-from coldloop.registers.common import Event
-from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.plant import PlantSample, StationSample
+from coldloop.registers import common, optimizer_plc, plant
 
 
 class Way(StrEnum):
@@ -100,7 +98,7 @@ class PendingTicks:
         self._has_station = False
         self.first, self.count = 0, 0
 
-    def extend(self, ticks: int, like: PlantSample | SampleBlock) -> None:
+    def extend(self, ticks: int, like: plant.PlantSample | SampleBlock) -> None:
         """Add ticks of which nothing is known, of as many signals as a sample or a block has."""
         end = self.count + ticks
         if not self._parts:
@@ -112,7 +110,7 @@ class PendingTicks:
             part[self.count : end] = np.nan
         self.count = end
 
-    def put(self, sample: PlantSample, station: StationSample | None) -> bool:
+    def put(self, sample: plant.PlantSample, station: plant.StationSample | None) -> bool:
         """Put a tick where it belongs; return whether nothing was known of it before."""
         row = sample.tick - self.first
         load, u, y, x, warm = self._parts
@@ -161,11 +159,11 @@ class Recording(NamedTuple):
     """Measured outputs, shape (N, outputs)."""
     x: FloatArray
     """Simulated states, shape (N, states)."""
-    updates: list[Optimization]
+    updates: list[optimizer_plc.Optimization]
     link: LinkStatistics
     station: FloatArray = NO_STATION
     """Samples of the station as in `SampleBlock`."""
-    events: Sequence[tuple[str, Event]] = ()
+    events: Sequence[tuple[str, common.Event]] = ()
     """Events of the journals, each with the service that reported it."""
 
     @property
@@ -184,8 +182,7 @@ BLOCK_TICKS: Final = 512
 SETTLED_TICKS: Final = 512
 """An update that nothing has followed for so long after its period was not cut off. In a networked run samples are
 read up to 256 ticks before the updates that go with them."""
-KEPT_TICKS: Final = BLOCK_TICKS
-"""Newest ticks that are not passed on yet: a restarted plant may do some of them again."""
+KEPT_TICKS: Final = BLOCK_TICKS  # newest ticks that are not passed on yet: a restarted plant may do some of them again
 
 
 class Sink:
@@ -194,19 +191,19 @@ class Sink:
     def begin(self) -> None:
         """Real time begins to count: the first tick is about to be done."""
 
-    def sample(self, sample: PlantSample) -> None:
+    def sample(self, sample: plant.PlantSample) -> None:
         """Take a tick as it is done."""
 
     def block(self, block: SampleBlock) -> None:
         """Take up to `BLOCK_TICKS` ticks."""
 
-    def reported(self, update: Optimization) -> None:
+    def reported(self, update: optimizer_plc.Optimization) -> None:
         """Take an update as it is reported, before it is known whether its sequence is played."""
 
-    def update(self, update: Optimization) -> None:
+    def update(self, update: optimizer_plc.Optimization) -> None:
         """Take an update whose sequence was played, before the block that its period ends in is much older."""
 
-    def event(self, service: str, event: Event) -> None:
+    def event(self, service: str, event: common.Event) -> None:
         """Take an event of the journal of a service, `control_plc` or `plant`."""
 
     def close(self) -> None:
@@ -218,18 +215,18 @@ class MemorySink(Sink):
 
     def __init__(self) -> None:
         self._blocks: list[SampleBlock] = []
-        self._updates: list[Optimization] = []
-        self.events: list[tuple[str, Event]] = []
+        self._updates: list[optimizer_plc.Optimization] = []
+        self.events: list[tuple[str, common.Event]] = []
 
     def block(self, block: SampleBlock) -> None:
         """Keep a block."""
         self._blocks.append(block)
 
-    def update(self, update: Optimization) -> None:
+    def update(self, update: optimizer_plc.Optimization) -> None:
         """Keep an update."""
         self._updates.append(update)
 
-    def event(self, service: str, event: Event) -> None:
+    def event(self, service: str, event: common.Event) -> None:
         """Keep an event."""
         self.events.append((service, event))
 
@@ -257,9 +254,9 @@ class Recorder:
         self._memory = MemorySink()
         self._sinks = (self._memory,) if sinks is None else tuple(sinks)
         self._pending = PendingTicks()
-        self._stations: dict[int, StationSample] = {}
+        self._stations: dict[int, plant.StationSample] = {}
         """Samples of the station, by ticks whose own sample is still to come."""
-        self._unsettled: deque[Optimization] = deque()
+        self._unsettled: deque[optimizer_plc.Optimization] = deque()
         self._stop: ColdloopError | None = None
         self._closed = False
         self._began = self._last = time.monotonic()
@@ -279,7 +276,7 @@ class Recorder:
         """Let the next sample raise `reason`: a signal handler calls this."""
         self._stop = reason
 
-    def sample(self, sample: PlantSample) -> None:
+    def sample(self, sample: plant.PlantSample) -> None:
         """Take the next tick; or a later one, and those before it are unknown; or one of the last ones that came again.
 
         Raises LinkError: a tick came again that is older than `KEPT_TICKS`; ColdloopError: the run is to stop; the tick
@@ -299,21 +296,17 @@ class Recorder:
         self.missing_ticks += missing - (again and unknown)
         self._taken(sample)
 
-    def stretch(self, block: SampleBlock, updates: Sequence[Optimization]) -> None:
-        """Take the next ticks at once, and the updates that were reported in them; sinks see the last tick of them.
-
-        Raises ColdloopError: the run is to stop; the ticks are recorded.
-        """
+    def stretch(self, block: SampleBlock, updates: Sequence[optimizer_plc.Optimization]) -> None:
+        """Take ticks and their updates at once; sinks see the last one. Raises ColdloopError: the run is to stop."""
         for update in updates:
             self.update(update)
         self._pending.extend(len(block.load), block)
         self._pending.put_block(block)
         self.next_tick += len(block.load)
         load, u, y, x = (part[-1].tolist() for part in (block.load, block.u, block.y, block.x))
-        self._taken(PlantSample(self.next_tick - 1, load, tuple(u), tuple(y), tuple(x)))
+        self._taken(plant.PlantSample(self.next_tick - 1, load, tuple(u), tuple(y), tuple(x)))
 
-    def _taken(self, sample: PlantSample) -> None:
-        """Pass on settled samples, and stop on request."""
+    def _taken(self, sample: plant.PlantSample) -> None:
         self._last = time.monotonic()
         for sink in self._sinks:
             sink.sample(sample)
@@ -322,11 +315,11 @@ class Recorder:
         if self._stop is not None:
             raise self._stop
 
-    def station(self, sample: StationSample) -> None:
+    def station(self, sample: plant.StationSample) -> None:
         """Take what goes with a tick that is about to come, where the plant is a whole refrigerator."""
         self._stations[sample.tick] = sample
 
-    def update(self, update: Optimization) -> None:
+    def update(self, update: optimizer_plc.Optimization) -> None:
         """Take the next update, also one that a load step will cut off."""
         self._unsettled.append(update)
         for sink in self._sinks:
@@ -334,7 +327,7 @@ class Recorder:
         if len(self._unsettled) > BLOCK_TICKS:
             self._settle()
 
-    def event(self, event: Event, service: str = CONTROL) -> None:
+    def event(self, event: common.Event, service: str = CONTROL) -> None:
         """Take an event of the journal of a service; before the ticks after it are older than `SETTLED_TICKS`."""
         for sink in self._sinks:
             sink.event(service, event)
@@ -367,7 +360,6 @@ class Recorder:
         _all(*calls)
 
     def _settle(self) -> None:
-        """Pass on the updates of which it is known that their sequence was played."""
         while self._unsettled:
             update, *following = tuple(islice(self._unsettled, 2))
             end = update.tick + update.tau_u

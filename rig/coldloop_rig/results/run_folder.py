@@ -42,19 +42,15 @@ GONE: Final = frozenset(
 )
 """Settings of a rule that was replaced, which are in the manifests of runs that did not use it, too."""
 TAU_U: Final = "tau_u_s"
-DRAWN_TICKS: Final = 60_000
-"""A longer trace is drawn by the least and the largest value of many ticks."""
+DRAWN_TICKS: Final = 60_000  # a longer trace is drawn by the least and the largest value of many ticks
 BANDS: Final = ("optimizer_plc.program.design.output_low", "optimizer_plc.program.design.output_high")
-BOUNDS: Final = ("limits.low", "limits.high")
-"""Keys that have a number for each output with a band, and for each input."""
+BOUNDS: Final = ("limits.low", "limits.high")  # keys that have a number for each output with a band, and for each input
 ENDED: Final = "name the folder of a run that has ended"
 MOST_BYTES: Final = 2**24
 """Largest size of a JSON document."""
 MOST_COLUMNS: Final = 2000
-MOST_TEXT: Final = 4096
-"""Bytes of a text in a table."""
-ROW_BYTES: Final = 4096
-"""Largest average size of a row before compression; a file may have `SPARE_BYTES` more."""
+MOST_TEXT: Final = 4096  # bytes of a text in a table
+ROW_BYTES: Final = 4096  # largest average size of a row before compression; a file may have `SPARE_BYTES` more
 SPARE_BYTES: Final = 2**20
 MOST_IN_MEMORY: Final = 2_000_000
 """Rows of a file that is read as a whole: 139 h of ticks."""
@@ -119,10 +115,7 @@ class _Manifest(_Part):
 
 
 class RunFolder:
-    """Results on disk, of the present format.
-
-    Raises UsageError: there are none, or they are of another version, or damaged.
-    """
+    """Results on disk. Raises UsageError: there are none, or they are of another version, or damaged."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -184,7 +177,6 @@ class RunFolder:
         return file
 
     def _excess(self, name: str, footer: pq.FileMetaData, most: int) -> str:
-        """Return what a file has too much of, by its footer."""
         rows, ticks = footer.num_rows, self.manifest["recorded_ticks"]
         size = sum(footer.row_group(group).total_byte_size for group in range(footer.num_row_groups))
         if name != EVENTS and rows > ticks:
@@ -199,10 +191,7 @@ class RunFolder:
 
     @cached_property
     def process(self) -> Process:
-        """The process that was run, as it was then.
-
-        Raises UsageError: its declaration is none that this version makes.
-        """
+        """The process that was run. Raises UsageError: its declaration is none that this version makes."""
         place = f"{self.path / str(self.manifest['inputs']['model']['file'])}: process"
         return process_in(self.model.get("process", {}), place, "use the version of Coldloop that made this run")
 
@@ -214,10 +203,7 @@ class RunFolder:
 
     @contextmanager
     def reading(self, name: str, most: int = LONGEST_TICKS) -> Iterator[pq.ParquetFile]:
-        """Open a Parquet file of the run; a damaged one is a one-line error.
-
-        Raises UsageError: it cannot be read, or has other columns.
-        """
+        """Open a Parquet file of the run. Raises UsageError, in a line: it cannot be read, or has other columns."""
         try:
             with self.file(name, most) as file:
                 yield file
@@ -307,14 +293,12 @@ def export(run: Path, kind: str, out: Path, *, force: bool) -> list[Path]:
     return list(paths)
 
 
-Writers = dict[str, Callable[[Path], object]]
-"""Functions that write a file, by the file's name."""
+Writers = dict[str, Callable[[Path], object]]  # functions that write a file, by the file's name
 ABOUT: Final = ("complete", "started_utc", "coldloop", "way")
 """Keys of the manifest that a MATLAB or HDF5 file has, too."""
 
 
 def _tables(run: RunFolder, most: int = LONGEST_TICKS) -> dict[str, pq.ParquetFile]:
-    """Return the files of a run by the name of their table."""
     present = [name for name in FILES if name != STATION or (run.path / name).exists()]
     return {name.removesuffix(".parquet"): run.file(name, most) for name in present}
 

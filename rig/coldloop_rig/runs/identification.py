@@ -24,10 +24,8 @@ SETTLING_S: Final = 300.0
 """Left out at the beginning: the state is not known there, and is forgotten like the model's slowest mode, in 110 s."""
 BLOCKS: Final = 8
 """Blocks of the fitted half: left out in turn, they give standard errors that allow for correlated residuals."""
-LEAST_S: Final = 1800.0
-"""Shortest record: blocks of 90 s, longer than the window."""
-MOST_ERROR: Final = 0.05
-"""Largest standard error of a factor that is taken."""
+LEAST_S: Final = 1800.0  # shortest record: blocks of 90 s, longer than the window
+MOST_ERROR: Final = 0.05  # largest standard error of a factor that is taken
 TAIL: Final = 0.025
 
 

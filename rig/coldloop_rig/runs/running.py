@@ -41,12 +41,7 @@ from coldloop_rig.cosim.scenario import INPUTS, LOAD_COPY, Job, Scenario, StopRe
 from coldloop_rig.figures.worker import FigureProcess
 from coldloop_rig.interruption import INTERRUPTION
 from coldloop_rig.plc_sizing.holding import digits_last_s, shortest_period_s, waiting
-from coldloop_rig.results.columns import FILES, FORMAT, schema_document
-from coldloop_rig.results.file_sinks import DiskReserve, EventsSink, StationSink, TraceSink, UpdatesSink
-from coldloop_rig.results.folders import claim_folder, installed_version, write_json
-from coldloop_rig.results.indicators import RunEvaluation, StageCost
-from coldloop_rig.results.recording import Recorder, Sink, Way
-from coldloop_rig.results.run_folder import RunFolder
+from coldloop_rig.results import columns, file_sinks, folders, indicators, recording, run_folder
 from coldloop_rig.settings import Settings
 
 MODEL_COPY: Final = f"{INPUTS}/model.json"
@@ -111,10 +106,10 @@ def _first_manifest(
     configured = {key: value for key, value, _ in effective.effective() if value is not None}  # None is "not set"
     model = load_model(effective.settings.model.file)
     return {
-        "format": FORMAT, "complete": False, "reason": "the run has not ended, or its process was killed",
+        "format": columns.FORMAT, "complete": False, "reason": "the run has not ended, or its process was killed",
         "started_utc": _now_utc(), "ended_utc": None,
         "coldloop": __version__, "python": platform.python_version(), "platform": platform.platform(),
-        "dependencies": {name: installed_version(name) for name in DEPENDENCIES},
+        "dependencies": {name: folders.installed_version(name) for name in DEPENDENCIES},
         "command": sys.argv[1:], "arguments": dict(arguments), "way": way, "ticks": ticks, "recorded_ticks": 0,
         "configuration": configured, "inputs": dict(inputs),
         "hashes": {
@@ -130,9 +125,9 @@ def plain_arguments(options: argparse.Namespace) -> dict[str, str]:
 
 
 NAMES: Final = (
-    "manifest.json", "summary.json", "schema.json", *FILES, "run.png", "run.pdf", "run.svg",
+    "manifest.json", "summary.json", "schema.json", *columns.FILES, "run.png", "run.pdf", "run.svg",
     "chaos.json", "chaos.md", "chaos.png",
-    "report.html", "run.mat", "run.h5", *(f"{Path(name).stem}.csv" for name in FILES),
+    "report.html", "run.mat", "run.h5", *(f"{Path(name).stem}.csv" for name in columns.FILES),
 )  # fmt: skip
 """Files of an earlier run, and what was made of them, which a new one in the same folder replaces."""
 
@@ -146,7 +141,7 @@ class RunFiles:
 
     def __init__(
         self, folder: Path, effective: Configuration[Settings], scenario: Scenario, way: str,
-        arguments: Mapping[str, Any], sinks: Sequence[Sink],
+        arguments: Mapping[str, Any], sinks: Sequence[recording.Sink],
     ) -> None:  # fmt: skip
         settings = effective.settings
         for file in (settings.model.file, Path(settings.plant.load)):
@@ -154,23 +149,23 @@ class RunFiles:
                 raise UsageError(f"{file}: the run replaces what is in {folder}; name another --out")
         model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
         process, self.folder = settings.process, folder
-        self._evaluation = RunEvaluation(model, design)
+        self._evaluation = indicators.RunEvaluation(model, design)
         self._discard()
-        self._reserve = DiskReserve(folder)
+        self._reserve = file_sinks.DiskReserve(folder)
         self._realtime = scenario.realtime
         with contextlib.ExitStack() as failed:
             failed.callback(self._reserve.close)
             inputs = _copy_inputs(settings, scenario.load, folder)
             self._manifest = _first_manifest(effective, scenario.ticks, inputs, way, arguments)
-            write_json(folder / "manifest.json", self._manifest)
+            folders.write_json(folder / "manifest.json", self._manifest)
             is_whole = settings.plant.kind is PlantKind.REFRIGERATOR
-            write_json(folder / "schema.json", schema_document(process, station=is_whole))
+            folders.write_json(folder / "schema.json", columns.schema_document(process, station=is_whole))
             made = folder, self._reserve, process
-            trace = TraceSink(folder, self._reserve, StageCost(model, design))
-            files: list[Sink] = [trace, UpdatesSink(*made), EventsSink(*made)]
-            files += [StationSink(*made)] if is_whole else []
+            trace = file_sinks.TraceSink(folder, self._reserve, indicators.StageCost(model, design))
+            files: list[recording.Sink] = [trace, file_sinks.UpdatesSink(*made), file_sinks.EventsSink(*made)]
+            files += [file_sinks.StationSink(*made)] if is_whole else []
             failed.pop_all()
-        self.recorder = Recorder(scenario.ticks, [self._evaluation, *files, *sinks])
+        self.recorder = recording.Recorder(scenario.ticks, [self._evaluation, *files, *sinks])
 
     def finish(self, error: BaseException | None, figure: FigureProcess) -> dict[str, Any]:
         """Close the files, and write summary, manifest and figures of what was recorded; return the summary.
@@ -196,8 +191,8 @@ class RunFiles:
         hashes = {**self._manifest["hashes"], "trace_sha256": self._evaluation.trace_sha256}
         ended = {"complete": reason is None, "reason": reason, "ended_utc": _now_utc(), "recorded_ticks": recorded}
         try:
-            write_json(self.folder / "manifest.json", {**self._manifest, **ended, "hashes": hashes})
-            write_json(self.folder / "summary.json", summary)
+            folders.write_json(self.folder / "manifest.json", {**self._manifest, **ended, "hashes": hashes})
+            folders.write_json(self.folder / "summary.json", summary)
             figure.draw(self.folder)
         except (OSError, ColdloopError) as of_files:
             error = error or of_files
@@ -212,7 +207,9 @@ class RunFiles:
         shutil.rmtree(self.folder / INPUTS, ignore_errors=True)
 
 
-def summary_of(evaluation: RunEvaluation, recorder: Recorder, *, realtime: bool, reason: str | None) -> dict[str, Any]:
+def summary_of(
+    evaluation: indicators.RunEvaluation, recorder: recording.Recorder, *, realtime: bool, reason: str | None
+) -> dict[str, Any]:
     """Return the summary of a run; without a reason it is complete. What does not exist is None.
 
     Nothing is late in lock-step, so that lateness exists in real time only.
@@ -240,7 +237,7 @@ def _results_error(error: BaseException, folder: Path, kept: str = "") -> BaseEx
     return error
 
 
-class _FirstTick(Sink):
+class _FirstTick(recording.Sink):
     """Lets a signal end a run in good order from its first tick on."""
 
     def sample(self, _: PlantSample) -> None:
@@ -270,19 +267,16 @@ def check_certificates(settings: Settings) -> None:
 
 
 def run_into(
-    folder: Path, job: Job, arguments: Mapping[str, Any], figure: FigureProcess, sinks: Sequence[Sink]
+    folder: Path, job: Job, arguments: Mapping[str, Any], figure: FigureProcess, sinks: Sequence[recording.Sink]
 ) -> dict[str, Any]:
-    """Do a run in a folder that is claimed; return its summary.
-
-    Raises ColdloopError: the run is not complete; what was recorded is in the folder.
-    """
+    """Do a run in a claimed folder; return its summary. Raises ColdloopError: the run is not complete."""
     stop = StopRequest()
     with INTERRUPTION.passed_to(stop):
         files = RunFiles(folder, job.effective, job.scenario, job.way, arguments, [*sinks, _FirstTick()])
         stop.recorder = files.recorder
         error: BaseException | None = stop.error
         try:
-            if error is None and job.way is Way.IN_PROCESS:
+            if error is None and job.way is recording.Way.IN_PROCESS:
                 with INTERRUPTION.in_one_process():
                     OneProcessRig(job.effective.settings).run(job.scenario, files.recorder)
             elif error is None:
@@ -310,11 +304,11 @@ def repeat(folder: Path, out: Path | None, *, force: bool, trusted: Path | None)
     Raises:
         UsageError: There is no run to repeat, or an input or the configuration was changed since.
     """
-    run = RunFolder(folder)
+    run = run_folder.RunFolder(folder)
     manifest = run.manifest
     refused = {
-        Way.CHAOS: "a run with faults, which depend on the machine; `coldloop chaos` runs the plan again",
-        Way.RECORDED: "a session under way was recorded, from its middle on: it cannot be repeated",
+        recording.Way.CHAOS: "a run with faults, which depend on the machine; `coldloop chaos` runs the plan again",
+        recording.Way.RECORDED: "a session under way was recorded, from its middle on: it cannot be repeated",
     }
     if why := refused.get(manifest["way"]):
         raise UsageError(f"{folder}: {why}")
@@ -339,8 +333,7 @@ def repeat(folder: Path, out: Path | None, *, force: bool, trusted: Path | None)
     return False, _differences(manifest, run, trace)
 
 
-def _recorded_configuration(run: RunFolder) -> Configuration[Settings]:
-    """Return the configuration of a run, with the copies of its inputs instead of the originals."""
+def _recorded_configuration(run: run_folder.RunFolder) -> Configuration[Settings]:
     values = dict(run.configuration)
     copies = {"plant.load": "load", "model.file": "model", "plant.refrigerator.file": "refrigerator"}
     for key, entry in copies.items():
@@ -361,23 +354,24 @@ def _repeated_trace(effective: Configuration[Settings], scenario: Scenario, out:
     process = effective.settings.process
     with RunProgress(scenario.ticks, process) as progress, FigureProcess(["png"]) as figure:
         if out is not None:
-            claim_folder(out, force=force)
-            summary = run_into(out, Job(effective, scenario, Way.IN_PROCESS), {}, figure, [progress])
+            folders.claim_folder(out, force=force)
+            summary = run_into(out, Job(effective, scenario, recording.Way.IN_PROCESS), {}, figure, [progress])
             return str(summary["trace_sha256"])
         settings = effective.settings
-        evaluation = RunEvaluation(load_model(settings.model.file), settings.optimizer_plc.program.design)
-        recorder = Recorder(scenario.ticks, [evaluation, progress])
+        evaluation = indicators.RunEvaluation(load_model(settings.model.file), settings.optimizer_plc.program.design)
+        recorder = recording.Recorder(scenario.ticks, [evaluation, progress])
         OneProcessRig(settings).run(scenario, recorder)
         recorder.close()
         return evaluation.trace_sha256
 
 
-def _differences(manifest: Mapping[str, Any], run: RunFolder, trace: str) -> str:
-    """Return what may be the reason of another trace."""
+def _differences(manifest: Mapping[str, Any], run: run_folder.RunFolder, trace: str) -> str:
     lines = [f"another trace: {trace} instead of {manifest['hashes']['trace_sha256']}"]
     if manifest["coldloop"] != __version__:
         lines.append(f"coldloop {__version__} instead of {manifest['coldloop']}")
-    versions = {name: (installed_version(name), manifest["dependencies"].get(name, "absent")) for name in DEPENDENCIES}
+    versions = {
+        name: (folders.installed_version(name), manifest["dependencies"].get(name, "absent")) for name in DEPENDENCIES
+    }
     lines += [f"{name} {there} instead of {then}" for name, (there, then) in versions.items() if there != then]
     if misses := run.summary["deadline_misses"]:
         lines.append(f"the run missed {misses} deadlines, which depend on the machine")
@@ -390,10 +384,7 @@ PERIOD = "optimizer_plc.program.updating_period_s"
 
 
 def remarks(effective: Configuration[Settings]) -> list[str]:
-    """Return what a user should know before a run, a line each; usually nothing.
-
-    Raises UsageError: in real time no answer would ever be there in time.
-    """
+    """Return remarks for a user before a run, a line each. Raises UsageError: in real time no answer is in time."""
     program, realtime = effective.settings.optimizer_plc.program, effective.settings.session.mode is TimeMode.REALTIME
     process, (budget, _) = effective.settings.process, _budget(program)
     ticks = round(program.updating_period_s / process.tick_s)

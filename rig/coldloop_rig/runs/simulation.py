@@ -22,9 +22,7 @@ from matplotlib.figure import Figure
 from coldloop import __version__
 from coldloop.config import Configuration
 from coldloop.errors import UsageError
-from coldloop.process.declaration import Process
-from coldloop.process.lti_model import load as load_model
-from coldloop.process.updating_periods import duration, whole_ticks
+from coldloop.process import declaration, lti_model, updating_periods
 from coldloop.registers.common import Event
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.figures import plot
@@ -43,7 +41,6 @@ class Table:
     arrow: pa.Table
 
     def __repr__(self) -> str:
-        """Return how large it is, and what is in it."""
         return f"Table({self.arrow.num_rows} rows of {', '.join(self.arrow.column_names)})"
 
     @property
@@ -72,13 +69,12 @@ class Simulation:
     """Content of `summary.json`."""
     configuration: dict[str, Any]
     """The effective configuration by dotted key."""
-    process: Process
+    process: declaration.Process
     """Process that was simulated."""
     _cost: StageCost
     _events: tuple[tuple[str, Event], ...]
 
     def __repr__(self) -> str:
-        """Return what was run, for how long, and the trace."""
         program = "optimizer_plc.program."
         tau_u = self.configuration[f"{program}updating_period_s"]
         return (
@@ -174,15 +170,15 @@ def _run(effective: Configuration[Settings], duration_s: float | str | None) -> 
     settings, tick_s, ticks = effective.settings, effective.settings.process.tick_s, None
     if isinstance(duration_s, str):
         try:
-            ticks = duration(duration_s).ticks(tick_s, "duration_s")
+            ticks = updating_periods.duration(duration_s).ticks(tick_s, "duration_s")
         except ArgumentTypeError as error:
             raise UsageError(f"duration_s: {error}") from None
     elif duration_s is not None:
-        ticks = whole_ticks(duration_s, tick_s)
+        ticks = updating_periods.whole_ticks(duration_s, tick_s)
         if ticks is None or ticks <= 0:
             raise UsageError(f"duration_s={duration_s}: not a positive multiple of {tick_s} s")
     scenario = make_scenario(settings, ticks)
-    model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
+    model, design = lti_model.load(settings.model.file), settings.optimizer_plc.program.design
     evaluation, memory = RunEvaluation(model, design), MemorySink()
     recorder = Recorder(scenario.ticks, [evaluation, memory])
     OneProcessRig(settings).run(scenario, recorder)
