@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from coldloop_optimizer_plc.program import OptimizerProgram
     from coldloop_optimizer_plc.settings import ProgramSettings
     from coldloop_plant.settings import PlantKind
-    from coldloop_refrigerator.kind import RefrigeratorKind
+    from coldloop_refrigerator.program import RefrigeratorKind
 
 LOOK_S: Final = 0.2
 WAITING: Final = 2
@@ -35,7 +35,7 @@ SELDOM: Final = re.compile(r"/site-packages/(.*/tests?/|(pip|setuptools|mypy|myp
 def plant() -> None:
     """Make each plant that is ours, which compiles its kernels."""
     from coldloop_plant.settings import PlantKind  # noqa: PLC0415 not in every image
-    from coldloop_refrigerator.kind import RefrigeratorKind  # noqa: PLC0415
+    from coldloop_refrigerator.program import RefrigeratorKind  # noqa: PLC0415
 
     _make_plant(PlantKind.COLD_BOX)
     _make_plant(PlantKind.REFRIGERATOR, RefrigeratorKind)  # a set-up has no entry points yet

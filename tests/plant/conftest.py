@@ -16,7 +16,7 @@ from coldloop.registers.codec import Seal, codec_of
 from coldloop.registers.common import EVENT_ROWS, Event, EventKind
 from coldloop.registers.declaration import Role
 from coldloop.registers.plant import Actuators, Measurement
-from coldloop_plant.cold_box import ColdBox, advance, derivative, outputs
+from coldloop_plant.cold_box import ColdBox, advance, evaluated
 from coldloop_plant.cold_box.plant_file import REFERENCE
 from coldloop_plant.helium import Helium, load_helium
 from coldloop_plant.kinds import plant_maker
@@ -37,10 +37,10 @@ class Plant:
     box: ColdBox = REFERENCE
 
     def rates(self, x: RealArray, u: RealArray, w: float) -> RealArray:
-        return derivative(x, u, w, self.box, self.helium)
+        return evaluated(x, u, w, self.box, self.helium)[0]
 
     def outputs(self, x: RealArray, u: RealArray, w: float) -> dict[str, float]:
-        values = outputs(x, u, w, self.box, self.helium)
+        values = evaluated(x, u, w, self.box, self.helium)[1]
         return dict(zip(self.model.output_names, values.tolist(), strict=True))
 
     def simulate(self, x: RealArray, u: RealArray, w: float, seconds: float, dt: float = 0.25) -> RealArray:

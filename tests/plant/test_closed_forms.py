@@ -22,8 +22,17 @@ from coldloop_plant.helium import (
 from coldloop_plant.numeric import RealArray
 from coldloop_refrigerator.exergy import entropy, supply_entropy
 from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_refrigerator.precooler import BOILING_POINT, LATENT_HEAT, LIQUID_DENSITY, boil, nitrogen_level
-from coldloop_refrigerator.station import SECOND_VIRIAL, GasVolume, gas_mass, gas_pressure
+from coldloop_refrigerator.warm import (
+    BOILING_POINT,
+    LATENT_HEAT,
+    LIQUID_DENSITY,
+    SECOND_VIRIAL,
+    GasVolume,
+    boil,
+    gas_mass,
+    gas_pressure,
+    nitrogen_level,
+)
 
 HELIUM = load_helium()
 BATH = REFERENCE.separator

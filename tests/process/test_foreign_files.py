@@ -18,7 +18,7 @@ from coldloop.service.monitoring import TelemetrySettings
 from coldloop.text import file_digest
 from coldloop_chaos.faults import find_plan
 from coldloop_hmi.users import PageRole, Users, write_user
-from coldloop_plant.own_plants import _fmu_of
+from coldloop_plant.own_plants import fmu_of
 from coldloop_rig.cli.commands.options import _tls_site
 from coldloop_rig.plc_sizing.plc import find_profile
 from coldloop_rig.process_file.judgement import described
@@ -225,7 +225,7 @@ def test_an_fmu_is_found_where_it_was_or_beside_the_model_file(tmp_path: Path) -
         parameters_digest=file_digest(fmu),
     )  # fmt: skip
     (tmp_path / "tank.fmu").write_bytes(b"another one")
-    assert _fmu_of(header) == fmu
+    assert fmu_of(header) == fmu
     fmu.write_bytes(b"changed")
     with pytest.raises(ColdloopError, match=r"made from another .*tank\.fmu than is there or beside it"):
-        _fmu_of(header)
+        fmu_of(header)

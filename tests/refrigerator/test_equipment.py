@@ -81,11 +81,11 @@ def test_compressors_start_one_after_the_other_idle_first_with_the_cold_box_isol
     assert program.memory.x[NC2_SPEED] == pytest.approx(0.0, abs=1e-6)
     run(program, 40.0)
     assert 10.0 < program.memory.x[CV956] < 90.0, "as far as the low-pressure line has room"
-    assert program.acting == (0.0, 0.0, 0.0)
+    assert program.station_status.acting == (0.0, 0.0, 0.0)
     assert program.memory.x[NC2_SPEED] == pytest.approx(0.0, abs=1e-6)
     run(program, 16.0)
     assert program.station.mode == StationMode.ONE_COMPRESSOR
-    assert program.acting[0] == FILE.u0[0]
+    assert program.station_status.acting[0] == FILE.u0[0]
     run(program, 120.0)
     assert program.station.mode not in {StationMode.ONE_COMPRESSOR, StationMode.STARTING, StationMode.STOPPED}
     assert program.memory.x[NC2_SPEED] > 0.9
@@ -121,12 +121,12 @@ def test_a_turbine_that_trips_stops_at_once_and_runs_up_in_a_minute() -> None:
     run(program, 11.0)
     assert program.measure()[V1] == 0.0
     assert program.station.alarms & StationAlarm.TURBINE_TRIPPED
-    assert program.acting == (43.0, 75.0, 0.0)
+    assert program.station_status.acting == (43.0, 75.0, 0.0)
     run(program, 89.0)
-    assert 0.0 < program.acting[2] < 36.0 * 0.5, "30 s after it was switched on"
+    assert 0.0 < program.station_status.acting[2] < 36.0 * 0.5, "30 s after it was switched on"
     assert not program.station.alarms & StationAlarm.TURBINE_TRIPPED
     run(program, 90.0)
-    assert program.acting[2] == 36.0
+    assert program.station_status.acting[2] == 36.0
 
 
 def test_the_governor_holds_the_speed_of_a_warm_turbine_below_its_trip() -> None:
@@ -161,10 +161,10 @@ def test_a_stuck_valve_holds_its_opening_whatever_is_asked_until_it_is_free() ->
     run(program, 11.0)
     program.apply((50.0, 75.0, 36.0))
     run(program, 2.0)
-    assert program.acting == (43.0, 75.0, 36.0)
+    assert program.station_status.acting == (43.0, 75.0, 36.0)
     assert program.station.alarms == StationAlarm.ACTUATOR
     run(program, 8.0)
-    assert program.acting == (50.0, 75.0, 36.0)
+    assert program.station_status.acting == (50.0, 75.0, 36.0)
     assert program.station.alarms == 0
 
 
@@ -172,7 +172,7 @@ def test_a_stuck_valve_holds_its_opening_whatever_is_asked_until_it_is_free() ->
 def test_a_heater_is_off_as_asked_or_fully_on(state: int, watts: float) -> None:
     program = make([(0.0, "heater", state)])
     run(program, 1.0)
-    assert program.acting == (43.0, watts, 36.0)
+    assert program.station_status.acting == (43.0, watts, 36.0)
     assert bool(program.station.alarms & StationAlarm.ACTUATOR) == (watts != 75.0)
 
 
@@ -230,5 +230,5 @@ def test_what_is_stuck_tripped_and_blocked_survives_a_restart_of_the_rack() -> N
     run(first, 60.0)
     run(second, 60.0)
     assert first.state == second.state
-    assert first.acting == second.acting
+    assert first.station_status.acting == second.station_status.acting
     assert first.memory.equipment.tolist() == second.memory.equipment.tolist()

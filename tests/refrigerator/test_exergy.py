@@ -20,7 +20,7 @@ from coldloop_refrigerator.exergy import (
     supply_entropy,
 )
 from coldloop_refrigerator.model import Rest, refrigerator_operating_point
-from coldloop_refrigerator.physics import read
+from coldloop_refrigerator.physics import evaluated
 from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR, read_refrigerator
 from coldloop_refrigerator.program import SHIPPED, read_refrigerator_file
 
@@ -37,7 +37,7 @@ def reference() -> Rest:
     file = read_refrigerator_file(SHIPPED)
     x, u, v = np.array(file.x0), np.array(file.u0), np.array(file.v0)
     d = np.array([file.w0, 300.0, 0.0, 1.0, 1.0, 1.0])
-    return Rest(x, u, v, d, *read(x, u, v, d, REFERENCE_REFRIGERATOR, HELIUM), 0.0)
+    return Rest(x, u, v, d, *evaluated(x, u, v, d, REFERENCE_REFRIGERATOR, HELIUM)[1:], 0.0)
 
 
 @pytest.fixture(scope="module")

@@ -43,13 +43,13 @@ from coldloop_refrigerator.physics import (
     STATE_NAMES,
     advance_refrigerator,
     evaluate_refrigerator,
+    evaluated,
     high_pressure_mass,
     inventory,
-    rates,
 )
 from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR
 from coldloop_refrigerator.program import SHIPPED, read_refrigerator_file
-from coldloop_refrigerator.station import gas_mass
+from coldloop_refrigerator.warm import gas_mass
 
 pytestmark = pytest.mark.usefixtures("compiles")
 
@@ -180,7 +180,7 @@ def test_the_complex_step_gives_the_derivatives_of_the_rates(name: str) -> None:
     for k in (0, *range(FIRST, pipes().coil + 1, 3), M_HP, M_HP + 1):
         step = np.zeros_like(x)
         step[k] = sizes[k]
-        above, below = (rates(x + sign * step, u, v, d, PLANT, HELIUM) for sign in (1.0, -1.0))
+        above, below = (evaluated(x + sign * step, u, v, d, PLANT, HELIUM)[0] for sign in (1.0, -1.0))
         difference = (above - below) / (2.0 * sizes[k])
         column = J[: len(x), k]
         assert difference == pytest.approx(column, rel=1e-4, abs=1e-5 * np.max(np.abs(column)) + 1e-9), STATE_NAMES[k]
@@ -230,9 +230,9 @@ def test_gas_that_blows_down_without_walls_cools_along_its_isentrope(T: float, t
     def slopes(P: float, T: float) -> tuple[float, float]:
         cells, dT = held_cells(exchanger, P, T), np.zeros(1)
         leaving = Passing(outflow, 0.0, float(cells[0, H]))
-        march_flows(exchanger, dT, leaving, 0.0, float(cells[0, H]), np.ones(1, np.bool_), cells)
+        march_flows(dT, leaving, 0.0, float(cells[0, H]), np.ones(1, np.bool_), cells)
         dP = -cells[0, M_IN] / cells[0, M_IN_P]
-        pass_rates(exchanger, leaving, 0.0, dP, cells, dT)
+        pass_rates(leaving.m, leaving.h, 0.0, dP, cells, dT)
         return dP, dT[0]
 
     while P > 6e5:

@@ -12,7 +12,7 @@ from coldloop.kernels.intrinsics import borrowed, named, plain_tuples
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.model_range import model_range
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop_plant.cold_box import OUTPUTS, ColdBox, advance, derivative
+from coldloop_plant.cold_box import OUTPUTS, ColdBox, advance, evaluated
 from coldloop_plant.cold_box.plant_file import REFERENCE
 from coldloop_plant.components.phase_separator import content
 from coldloop_plant.helium import Helium, load_helium, supply_enthalpy_and_density
@@ -207,7 +207,7 @@ def box_held(
             sums[0] += WEIGHTS[k] * inwards
             sums[1] += WEIGHTS[k] * abs(inwards)
             sums[2] = max(sums[2], abs(stored - inwards))
-            stage = x + AHEAD[k] * derivative(stage, u, w, box, helium)
+            stage = x + AHEAD[k] * evaluated(stage, u, w, box, helium)[0]
         x = advance(x, u, w, 0.25, box, helium)
     return x, sums
 

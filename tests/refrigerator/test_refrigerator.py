@@ -20,8 +20,7 @@ from coldloop_refrigerator.physics import (
     SIGNAL_NAMES,
     STATE_NAMES,
     advance_refrigerator,
-    rates,
-    read,
+    evaluated,
 )
 from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR
 from coldloop_refrigerator.program import SHIPPED, read_refrigerator_file, refrigerator_digest
@@ -45,12 +44,12 @@ def rest() -> Point:
 
 
 def signals_of(point: Point) -> dict[str, float]:
-    _, signals = read(*point, PLANT, HELIUM)
+    _, _, signals = evaluated(*point, PLANT, HELIUM)
     return dict(zip(SIGNAL_NAMES, signals.tolist(), strict=True))
 
 
 def outputs_of(point: Point) -> dict[str, float]:
-    y, _ = read(*point, PLANT, HELIUM)
+    _, y, _ = evaluated(*point, PLANT, HELIUM)
     return dict(zip(OUTPUT_NAMES, y.tolist(), strict=True))
 
 
@@ -63,7 +62,7 @@ def simulate(point: Point, seconds: float, dt: float = 0.25) -> Point:
 
 @pytest.mark.usefixtures("compiles")
 def test_the_operating_point_is_at_rest(rest: Point) -> None:
-    assert np.max(np.abs(rates(*rest, PLANT, HELIUM) / rate_scales(PLANT))) < 1e-9
+    assert np.max(np.abs(evaluated(*rest, PLANT, HELIUM)[0] / rate_scales(PLANT))) < 1e-9
 
 
 def test_the_cold_box_feels_what_it_feels_alone(rest: Point) -> None:
@@ -146,7 +145,12 @@ def rest_of_linear(rest: Point, moved: Point, seconds: float) -> dict[str, float
 
 def reference_integration(point: Point, seconds: float) -> RealArray:
     solved = solve_ivp(
-        lambda _t, x: rates(x, *point[1:], PLANT, HELIUM), (0.0, seconds), point.x, "LSODA", rtol=1e-10, atol=1e-11
+        lambda _, x: evaluated(x, *point[1:], PLANT, HELIUM)[0],
+        (0.0, seconds),
+        point.x,
+        "LSODA",
+        rtol=1e-10,
+        atol=1e-11,
     )
     assert solved.success
     end: RealArray = solved.y[:, -1]

@@ -22,8 +22,7 @@ from coldloop_refrigerator.station_control import (
     StationMeasurement,
     beyond,
     control_station,
-    opened_by,
-    shut_by,
+    overridden,
     station_law,
 )
 
@@ -164,15 +163,15 @@ def test_without_compressors_the_high_pressure_line_empties_into_the_buffer_and_
     program = make(events=[event(10.0, "nc1", 0), event(10.0, "nc2", 0)])
     run(program, 12.0)
     assert program.station.mode == StationMode.STOPPED
-    assert program.commands[0] > 50.0
-    assert program.commands[1:3] == (100.0, 0.0)
+    assert program.station_status.commands[0] > 50.0
+    assert program.station_status.commands[1:3] == (100.0, 0.0)
     signals = run(program, 20.0)
-    bypass, discharge, charge = program.commands[:3]
+    bypass, discharge, charge = program.station_status.commands[:3]
     assert bypass < 10.0
     assert (discharge, charge) == (100.0, 0.0)
     assert max(signals[:, LP]) == pytest.approx(1.30, abs=0.01)
     later = run(program, 40.0)
-    assert program.commands[0] == 0.0, "what lifts the low pressure further is what the load evaporates"
+    assert program.station_status.commands[0] == 0.0, "what lifts the low pressure further is what the load evaporates"
     assert signals[-1, LP] < later[-1, LP] < 1.5
 
 
@@ -230,7 +229,7 @@ def test_charging_stops_when_the_low_pressure_is_too_high() -> None:
     [(17.0, 17.0, 17.6, 0.0), (17.3, 17.0, 17.6, 0.5), (18.0, 17.0, 17.6, 1.0), (0.94, 0.99, 0.89, 0.5)],
 )
 def test_a_limit_acts_in_proportion(pressure: float, limit: float, full: float, share: float) -> None:
-    assert beyond(pressure, limit, full) == pytest.approx(share)
+    assert beyond(pressure, (limit, full)) == pytest.approx(share)
 
 
 @pytest.mark.parametrize(
@@ -247,7 +246,7 @@ def test_a_limit_acts_in_proportion(pressure: float, limit: float, full: float, 
 def test_a_pressure_beyond_its_limit_first_opens_a_valve_then_shuts_the_other(
     asked: tuple[float, float], high: float, low: float, moved: tuple[float, float]
 ) -> None:
-    assert opened_by(shut_by((30.0, *asked), high, low), high, low) == pytest.approx((30.0, *moved))
+    assert overridden((30.0, *asked), high, low)[1] == pytest.approx((30.0, *moved))
 
 
 @BOTH
@@ -288,7 +287,7 @@ def test_the_retained_state_of_a_cold_box_is_refused() -> None:
 
 def test_what_an_operator_gives_holds_until_a_later_event() -> None:
     schedule = EventSchedule([event(10.0, "leak", 2.0), event(30.0, "nc1", 0)], 295.0, 0.0)
-    schedule.put(60, Surroundings(leak=5.0, nitrogen=0))
+    schedule.put.append((60, Surroundings(leak=5.0, nitrogen=0)))
     assert schedule.at(39).leak == 0.0
     assert schedule.at(40) == Surroundings(leak=2.0, ambient=295.0)
     assert schedule.at(60) == Surroundings(leak=5.0, nitrogen=0)

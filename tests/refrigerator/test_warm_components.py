@@ -24,16 +24,19 @@ from coldloop_plant.helium import (
     vapour_temperature,
 )
 from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR, RefrigeratorParameters
-from coldloop_refrigerator.precooler import (
+from coldloop_refrigerator.warm import (
     BOILING_POINT,
     LATENT_HEAT,
     LIQUID_DENSITY,
     boil,
+    compress,
     exchanged_heat,
+    gas_density,
+    gas_mass,
+    gas_pressure,
     nitrogen_level,
     transfer_warm,
 )
-from coldloop_refrigerator.station import compress, gas_density, gas_mass, gas_pressure
 
 HELIUM = load_helium()
 STATION = REFERENCE_REFRIGERATOR.station

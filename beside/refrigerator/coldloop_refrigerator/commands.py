@@ -2,17 +2,13 @@
 
 import argparse
 import sys
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coldloop.service.command_line import add_configuration_options
 from coldloop_rig.cli.commands.options import Command, configuration
 
-if TYPE_CHECKING:
-    from coldloop_refrigerator.exergy import ExergyBalance
-
 SAID: Final = {"exergy": "where a refrigerator loses the exergy that it is given"}
-GROUP: Final = {"exergy": "a plant and its controller"}
-"""Group in which `coldloop --help` lists the command."""
+GROUP: Final = {"exergy": "a plant and its controller"}  # Group in which `coldloop --help` lists the command
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
@@ -35,32 +31,28 @@ def execute_exergy(options: argparse.Namespace) -> int:
         rest, _ = refrigerator_operating_point(file, load_helium(), settings.plant.station.weights)
     except NoEquilibriumError as error:
         raise UsageError(f"{options.plant or 'the reference refrigerator'}: {error}") from None
-    sys.stdout.write("\n".join(lines_of(exergy_balance(rest, file.refrigerator, load_helium()))) + "\n")
-    return 0
-
-
-def lines_of(balance: "ExergyBalance") -> list[str]:
-    """Return a balance as text; rows are sorted by what is lost."""
-    rows = sorted(balance.destroyed.items(), key=lambda row: -row[1])
+    balance = exergy_balance(rest, file.refrigerator, load_helium())
     of_all, of_electricity = (100.0 * balance.useful / each for each in (balance.put_in, balance.electricity))
-    return [
+    lines = [
         f"cold power {balance.cold_power:.1f} W at {balance.T_bath:.3f} K, load and heater",
         f"specific power {balance.specific_power:.0f} W/W of electricity; Carnot {balance.ideal_power:.1f} W/W",
         f"Carnot fraction {of_electricity:.2f} % by the electricity, {of_all:.2f} % with the nitrogen's exergy",
         "",
         f"{'exergy':26} {'kW':>9} {'%':>8}",
-        _row("electricity", balance.electricity, balance.put_in),
-        _row("liquid nitrogen", balance.nitrogen, balance.put_in),
-        "",
-        *(_row(name, lost, balance.put_in) for name, lost in rows),
-        _row("useful: of the cold power", balance.useful, balance.put_in),
-        _row("sum", balance.useful + sum(balance.destroyed.values()), balance.put_in),
     ]
-
-
-def _row(name: str, exergy: float, whole: float) -> str:
-    kilowatts, share = (round(value, 3) + 0.0 for value in (1e-3 * exergy, 100.0 * exergy / whole))  # no -0.000
-    return f"{name:26} {kilowatts:9.3f} {share:8.2f}"
+    rows = {
+        "electricity": balance.electricity,
+        "liquid nitrogen": balance.nitrogen,
+        "": 0.0,
+        **dict(sorted(balance.destroyed.items(), key=lambda row: -row[1])),
+        "useful: of the cold power": balance.useful,
+        "sum": balance.useful + sum(balance.destroyed.values()),
+    }
+    for name, exergy in rows.items():
+        kilowatts, share = (round(each, 3) + 0.0 for each in (1e-3 * exergy, 100.0 * exergy / balance.put_in))  # no -0
+        lines.append(f"{name:26} {kilowatts:9.3f} {share:8.2f}" if name else "")
+    sys.stdout.write("\n".join(lines) + "\n")
+    return 0
 
 
 COMMANDS: Final = {"exergy": Command(_declare, execute_exergy)}

@@ -26,11 +26,9 @@ class RefrigeratorState(NamedTuple):
     """A refrigerator between two ticks."""
 
     x: Array
-    """States of the cold box, the first 28 of `memory.x`."""
+    """States of the cold box, the first 28 of `memory.x`; outputs (22,); the station's signals, mode, alarms (21,)."""
     y: Array
-    """Outputs, shape (22,)."""
     station: Array
-    """Signals, mode and alarms of the station, shape (21,)."""
     noise: Array
     """Draws for the sensors, a row for each tick of the trace, shape (N, 22) or (0, 22)."""
     memory: RefrigeratorMemory

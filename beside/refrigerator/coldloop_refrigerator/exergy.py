@@ -55,26 +55,19 @@ def supply_entropy(P: float, T: float, helium: Helium) -> float:
     return entropy(P, enthalpies[edge], helium) - float(np.sum(np.diff(enthalpies[: edge + 1]) / between))
 
 
-LIQUID_NITROGEN: Final = 754.2e3
-"""J/kg at 80 K and 2.5 bar, about 300 K and 1 atm (CoolProp 8.0)."""
-NITROGEN_VAPOUR: Final = 198.2e3
-"""J/kg, of the saturated vapour at 1.05 bar, which leaves unused."""
+LIQUID_NITROGEN: Final = 754.2e3  # J/kg at 80 K and 2.5 bar, about 300 K and 1 atm (CoolProp 8.0)
+NITROGEN_VAPOUR: Final = 198.2e3  # J/kg, of the saturated vapour at 1.05 bar, which leaves unused
 T1, T2, T4, T6, T9 = (OUTPUT_NAMES.index(name) for name in ("T1", "T2", "T4", "T6", "T9"))
 
 
 class ExergyBalance(NamedTuple):
     """The exergy (W) that a refrigerator at rest is given, what of it is useful, and where the difference is lost."""
 
-    electricity: float
-    """Exergy of the compressors' electricity, W."""
-    nitrogen: float
-    """Exergy of the liquid nitrogen that is fed, W."""
-    cold_power: float
-    """Load and heater, W."""
-    T_bath: float
-    """K."""
-    destroyed: dict[str, float]
-    """By component."""
+    electricity: float  # Exergy of the compressors' electricity, W
+    nitrogen: float  # Exergy of the liquid nitrogen that is fed, W
+    cold_power: float  # Load and heater, W
+    T_bath: float  # K
+    destroyed: dict[str, float]  # By component
 
     @property
     def put_in(self) -> float:

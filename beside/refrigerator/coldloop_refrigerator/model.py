@@ -21,7 +21,6 @@ from coldloop.service.command_line import add_configuration_options
 from coldloop.service.start import SECTIONS
 from coldloop_plant.cold_box import model as cold_box
 from coldloop_plant.cold_box import streams
-from coldloop_plant.cold_box.model import Equilibrium
 from coldloop_plant.cold_box.plant_file import OPERATING_INPUTS, OPERATING_LEVEL
 from coldloop_plant.equilibrium import Linear, Modes, NoEquilibriumError, complex_step, model_of, newton
 from coldloop_plant.helium import Helium, load_helium
@@ -30,9 +29,8 @@ from coldloop_plant.settings import LqWeights, PlantSettings, StationSettings
 from coldloop_refrigerator import physics
 from coldloop_refrigerator.physics import COMMAND_NAMES, STATE_NAMES, Refrigerator
 from coldloop_refrigerator.plant_file import KIND, REFERENCE_REFRIGERATOR, RefrigeratorPlantFile
-from coldloop_refrigerator.precooler import LIQUID_DENSITY
 from coldloop_refrigerator.program import SHIPPED, RefrigeratorFile, read_refrigerator_file, refrigerator_digest
-from coldloop_refrigerator.station import GasVolume, compress, gas_mass
+from coldloop_refrigerator.warm import LIQUID_DENSITY, GasVolume, compress, gas_mass
 
 AMBIENT: Final = 300.0
 V_L, M_HP, M_LP, M_BUFFER, M_LOST, M_N2, CV956, CV167 = (
@@ -56,8 +54,7 @@ def jacobian(x: RealArray, u: RealArray, v: RealArray, d: RealArray, plant: Refr
 
     def evaluate(z: Array) -> Array:
         xz, uz, vz, dz = np.split(z, cuts)
-        shown = physics.read(xz, uz, vz, dz, plant, helium)
-        return np.concatenate([physics.rates(xz, uz, vz, dz, plant, helium), *shown])
+        return np.concatenate(physics.evaluated(xz, uz, vz, dz, plant, helium))
 
     at = np.concatenate([x, u, v, d])
     return complex_step(evaluate, at, np.ones(at.size))
@@ -74,26 +71,19 @@ GIVEN: Final = (V_L, M_LP, M_BUFFER, M_LOST, M_N2, *AS_ASKED)
 
 
 class Rest(NamedTuple):
-    """The refrigerator at rest."""
+    """The refrigerator at rest, in the shapes and units of `physics`."""
 
     x: RealArray
-    """Shape (48,)."""
     u: RealArray
-    """Shape (3,)."""
     v: RealArray
-    """Shape (4,)."""
     d: RealArray
-    """Shape (6,)."""
     y: RealArray
-    """Shape (22,)."""
     signals: RealArray
-    """Shape (19,)."""
-    residual: float
-    """Largest |dx/dt| in units of `rate_scales`, per second."""
+    residual: float  # Largest |dx/dt| in units of `rate_scales`, per second
 
 
 def find_refrigerator_equilibrium(
-    cold: Equilibrium, plant: Refrigerator, helium: Helium, P_buffer: float = 6e5
+    cold: cold_box.Equilibrium, plant: Refrigerator, helium: Helium, P_buffer: float = 6e5
 ) -> Rest:
     """Return the rest of `plant` at the cold box's inputs and level, near the rest `cold` of the cold box alone.
 
@@ -108,9 +98,11 @@ def find_refrigerator_equilibrium(
         NoEquilibriumError: Newton's method does not converge.
     """
     start, u, n, m = first_guess(cold, plant, helium, P_buffer), cold.u, len(STATE_NAMES), len(cold.u)
-    v = np.array([start[CV956], 0.0, 0.0, start[CV167]])
-    x = _relaxed(start.copy(), u, v, _disturbances(cold.w), plant, helium)
-    x[CV956] = v[0] = _balancing_bypass(x, u, v, _disturbances(cold.w), plant, helium)
+    v, d = np.array([start[CV956], 0.0, 0.0, start[CV167]]), _disturbances(cold.w)
+    x = _relaxed(start.copy(), u, v, d, plant, helium)
+    dx, _, signals = physics.evaluated(x, u, v, d, plant, helium)
+    surplus = 1e3 * dx[M_HP] / signals[physics.SIGNAL_NAMES.index("M_CV956")]
+    x[CV956] = v[0] = max(0.0, float(x[CV956] * (1.0 + surplus)))  # else the surplus works on the passes
     free = [i for i in range(n) if i not in (*GIVEN, M_HP)]
     warm = [k for k, i in enumerate(free) if STATE_NAMES[i].startswith("T_")]
     scales, unknown = rate_scales(plant), [*free, n + m + len(COMMAND_NAMES), n + m, n + m + 3]  # load, bypass, feed
@@ -130,19 +122,10 @@ def find_refrigerator_equilibrium(
         return z
 
     z, residual = newton(
-        np.array([*x, *v, cold.w]), lambda z: physics.rates(*apart(z), plant, helium) / scales, step, 60,
+        np.array([*x, *v, cold.w]), lambda z: physics.evaluated(*apart(z), plant, helium)[0] / scales, step, 60,
         "the refrigerator has no equilibrium",
     )  # fmt: skip
-    return Rest(*apart(z), *physics.read(*apart(z), plant, helium), residual)
-
-
-def _balancing_bypass(
-    x: RealArray, u: RealArray, v: RealArray, d: RealArray, plant: Refrigerator, helium: Helium
-) -> float:
-    """Return the opening (%) with which the high-pressure side keeps its mass; else it works on the passes."""
-    _, signals = physics.read(x, u, v, d, plant, helium)
-    surplus = 1e3 * physics.rates(x, u, v, d, plant, helium)[M_HP]
-    return max(0.0, float(x[CV956] * (1.0 + surplus / signals[physics.SIGNAL_NAMES.index("M_CV956")])))
+    return Rest(*apart(z), *physics.evaluated(*apart(z), plant, helium)[1:], residual)
 
 
 def _relaxed(x: RealArray, u: RealArray, v: RealArray, d: RealArray, plant: Refrigerator, helium: Helium) -> RealArray:
@@ -166,7 +149,7 @@ def _relaxed(x: RealArray, u: RealArray, v: RealArray, d: RealArray, plant: Refr
     return x
 
 
-def first_guess(cold: Equilibrium, plant: Refrigerator, helium: Helium, P_buffer: float) -> RealArray:
+def first_guess(cold: cold_box.Equilibrium, plant: Refrigerator, helium: Helium, P_buffer: float) -> RealArray:
     """Return the state from which the search sets out."""
     station, precooler = plant.station, plant.precooler
     hot = AMBIENT + station.cooler_approach
@@ -250,12 +233,22 @@ def prediction_model(
     helium = load_helium()
     point = np.array(file.x0), np.array(file.u0), np.array(file.v0), _disturbances(file.w0)
     J = jacobian(*point, plant, helium)
-    y0, _ = physics.read(*point, plant, helium)
+    _, y0, _ = physics.evaluated(*point, plant, helium)
     n, extra = len(STATE_NAMES), len(LOOP_STATES)
     inputs, load = slice(n, n + 3), n + 7 + physics.DISTURBANCE_NAMES.index("NCR22_HL")
     outputs, rows = slice(n, n + len(y0)), list(KEPT)
+    kept, lag_s = len(rows), plant.station.actuator.lag
+    A, loop = np.zeros((kept + extra, kept + extra)), np.zeros((2 + extra, kept + extra))
+    A[:kept, :kept] = J[np.ix_(rows, rows)]
+    A[:kept, kept] = J[rows, CV956] / -J[M_HP, CV956]  # the bypass flow leaves the high-pressure side, whose gas cools,
+    A[kept - 1, kept : kept + 2] = 1.0  # and reaches, with that from the buffer, the low-pressure line
+    loop[:2, :kept] = J[np.ix_(PRESSURE_ROWS, rows)]  # the high pressure also follows the passes' temperatures
+    loop[2:, kept:] = np.eye(extra)
+    A[kept : kept + 2] = -np.array(file.gains) @ loop / lag_s  # flows follow -K (pressures, flows, integrals)
+    A[kept : kept + 2, kept : kept + 2] -= np.eye(2) / lag_s
+    A[kept + 2 :] = loop[:2]
     linear = Linear(
-        A=_closed(J, np.array(file.gains), plant.station.actuator.lag),
+        A=A,
         B=np.vstack([J[rows, inputs], np.zeros((extra, 3))]),
         F=np.concatenate([J[rows, load], np.zeros(extra)]), C=np.hstack([J[outputs, rows], np.zeros((len(y0), extra))]),
         D=J[outputs, inputs], G=J[outputs, load],
@@ -265,24 +258,6 @@ def prediction_model(
         {STATE_NAMES[i]: physics.STATE_UNITS[i] for i in rows} | LOOP_STATES, refrigerator_digest(plant), plant=KIND,
         plant_parameters=dict(parameters or {}), plant_rest=dict(rest or {}),
     )  # fmt: skip
-
-
-def _closed(J: RealArray, K: RealArray, lag_s: float) -> RealArray:
-    """Return dx/dt over x of the kept states and the loop, whose flows follow -K (pressures, flows, integrals)."""
-    kept = len(KEPT)
-    LP = kept - 1
-    A = np.zeros((kept + 4, kept + 4))
-    A[:kept, :kept] = J[np.ix_(KEPT, KEPT)]
-    A[:kept, kept] = J[KEPT, CV956] / -J[M_HP, CV956]  # the bypass flow leaves the high-pressure side, whose gas cools,
-    A[LP, kept : kept + 2] = 1.0  # and reaches, with that from the buffer, the low-pressure line
-    pressures = np.zeros((2, kept + 4))
-    pressures[:, :kept] = J[np.ix_(PRESSURE_ROWS, KEPT)]  # the high pressure also follows the passes' temperatures
-    loop = np.vstack([pressures, np.zeros((4, kept + 4))])
-    loop[2:, kept:] = np.eye(4)
-    A[kept : kept + 2] = -K @ loop / lag_s
-    A[kept : kept + 2, kept : kept + 2] -= np.eye(2) / lag_s
-    A[kept + 2 :] = pressures
-    return A
 
 
 def refrigerator_operating_point(
@@ -315,7 +290,7 @@ def refrigerator_operating_point(
             raise NoEquilibriumError(
                 "station: no gains hold both pressures; more station.hp_volume_m3 and station.lp_volume_m3 would help"
             ) from None
-        model = prediction_model(own, plant, file.parameters, own.document)
+        model = prediction_model(own, plant, file.parameters, own.model_dump(mode="json"))
         modes = _modes(model.A, model.state_names, model.state_units, plant)
         for obstacle in (*modes.growing(", with its pressures controlled"), *modes.too_fast(slower)):
             raise NoEquilibriumError(obstacle)
@@ -339,7 +314,7 @@ def _wrong_pressures(file: RefrigeratorPlantFile) -> Iterator[str]:
         )
 
 
-def _wrong_flows(cold: Equilibrium, file: RefrigeratorPlantFile, helium: Helium) -> Iterator[str]:
+def _wrong_flows(cold: cold_box.Equilibrium, file: RefrigeratorPlantFile, helium: Helium) -> Iterator[str]:
     """Yield that the compressors deliver less than the cold box takes."""
     least_bypass = 0.5  # g/s: with less the low pressure cannot be raised
     box, station = file.refrigerator.box, file.refrigerator.station
@@ -359,7 +334,7 @@ def _wrong_flows(cold: Equilibrium, file: RefrigeratorPlantFile, helium: Helium)
         )
 
 
-def _why_restless(cold: Equilibrium, file: RefrigeratorPlantFile, helium: Helium) -> str:
+def _why_restless(cold: cold_box.Equilibrium, file: RefrigeratorPlantFile, helium: Helium) -> str:
     """Return why no rest was found: a part is too fast, or a valve too small, as with a wider one there is a rest."""
     plant, P_buffer = file.refrigerator, file.station.buffer_bar * PA_PER_BAR
     x, n = first_guess(cold, plant, helium, P_buffer), len(STATE_NAMES)
@@ -399,9 +374,9 @@ def _too_narrow(v: RealArray) -> Iterator[str]:
         )
 
 
-def cold_part(rest: Rest) -> Equilibrium:
+def cold_part(rest: Rest) -> cold_box.Equilibrium:
     """Return the rest of the cold box within that of the refrigerator."""
-    return Equilibrium(rest.x[: physics.BOX_STATES], rest.u, float(rest.d[0]), rest.y, rest.residual)
+    return cold_box.Equilibrium(rest.x[: physics.BOX_STATES], rest.u, float(rest.d[0]), rest.y, rest.residual)
 
 
 def cooled_file(file: RefrigeratorPlantFile, rest: Rest) -> RefrigeratorPlantFile:
@@ -417,29 +392,20 @@ def described_at_rest(file: RefrigeratorPlantFile, control: StationSettings) -> 
         NoEquilibriumError: As `refrigerator_operating_point`.
     """
     rest, model = refrigerator_operating_point(file, load_helium(), control.weights)
-    return cold_box.AtRest(
-        cold_part(rest), cooled_file(file, rest).box, model, [*_station_lines(rest), *_set_point_line(file, control)]
-    )
-
-
-def _station_lines(rest: Rest) -> list[str]:
     signals = dict(zip(STATION_SIGNAL_NAMES, rest.signals.tolist(), strict=True))
     openings = [f"{name} {value:.2f} %" for name, value in zip(STATION_VALVE_NAMES, rest.v.tolist(), strict=True)]
     per_watt = 1e3 * signals["E_NC"] / float(rest.d[0] + rest.u[1])
-    return [
+    lines = [
         f"station    {'  '.join(openings)}",
         f"           compressors {signals['M_NC']:.1f} g/s, {signals['E_NC']:.1f} kW, {per_watt:.0f} W/W",
         f"           bypass {signals['M_CV956']:.1f} g/s, nitrogen {signals['M_GN2']:.2f} g/s",
     ]
-
-
-def _set_point_line(plant: RefrigeratorPlantFile, control: StationSettings) -> list[str]:
-    """Return the settings to change where the steady-state pressures are not the setpoints."""
-    high, low = plant.boundaries.p_hp_bar, plant.boundaries.p_lp_bar
-    if (high, low) == (control.hp_bar, control.lp_bar):
-        return []
-    settings = f"--set plant.station.hp_bar={high:g} --set plant.station.lp_bar={low:g}"
-    return [f"set points {control.hp_bar:g} and {control.lp_bar:g} bar are not the pressures at rest: {settings}"]
+    high, low = file.boundaries.p_hp_bar, file.boundaries.p_lp_bar
+    if (high, low) != (control.hp_bar, control.lp_bar):
+        settings = f"--set plant.station.hp_bar={high:g} --set plant.station.lp_bar={low:g}"
+        set_points = f"set points {control.hp_bar:g} and {control.lp_bar:g} bar"
+        lines.append(f"{set_points} are not the pressures at rest: {settings}")
+    return cold_box.AtRest(cold_part(rest), cooled_file(file, rest).box, model, lines)
 
 
 def _modes(A: RealArray, names: Sequence[str], units: Sequence[str], plant: Refrigerator) -> Modes:
@@ -448,10 +414,8 @@ def _modes(A: RealArray, names: Sequence[str], units: Sequence[str], plant: Refr
 
 def slower(part: str) -> str:
     """Return what makes a part slower; station and coil have no walls of aluminium."""
-    more = {
-        "station": "station.hp_volume_m3, station.lp_volume_m3 or station.valve_lag_s",
-        "nef5": "nef5.capacity_kj_per_k",
-    }
+    volumes = "station.hp_volume_m3, station.lp_volume_m3 or station.valve_lag_s"
+    more = {"station": volumes, "nef5": "nef5.capacity_kj_per_k"}
     return f"more {more[part]} would help" if part in more else cold_box.slower(part)
 
 

@@ -26,45 +26,17 @@ from coldloop_plant.components.heat_exchanger import WILD, HighPressureFlow, Low
 from coldloop_plant.components.phase_separator import Content, add_to_account, content, settle_account, start_account
 from coldloop_plant.helium import Helium
 from coldloop_plant.numeric import PA_PER_BAR, Array, RealArray
-from coldloop_refrigerator.high_pressure import (
-    COARSE_CELL,
-    COARSE_PRESSURE,
-    FIRST,
-    Filling,
-    add_gains,
-    fill_passes,
-    piped,
-    read_passes,
-    settle_passes,
-    side_mass,
-    side_pressure,
-    start_gains,
-)
-from coldloop_refrigerator.precooler import (
-    PRECOOLER_STATE_UNITS,
-    PRECOOLER_STATES,
-    Precooler,
-    Precooling,
-    nitrogen_level,
-)
-from coldloop_refrigerator.station import (
-    STATION_STATE_UNITS,
-    STATION_STATES,
-    CompressionStation,
-    StationFlows,
-    station_pressures,
-    station_rates,
-)
+from coldloop_refrigerator import high_pressure as passes
+from coldloop_refrigerator import warm
+from coldloop_refrigerator.warm import Precooler, gas_pressure, station_rates
 
 BOX_STATES: Final = len(cold_box.STATE_NAMES)
-STATION: Final = BOX_STATES + len(PRECOOLER_STATES)
-"""Index of the station's first state; CV167 is before it."""
-VALVES: Final = STATION + STATION_STATES.index("CV956")
+STATION: Final = BOX_STATES + len(warm.PRECOOLER_STATES)  # Index of the station's first state; CV167 is before it
+VALVES: Final = STATION + warm.STATION_STATES.index("CV956")
 """Index of the first of the station's valves, in the order of `COMMAND_NAMES`."""
-COIL: Final = BOX_STATES + PRECOOLER_STATES.index("T_nef5")
-"""Index of the last state of the high-pressure passes."""
-STATE_NAMES: Final = (*cold_box.STATE_NAMES, *PRECOOLER_STATES, *STATION_STATES)
-STATE_UNITS: Final = (*cold_box.STATE_UNITS, *PRECOOLER_STATE_UNITS, *STATION_STATE_UNITS)
+COIL: Final = BOX_STATES + warm.PRECOOLER_STATES.index("T_nef5")  # Index of the last state of the high-pressure passes
+STATE_NAMES: Final = (*cold_box.STATE_NAMES, *warm.PRECOOLER_STATES, *warm.STATION_STATES)
+STATE_UNITS: Final = (*cold_box.STATE_UNITS, *warm.PRECOOLER_STATE_UNITS, *warm.STATION_STATE_UNITS)
 COMMAND_NAMES: Final = cold_box.STATION_VALVE_NAMES
 DISTURBANCE_NAMES: Final = ("NCR22_HL", "T_ambient", "leak", "nitrogen", "NC1", "NC2")
 """Heat load (W), ambient temperature (K), leak at 16 bar (kg/s); 0 or 1: nitrogen in the tank, compressors to run."""
@@ -76,10 +48,9 @@ SIGNALS: Final = len(SIGNAL_NAMES)
 class Refrigerator(NamedTuple):
     """Components of the refrigerator, in SI units; `refrigerator.plant_file` has the reference plant's."""
 
-    box: ColdBox
-    """Its boundaries P_HP and P_LP are the pressures at rest; the equations do not read them, nor T_in."""
+    box: ColdBox  # Its boundaries P_HP and P_LP are the pressures at rest; the equations do not read them, nor T_in
     precooler: Precooler
-    station: CompressionStation
+    station: warm.CompressionStation
 
 
 class Crossing(NamedTuple):
@@ -87,7 +58,7 @@ class Crossing(NamedTuple):
 
     high: HighPressureFlow
     """Through CV155 and CV156, as it would come from the compressors, were nothing stored on the way."""
-    filling: Filling
+    filling: passes.Filling
     """Flows of helium into and out of line and passes."""
     cold: Streams
     """Streams of the cold box."""
@@ -97,7 +68,7 @@ class Crossing(NamedTuple):
     """Flow from the bath into the recovery line, kg/s."""
     bath: Content
     """Content of the bath."""
-    cooling: Precooling
+    cooling: warm.Precooling
     """Flows of NEF6 and NEF5."""
     heater: float
     """W."""
@@ -112,48 +83,37 @@ def evaluate_refrigerator(
     Returns the streams that cross the boundary of its cold part.
     """
     station, precooler, box = plant.station, plant.precooler, plant.box
-    pipes = piped(box, precooler)
-    held = read_passes(x, pipes, helium)
+    pipes = passes.piped(box, precooler)
+    held = passes.read_passes(x, pipes, helium)
     T_hot = d[1] + station.cooler_approach
-    HP = side_pressure(station.hp.volume, x[STATION], T_hot, held.mass)
-    P = station_pressures(HP, x[STATION:], station, d[1])
+    HP = passes.side_pressure(station.hp.volume, x[STATION], T_hot, held.mass)
+    LP, P_buffer = gas_pressure(station.lp, x[STATION + 1], d[1]), gas_pressure(station.buffer, x[STATION + 2], d[1])
     joined = ColdBox(
-        box.separator, box.jt_valve, box.turbine, box.nef1, box.nef2, box.nef34, box.return_line, P.HP, P.LP,
+        box.separator, box.jt_valve, box.turbine, box.nef1, box.nef2, box.nef34, box.return_line, HP, LP,
         x[pipes.coil],
     )  # fmt: skip
     inputs = u if d[4].real + d[5].real > 0.0 else 0.0 * u
     cold, leaving, relief, bath = evaluate(
         x[:BOX_STATES], inputs, d[0], joined, helium, dx[:BOX_STATES], y, is_supply_held=False
     )
-    high = HighPressureFlow(cold.m_jt + cold.m_t, T_hot, P.HP)
-    flows = station_rates(
-        x[STATION:], P, high.mass_flow, leaving.mass_flow, d[1], d[2], d[4:].real, station, dx[STATION:]
-    )
-    filling, cooling = fill_passes(
-        P.HP, dx[STATION], T_hot, cold, leaving, station.hp.volume, pipes, held, helium, x, d[3], dx
+    high = HighPressureFlow(cold.m_jt + cold.m_t, T_hot, HP)
+    station_rates(
+        x[STATION:], HP, LP, P_buffer, high.mass_flow, leaving.mass_flow, d[1], d[2], d[4:].real, station,
+        dx[STATION:], signals[6:],
+    )  # fmt: skip
+    filling, cooling = passes.fill_passes(
+        HP, dx[STATION], T_hot, cold, leaving, station.hp.volume, pipes, held, helium, x, d[3], dx
     )
     dx[STATION + 3] += relief
     move_valves(x, v, plant, dx)
-    signals[0], signals[1], signals[2] = P.LP / PA_PER_BAR, P.HP / PA_PER_BAR, P.buffer / PA_PER_BAR
+    signals[0], signals[1], signals[2] = LP / PA_PER_BAR, HP / PA_PER_BAR, P_buffer / PA_PER_BAR
     signals[3], signals[4] = cooling.warm_end.T, x[pipes.coil - 1]
     signals[5] = 1e3 * filling.entering
-    _write_flows(flows, signals[6:])
     signals[10] += 1e3 * relief
-    signals[13] = nitrogen_level(precooler.nef5, x[pipes.coil + 1])
-    signals[14] = x[pipes.coil + 2]
-    signals[15] = 1e3 * cooling.boiling.boil_off
-    signals[16] = inventory(x, plant, helium)
-    signals[17] = x[STATION + 3]
-    signals[18] = d[1]
+    signals[13], signals[14] = warm.nitrogen_level(precooler.nef5, x[pipes.coil + 1]), x[pipes.coil + 2]
+    signals[15], signals[16] = 1e3 * cooling.boiling.boil_off, inventory(x, plant, helium)
+    signals[17], signals[18] = x[STATION + 3], d[1]
     return Crossing(high, filling, cold, leaving, relief, bath, cooling, inputs[1])
-
-
-@kernel
-def _write_flows(flows: StationFlows, signals: Array) -> None:
-    signals[0] = 1e3 * flows.compressed
-    signals[1], signals[2], signals[3] = 1e3 * flows.bypass, 1e3 * flows.discharge, 1e3 * flows.charge
-    signals[4] = 1e3 * flows.out
-    signals[5], signals[6] = 1e-3 * flows.power, 1e-3 * flows.cooling
 
 
 @kernel
@@ -175,25 +135,19 @@ def inventory(x: Array, plant: Refrigerator, helium: Helium) -> float:
 @kernel
 def high_pressure_mass(x: Array, P: float, T_ambient: float, plant: Refrigerator, helium: Helium) -> float:
     """Return what the high-pressure line and the passes hold (kg) at `P` (Pa), the passes as warm as in `x`."""
-    held = read_passes(x, piped(plant.box, plant.precooler), helium)
-    mass, _ = side_mass(plant.station.hp.volume, P, T_ambient + plant.station.cooler_approach, held.mass)
+    held = passes.read_passes(x, passes.piped(plant.box, plant.precooler), helium)
+    mass, _ = passes.side_mass(plant.station.hp.volume, P, T_ambient + plant.station.cooler_approach, held.mass)
     return mass
 
 
 @kernel
-def rates(x: Array, u: Array, v: Array, d: Array, plant: Refrigerator, helium: Helium) -> Array:
-    """Return dx/dt, shape (48,), in `STATE_UNITS` per second."""
-    dx = np.empty_like(x)
-    evaluate_refrigerator(x, u, v, d, plant, helium, dx, np.empty(22, x.dtype), np.empty(SIGNALS, x.dtype))
-    return dx
-
-
-@kernel
-def read(x: Array, u: Array, v: Array, d: Array, plant: Refrigerator, helium: Helium) -> tuple[Array, Array]:
-    """Return the outputs of the cold box, shape (22,), and the warm signals, shape (19,)."""
-    y, signals = np.empty(22, x.dtype), np.empty(SIGNALS, x.dtype)
-    evaluate_refrigerator(x, u, v, d, plant, helium, np.empty_like(x), y, signals)
-    return y, signals
+def evaluated(
+    x: Array, u: Array, v: Array, d: Array, plant: Refrigerator, helium: Helium
+) -> tuple[Array, Array, Array]:
+    """Return dx/dt (48,) in `STATE_UNITS` per second, the outputs of the cold box (22,) and the warm signals (19,)."""
+    dx, y, signals = np.empty_like(x), np.empty(OUTPUTS, x.dtype), np.empty(SIGNALS, x.dtype)
+    evaluate_refrigerator(x, u, v, d, plant, helium, dx, y, signals)
+    return dx, y, signals
 
 
 @kernel
@@ -224,31 +178,27 @@ def advance_along(
     stage, total = np.empty(n), np.empty(n)
     stages = np.empty((4, n))
     account = start_account(content(plant.box.separator, x[0], x[1], helium), first)
-    gains = start_gains(cells)
+    gains = passes.start_gains(cells)
     swing: float = 0.0
     for i in range(n):
         stages[0, i] = x[i]
         total[i] = first[i]
         stage[i] = x[i] + 0.5 * dt * first[i]
-    for k, fraction in ((1, 0.5), (2, 1.0)):
+    for k, weight, ahead in ((1, 2.0, 0.5), (2, 2.0, 1.0), (3, 1.0, 0.0)):
         crossing = evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
-        account = add_to_account(account, crossing.bath, slope, 2.0)
-        add_gains(gains, crossing.filling.cells, 2.0)
+        account = add_to_account(account, crossing.bath, slope, weight)
+        passes.add_gains(gains, crossing.filling.cells, weight)
         swing = max(swing, abs(crossing.filling.P - P))
         for i in range(n):
             stages[k, i] = stage[i]
-            total[i] += 2.0 * slope[i]
-            stage[i] = x[i] + fraction * dt * slope[i]
-    crossing = evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
-    account = add_to_account(account, crossing.bath, slope, 1.0)
-    add_gains(gains, crossing.filling.cells, 1.0)
-    swing = max(swing, abs(crossing.filling.P - P))
-    for i in range(n):
-        stages[3, i] = stage[i]
-        stage[i] = x[i] + dt / 6.0 * (total[i] + slope[i])
+            total[i] += weight * slope[i]
+            stage[i] = x[i] + (ahead * dt * slope[i] if k < 3 else dt / 6.0 * total[i])
     settle_account(plant.box.separator, account, dt / 6.0, stage, helium)
-    pipes = piped(plant.box, plant.precooler)
-    if swing > COARSE_PRESSURE or COARSE_CELL < widest_move(stages, stage, FIRST, pipes.coil) < WILD:
+    pipes = passes.piped(plant.box, plant.precooler)
+    if (
+        swing > passes.COARSE_PRESSURE
+        or passes.COARSE_CELL < widest_move(stages, stage, passes.FIRST, pipes.coil) < WILD
+    ):
         T_hot = d[1] + plant.station.cooler_approach
-        settle_passes(stage[STATION], gains, dt / 6.0, T_hot, plant.station.hp.volume, pipes, stage, helium)
+        passes.settle_passes(stage[STATION], gains, dt / 6.0, T_hot, plant.station.hp.volume, pipes, stage, helium)
     return stage

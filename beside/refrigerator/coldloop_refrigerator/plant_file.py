@@ -14,7 +14,6 @@ from coldloop_plant.cold_box.plant_file import (
     LISTING,
     BoxParameters,
     ExchangerSection,
-    HeatTransfer,
     Litres,
     PlantFile,
     Section,
@@ -22,63 +21,47 @@ from coldloop_plant.cold_box.plant_file import (
 )
 from coldloop_plant.components.expansion import Actuator, ReliefValve, Valve
 from coldloop_refrigerator.physics import Refrigerator
-from coldloop_refrigerator.precooler import NEF6_CELLS, NitrogenBath, Precooler
-from coldloop_refrigerator.station import CompressionStation, GasVolume, ScrewCompressor
+from coldloop_refrigerator.warm import (
+    NEF6_CELLS,
+    CompressionStation,
+    GasVolume,
+    NitrogenBath,
+    Precooler,
+    ScrewCompressor,
+)
 
-KIND: Final = "refrigerator"
-"""Kind of the plant in model files, and `plant.kind`."""
+KIND: Final = "refrigerator"  # Kind of the plant in model files, and `plant.kind`
 
 CubicMetres = Annotated[float, within(0.05, 1000)]
 Area = Annotated[float, within(0.05, 100_000)]
-ReliefPressure = Annotated[float, within(1.01, 50)]
-ReliefSpan = Annotated[float, within(0.01, 10)]
 Lag = Annotated[float, within(0.5, 1000)]
 Speed = Annotated[float, within(0.1, 1000)]
 Share = Annotated[float, within(0.05, 1)]
 
 
-class Nef6Section(ExchangerSection):
-    """The exchanger from ambient temperature to the nitrogen bath."""
-
-    ua_w_per_k: HeatTransfer = 21_500.0
-    volume_l: Litres = 40.0
-    aluminium_kg: Annotated[float, within(0.1, 20_000)] = 150.0
-
-
 class Nef5Section(Section):
-    """The nitrogen bath with its feed valve CV167."""
+    """The nitrogen bath, the fields of `NitrogenBath`, with its feed valve CV167."""
 
     ua_w_per_k: Annotated[float, within(1, 100_000)] = 336.44
-    """UA of the wetted coil, W/K."""
     volume_l: Litres = 30.0
-    """Volume of the vessel, l."""
     wet_level_pct: Annotated[float, within(1, 100)] = 25.0
-    """Level above which the whole coil is wet."""
     capacity_kj_per_k: Annotated[float, within(0.1, 10_000)] = 20.0
-    """Heat capacity of the coil and the helium in it, kJ/K."""
     cv167_area_mm2: Annotated[float, within(0.01, 1000)] = 1.3
     """Effective flow area of CV167 when fully open."""
     cv167_lag_s: Lag = 2.0
-    """Time constant of its drive."""
     cv167_fastest_pct_per_s: Speed = 10.0
-    """Largest speed of its drive."""
+    """Time constant and largest speed of its drive."""
 
 
 class CompressorSection(Section):
-    """A screw compressor with its motor."""
+    """A screw compressor with its motor: the fields of `ScrewCompressor`."""
 
     displacement_l_per_s: Annotated[float, within(0.1, 50_000)] = 380.0
-    """Swept volume at full speed."""
     filling: Share = 0.92
-    """Volumetric efficiency without a pressure rise."""
     slip: Annotated[float, within(0, 0.1)] = 0.006
-    """Loss of it per unit of pressure ratio."""
     isothermal_efficiency: Annotated[float, within(0.2, 1)] = 0.55
-    """At the built-in pressure ratio."""
     built_in_ratio: Annotated[float, within(1.1, 100)] = 10.0
-    """Ratio that the rotors' ports are made for."""
     mismatch: Annotated[float, within(0, 1)] = 0.05
-    """Loss of isothermal efficiency per squared logarithm of the ratio over the built-in one."""
     motor_efficiency: Share = 0.95
 
 
@@ -86,40 +69,31 @@ class StationSection(Section):
     """Volumes, valves and cooler of the compression station."""
 
     hp_volume_m3: CubicMetres = 2.0
-    """Volume of the high-pressure line, m3."""
     lp_volume_m3: CubicMetres = 1.5
-    """Volume of the low-pressure line, m3."""
+    """Volumes of the high-pressure and the low-pressure line, m3."""
     buffer_volume_m3: CubicMetres = 20.0
-    """Volume of the medium-pressure vessel, m3."""
     buffer_bar: Annotated[float, within(1, 20)] = 6.0
-    """Its pressure at rest."""
+    """Volume of the medium-pressure vessel, m3, and its pressure at rest."""
     cv956_area_mm2: Area = 34.0
-    """Effective flow area when fully open of the bypass,"""
     cv952_area_mm2: Area = 20.0
-    """of the valve from the high-pressure line to the buffer,"""
     cv953_area_mm2: Area = 40.0
-    """and of that from the buffer to the low-pressure line."""
+    """Effective flow areas when fully open of the bypass, the discharge and the charge valve."""
     valve_lag_s: Lag = 1.0
-    """Time constant of the drives of these three."""
     valve_fastest_pct_per_s: Speed = 20.0
-    """Largest speed of these drives."""
+    """Time constant and largest speed of the drives of these three."""
     cooler_approach_k: Annotated[float, within(0, 50)] = 5.0
     """Excess of the compressed gas's temperature over the surroundings, K."""
     run_up_s: Lag = 6.0
-    """Time constant of a compressor that starts,"""
     run_down_s: Lag = 1.5
-    """and of one that stops."""
+    """Time constants of a compressor that starts and of one that stops."""
 
 
 class ReliefSection(Section):
-    """A relief valve into the atmosphere."""
+    """A relief valve into the atmosphere: the fields of `ReliefValve`."""
 
-    pressure_bar: ReliefPressure
-    """Pressure at which it begins to open, bar."""
-    span_bar: ReliefSpan
-    """Rise above it at which it is fully open."""
+    pressure_bar: Annotated[float, within(1.01, 50)]
+    span_bar: Annotated[float, within(0.01, 10)]
     area_mm2: Area
-    """Effective flow area then."""
 
     @property
     def component(self) -> ReliefValve:
@@ -128,41 +102,18 @@ class ReliefSection(Section):
         return ReliefValve(pressure, span, Valve(area))
 
 
-class HpReliefSection(ReliefSection):
-    """Relief valve of the high-pressure line."""
-
-    pressure_bar: ReliefPressure = 18.0
-    span_bar: ReliefSpan = 1.0
-    area_mm2: Area = 120.0
-
-
-class LpReliefSection(ReliefSection):
-    """Relief valve of the low-pressure line."""
-
-    pressure_bar: ReliefPressure = 1.5
-    span_bar: ReliefSpan = 0.2
-    area_mm2: Area = 2500.0
-
-
-class BufferReliefSection(ReliefSection):
-    """Relief valve of the buffer."""
-
-    pressure_bar: ReliefPressure = 13.0
-    span_bar: ReliefSpan = 1.0
-    area_mm2: Area = 100.0
-
-
 class RefrigeratorParameters(BoxParameters):
     """The parameters of a refrigerator."""
 
-    nef6: Nef6Section = Nef6Section()
+    nef6: ExchangerSection = ExchangerSection(ua_w_per_k=21_500.0, volume_l=40.0, aluminium_kg=150.0)
+    """The exchanger from ambient temperature to the nitrogen bath."""
     nef5: Nef5Section = Nef5Section()
     nc1: CompressorSection = CompressorSection()
     nc2: CompressorSection = CompressorSection()
     station: StationSection = StationSection()
-    hp_relief: HpReliefSection = HpReliefSection()
-    lp_relief: LpReliefSection = LpReliefSection()
-    buffer_relief: BufferReliefSection = BufferReliefSection()
+    hp_relief: ReliefSection = ReliefSection(pressure_bar=18.0, span_bar=1.0, area_mm2=120.0)
+    lp_relief: ReliefSection = ReliefSection(pressure_bar=1.5, span_bar=0.2, area_mm2=2500.0)
+    buffer_relief: ReliefSection = ReliefSection(pressure_bar=13.0, span_bar=1.0, area_mm2=100.0)
 
     @property
     def refrigerator(self) -> Refrigerator:

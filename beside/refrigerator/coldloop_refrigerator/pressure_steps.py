@@ -16,7 +16,7 @@ from coldloop.process.cold_box import INPUT_NAMES, TICK_S
 from coldloop_plant.helium import load_helium
 from coldloop_plant.numeric import RealArray
 from coldloop_plant.settings import StationControlKind, StationSettings
-from coldloop_refrigerator.physics import COMMAND_NAMES, SIGNAL_NAMES, STATE_NAMES, advance_refrigerator, read
+from coldloop_refrigerator.physics import COMMAND_NAMES, SIGNAL_NAMES, STATE_NAMES, advance_refrigerator, evaluated
 from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR
 from coldloop_refrigerator.program import SHIPPED, RefrigeratorFile, read_refrigerator_file
 from coldloop_refrigerator.station_control import MEMORY_SIZE, StationMeasurement, control_station, station_law
@@ -27,8 +27,7 @@ STEPS: Final = (
     ("CV156", 3.0), (LOAD, 60.0), (LOAD, -60.0),
 )  # fmt: skip
 """Stepped signals and the sizes of their steps: openings in %, heater and load in W."""
-SETTLED_BAR: Final = (0.01, 0.001)
-"""High and low pressure have settled when they stay within these of their last value."""
+SETTLED_BAR: Final = (0.01, 0.001)  # High and low pressure have settled when they stay within these of their last value
 AMBIENT_K: Final = 300.0
 PRESSURES: Final = tuple(SIGNAL_NAMES.index(name) for name in ("P12", "P11"))
 BUFFER, NITROGEN = (SIGNAL_NAMES.index(name) for name in ("P13", "L_N2"))
@@ -38,12 +37,9 @@ OPENINGS: Final = tuple(STATE_NAMES.index(name) for name in ("CV956", "CV952", "
 class Response(NamedTuple):
     """Response of one pressure to one step."""
 
-    peak: float
-    """Deviation from rest that is largest in amount, with its sign, bar."""
-    overshoot: float
-    """Largest deviation to the other side after that, bar, not below 0."""
-    settled_s: float | None
-    """From the step on; None: not within the time that was looked at."""
+    peak: float  # Deviation from rest that is largest in amount, with its sign, bar
+    overshoot: float  # Largest deviation to the other side after that, bar, not below 0
+    settled_s: float | None  # From the step on; None: not within the time that was looked at
 
 
 def response_of(deviations: RealArray, band: float, tick_s: float = TICK_S) -> Response:
@@ -71,7 +67,7 @@ def pressures_after(
     u, added = np.array(file.u0, dtype=np.float64), np.zeros(len(COMMAND_NAMES))
     d = np.array([file.w0, AMBIENT_K, 0.0, 1.0, 1.0, 1.0])
     x, v = np.array(file.x0), np.array(file.v0, dtype=np.float64)
-    _, signals = read(x, u, v, d, plant, helium)
+    _, _, signals = evaluated(x, u, v, d, plant, helium)
     if name == LOAD:
         d[0] += size
     elif name in INPUT_NAMES:
@@ -84,20 +80,17 @@ def pressures_after(
     for row in rows:
         row[:] = signals[list(PRESSURES)]
         if control is not None:
-            v = np.array(control_station(law, memory, _measured(x, signals))[0])
+            hp, lp, buffer, nitrogen = signals[[*PRESSURES, BUFFER, NITROGEN]].tolist()
+            bypass, discharge, charge = x[list(OPENINGS)].tolist()
+            measured = StationMeasurement(
+                hp, lp, buffer, bypass, discharge, charge, nitrogen, lost=0.0, bath=1.23, nc1=True, nc2=True,
+                loaded=2, turbine=True, overspeed=False, deviating=False, suction=False,
+            )  # fmt: skip
+            v = np.array(control_station(law, memory, measured)[0])
         opened = np.clip(v + added, 0.0, 100.0)
         x = advance_refrigerator(x, u, opened, d, TICK_S, plant, helium)
-        _, signals = read(x, u, opened, d, plant, helium)
+        _, _, signals = evaluated(x, u, opened, d, plant, helium)
     return rows
-
-
-def _measured(x: RealArray, signals: RealArray) -> StationMeasurement:
-    hp, lp, buffer, nitrogen = (float(signals[index]) for index in (*PRESSURES, BUFFER, NITROGEN))
-    bypass, discharge, charge = (float(x[index]) for index in OPENINGS)
-    return StationMeasurement(
-        hp, lp, buffer, bypass, discharge, charge, nitrogen, lost=0.0, bath=1.23, nc1=True, nc2=True, loaded=2,
-        turbine=True, overspeed=False, deviating=False, suction=False,
-    )  # fmt: skip
 
 
 def table(seconds: float, steps: Sequence[tuple[str, float]] = STEPS) -> list[str]:

@@ -1,5 +1,7 @@
 """The whole refrigerator as a program: the plant, its station's controller, their disturbances, and how it starts.
 
+`RefrigeratorKind`, an entry point of `coldloop.plant_kinds`, is what the plant service and the command line ask for.
+
 It starts at the operating point of its file, which `python -m coldloop_refrigerator.model FILE` makes off line.
 Like the model file it is JSON with its own digest, so that every run, on any machine, begins with the same bits. Or it
 starts warm, before its cool-down.
@@ -17,25 +19,29 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from coldloop.config import explained
-from coldloop.errors import ModelFileError
+from coldloop.errors import ConfigurationError, ModelFileError
+from coldloop.kernels.cache import kernels_of
 from coldloop.kernels.intrinsics import plain_tuples
 from coldloop.process.cold_box import TICK_S
-from coldloop.process.model_file import FORMAT, read_document, write_document
+from coldloop.process.lti_model import LtiModel
+from coldloop.process.model_file import COLD_BOX, FORMAT, ModelHeader, read_document, write_document
 from coldloop.process.model_range import present_model_range
 from coldloop.registers.plant import StationAlarm, StationMode, StationSample, StationStatus, Surroundings
-from coldloop_plant.cold_box import ColdBoxProgram
-from coldloop_plant.cold_box.model import parameters_digest
+from coldloop_plant import settings
+from coldloop_plant.cold_box import ColdBox, ColdBoxProgram
+from coldloop_plant.cold_box.model import AtRest, parameters_digest
+from coldloop_plant.cold_box.plant_file import REFERENCE, PlantFile
 from coldloop_plant.components.phase_separator import SUPERHEAT, content
 from coldloop_plant.helium import Helium, load_helium, saturation, vapour_enthalpy_and_cp
+from coldloop_plant.kinds import box_of, parameters_in
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.program import HeatLoad, MeasurementNoise
-from coldloop_plant.settings import MEASURED, LqWeights, RefrigeratorEvent, StationSettings
-from coldloop_refrigerator import physics, tick
+from coldloop_plant.program import HeatLoad, MakePlant, MeasurementNoise, NoiseOfSeed, PlantProgram
+from coldloop_refrigerator import physics, plant_file, tick
 from coldloop_refrigerator.physics import BOX_STATES, COMMAND_NAMES, STATE_NAMES, Refrigerator
 from coldloop_refrigerator.plant_file import KIND, REFERENCE_REFRIGERATOR
-from coldloop_refrigerator.station import gas_mass
-from coldloop_refrigerator.station_control import Commands, station_law
+from coldloop_refrigerator.station_control import station_law
 from coldloop_refrigerator.tick import RefrigeratorMemory
+from coldloop_refrigerator.warm import gas_mass
 
 SHIPPED = Path(__file__).with_name("refrigerator.json")
 if TYPE_CHECKING:
@@ -45,11 +51,11 @@ REMEDY = "make a new one with `python -m coldloop_refrigerator.model FILE`"
 
 
 class RefrigeratorFile(BaseModel, frozen=True):
-    """The operating point of a refrigerator, and its pressure controller's gains."""
+    """The operating point of a refrigerator, and its pressure controller's gains; `plant_rest` of a model file."""
 
     state_names: tuple[str, ...] = STATE_NAMES
     command_names: tuple[str, ...] = COMMAND_NAMES
-    weights: LqWeights
+    weights: settings.LqWeights
     """Weights that the gains were designed with."""
     parameters_digest: str
     """SHA-256 of the parameters and tables that it was made from."""
@@ -64,14 +70,9 @@ class RefrigeratorFile(BaseModel, frozen=True):
     gains: tuple[tuple[float, ...], tuple[float, ...]]
     """K of the LQ controller, shape (2, 6)."""
 
-    @property
-    def document(self) -> dict[str, Any]:
-        """As plain data: what a model file of the refrigerator carries as its `plant_rest`."""
-        return self.model_dump(mode="json")
-
     def save(self, path: Path) -> None:
         """Write the file (OSError if it cannot be written)."""
-        write_document(path, {"format": FORMAT, "plant": KIND, **self.document})
+        write_document(path, {"format": FORMAT, "plant": KIND, **self.model_dump(mode="json")})
 
 
 def read_refrigerator_file(path: Path, plant: Refrigerator = REFERENCE_REFRIGERATOR) -> RefrigeratorFile:
@@ -87,7 +88,7 @@ def read_refrigerator_file(path: Path, plant: Refrigerator = REFERENCE_REFRIGERA
 
 
 def rest_in(document: dict[str, Any], plant: Refrigerator, path: str) -> RefrigeratorFile:
-    """Return what `RefrigeratorFile.document` has made of this very refrigerator; `path` is for the message.
+    """Return what a `RefrigeratorFile` in plain data holds of this very refrigerator; `path` is for the message.
 
     Raises:
         ModelFileError: It is incomplete, or was made from another plant.
@@ -152,28 +153,20 @@ class EventSchedule:
     first six hours are the warmer.
     """
 
-    def __init__(self, events: Sequence[RefrigeratorEvent], ambient: float, daily_swing: float) -> None:
+    def __init__(self, events: Sequence[settings.RefrigeratorEvent], ambient: float, daily_swing: float) -> None:
         self._swing = daily_swing
         self._given = Surroundings(ambient=ambient)
         self._changes = sorted(((event.tick, event.target, event.value) for event in events), key=itemgetter(0))
         """Tick, what, and its value, in the order in which they are made."""
-        self._put: list[tuple[int, Surroundings]] = []
-
-    def put(self, tick: int, given: Surroundings) -> None:
-        """Let something hold from `tick` on, until an event that is planned for later."""
-        self._put.append((tick, given))
-
-    @property
-    def puts(self) -> list[tuple[int, Surroundings]]:
-        """Ticks and boundary conditions that `put` has taken."""
-        return list(self._put)
+        self.put: list[tuple[int, Surroundings]] = []
+        """Boundary conditions, and from which tick on each holds, until an event that is planned for later."""
 
     def at(self, tick: int) -> Surroundings:
         """Return what is given from `tick` (0 or later) to the next, the day's swing left out."""
-        since, given = next(((at, put) for at, put in reversed(self._put) if at <= tick), (-1, self._given))
+        since, given = next(((at, put) for at, put in reversed(self.put) if at <= tick), (-1, self._given))
         for at, target, value in self._changes:
             if since < at <= tick:
-                changed: dict[str, Any] = {target.value: value if target in MEASURED else int(value)}
+                changed: dict[str, Any] = {target.value: value if target in settings.MEASURED else int(value)}
                 given = given._replace(**changed)
         return given
 
@@ -205,7 +198,7 @@ class RefrigeratorProgram(ColdBoxProgram):
         file: RefrigeratorFile,
         u0: Sequence[float],
         load: HeatLoad,
-        station: StationSettings,
+        station: settings.StationSettings,
         events: EventSchedule,
         noise: MeasurementNoise | None = None,
         seed: int = 0,
@@ -213,18 +206,18 @@ class RefrigeratorProgram(ColdBoxProgram):
     ) -> None:
         self.plant = plant
         self._plant, self._tables = plain_tuples(plant), plain_tuples(load_helium())
-        self.law = station_law(station, file.gains, file.v0, plant.station)
-        """Control law of the station."""
+        self.law = station_law(station, file.gains, file.v0, plant.station)  # Control law of the station
         self._law = plain_tuples(self.law)
         self._events = events
         self._gauge_deviation, self._seed = station.noise_bar, seed
         x, v = np.array(file.x0, dtype=np.float64), np.array(file.v0, dtype=np.float64)
         d = self._disturbances(0, load.value(0))
-        equipment = tick.standing_equipment(np.array(u0)) if warm else tick.resting_equipment(np.array(u0))
+        equipment = tick.resting_equipment(np.array(u0), warm=warm)
         if warm:
             x = warm_state(file.x0, plant, load_helium(), ambient=d[AMBIENT], low_pressure=1e5 * station.lp_bar)
         self._memory = m = tick.begin_memory(x, v, equipment)
-        m.y[:], m.signals[:] = physics.read(x, equipment[tick.ACTING : tick.DEVIATING], v, d, plant, load_helium())
+        acting = equipment[tick.ACTING : tick.DEVIATING]
+        _, m.y[:], m.signals[:] = physics.evaluated(x, acting, v, d, plant, load_helium())
         tick.control_tick(self._memory, d, self.law)
         super().__init__(box=plant.box, x0=x[:BOX_STATES].tolist(), u0=u0, load=load, noise=noise)
 
@@ -250,9 +243,11 @@ class RefrigeratorProgram(ColdBoxProgram):
 
     @property
     def station_status(self) -> StationStatus:
-        """The same for the registers, with what its controller asks for."""
+        """The same for the registers, with openings asked of the warm valves (%) and inputs that acted on the box."""
         sample = self.station
-        return StationStatus(sample.tick, sample.mode, sample.alarms, sample.signals, self.commands, self.acting)
+        m = self._memory
+        commands, acting = tuple(m.commands.tolist()), tuple(m.equipment[tick.ACTING : tick.DEVIATING].tolist())
+        return StationStatus(sample.tick, sample.mode, sample.alarms, sample.signals, commands, acting)
 
     @property
     def surroundings(self) -> Surroundings:
@@ -261,17 +256,7 @@ class RefrigeratorProgram(ColdBoxProgram):
 
     def give(self, surroundings: Surroundings) -> None:
         """Change what is given, from the next tick on."""
-        self._events.put(self.tick + 1, surroundings)
-
-    @property
-    def commands(self) -> Commands:
-        """Openings that the station's controller asks for from the current tick on, %."""
-        return Commands(*self._memory.commands.tolist())
-
-    @property
-    def acting(self) -> tuple[float, ...]:
-        """The inputs that acted on the cold box up to the current tick: CV155 %, NCR22_A W, CV156 %."""
-        return tuple(self._memory.equipment[tick.ACTING : tick.DEVIATING].tolist())
+        self._events.put.append((self.tick + 1, surroundings))
 
     def advance(self) -> None:
         """Go one tick forward."""
@@ -282,18 +267,15 @@ class RefrigeratorProgram(ColdBoxProgram):
         self._measured = self._sample(self._memory.y)
 
     def _disturbances(self, tick: int, w: float) -> RealArray:
-        given, ambient = self._events.at(tick), self._events.ambient(tick)
+        """Return what is given in a tick under a load `w` (W); the gauges' noise follows from tick and seed alone."""
+        given, ambient, gauges = self._events.at(tick), self._events.ambient(tick), np.zeros(2)
+        if self._gauge_deviation:
+            generator = np.random.Generator(np.random.Philox(key=self._seed, counter=[0, tick, 0, 0]))
+            gauges = self._gauge_deviation * generator.standard_normal(2)
         physical = (w, ambient, 1e-3 * given.leak, given.nitrogen, given.nc1, given.nc2)
         equipment = (given.turbine, given.cv155, given.cv156, given.heater)
         blocking = (given.blocked_nef1, given.blocked_nef2, given.blocked_nef34, given.blocked_nef6)
-        return np.array([*physical, *self._gauge_noise(tick), *equipment, *blocking], dtype=np.float64)
-
-    def _gauge_noise(self, tick: int) -> RealArray:
-        """Return by how much the gauges of high and low pressure are off (bar): a function of tick and seed alone."""
-        if not self._gauge_deviation:
-            return np.zeros(2)
-        generator = np.random.Generator(np.random.Philox(key=self._seed, counter=[0, tick, 0, 0]))
-        return self._gauge_deviation * generator.standard_normal(2)
+        return np.array([*physical, *gauges, *equipment, *blocking], dtype=np.float64)
 
     def ahead(self, ticks: int) -> RealArray:
         """Return the disturbances, without load, of `ticks` ticks and of the one behind them, shape (ticks + 1, 16)."""
@@ -325,8 +307,7 @@ class RefrigeratorProgram(ColdBoxProgram):
             if values.shape != getattr(self._memory, name).shape:
                 raise ValueError(f"{name}: expected {len(getattr(self._memory, name))} numbers")
         super().resume(*retained, **named)
-        for since, put in warm["given"]:
-            self._events.put(int(since), Surroundings(*put))
+        self._events.put += [(int(since), Surroundings(*put)) for since, put in warm["given"]]
         self._memory = self._memory._replace(**kept)
         self._memory.acted[:] = np.nan
 
@@ -334,5 +315,60 @@ class RefrigeratorProgram(ColdBoxProgram):
         """Return what `resume` needs, as plain data."""
         m = self._memory
         warm: dict[str, Any] = {name: getattr(m, name).tolist() for name in RETAINED}
-        warm["given"] = [(tick, list(put)) for tick, put in self._events.puts]
+        warm["given"] = [(tick, list(put)) for tick, put in self._events.put]
         return {**super().retained(), "warm": warm}
+
+
+class RefrigeratorKind:
+    """The refrigerator as a `coldloop_plant.kinds.Kind`."""
+
+    def plant_in(self, model: ModelHeader | LtiModel, where: str) -> tuple[ColdBox, str]:
+        """Return the cold box of the refrigerator that a model file describes, and the digest of its parameters."""
+        plant = _refrigerator_in(model, where)
+        return plant.box, refrigerator_digest(plant)
+
+    def maker_of(self, header: ModelHeader, section: settings.PlantSection, noise_of_seed: NoiseOfSeed) -> MakePlant:
+        """Return what makes the refrigerator of a model file, for a load and a seed.
+
+        Raises:
+            ModelFileError: The refrigerator's file, or what the model file says of the plant, cannot be used.
+            ConfigurationError: Its gains are not of the configured weights.
+        """
+        if header.plant == COLD_BOX and box_of(header) != REFERENCE:
+            raise ModelFileError("model.file: of another cold box than the refrigerator's; set plant.kind to cold-box")
+        plant, named = REFERENCE_REFRIGERATOR, section.refrigerator.file
+        if header.plant != COLD_BOX:
+            plant = _refrigerator_in(header, "model.file")
+        if named is None and header.plant_rest:
+            file = rest_in(header.plant_rest, plant, "model.file: plant_rest")
+        else:
+            file = read_refrigerator_file(named or SHIPPED, plant)
+        if section.station.control is settings.StationControlKind.LQ and section.station.weights != file.weights:
+            raise ConfigurationError(
+                "plant.station.weights: the gains of this refrigerator belong to other weights; make a file with"
+                " `python -m coldloop_refrigerator.model FILE` and name it in plant.refrigerator.file, or, with a"
+                " plant file, its model file with `coldloop model --plant` and these weights"
+            )
+        happening = section.refrigerator
+
+        def make(load: HeatLoad, seed: int) -> PlantProgram:
+            events = EventSchedule(happening.events, happening.ambient_k, happening.daily_swing_k)
+            with kernels_of("the refrigerator", about_s=20):
+                return RefrigeratorProgram(
+                    plant=plant, file=file, u0=header.u0, load=load, station=section.station, events=events,
+                    noise=noise_of_seed(seed), seed=seed, warm=happening.start is settings.RefrigeratorStart.WARM,
+                )  # fmt: skip
+
+        return make
+
+    read_plant_file = staticmethod(plant_file.read_plant_file)
+
+    def at_rest(self, file: PlantFile, control: settings.StationSettings) -> AtRest:
+        """Return the refrigerator of a plant file at rest, and its model with the gains of the controller's weights."""
+        from coldloop_refrigerator.model import described_at_rest  # noqa: PLC0415 it needs SciPy, the service does not
+
+        return described_at_rest(plant_file.RefrigeratorPlantFile.model_validate(file), control)
+
+
+def _refrigerator_in(model: ModelHeader | LtiModel, where: str) -> Refrigerator:
+    return parameters_in(model, plant_file.RefrigeratorParameters, where).refrigerator

@@ -21,32 +21,27 @@ from coldloop_plant.components.expansion import CHOKED, Valve
 from coldloop_plant.helium import GAS_CONSTANT
 from coldloop_plant.numeric import PA_PER_BAR, RealArray
 from coldloop_plant.settings import StationControlKind, StationSettings
-from coldloop_refrigerator.station import CompressionStation
+from coldloop_refrigerator.warm import CompressionStation
 
-DESIGN_TEMPERATURE: Final = 300.0
-"""K, at which the controller takes the valves' flows to be."""
-ROUNDING: Final = 1e-9
-"""kg/s, by which flows that are the same may differ."""
+DESIGN_TEMPERATURE: Final = 300.0  # K, at which the controller takes the valves' flows to be
+ROUNDING: Final = 1e-9  # kg/s, by which flows that are the same may differ
 STOPPED_RISE: Final = 0.25
 """bar above its set point, at which the low pressure shuts the bypass when no compressor is loaded."""
 STOPPED_HIGHEST: Final = 1.3
 """bar, to which that is limited: the relief valve of the low-pressure line opens at 1.5 bar."""
-STOPPED_SPAN: Final = 0.25
-"""bar below that, at which the bypass is fully open."""
+STOPPED_SPAN: Final = 0.25  # bar below that, at which the bypass is fully open
 STARTING_SPAN: Final = 0.1
 """bar below its set point, at which the low pressure has the charge valve open while the first compressor starts."""
 DECISION_S: Final = 5.0
 """s, over which the inventory flow is smoothed that decides which of the buffer's valves may open."""
-SHUT: Final = 0.5
-"""%, to which a valve of the buffer has to shut before the other one opens."""
+SHUT: Final = 0.5  # %, to which a valve of the buffer has to shut before the other one opens
 HP_INTEGRAL, LP_INTEGRAL, NITROGEN_INTEGRAL, SMOOTHED, DIRECTION = range(5)
 """Indices of the controller's memory: integrals of the errors of HP and LP (bar s) and of the nitrogen's level (% s);
 with a dead band the smoothed inventory flow (kg/s), and 1 while the charge valve may be open, -1 for the discharge
 valve."""
 MEMORY_SIZE: Final = 5
 COMPRESSORS: Final = 2
-LEAST_PRESSURE: Final = 0.5
-"""bar, taken for the valves' flows when a line is emptier."""
+LEAST_PRESSURE: Final = 0.5  # bar, taken for the valves' flows when a line is emptier
 AUTOMATIC, LIMITED, CHARGE_STOPPED, ONE_COMPRESSOR, STOPPED, STARTING, OVERRIDE = map(int, StationMode)
 
 
@@ -54,36 +49,21 @@ class StationMeasurement(NamedTuple):
     """Readings of the station's sensors at a tick."""
 
     hp: float
-    """bar."""
     lp: float
-    """bar."""
-    buffer: float
-    """bar."""
+    buffer: float  # Pressures, bar
     bypass: float
-    """Opening of CV956, %."""
     discharge: float
-    """Opening of CV952, %."""
-    charge: float
-    """Opening of CV953, %."""
-    nitrogen: float
-    """Level, %."""
-    lost: float
-    """Helium that has left the circuit, kg."""
-    bath: float
-    """Pressure of the bath, bar."""
-    nc1: bool
-    """Whether the compressor is switched on, and not tripped by the low pressure."""
+    charge: float  # Openings of CV956, CV952 and CV953, %
+    nitrogen: float  # Level, %
+    lost: float  # Helium that has left the circuit, kg
+    bath: float  # Pressure of the bath, bar
+    nc1: bool  # Whether the compressor is switched on, and not tripped by the low pressure
     nc2: bool
-    loaded: int
-    """Compressors that are switched on and loaded."""
-    turbine: bool
-    """Whether the turbine may run."""
-    overspeed: bool
-    """Whether its protection has tripped it."""
-    deviating: bool
-    """Whether a valve or the heater of the cold box is not as it is asked."""
-    suction: bool
-    """Whether the low pressure has tripped a compressor."""
+    loaded: int  # Compressors that are switched on and loaded
+    turbine: bool  # Whether the turbine may run
+    overspeed: bool  # Whether its protection has tripped it
+    deviating: bool  # Whether a valve or the heater of the cold box is not as it is asked
+    suction: bool  # Whether the low pressure has tripped a compressor
 
 
 class Commands(NamedTuple):
@@ -102,48 +82,22 @@ class Loop(NamedTuple):
     integral_s: float
 
 
-class AlarmLimits(NamedTuple):
-    """Limits at which alarms begin: bar, % and kg."""
-
-    hp_high: float
-    hp_low: float
-    lp_high: float
-    lp_low: float
-    nitrogen_low: float
-    helium_lost: float
-    bath_relief: float
-
-
-class Overrides(NamedTuple):
-    """Pressures (bar) at which a limit begins to move the buffer's valves, and those at which it has them to itself."""
-
-    hp: float
-    hp_full: float
-    lp: float
-    lp_full: float
-
-
 class EquipmentLaw(NamedTuple):
-    """Constants of the starts and of the turbine's protection."""
+    """Constants of the starts and of the turbine's protection: keys of `plant.station`.
+
+    The fields of `CompressorStart`, `StationAlarmSettings.lp_low_bar` below which no compressor is started, the fields
+    of `TurbineProtection`, `PressureProtection.trip_lp_bar`.
+    """
 
     idle: float
-    """Share of its flow that a compressor has while it idles."""
     idle_s: float
-    """s, for which it idles."""
     load_s: float
-    """s, in which it is loaded after that."""
     second: float
-    """Share of what the first one gives that the cold box takes when the second one is started."""
     least_lp: float
-    """Low pressure (bar) below which none is started."""
     run_up_s: float
-    """s, in which CV156 opens at the fastest when the turbine starts."""
     governed_hz: float
-    """Speed to which the governor limits the turbine by CV156."""
     overspeed_hz: float
-    """Speed at which it is tripped."""
     trip_lp: tuple[float, float]
-    """Low pressure (bar) that stops each compressor; held until it is switched off."""
 
 
 class StationLaw(NamedTuple):
@@ -177,9 +131,12 @@ class StationLaw(NamedTuple):
     """Set point of the level, %."""
     feed: float
     """Opening of CV167 at the operating point, %."""
-    alarms: AlarmLimits
+    alarms: tuple[float, float, float, float, float, float, float]
+    """Limits at which alarms begin, as in `StationAlarmSettings`: bar, % and kg."""
     equipment: EquipmentLaw
-    overrides: Overrides
+    hp_override: tuple[float, float]
+    """High pressures (bar) at which it begins to move the buffer's valves, and at which it has them to itself."""
+    lp_override: tuple[float, float]
 
 
 class Flows(NamedTuple):
@@ -203,13 +160,11 @@ def control_station(c: StationLaw, integrals: RealArray, m: StationMeasurement) 
         discharge = 100.0 if m.hp > m.buffer and m.lp > c.lp else 0.0
         charge = 100.0 * min(max((c.lp - m.lp) / STARTING_SPAN, 0.0), 1.0)
         return Commands(bypass_at_rest(c, m.lp), discharge, charge, feed), STARTING
-    wanted = flows_of_lq(c, integrals, m) if c.is_lq else flows_of_pi(c, integrals, m)
+    wanted = wanted_flows(c, integrals, m)
     allowed = outside_dead_band(c, integrals, wanted, m) if c.dead_band > 0.0 else wanted
     given, openings = split(c, allowed, m)
     mode = mode_of(c, allowed, given, m)
-    high, low = beyond(m.hp, c.overrides.hp, c.overrides.hp_full), beyond(m.lp, c.overrides.lp, c.overrides.lp_full)
-    limited = shut_by(openings, high, low)
-    moved = opened_by(limited, high, low)
+    limited, moved = overridden(openings, beyond(m.hp, c.hp_override), beyond(m.lp, c.lp_override))
     if moved != openings:
         given, mode = flows_through(c, limited, m), OVERRIDE
     follow(c, integrals, wanted, given, m)
@@ -217,33 +172,30 @@ def control_station(c: StationLaw, integrals: RealArray, m: StationMeasurement) 
 
 
 @kernel
-def beyond(pressure: float, limit: float, full: float) -> float:
+def beyond(pressure: float, limits: tuple[float, float]) -> float:
     """Return how far a pressure is beyond a limit, as a share of the way to where that acts fully, 0 to 1."""
+    limit, full = limits
     return min(max((pressure - limit) / (full - limit), 0.0), 1.0)
 
 
 @kernel
-def shut_by(openings: tuple[float, float, float], high: float, low: float) -> tuple[float, float, float]:
-    """Return the openings (%) of bypass, discharge and charge valve that a high and a low pressure leave of them.
+def overridden(
+    openings: tuple[float, float, float], high: float, low: float
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Return what a high and a low pressure leave of the openings (%) of bypass, discharge and charge valve, and make.
 
-    In the second half of its way a pressure shuts the valve that makes it worse. The integrals know of this.
+    In the first half of its way beyond its limit a pressure opens the valve that relieves it, in the second half it
+    shuts the one that makes it worse: the integrals know of that alone. With both beyond their limits, as when the
+    turbine trips, the buffer is a second bypass.
     """
-    return openings[0], min(openings[1], 200.0 * (1.0 - low)), min(openings[2], 200.0 * (1.0 - high))
-
-
-@kernel
-def opened_by(openings: tuple[float, float, float], high: float, low: float) -> tuple[float, float, float]:
-    """Return the openings (%) with which each pressure beyond its limit is relieved: fully after half of its way.
-
-    The integrals do not know of this. With both beyond their limits, as when the turbine trips, the buffer is a second
-    bypass.
-    """
-    return openings[0], max(openings[1], min(200.0 * high, 100.0)), max(openings[2], min(200.0 * low, 100.0))
+    bypass, discharge, charge = openings
+    left = bypass, min(discharge, 200.0 * (1.0 - low)), min(charge, 200.0 * (1.0 - high))
+    return left, (bypass, max(left[1], min(200.0 * high, 100.0)), max(left[2], min(200.0 * low, 100.0)))
 
 
 @kernel
 def flows_through(c: StationLaw, openings: tuple[float, float, float], m: StationMeasurement) -> Flows:
-    """Return what the valves pass at these openings (%), as the flows that `split` says it gives."""
+    """Return what the valves pass at openings (%) of bypass, discharge and charge valve, as virtual flows."""
     discharge = openings[1] * per_percent(c.discharge, m.hp)
     bypass = openings[0] * per_percent(c.bypass, m.hp) + (discharge if c.is_lq else 0.0)
     return Flows(bypass, openings[2] * per_percent(c.charge, m.buffer) - discharge)
@@ -276,9 +228,14 @@ def outside_dead_band(c: StationLaw, integrals: RealArray, wanted: Flows, m: Sta
 
 
 @kernel
-def flows_of_lq(c: StationLaw, integrals: RealArray, m: StationMeasurement) -> Flows:
-    """Return the flows that state feedback asks for."""
-    opened = flowing(c, m)
+def wanted_flows(c: StationLaw, integrals: RealArray, m: StationMeasurement) -> Flows:
+    """Return the flows that state feedback asks for, or two single loops."""
+    if not c.is_lq:
+        return Flows(
+            c.nominal - c.over_lp.gain * (m.lp - c.lp + integrals[LP_INTEGRAL] / c.over_lp.integral_s),
+            -c.over_hp.gain * (m.hp - c.hp + integrals[HP_INTEGRAL] / c.over_hp.integral_s),
+        )
+    opened = flows_through(c, (m.bypass, m.discharge, m.charge), m)
     state = (
         m.hp - c.hp, m.lp - c.lp, opened.bypass - c.nominal, opened.inventory,
         integrals[HP_INTEGRAL], integrals[LP_INTEGRAL],
@@ -288,24 +245,6 @@ def flows_of_lq(c: StationLaw, integrals: RealArray, m: StationMeasurement) -> F
         bypass += c.gains[0, i] * state[i]
         inventory += c.gains[1, i] * state[i]
     return Flows(c.nominal - bypass, -inventory)
-
-
-@kernel
-def flows_of_pi(c: StationLaw, integrals: RealArray, m: StationMeasurement) -> Flows:
-    """Return the flows that two single loops ask for."""
-    return Flows(
-        c.nominal - c.over_lp.gain * (m.lp - c.lp + integrals[LP_INTEGRAL] / c.over_lp.integral_s),
-        -c.over_hp.gain * (m.hp - c.hp + integrals[HP_INTEGRAL] / c.over_hp.integral_s),
-    )
-
-
-@kernel
-def flowing(c: StationLaw, m: StationMeasurement) -> Flows:
-    """Return what the valves pass at their present openings, as virtual flows."""
-    discharge = m.discharge * per_percent(c.discharge, m.hp)
-    charge = m.charge * per_percent(c.charge, m.buffer)
-    bypass = m.bypass * per_percent(c.bypass, m.hp)
-    return Flows(bypass + discharge, charge - discharge)
 
 
 @kernel
@@ -366,12 +305,13 @@ def mode_of(c: StationLaw, wanted: Flows, given: Flows, m: StationMeasurement) -
 
 
 @kernel
-def raised_alarms(limits: AlarmLimits, m: StationMeasurement) -> int:
+def raised_alarms(c: StationLaw, m: StationMeasurement) -> int:
     """Return the alarms at this tick, the bits of `StationAlarm` in their order."""
+    hp_high, hp_low, lp_high, lp_low, nitrogen_low, helium_lost, bath_relief = c.alarms
     conditions = (
-        m.hp > limits.hp_high, m.hp < limits.hp_low, m.lp > limits.lp_high, m.lp < limits.lp_low,
-        not m.nc1, not m.nc2, m.nitrogen < limits.nitrogen_low, m.lost > limits.helium_lost,
-        not (m.nc1 or m.nc2), m.bath > limits.bath_relief, not m.turbine, m.overspeed, m.deviating, m.suction,
+        m.hp > hp_high, m.hp < hp_low, m.lp > lp_high, m.lp < lp_low, not m.nc1, not m.nc2, m.nitrogen < nitrogen_low,
+        m.lost > helium_lost, not (m.nc1 or m.nc2), m.bath > bath_relief, not m.turbine, m.overspeed, m.deviating,
+        m.suction,
     )  # fmt: skip
     raised = 0
     for bit in range(len(conditions)):
@@ -395,7 +335,7 @@ def station_law(
 
     `gains` are K of the LQ controller, (2, 6), `openings` (%) those at the operating point, in the order of `Commands`.
     """
-    limits, is_lq = settings.alarms, settings.control is StationControlKind.LQ
+    is_lq, trips = settings.control is StationControlKind.LQ, settings.protection
     per_bar = hypot(*gains[1][:2]) if is_lq else settings.pi_hp.gain
     return StationLaw(
         is_lq=is_lq,
@@ -408,14 +348,10 @@ def station_law(
         over_hp=Loop(**settings.pi_hp.model_dump()), over_lp=Loop(**settings.pi_lp.model_dump()),
         over_nitrogen=Loop(**settings.pi_nitrogen.model_dump()),
         nitrogen=settings.nitrogen_level, feed=openings[3],
-        alarms=AlarmLimits(
-            limits.hp_high_bar, limits.hp_low_bar, limits.lp_high_bar, limits.lp_low_bar, limits.nitrogen_low,
-            limits.helium_lost_kg, limits.bath_relief_bar,
-        ),
-        equipment=EquipmentLaw(
-            settings.start.idle, settings.start.idle_s, settings.start.load_s, settings.start.second, limits.lp_low_bar,
-            settings.turbine.run_up_s, settings.turbine.governed_hz, settings.turbine.overspeed_hz,
-            settings.protection.trip_lp_bar,
-        ),
-        overrides=Overrides(*settings.protection.hp_bar, *settings.protection.lp_bar),
+        alarms=tuple(settings.alarms.model_dump().values()),
+        equipment=EquipmentLaw(*[
+            *settings.start.model_dump().values(), settings.alarms.lp_low_bar, *settings.turbine.model_dump().values(),
+            trips.trip_lp_bar,
+        ]),
+        hp_override=trips.hp_bar, lp_override=trips.lp_bar,
     )  # fmt: skip

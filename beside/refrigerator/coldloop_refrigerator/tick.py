@@ -5,39 +5,23 @@ box and what is given become what acts: in ordinary operation it is the same, to
 """
 
 from math import sqrt
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.kernels.intrinsics import borrowed, named
+from coldloop.kernels.intrinsics import PlainTuples, borrowed, named
 from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, P1, TICK_S, V1
 from coldloop_plant.cold_box import ColdBox
 from coldloop_plant.components.heat_exchanger import HeatExchanger
 from coldloop_plant.helium import Helium
 from coldloop_plant.numeric import PA_PER_BAR, RealArray
+from coldloop_refrigerator import physics, station_control
 from coldloop_refrigerator.high_pressure import COLUMNS
-from coldloop_refrigerator.physics import (
-    COIL,
-    DISTURBANCE_NAMES,
-    SIGNAL_NAMES,
-    SIGNALS,
-    STATE_NAMES,
-    Refrigerator,
-    advance_along,
-    evaluate_refrigerator,
-    move_valves,
-)
-from coldloop_refrigerator.precooler import Precooler
-from coldloop_refrigerator.station_control import (
-    MEMORY_SIZE,
-    EquipmentLaw,
-    StationLaw,
-    StationMeasurement,
-    control_station,
-    raised_alarms,
-)
+from coldloop_refrigerator.physics import DISTURBANCE_NAMES, SIGNAL_NAMES, STATE_NAMES, Refrigerator
+from coldloop_refrigerator.station_control import EquipmentLaw, StationLaw
+from coldloop_refrigerator.warm import Precooler
 
 GIVEN_NAMES: Final = (
     *DISTURBANCE_NAMES, "HP_noise", "LP_noise", "turbine", "cv155", "cv156", "heater",
@@ -52,55 +36,38 @@ NC1, NC2, HP_NOISE, LP_NOISE, TURBINE, CV155_MOVES, CV156_MOVES, HEATER, BLOCKIN
 HEATER_OFF, HEATER_FOLLOWS, HEATER_ON = range(3)
 
 START, ADMISSION, TRIPPED, CV155, CV156, BLOCKED, ACTING, DEVIATING = 0, 2, 3, 4, 5, 6, 10, 13
-LOW_SUCTION: Final = -1.0
-"""Sentinel for a start: the low pressure has tripped the compressor."""
+LOW_SUCTION: Final = -1.0  # Sentinel for a start: the low pressure has tripped the compressor
 EQUIPMENT_SIZE: Final = 14
 """The equipment's memory: how far each compressor's start has come (2, 1 is loaded, -1 tripped by
 the low pressure), the share of CV156's opening that
 the turbine's governor allows, 1 after an overspeed trip, positions of CV155 and CV156 (%), the blocked share of NEF1,
 NEF2, NEF34 and NEF6 (4), the inputs that act on the cold box (3), and 1 where one is not as it is asked."""
 
-FULL_HEATER_W: Final = 150.0
-"""Power of a heater that is stuck on, W."""
+FULL_HEATER_W: Final = 150.0  # Power of a heater that is stuck on, W
 MOST_BLOCKED: Final = 0.98
 CLEAN_DROP_BAR: Final = 0.05
 """Pressure drop of the high-pressure side of each exchanger at the operating point, of which only the rise counts."""
-VALVE_DROP_BAR: Final = (14.77, 4.62)
-"""Pressure drops of CV155 and CV156 at the operating point, bar."""
-NOMINAL_OPENING: Final = (43.0, 36.0)
-"""%, of CV155 and CV156."""
-GOVERNOR_S: Final = 5.0
-"""s, in which the governor closes by as much as the speed is too high."""
+VALVE_DROP_BAR: Final = (14.77, 4.62)  # Pressure drops of CV155 and CV156 at the operating point, bar
+NOMINAL_OPENING: Final = (43.0, 36.0)  # %, of CV155 and CV156
+GOVERNOR_S: Final = 5.0  # s, in which the governor closes by as much as the speed is too high
 LEAST_ADMISSION: Final = 0.002
-DEVIATION: Final = 1.0
-"""% or W between what is asked and what acts, from which on it is alarmed."""
+DEVIATION: Final = 1.0  # % or W between what is asked and what acts, from which on it is alarmed
 
 
 class Acting(NamedTuple):
     """Inputs and disturbances that act on the plant in a tick."""
 
-    u: RealArray
-    """Inputs of the cold box, shape (3,)."""
-    d: RealArray
-    """Disturbances; NC1 and NC2 are the shares that they are to run at."""
-    plant: Refrigerator
-    """With the exchangers as they are blocked."""
+    u: RealArray  # Inputs of the cold box, shape (3,)
+    d: RealArray  # Disturbances; NC1 and NC2 are the shares that they are to run at
+    plant: Refrigerator  # With the exchangers as they are blocked
 
 
-def resting_equipment(u: RealArray) -> RealArray:
-    """Return the equipment's memory with all in order, at the inputs `u` (3,)."""
+def resting_equipment(u: RealArray, *, warm: bool = False) -> RealArray:
+    """Return the equipment's memory with all in order at the inputs `u` (3,); `warm`: nothing has started."""
     memory = np.zeros(EQUIPMENT_SIZE)
-    memory[:ADMISSION] = memory[ADMISSION] = 1.0
     memory[CV155], memory[CV156] = u[0], u[2]
-    memory[ACTING:DEVIATING] = u
-    return memory
-
-
-def standing_equipment(u: RealArray) -> RealArray:
-    """Return the equipment's memory of a refrigerator that stands: compressors and turbine have not started."""
-    memory = resting_equipment(u)
-    memory[:ADMISSION] = memory[ADMISSION] = 0.0
-    memory[ACTING:DEVIATING] = 0.0
+    if not warm:
+        memory[:TRIPPED], memory[ACTING:DEVIATING] = 1.0, u
     return memory
 
 
@@ -135,7 +102,8 @@ def act(
     memory[ACTING] = 0.0 if isolated else memory[CV155]
     memory[ACTING + 1] = 0.0 if isolated else heater
     memory[ACTING + 2] = memory[CV156] if runs else 0.0
-    memory[DEVIATING] = 1.0 if deviates(memory, u, heater) else 0.0
+    off = max(abs(memory[CV155] - u[0]), abs(memory[CV156] - u[2] * memory[ADMISSION]), abs(heater - u[1]))
+    memory[DEVIATING] = 1.0 if off > DEVIATION else 0.0
     inputs = memory[ACTING:DEVIATING].copy()
     warm = further_drop(memory[BLOCKED + 2]) + further_drop(memory[BLOCKED + 3])
     cold = further_drop(memory[BLOCKED]) + further_drop(memory[BLOCKED + 1])
@@ -224,14 +192,6 @@ def blocked_exchanger(exchanger: HeatExchanger, blocked: float) -> HeatExchanger
     return HeatExchanger(exchanger.UA * (1.0 - blocked), exchanger.volume, exchanger.aluminium, exchanger.cells)
 
 
-@kernel
-def deviates(memory: RealArray, u: RealArray, heater: float) -> bool:
-    """Return whether a valve or the heater (W) is not as it is asked by `u` (3,) and the governor."""
-    valves = max(abs(memory[CV155] - u[0]), abs(memory[CV156] - u[2] * memory[ADMISSION]))
-    off: bool = max(valves, abs(heater - u[1])) > DEVIATION
-    return off
-
-
 HP, LP, BUFFER, NITROGEN, LOST = (SIGNAL_NAMES.index(name) for name in ("P12", "P11", "P13", "L_N2", "lost"))
 TO_BOX, COMPRESSED = SIGNAL_NAMES.index("M12"), SIGNAL_NAMES.index("M_NC")
 CV956, CV952, CV953 = (STATE_NAMES.index(name) for name in ("CV956", "CV952", "CV953"))
@@ -239,8 +199,7 @@ BLOCKED_SHARES: Final = len(INPUT_NAMES) + len(DISTURBANCE_NAMES)
 ACTED: Final = BLOCKED_SHARES + ACTING - BLOCKED
 MODE: Final = 0
 ALARMS: Final = 1
-LEAST_FLOW: Final = 0.1
-"""g/s through the compressors, below which none of it counts as taken by the cold box."""
+LEAST_FLOW: Final = 0.1  # g/s through the compressors, below which none of it counts as taken by the cold box
 
 
 class RefrigeratorMemory(NamedTuple):
@@ -271,8 +230,8 @@ class RefrigeratorMemory(NamedTuple):
 def begin_memory(x: RealArray, v: RealArray, equipment: RealArray) -> RefrigeratorMemory:
     """Return a memory at the state `x`, with openings `v` asked and `equipment` as it is; nothing is read yet."""
     return RefrigeratorMemory(
-        x, np.zeros(len(OUTPUT_NAMES)), np.zeros(SIGNALS), v, np.zeros(MEMORY_SIZE), equipment, np.zeros(2, np.int64),
-        np.zeros_like(x), np.zeros((COIL + 1, COLUMNS)), np.full(ACTED, np.nan),
+        x, np.zeros(len(OUTPUT_NAMES)), np.zeros(physics.SIGNALS), v, np.zeros(station_control.MEMORY_SIZE), equipment,
+        np.zeros(2, np.int64), np.zeros_like(x), np.zeros((physics.COIL + 1, COLUMNS)), np.full(ACTED, np.nan),
     )  # fmt: skip
 
 
@@ -280,15 +239,15 @@ def begin_memory(x: RealArray, v: RealArray, equipment: RealArray) -> Refrigerat
 def control_tick(m: RefrigeratorMemory, d: RealArray, law: StationLaw) -> None:
     """Let the controller answer what its sensors show; `d` (16,) holds from the tick on that begins."""
     x, signals, equipment = m.x, m.signals, m.equipment
-    measured = StationMeasurement(
+    measured = station_control.StationMeasurement(
         signals[HP] + d[HP_NOISE], signals[LP] + d[LP_NOISE], signals[BUFFER], x[CV956], x[CV952], x[CV953],
         signals[NITROGEN], signals[LOST], m.y[P1], d[NC1] != 0.0 and equipment[START] >= 0.0,
         d[NC2] != 0.0 and equipment[START + 1] >= 0.0,
         loaded_compressors(equipment, d), d[TURBINE] != 0.0 and equipment[TRIPPED] == 0.0, equipment[TRIPPED] != 0.0,
         equipment[DEVIATING] != 0.0, min(equipment[START], equipment[START + 1]) < 0.0,
     )  # fmt: skip
-    m.status[ALARMS] = raised_alarms(law.alarms, measured)
-    commands, m.status[MODE] = control_station(law, m.integrals, measured)
+    m.status[ALARMS] = station_control.raised_alarms(law, measured)
+    commands, m.status[MODE] = station_control.control_station(law, m.integrals, measured)
     for i in range(len(commands)):
         m.commands[i] = commands[i]
 
@@ -297,7 +256,7 @@ def control_tick(m: RefrigeratorMemory, d: RealArray, law: StationLaw) -> None:
 def read_tick(m: RefrigeratorMemory, acting: Acting, helium: Helium) -> None:
     """Write what the sensors show at the state, and how the state moves."""
     u, d = acting.u, acting.d
-    crossing = evaluate_refrigerator(m.x, u, m.commands, d, acting.plant, helium, m.slope, m.y, m.signals)
+    crossing = physics.evaluate_refrigerator(m.x, u, m.commands, d, acting.plant, helium, m.slope, m.y, m.signals)
     m.cells[:] = crossing.filling.cells
     m.acted[:] = what_acts(m, acting)
 
@@ -320,26 +279,21 @@ def advance_tick(
     taken = m.signals[TO_BOX] / max(m.signals[COMPRESSED], LEAST_FLOW)
     acting = act(law.equipment, m.equipment, u, d, m.signals[LP], taken, m.y[V1], plant)
     if np.all(what_acts(m, acting) == m.acted):
-        move_valves(m.x, m.commands, acting.plant, m.slope)
+        physics.move_valves(m.x, m.commands, acting.plant, m.slope)
     else:
         read_tick(m, acting, helium)
     P = PA_PER_BAR * m.signals[HP]
-    m.x[:] = advance_along(
+    m.x[:] = physics.advance_along(
         m.x, m.slope, m.cells, P, acting.u, m.commands, acting.d, TICK_S, acting.plant, helium
-    )  # fmt: skip
+    )
     read_tick(m, acting, helium)
     control_tick(m, ahead, law)
 
 
 @kernel
 def advance_program_tick(
-    m: RefrigeratorMemory,
-    u: RealArray,
-    d: RealArray,
-    ahead: RealArray,
-    plant: Any,  # noqa: ANN401 - any nesting of tuples
-    helium: Any,  # noqa: ANN401 - any nesting of tuples
-    law: Any,  # noqa: ANN401 - any nesting of tuples
-) -> None:
+    m: RefrigeratorMemory, u: RealArray, d: RealArray, ahead: RealArray, plant: PlainTuples, helium: PlainTuples,
+    law: PlainTuples,
+) -> None:  # fmt: skip
     """Do `advance_tick`; parameters, tables and law come as `plain_tuples`."""
     advance_tick(m, u, d, ahead, named(Refrigerator, plant), named(Helium, borrowed(helium)), named(StationLaw, law))

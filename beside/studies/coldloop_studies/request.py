@@ -78,7 +78,9 @@ class LinearRig(OneProcessRig):
         super().__init__(settings, compiled=False)
 
     def _plant(self, load: LoadProfile, seed: int) -> LinearPlant:
-        return LinearPlant(load_model(self._settings.model.file), load, noise_of(self._settings.plant.sensors, seed))
+        return LinearPlant(
+            load_model(self._settings.model.file), load=load, noise=noise_of(self._settings.plant.sensors, seed)
+        )
 
 
 @dataclass(frozen=True)

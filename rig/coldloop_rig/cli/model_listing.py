@@ -87,10 +87,10 @@ def held_line(box: ColdBox, level: float, design: ControlDesign, limits: InputLi
     heater, warmth = (limits.low[1], limits.high[1]), (design.output_low[1], design.output_high[1])
     try:
         with np.errstate(all="ignore"):
-            held = cold_box.held_loads(box, load_helium(), level, openings[0], heater, openings[1], warmth)
+            least, largest = cold_box.held_loads(box, load_helium(), level, openings[0], heater, openings[1], warmth)
     except ValueError:
         return "holds      no load with T5 within its band\n"
-    loads = f"[{max(held.least.w, 0.0):.0f},{max(held.largest.w - cold_box.LOOP_MARGIN, 0.0):.0f}]"
+    loads = f"[{max(least.w, 0.0):.0f},{max(largest.w - cold_box.LOOP_MARGIN, 0.0):.0f}]"
     return f"holds      loads of {loads} W at least: --set optimizer_plc.program.holdable_load_w={loads}\n"
 
 

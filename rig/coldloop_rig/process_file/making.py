@@ -287,7 +287,7 @@ def from_fmu(file: Process, folder: Path, name: str) -> Linearised:
     """
     fmu = Fmu(folder / name)
     simulation, wiring = _at_rest(file, fmu, _wiring(file, fmu))
-    y, x = simulation.outputs(), simulation.states()
+    y, x = simulation.read(simulation.outputs), simulation.read(simulation.states)
     notes = [f"warning    FMU: {finding}" for finding in fmu.findings[:MOST_FINDINGS]]
     notes += [
         f"warning    FMU: {one} is of type {fmu.port(one).type}: what it is given is rounded"
@@ -359,7 +359,7 @@ def _steps_per_tick(file: Process, fmu: Fmu) -> int:
 def _sample(file: Process, simulation: FmuSimulation) -> Array:
     for _ in range(file.ticks_per_sample):
         simulation.tick()
-    return simulation.outputs()
+    return simulation.read(simulation.outputs)
 
 
 def _at_rest(file: Process, fmu: Fmu, wiring: Wiring) -> tuple[FmuSimulation, Wiring]:
@@ -407,11 +407,11 @@ def _differentiated(file: Process, fmu: Fmu, wiring: Wiring, simulation: FmuSimu
         values = {name: value for name, value in zip(names, v.tolist(), strict=True) if name is not None}
         start = {**wiring.start, **values}
         begun = FmuSimulation(fmu, replace(wiring, start=start), file.tick_s)
-        return np.append(begun.read(rates), begun.outputs())
+        return np.append(begun.read(rates), begun.read(begun.outputs))
 
-    at = np.array([*simulation.states(), *u, *w])
+    at = np.array([*simulation.read(simulation.states), *u, *w])
     spans = np.array([one.range[1] - one.range[0] for one in file.outputs])
-    if not (np.abs(evaluated(at)[-len(outputs) :] - simulation.outputs()) <= 1e-3 * spans).all():
+    if not (np.abs(evaluated(at)[-len(outputs) :] - simulation.read(simulation.outputs)) <= 1e-3 * spans).all():
         return None  # its start values are not its states
     return central_differences(evaluated, at, STEP * np.maximum(1.0, np.abs(at)))[0], "differences of start values"
 
@@ -431,7 +431,7 @@ def _step_tested(file: Process, simulation: FmuSimulation, where: str) -> Record
             hold = int(np.exp(generator.uniform(0.0, np.log(max(2.0, horizon / 2)))))
             steps[k : k + hold, j] = levels[generator.integers(2)]
             k += hold
-    outputs, after = np.empty((count, len(file.outputs))), simulation.outputs()
+    outputs, after = np.empty((count, len(file.outputs))), simulation.read(simulation.outputs)
     for k, row in enumerate(steps):
         outputs[k] = after
         u, w = row[: len(file.inputs)], row[len(file.inputs) :]

@@ -21,18 +21,12 @@ TOLERANCE = 1e-10  # of a state of rest, in sizes of the states per second
 class Linear(NamedTuple):
     """dx/dt = A x + B u + F w, y = C x + D u + G w, in deviations and physical units, time in seconds."""
 
-    A: RealArray
-    """Shape (n, n)."""
+    A: RealArray  # Shapes (n, n), (n, m) and (n, k), or (n,) where w is one number
     B: RealArray
-    """Shape (n, m)."""
     F: RealArray
-    """Shape (n, k), or (n,) where w is one number."""
-    C: RealArray
-    """Shape (p, n)."""
+    C: RealArray  # Shapes (p, n), (p, m) and (p, k), or (p,)
     D: RealArray
-    """Shape (p, m)."""
     G: RealArray
-    """Shape (p, k), or (p,)."""
 
     @classmethod
     def of(cls, jacobian: RealArray, states: int, inputs: int) -> Self:
@@ -57,13 +51,8 @@ def central_differences(
     """Return the Jacobian of a function by central differences, with `steps` and with steps twice as wide."""
     by_step = []
     for widths in (steps, 2.0 * steps):
-        columns = []
-        for i, h in enumerate(widths):
-            ahead, behind = at.copy(), at.copy()
-            ahead[i] += h
-            behind[i] -= h
-            columns.append((function(ahead) - function(behind)) / (2 * h))
-        by_step.append(np.array(columns).T)
+        moves = zip(np.diag(widths), widths, strict=True)
+        by_step.append(np.array([(function(at + move) - function(at - move)) / (2 * h) for move, h in moves]).T)
     return by_step[0], by_step[1]
 
 
@@ -104,17 +93,14 @@ def newton(
 FASTEST = 4.0
 """Largest rate at rest, 1/s. A tick of 0.25 s follows 11 /s, and away from rest rates are up to three times as large;
 the reference plant has 1.6 /s."""
-GROWTH = 1e-4
-"""Rate from which on a deviation is said to grow, 1/s; that of the level is 0 but for rounding."""
+GROWTH = 1e-4  # Rate from which on a deviation is said to grow, 1/s; that of the level is 0 but for rounding
 
 
 class Modes(NamedTuple):
     """The modes of a plant."""
 
-    rates: RealArray
-    """Real parts of the eigenvalues, 1/s."""
-    parts: list[str]
-    """Part of the plant that moves most with each."""
+    rates: RealArray  # Real parts of the eigenvalues, 1/s
+    parts: list[str]  # Part of the plant that moves most with each
 
     @classmethod
     def of(cls, A: RealArray, sizes: RealArray, parts: Sequence[str]) -> Self:

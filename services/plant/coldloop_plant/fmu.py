@@ -33,19 +33,16 @@ CONTINUOUS: Final = ("Real", "Float")
 DOUBLE: Final = ("Real", "Float64")  # what derivatives can be asked for
 MOST_UNPACKED: Final = 512 * 1024 * 1024  # bytes
 ELEMENT: Final = re.compile(r"(.+)\[(\d+(?:,\s*\d+)*)\]")
-ERROR: Final = 3
-"""Status of FMI from which on a message says what is wrong."""
+ERROR: Final = 3  # Status of FMI from which on a message says what is wrong
 
 
 class Port(NamedTuple):
     """A number that an FMU shows: a variable, or an element of an array of FMI 3.0."""
 
     reference: int
-    type: str
-    """Type of the functions that set and get it."""
+    type: str  # Type of the functions that set and get it
     place: int = 0
-    size: int = 1
-    """Elements of the array, which are set and read together."""
+    size: int = 1  # Elements of the array, which are set and read together
 
     @property
     def is_discrete(self) -> bool:
@@ -85,15 +82,22 @@ class Fmu:
                 self.description = fmpy.read_model_description(self.folder, validate=False)
             platforms = fmpy.supported_platforms(self.folder)
         self.variables = {each.name: each for each in self.description.modelVariables}
-        slave = self.description.coSimulation
-        self._check(slave, platforms, fmpy.platform)
+        slave, version = self.description.coSimulation, str(self.description.fmiVersion)
+        if not version.startswith(("2.0", "3.0")):
+            raise ModelFileError(f"{path}: is of FMI {version}; get one of FMI 2.0 or 3.0 from the tool that made it")
+        if slave is None:
+            raise ModelFileError(f"{path}: has no co-simulation; get one with it from the tool that made it")
+        if fmpy.platform not in platforms:
+            others = ", ".join(platforms) or "none"
+            raise ModelFileError(
+                f"{path}: has no library for {fmpy.platform}, but for {others}; get it made for this platform"
+            )
         self.keeps_state = bool(slave.canGetAndSetFMUstate and slave.canSerializeFMUstate)
         """Whether a state of it can be saved, and be returned to."""
         self.has_derivatives = bool(slave.providesDirectionalDerivative)
         self.is_single = bool(slave.canBeInstantiatedOnlyOncePerProcess)
         """Whether a new instance ends the one before it."""
-        self.end_former: Callable[[], object] | None = None
-        """Ends the instance that a new one takes the place of."""
+        self.end_former: Callable[[], object] | None = None  # Ends the instance that a new one takes the place of
 
     def _unpacked(self, most: int) -> str:
         """Return a folder with the members of the archive; zipfile gives no more of one than its directory says."""
@@ -112,16 +116,6 @@ class Fmu:
                     "set TMPDIR to another folder"
                 ) from error
         return folder
-
-    def _check(self, slave: Any, platforms: Sequence[str], here: str) -> None:  # noqa: ANN401 FMPy has no types
-        where, version = self.path, str(self.description.fmiVersion)
-        if not version.startswith(("2.0", "3.0")):
-            raise ModelFileError(f"{where}: is of FMI {version}; get one of FMI 2.0 or 3.0 from the tool that made it")
-        if slave is None:
-            raise ModelFileError(f"{where}: has no co-simulation; get one with it from the tool that made it")
-        if here not in platforms:
-            others = ", ".join(platforms) or "none"
-            raise ModelFileError(f"{where}: has no library for {here}, but for {others}; get it made for this platform")
 
     def port(self, name: str) -> Port:
         """Return the number of this name; elements of an array, as `x[1]` or `x[2,1]`, count from 1, row by row.
@@ -186,8 +180,8 @@ class FmuSimulation:
 
         names = [*wiring.inputs, *([wiring.load] if wiring.load else []), *wiring.disturbances]
         self.inputs = [fmu.port(name) for name in names]
-        self._outputs = [fmu.port(name) for name in wiring.outputs]
-        self._states = [fmu.port(name) for name in wiring.states]
+        self.outputs = [fmu.port(name) for name in wiring.outputs]
+        self.states = [fmu.port(name) for name in wiring.states]
         self._fmu = fmu
         self._wiring = wiring
         self._step_s = tick_s / wiring.steps_per_tick
@@ -251,14 +245,6 @@ class FmuSimulation:
         sizes = () if self._fmu.is_fmi2 else (sum(counts.values()),)
         return list(getattr(self._slave, f"get{kind}")(list(counts), *sizes))
 
-    def outputs(self) -> RealArray:
-        """Return the outputs."""
-        return self.read(self._outputs)
-
-    def states(self) -> RealArray:
-        """Return the states that it shows."""
-        return self.read(self._states)
-
     def tick(self) -> None:
         """Go one tick forward.
 
@@ -282,11 +268,11 @@ class FmuSimulation:
     def derivatives(self, of: Sequence[Port]) -> RealArray:
         """Return partial derivatives by states, inputs, load and k other disturbances, shape (of, n + m + 1 + k)."""
         unknown = [port.reference for port in of]
-        by = [*self._states, *self.inputs]
+        by = [*self.states, *self.inputs]
         with self._calling("directional derivatives fail"):
             columns = [self._slave.getDirectionalDerivative(unknown, [one.reference], [1.0]) for one in by]
             found = np.array(columns, dtype=np.float64).T
-        no_load = len(self._states) + len(self._wiring.inputs)
+        no_load = len(self.states) + len(self._wiring.inputs)
         return found if self._wiring.load else np.insert(found, no_load, 0.0, axis=1)
 
     def saved(self) -> dict[str, Any]:
@@ -321,7 +307,7 @@ class FmuPlant(DisturbedPlant):
 
     def _shown(self) -> RealArray:
         """Return the states; zeros where the FMU hides them."""
-        states = self._simulation.states()
+        states = self._simulation.read(self._simulation.states)
         return states if len(states) else self._hidden
 
     def _warm_up(self) -> None:
@@ -329,12 +315,12 @@ class FmuPlant(DisturbedPlant):
 
     def _own_outputs(self, w: RealArray) -> RealArray:
         self._simulation.put(self._u, w)
-        return self._simulation.outputs()
+        return self._simulation.read(self._simulation.outputs)
 
     def _own_step(self, w: RealArray) -> tuple[RealArray, RealArray]:
         self._simulation.put(self._u, w)
         self._simulation.tick()
-        return self._shown(), self._simulation.outputs()
+        return self._shown(), self._simulation.read(self._simulation.outputs)
 
     def _saved(self) -> dict[str, Any] | None:
         return self._simulation.saved() if self._keeps_state else None

@@ -3,7 +3,6 @@
 A model of neither is refused at once. A plant around the cold box comes with a package of its own, by an entry point.
 """
 
-from collections.abc import Callable
 from functools import cache, partial
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -23,7 +22,7 @@ from coldloop_plant.cold_box.model import AtRest, parameters_digest
 from coldloop_plant.cold_box.plant_file import LISTING, BoxParameters, PlantFile
 from coldloop_plant.components.expansion import Valve
 from coldloop_plant.helium import load_helium
-from coldloop_plant.program import HeatLoad, MakePlant, MeasurementNoise, PlantProgram
+from coldloop_plant.program import HeatLoad, MakePlant, MeasurementNoise, NoiseOfSeed, PlantProgram
 from coldloop_plant.settings import MismatchSettings, PlantKind, PlantSection, SensorSettings, StationSettings
 
 GROUP: Final = "coldloop.plant_kinds"
@@ -34,15 +33,13 @@ P = TypeVar("P", bound=BoxParameters)
 class Kind(Protocol):
     """A kind of plant around the cold box; models and plant files name it."""
 
-    def box_of(self, model: ModelHeader | LtiModel, where: str) -> ColdBox:
-        """Return the cold box in the plant that a model file describes (`ModelFileError`); `where` names the file."""
+    def plant_in(self, model: ModelHeader | LtiModel, where: str) -> tuple[ColdBox, str]:
+        """Return the cold box in the plant that a model file, named by `where`, describes, and the plant's digest.
 
-    def digest_of(self, model: ModelHeader, where: str) -> str:
-        """Return the digest of that plant's parameters (`ModelFileError`)."""
+        It raises `ModelFileError`.
+        """
 
-    def maker_of(
-        self, header: ModelHeader, section: PlantSection, noise_of_seed: Callable[[int], MeasurementNoise | None]
-    ) -> MakePlant:
+    def maker_of(self, header: ModelHeader, section: PlantSection, noise_of_seed: NoiseOfSeed) -> MakePlant:
         """Return what makes the plant of a model file, or around its reference cold box (`ColdloopError`)."""
 
     def read_plant_file(self, path: Path | None, limits: InputLimits, *, whole: bool) -> PlantFile:
@@ -78,15 +75,16 @@ def own_header(file: Path) -> ModelHeader:
     """
     header = read_header(file)
     if header.process:
-        from coldloop_plant.own_plants import check_files  # noqa: PLC0415 a cold box starts without it
+        from coldloop_plant.own_plants import FMU, fmu_of  # noqa: PLC0415 a cold box starts without it
 
-        check_files(header)
+        if header.plant == FMU:
+            fmu_of(header)
         return header
     names = (header.state_names[: len(STATE_NAMES)], header.input_names, header.output_names)
     if header.plant == COLD_BOX:
         own = _box_digest(box_of(header, str(file)))
     else:
-        own = kind_named(header.plant, str(file)).digest_of(header, str(file))
+        own = kind_named(header.plant, str(file)).plant_in(header, str(file))[1]
     if header.parameters_digest != own or names != (STATE_NAMES, INPUT_NAMES, OUTPUT_NAMES):
         raise ModelFileError(f"{file}: a model of another plant; make one with `coldloop model --out FILE`")
     return header
@@ -100,7 +98,7 @@ def box_of(model: ModelHeader | LtiModel, where: str = "model.file") -> ColdBox:
     """
     if model.plant == COLD_BOX:
         return parameters_in(model, BoxParameters, where).box
-    return kind_named(model.plant, where).box_of(model, where)
+    return kind_named(model.plant, where).plant_in(model, where)[0]
 
 
 def parameters_in(model: ModelHeader | LtiModel, kind: type[P], where: str) -> P:

@@ -23,8 +23,7 @@ from coldloop.registers.plant import LOAD_ROWS, LoadStatus, LoadStep
 SECOND_TICKS: Final = round(1.0 / REFERENCE_TICK_S)
 """Ticks of what is a second in the families below, of a process that is not stretched."""
 HOUR_TICKS: Final = 3600 * SECOND_TICKS
-LARGEST_STEP: Final = 200.0
-"""Largest load step of the six families, W."""
+LARGEST_STEP: Final = 200.0  # Largest load step of the six families, W
 
 
 class LoadFamily(NamedTuple):
@@ -62,35 +61,27 @@ NAMED: Final = {
 }
 
 
-DRAW_SEEDS: Final = 1000
-"""Between the seed of a family's draw and that of the next."""
+DRAW_SEEDS: Final = 1000  # Between the seed of a family's draw and that of the next
 
 
 def telegraph(family: LoadFamily, mean_w: float) -> LoadProfile:
     """Return one hour of a family about `mean_w`, in whole ticks, starting at the mean."""
     draw = random.Random(family.seed).random  # noqa: S311 not for secrets; the one generator stable over versions
-    if family.in_turn:
-        return _pulses(family, mean_w, draw())
     times, watts = [0], [mean_w]
     tick = round(family.longest_s * SECOND_TICKS)
+    if family.in_turn:  # it begins at the mean for a share of the longest time
+        tick = 1 + round(draw() * family.longest_s * SECOND_TICKS)
     while tick < HOUR_TICKS:
-        step = mean_w + family.steps[int(draw() * len(family.steps))]
-        if step != watts[-1]:
+        if family.in_turn:
+            rising = watts[-1] == mean_w + family.steps[0]
+            step, lasting = family.steps[rising], family.shortest_s if rising else family.longest_s
+        else:
+            step = family.steps[int(draw() * len(family.steps))]
+            lasting = family.shortest_s + draw() * (family.longest_s - family.shortest_s)
+        if mean_w + step != watts[-1]:
             times.append(tick)
-            watts.append(step)
-        tick += round((family.shortest_s + draw() * (family.longest_s - family.shortest_s)) * SECOND_TICKS)
-    return LoadProfile(tuple(times), tuple(watts))
-
-
-def _pulses(family: LoadFamily, mean_w: float, phase: float) -> LoadProfile:
-    """Return an hour of pulses that begins at the mean for a share `phase` (0 to 1) of the longest time."""
-    (low, high), times, watts = family.steps, [0], [mean_w]
-    tick = 1 + round(phase * family.longest_s * SECOND_TICKS)
-    while tick < HOUR_TICKS:
-        rising = watts[-1] == mean_w + low
-        times.append(tick)
-        watts.append(mean_w + (high if rising else low))
-        tick += round((family.shortest_s if rising else family.longest_s) * SECOND_TICKS)
+            watts.append(mean_w + step)
+        tick += round(lasting * SECOND_TICKS)
     return LoadProfile(tuple(times), tuple(watts))
 
 
@@ -124,23 +115,18 @@ def named_families(name: str) -> list[LoadFamily] | None:
 def drawn(family: LoadFamily, name: str, mean: float, process: Process) -> LoadProfile:
     """Return an hour of a family about the mean load of a process.
 
-    Raises:
-        LoadFileError: As `_stretched`.
-    """
-    return telegraph(family if process.load.has_named_loads else _stretched(family, name, mean, process), mean)
-
-
-def _stretched(family: LoadFamily, name: str, mean: float, process: Process) -> LoadFamily:
-    """Return a family whose largest step is the way from the mean to the nearer end of the load's span.
+    Of one without named loads the largest step is the way from the mean to the nearer end of the load's span.
 
     Raises:
-        LoadFileError: Its steps are larger than those of the six hours.
+        LoadFileError: The steps of such a family are larger than those of the six hours.
     """
-    low, high = process.load.span
-    if max(map(abs, family.steps)) > LARGEST_STEP:
-        raise LoadFileError(f"load {name}: of a refrigerator; name another, or a CSV file with loads of this plant")
-    scale = min(mean - low, high - mean) / LARGEST_STEP
-    return family._replace(steps=tuple(scale * step for step in family.steps))
+    if not process.load.has_named_loads:
+        low, high = process.load.span
+        if max(map(abs, family.steps)) > LARGEST_STEP:
+            raise LoadFileError(f"load {name}: of a refrigerator; name another, or a CSV file with loads of this plant")
+        scale = min(mean - low, high - mean) / LARGEST_STEP
+        family = family._replace(steps=tuple(scale * step for step in family.steps))
+    return telegraph(family, mean)
 
 
 def find_load(name: str, mean_w: float, process: Process) -> LoadProfile:
@@ -164,10 +150,8 @@ def find_load(name: str, mean_w: float, process: Process) -> LoadProfile:
     return read_load_file(path, process)
 
 
-MOST_UPCOMING: Final = 2 * LOAD_ROWS
-"""Steps to come that are kept."""
-FORGET_AT: Final = 256
-"""Steps that are past are forgotten when they are so many."""
+MOST_UPCOMING: Final = 2 * LOAD_ROWS  # Steps to come that are kept
+FORGET_AT: Final = 256  # Steps that are past are forgotten when they are so many
 
 
 class LoadSchedule:

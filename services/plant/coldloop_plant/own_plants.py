@@ -30,10 +30,9 @@ from coldloop.process.model_file import ModelHeader
 from coldloop.process.sections import Lag
 from coldloop.text import file_digest
 from coldloop_plant.numeric import RealArray
-from coldloop_plant.program import HeatLoad, MakePlant, MeasurementNoise, PlantProgram
+from coldloop_plant.program import HeatLoad, MakePlant, NoiseOfSeed, PlantProgram
 
-PYTHON: Final = "python"
-"""Kinds of plants: `ModelHeader.plant`."""
+PYTHON: Final = "python"  # Kinds of plants: `ModelHeader.plant`
 LINEAR: Final = "linear"
 TRANSFER_FUNCTIONS: Final = "transfer-functions"
 FMU: Final = "fmu"
@@ -176,17 +175,11 @@ def read_linear(m: Matrices, x: RealArray, u: RealArray, w: float, y: RealArray)
 class LinearPlant(PlantProgram):
     """The model in its own place, with as many states as the process declares; actuators do not saturate."""
 
-    def __init__(
-        self,
-        model: LtiModel,
-        load: HeatLoad,
-        noise: MeasurementNoise | None = None,
-        disturbances: Disturbances = NO_DISTURBANCES,
-    ) -> None:
+    def __init__(self, model: LtiModel, *, disturbances: Disturbances = NO_DISTURBANCES, **arguments: Any) -> None:  # noqa: ANN401
         parts: dict[str, Any] = {name: getattr(model, name) for name in Matrices._fields}
         self.constants = Matrices(**{name: part if name == "w0" else part.copy() for name, part in parts.items()})
         self.disturbances = disturbances
-        super().__init__(x0=model.x0.tolist(), u0=model.u0.tolist(), load=load, noise=noise, process=model.declared)
+        super().__init__(x0=model.x0.tolist(), u0=model.u0.tolist(), process=model.declared, **arguments)
 
     def _read(self, w: float) -> RealArray:
         y = np.empty(len(self.constants.y0))
@@ -202,21 +195,14 @@ class LinearPlant(PlantProgram):
 class LagTable(NamedTuple):
     """The lags side by side."""
 
-    places: NDArray[np.int64]
-    """Outputs that they move."""
-    sources: NDArray[np.int64]
-    """Sources that they follow: inputs, then load and disturbances."""
-    delays: NDArray[np.int64]
-    """Ticks."""
-    decay: RealArray
-    """Share of each lag's response that remains after a tick."""
+    places: NDArray[np.int64]  # Outputs that they move
+    sources: NDArray[np.int64]  # Sources that they follow: inputs, then load and disturbances
+    delays: NDArray[np.int64]  # Ticks
+    decay: RealArray  # Share of each lag's response that remains after a tick
     gain: RealArray
-    about: RealArray
-    """Inputs, load and disturbances at the operating point."""
-    y0: RealArray
-    """Outputs there."""
-    measured: NDArray[np.int64]
-    """Disturbances that are outputs, the last ones."""
+    about: RealArray  # Inputs, load and disturbances at the operating point
+    y0: RealArray  # Outputs there
+    measured: NDArray[np.int64]  # Disturbances that are outputs, the last ones
 
 
 class LagMemory(NamedTuple):
@@ -304,8 +290,7 @@ class TransferFunctionPlant(DisturbedPlant):
         self.memory = kept
 
 
-NAME: Final = r"[A-Za-z][A-Za-z0-9_]{0,31}"
-"""Pattern of the name of a signal or a state."""
+NAME: Final = r"[A-Za-z][A-Za-z0-9_]{0,31}"  # Pattern of the name of a signal or a state
 
 
 class Equations(Protocol):
@@ -396,65 +381,53 @@ def runge_kutta(equations: Equations, x: RealArray, u: RealArray, w: float | Rea
 
 
 class PythonPlant(DisturbedPlant):
-    """A user's plant, integrated tick by tick."""
+    """A user's plant, integrated tick by tick.
 
-    def __init__(self, equations: Equations, **arguments: Any) -> None:  # noqa: ANN401 of the base
+    Where the model has other states, the equations begin with the states `rest`, which are hidden: `x0` is shown.
+    """
+
+    def __init__(self, equations: Equations, *, rest: Sequence[float] | None = None, **arguments: Any) -> None:  # noqa: ANN401 of the base
         self._equations = equations
+        self._hidden = None if rest is None else np.array(rest, dtype=np.float64)
         self.whose = f"the plant's class {type(equations).__name__}"
         super().__init__(**arguments)
+
+    def _warm_up(self) -> None:
+        if self._hidden is None:  # else a tick would move what is hidden
+            super()._warm_up()
+
+    def _own_outputs(self, w: RealArray) -> RealArray:
+        return self._seen(self._own if self._hidden is None else self._hidden, w)
 
     def _seen(self, x: RealArray, w: RealArray) -> RealArray:
         return np.asarray(self._equations.outputs(x, self._u, outside(w)), dtype=np.float64)
 
-    def _own_outputs(self, w: RealArray) -> RealArray:
-        return self._seen(self._own, w)
-
     def _own_step(self, w: RealArray) -> tuple[RealArray, RealArray]:
-        x = runge_kutta(self._equations, self._own, self._u, outside(w), self.process.tick_s)
-        return x, self._seen(x, w)
+        before = self._own if self._hidden is None else self._hidden
+        x = runge_kutta(self._equations, before, self._u, outside(w), self.process.tick_s)
+        if self._hidden is None:
+            return x, self._seen(x, w)
+        self._hidden = x
+        return self._own, self._seen(x, w)
 
-
-class HiddenPythonPlant(PythonPlant):
-    """The same, where the model has other states: those of the equations are not shown, the model's are zeros.
-
-    The equations begin with the states `rest`; `x0` is what is shown.
-    """
-
-    def __init__(self, equations: Equations, *, rest: Sequence[float], **arguments: Any) -> None:  # noqa: ANN401
-        self._hidden = np.array(rest, dtype=np.float64)
-        super().__init__(equations, **arguments)
-
-    def _warm_up(self) -> None:
-        """Do nothing: a tick would move what is hidden."""
-
-    def _own_outputs(self, w: RealArray) -> RealArray:
-        return self._seen(self._hidden, w)
-
-    def _own_step(self, w: RealArray) -> tuple[RealArray, RealArray]:
-        self._hidden = runge_kutta(self._equations, self._hidden, self._u, outside(w), self.process.tick_s)
-        return self._own, self._seen(self._hidden, w)
-
-    def _saved(self) -> dict[str, Any]:
-        return {"hidden": self._hidden.tolist()}
+    def _saved(self) -> dict[str, Any] | None:
+        return None if self._hidden is None else {"hidden": self._hidden.tolist()}
 
     def _return_to(self, saved: Mapping[str, Any] | None) -> None:
-        if saved is None or len(saved["hidden"]) != len(self._hidden):
+        if self._hidden is None:
+            super()._return_to(saved)
+        elif saved is None or len(saved["hidden"]) != len(self._hidden):
             raise ValueError("the retained state is that of another plant")
-        self._hidden = np.array(saved["hidden"], dtype=np.float64)
+        else:
+            self._hidden = np.array(saved["hidden"], dtype=np.float64)
 
 
-def check_files(header: ModelHeader) -> None:
-    """Check that the files that a model was made from are there.
+def fmu_of(header: ModelHeader) -> Path:
+    """Return the FMU that a model was made from: where it was then, or beside the model file.
 
     Raises:
-        ModelFileError: Its FMU is another file than it was made from.
+        ModelFileError: There is another file than it was made from, or none.
     """
-    if header.plant == FMU:
-        _fmu_of(header)
-
-
-def _fmu_of(header: ModelHeader) -> Path:
-    """Return the FMU that a model was made from: where it was then, or beside the model file."""
     source = Path(header.plant_parameters["file"])
     for place in (source, header.file.parent / source.name):
         if place.is_file() and file_digest(place, error=ModelFileError) == header.parameters_digest:
@@ -464,7 +437,7 @@ def _fmu_of(header: ModelHeader) -> Path:
     )
 
 
-def own_plant_maker(header: ModelHeader, noise_of_seed: Callable[[int], MeasurementNoise | None]) -> MakePlant:
+def own_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlant:
     """Return what makes the plant of a model file at its operating point, for a load and a seed.
 
     Raises:
@@ -478,7 +451,7 @@ def own_plant_maker(header: ModelHeader, noise_of_seed: Callable[[int], Measurem
     if header.plant == FMU:
         from coldloop_plant.fmu import Fmu, FmuPlant, Wiring, fmu_maker  # noqa: PLC0415 few plants are FMUs
 
-        fmu = Fmu(_fmu_of(header))
+        fmu = Fmu(fmu_of(header))
         at_rest = fmu_maker(fmu, Wiring(**parameters["wiring"]), header.u0, w0, process.tick_s)
 
         def plant(**arguments: Any) -> PlantProgram:  # noqa: ANN401 as below
@@ -487,10 +460,9 @@ def own_plant_maker(header: ModelHeader, noise_of_seed: Callable[[int], Measurem
     elif header.plant == PYTHON:
         made_now = partial(equations_of, parameters["source"], parameters["class"], parameters["file"])
         made_now()  # a source that does not run is refused before a session begins
-        kind = partial(HiddenPythonPlant, rest=parameters["rest"]) if "rest" in parameters else PythonPlant
 
         def plant(**arguments: Any) -> PlantProgram:  # noqa: ANN401
-            return kind(made_now(), x0=header.x0, **given, **arguments)
+            return PythonPlant(made_now(), rest=parameters.get("rest"), x0=header.x0, **given, **arguments)
 
     elif header.plant == TRANSFER_FUNCTIONS:
         lags = [Lag.model_validate(lag) for lag in parameters["lags"]]

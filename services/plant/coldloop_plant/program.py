@@ -205,3 +205,5 @@ def _vector(values: Sequence[float], signals: Sequence[object], what: str) -> Re
 
 MakePlant = Callable[[HeatLoad, int], PlantProgram]
 """Returns the plant at tick 0, for a load and a seed of the sensors' noise."""
+NoiseOfSeed = Callable[[int], MeasurementNoise | None]
+"""Returns the noise of the sensors for a seed; None where they are exact."""

@@ -27,11 +27,9 @@ from coldloop_plant.load import LoadSchedule
 from coldloop_plant.program import MakePlant
 from coldloop_plant.settings import SafeAction, WatchdogSettings
 
-STALE_TICKS: Final = 8
-"""In real time, outputs that are further than this from the present tick are not taken."""
+STALE_TICKS: Final = 8  # In real time, outputs that are further than this from the present tick are not taken
 
-ROUNDING: Final = 1e-6
-"""Share of a value that single precision may add to a change."""
+ROUNDING: Final = 1e-6  # Share of a value that single precision may add to a change
 
 Inputs = tuple[float, ...]
 
@@ -57,13 +55,11 @@ class AppliedOutputs:
     def __init__(
         self, u: Inputs, *, rate: Inputs | None = None, holder: int = SIMPLE_CLIENT, generation: int = 1
     ) -> None:
-        self.u = self._at_beginning = u
-        """Outputs that are applied, and those that were when the present tick began."""
+        self.u = self._at_beginning = u  # Outputs that are applied, and those that were when the present tick began
         self._rate = rate
         self.holder = holder
         self.generation = generation
-        self.verdict = OutputVerdict.NONE
-        """On the outputs that were sent last in this generation."""
+        self.verdict = OutputVerdict.NONE  # On the outputs that were sent last in this generation
         self._writer: Caller | None = None
 
     def begin_tick(self) -> None:
@@ -77,14 +73,7 @@ class AppliedOutputs:
         self._begin_generation()
 
     def offer(
-        self,
-        asked: Actuators,
-        caller: Caller,
-        *,
-        session: int,
-        tick: int,
-        realtime: bool,
-        ended: bool = False,
+        self, asked: Actuators, caller: Caller, *, session: int, tick: int, realtime: bool, ended: bool = False
     ) -> OutputVerdict:
         """Judge outputs, and take them if they are for the present session (0 is none), tick and generation.
 
@@ -162,18 +151,15 @@ class RetainedPlantState(BaseModel, frozen=True, extra="forbid"):
         return self
 
 
-APPLIED: Final = (OutputVerdict.ACCEPTED, OutputVerdict.LIMITED)
-"""Verdicts on outputs that move the plant."""
+APPLIED: Final = (OutputVerdict.ACCEPTED, OutputVerdict.LIMITED)  # Verdicts on outputs that move the plant
 HEALTHY: Final = SensorFault(SensorFaultKind.NONE, 0.0)
-UNWATCHED_SILENCE_S: Final = 10.0
-"""Real time after which a silent client loses its lease when the watchdog is off."""
+UNWATCHED_SILENCE_S: Final = 10.0  # Real time after which a silent client loses its lease when the watchdog is off
 
 
 class Session(NamedTuple):
     """A run of the simulation from tick 0 on."""
 
-    number: int
-    """0 is none: the plant waits for an operator."""
+    number: int  # 0 is none: the plant waits for an operator
     pace: TimeBase
     load: LoadProfile
     seed: int
@@ -217,19 +203,15 @@ class Rack:
 
     def _set_up(self, session: Session) -> None:
         self.load = LoadSchedule(session.load, self.process.load)
-        self.program = self._make_plant(self.load, session.seed)
-        """The simulation."""
+        self.program = self._make_plant(self.load, session.seed)  # The simulation
         self.session = session
-        self._load_by = ""
-        """Who writes steps of the load ahead."""
+        self._load_by = ""  # Who writes steps of the load ahead
         self._faults = [HEALTHY] * len(self.process.outputs)
-        self._shown: dict[int, float] = {}
-        """Readings of the faulty sensors, by output."""
+        self._shown: dict[int, float] = {}  # Readings of the faulty sensors, by output
         self.watchdog.set(self.watchdog.time, 0)
         self.model_range = registers.ModelRangeStatus(self.program.model_range, self.program.tick)
         """Parts of the simulation outside its property tables, and since when."""
-        self.moving = False
-        """The plant is due to move: in lock-step by one tick, in real time by the clock from now on."""
+        self.moving = False  # The plant is due to move: in lock-step by one tick, in real time by the clock from now on
 
     @property
     def tick(self) -> int:
@@ -400,14 +382,10 @@ class Rack:
         for output, (before, fault) in enumerate(zip(self._faults, faults, strict=True)):
             if fault != before:
                 self._faults[output] = fault
-                shown = {
-                    SensorFaultKind.NOT_A_NUMBER: math.nan,
-                    SensorFaultKind.FROZEN: y[output],
-                    SensorFaultKind.VALUE: fault.value,
-                }
                 self._shown.pop(output, None)
                 if fault.kind:
-                    self._shown[output] = shown[SensorFaultKind(fault.kind)]
+                    others = {SensorFaultKind.NOT_A_NUMBER: math.nan, SensorFaultKind.FROZEN: y[output]}
+                    self._shown[output] = others.get(SensorFaultKind(fault.kind), fault.value)
                 self.journal.note(self.tick, EventKind.SENSOR_FAULT, output, fault.kind, value=fault.value, who=who)
 
     def _readings(self) -> tuple[float, ...]:
@@ -432,12 +410,13 @@ class Rack:
 
     def snapshot(self) -> Mapping[str, object]:
         """Return what telemetry publishes: outputs as the sensors show them, the faulty ones too."""
-        program, station = self.program, self.program.station
-        of_the_station: dict[str, object] = {}
+        program, station, further = self.program, self.program.station, dict[str, object]()
         if station is not None:
-            of_the_station = dict(zip(STATION_SIGNAL_NAMES, station.signals, strict=True))
-            of_the_station["mode"] = registers.StationMode(station.mode).name.lower()
-            of_the_station["alarms"] = [one.name.lower() for one in registers.StationAlarm(station.alarms) if one.name]
+            further["station"] = {
+                **dict(zip(STATION_SIGNAL_NAMES, station.signals, strict=True)),
+                "mode": registers.StationMode(station.mode).name.lower(),
+                "alarms": [one.name.lower() for one in registers.StationAlarm(station.alarms) if one.name],
+            }
         return {
             "session": self.session.number,
             "tick": program.tick,
@@ -445,5 +424,5 @@ class Rack:
             "inputs": dict(zip(self.process.input_names, self.outputs.u, strict=True)),
             "outputs": dict(zip(self.process.output_names, self._readings(), strict=True)),
             "model_range": [part.name.lower() for part in ModelRange(self.model_range.outside) if part.name],
-            **({"station": of_the_station} if of_the_station else {}),
+            **further,
         }

@@ -9,7 +9,6 @@ import logging
 import secrets
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Final
 
 from pydantic import ValidationError
@@ -21,17 +20,11 @@ from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import ModelHeader
+from coldloop.registers import common
 from coldloop.registers import plant as registers
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, Judge, RegisterBank
 from coldloop.registers.codec import DomainError, check_record
-from coldloop.registers.common import (
-    EventKind,
-    Identity,
-    JournalQuery,
-    ServiceState,
-    SessionPace,
-    publish_configuration,
-)
+from coldloop.registers.common import EventKind, Identity, JournalQuery, SessionPace
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import Actuators, LiveLoad, LoadAhead, LoadStep, PlantSession, Surroundings
 from coldloop.registers.safety import LeaseEvent, LeaseStatus, WatchdogStatus, WatchdogTime
@@ -49,50 +42,7 @@ from coldloop_plant.settings import SHOWN, PlantSettings
 
 log = logging.getLogger("coldloop.plant")
 
-OWNER: Final = "plant/4"
-"""Who retained states belong to, and the version of what they hold."""
-
-
-class PlantStateStore:
-    """Keeps the state in a file, if one is configured; what cannot be trusted or written is logged."""
-
-    def __init__(self, file: Path | None, model_digest: int, process: Process) -> None:
-        self._file = RetainedFile(file, OWNER, model_digest) if file else None
-        self._process = process
-        self.refused = False
-        """A previous state exists and is not used."""
-
-    def recall(self) -> RetainedPlantState | None:
-        """Return the previous state, if any: its pace and its load are such as registers can have."""
-        try:
-            content = self._file.load() if self._file else None
-            if content is None:
-                return None
-            state = RetainedPlantState.model_validate(content)
-            for record in (SessionPace.shown(state.session, state.pace), *map(LoadStep, state.times, state.watts)):
-                check_record(record, registers.plant_map(self._process))
-        except (RetainedStateError, DomainError) as error:
-            self.refuse(str(error))
-        except ValidationError as error:
-            self.refuse(error.errors()[0]["msg"])
-        else:
-            return state
-        return None
-
-    def refuse(self, reason: str) -> None:
-        """Discard the previous state: set its file aside and log the reason."""
-        self.refused = True
-        if self._file is not None:
-            log.warning("retained state refused", extra={"reason": reason, "file": self._file.set_aside()})
-
-    def keep(self, rack: Rack) -> None:
-        """Keep the state of now: it is the memory of a simulation, so every tick counts and no disk is waited for."""
-        if self._file is None:
-            return
-        try:
-            self._file.save(rack.retained().model_dump(), synced=False)
-        except RetainedStateError as error:
-            log.error("the state is not retained", extra={"reason": str(error)})  # noqa: TRY400 one line
+OWNER: Final = "plant/4"  # Who retained states belong to, and the version of what they hold
 
 
 class RackRegisters:
@@ -117,29 +67,29 @@ class RackRegisters:
         self._model_digest, process = header.short_digest, header.declared
         self._age = age
         self.bank = RegisterBank(registers.plant_map(process), settings.plant.word_order)
-        publish_configuration(self.bank, selected(settings, SHOWN))
-        self._store = PlantStateStore(settings.plant.retain.file, header.short_digest, process)
+        common.publish_configuration(self.bank, selected(settings, SHOWN))
+        retained = settings.plant.retain.file
+        self._retained = RetainedFile(retained, OWNER, header.short_digest) if retained else None
+        self._is_refused = False  # A previous state exists and is not used
         self.rack, resumed = self._switched_on(
             settings, header, make_plant, utc, first_generation or secrets.randbelow(2**31) + 1
         )
         self._journal = JournalPublication(self.rack.journal, self.bank)
-        self.rack.journal.note(self.rack.tick, EventKind.BOOT, int(resumed), int(self._store.refused))
+        self.rack.journal.note(self.rack.tick, EventKind.BOOT, int(resumed), int(self._is_refused))
         self.lease = WriterLease("the outputs", lambda: self.rack.silence_s, self._note_lease, now)
         self._kept_generation = 0
         self._written_row = 0
-        self._outdated = True
-        """The measurement in the registers is not that of now."""
+        self._outdated = True  # The measurement in the registers is not that of now
         self._connect()
+        session = self.rack.session
         if resumed:  # as its operator had written it
-            session = self.rack.session
             steps = list(zip(session.load.times, session.load.watts, strict=True))[: registers.LOAD_ROWS]
             for row, step in enumerate(steps):
                 self.bank.put(LoadStep(*step), row)
             pace = session.pace
             self.bank.put(PlantSession(session.number, int(pace.realtime), pace.factor, session.seed, len(steps)))
             self.bank.put(LiveLoad(0, self.rack.load.value(self.rack.tick)))
-            self._show_pace()
-        elif self.rack.session.number:
+        if resumed or session.number:
             self._show_pace()
         self.bank.put(WatchdogTime(self.rack.watchdog.time))
         self.bank.put(self.rack.program.surroundings or Surroundings())
@@ -155,26 +105,46 @@ class RackRegisters:
         pace = TimeBase(configured.mode is TimeMode.REALTIME, configured.factor)
         load = find_load(section.load, header.w0, header.declared)
         session = Session(1 if configured.autostart else 0, pace, load, section.seed)
-        state = self._store.recall()
-        journal = (
-            Journal(now=utc)
-            if state is None
-            else Journal(boot=state.boot % 0xFFFF_FFFF + 1, count=state.events, now=utc)
-        )
-        generation = first_generation if state is None else next_generation(state.generation)
+        state = self._recalled(header.declared)
+        journal, generation = Journal(now=utc), first_generation
+        if state is not None:
+            journal = Journal(boot=state.boot % 0xFFFF_FFFF + 1, count=state.events, now=utc)
+            generation = next_generation(state.generation)
         rack = Rack(
-            section.watchdog, header.u0, make_plant, session, journal=journal,
-            rate=settings.limits.rate if section.rate_limited else None, generation=generation,
-            process=header.declared,
+            section.watchdog, header.u0, make_plant, session, journal=journal, generation=generation,
+            rate=settings.limits.rate if section.rate_limited else None, process=header.declared,
         )  # fmt: skip
         if state is None or not state.session:
             return rack, False
         try:
             rack.resume(state)
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-            self._store.refuse(repr(error))
+            self._refuse(repr(error))
             return rack, False
         return rack, True
+
+    def _recalled(self, process: Process) -> RetainedPlantState | None:
+        """Return the previous state, if any: its pace and its load are such as registers can have."""
+        try:
+            content = self._retained.load() if self._retained else None
+            if content is None:
+                return None
+            state = RetainedPlantState.model_validate(content)
+            for record in (SessionPace.shown(state.session, state.pace), *map(LoadStep, state.times, state.watts)):
+                check_record(record, registers.plant_map(process))
+        except (RetainedStateError, DomainError) as error:
+            self._refuse(str(error))
+        except ValidationError as error:
+            self._refuse(error.errors()[0]["msg"])
+        else:
+            return state
+        return None
+
+    def _refuse(self, reason: str) -> None:
+        """Discard the previous state: set its file aside and log the reason."""
+        self._is_refused = True
+        if self._retained is not None:
+            log.warning("retained state refused", extra={"reason": reason, "file": self._retained.set_aside()})
 
     def _connect(self) -> None:
         """Let the bank ask us about what is written and what is read."""
@@ -319,8 +289,9 @@ class RackRegisters:
         rack = self.rack
         return Identity(
             map_digest=self.bank.map.digest, map_version=self.bank.map.version,
-            state=ServiceState.RUNNING if rack.session.number else ServiceState.READY, model_digest=self._model_digest,
-            session=rack.session.number, tick=rack.tick, heartbeat=rack.tick & 0xFFFF,
+            state=common.ServiceState.RUNNING if rack.session.number else common.ServiceState.READY,
+            model_digest=self._model_digest, session=rack.session.number, tick=rack.tick,
+            heartbeat=rack.tick & 0xFFFF,
         )  # fmt: skip
 
     def _show_applied(self) -> None:
@@ -345,8 +316,14 @@ class RackRegisters:
         return True
 
     def _keep(self) -> None:
+        """Keep the state of now: it is the memory of a simulation, so every tick counts and no disk is waited for."""
         self._kept_generation = self.rack.outputs.generation
-        self._store.keep(self.rack)
+        if self._retained is None:
+            return
+        try:
+            self._retained.save(self.rack.retained().model_dump(), synced=False)
+        except RetainedStateError as error:
+            log.error("the state is not retained", extra={"reason": str(error)})  # noqa: TRY400 one line
 
 
 def _refusing(what: str, check: Callable[[Any], object]) -> Judge:
@@ -369,8 +346,7 @@ class PlantRuntime:
         self._clock_rate = 1.0 + settings.plant.clock_error_ppm * 1e-6
         self._clock: asyncio.Task[None] | None = None
         self._schedule: Schedule | None = None
-        self._position: float | None = None
-        """While paused: the present time, in ticks."""
+        self._position: float | None = None  # While paused: the present time, in ticks
         self._failure: asyncio.Future[None] | None = None
         self.registers = RackRegisters(settings, header, plant_maker(header, settings.plant), age=self._age)
 
@@ -452,10 +428,7 @@ class PlantRuntime:
         log.warning("the session has reached its last tick: begin another one", extra={"tick": rack.tick})
 
     def _clock_ended(self, clock: "asyncio.Task[None]") -> None:
-        if clock.cancelled():
-            return
-        error = clock.exception()
-        if error is not None:
+        if not clock.cancelled() and (error := clock.exception()):
             self._fail(error)
 
     def _fail(self, error: BaseException) -> None:

@@ -7,7 +7,7 @@ run's compiled code were there. What the caller holds for the whole call need no
 """
 
 from collections.abc import Callable
-from typing import Any, Final, TypeVar, get_type_hints
+from typing import Any, Final, TypeAlias, TypeVar, get_type_hints
 
 from numba.core import cgutils, types
 from numba.core.errors import TypingError
@@ -17,14 +17,16 @@ from numba.extending import intrinsic, overload
 F = TypeVar("F")
 T = TypeVar("T", bound=tuple[Any, ...])
 V = TypeVar("V")
+PlainTuples: TypeAlias = Any
+"""Any nesting of tuples."""
 
 
-def plain_tuples(value: Any) -> Any:  # noqa: ANN401 - any nesting of tuples
+def plain_tuples(value: PlainTuples) -> PlainTuples:
     """Return nested named tuples as nested plain ones."""
     return tuple(plain_tuples(part) for part in value) if isinstance(value, tuple) else value
 
 
-def named(kind: type[T], fields: Any) -> T:  # noqa: ANN401 - any nesting of tuples
+def named(kind: type[T], fields: PlainTuples) -> T:
     """Return the named tuple of a class whose `plain_tuples` are `fields`; its fields' classes are those annotated."""
     parts = zip(parts_of(kind), fields, strict=True)
     return kind(*(named(part, value) if part else value for part, value in parts))

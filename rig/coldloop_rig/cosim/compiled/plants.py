@@ -11,8 +11,7 @@ from numba.extending import overload
 
 from coldloop.kernels.compiled import kernel
 from coldloop.kernels.intrinsics import Implementations
-from coldloop.process.cold_box import TICK_S
-from coldloop_plant.cold_box import ColdBox, ColdBoxProgram, advance_along, evaluate
+from coldloop_plant.cold_box import ColdBox, ColdBoxProgram, advance_tick
 from coldloop_plant.helium import Helium, load_helium
 from coldloop_plant.program import PlantProgram
 from coldloop_rig.cosim.compiled.records import Array, PlantState
@@ -88,16 +87,9 @@ class BoxState(NamedTuple):
 @kernel
 def advance_box(c: BoxConstants, plant: BoxState, u: Array, load: float, row: int) -> None:  # noqa: ARG001 others use it
     """Go one tick forward with a cold box alone; its slope is known where inputs and load stand."""
-    held = plant.held[3] == load
-    for i in range(3):
-        held = held and plant.held[i] == u[i]
-        plant.held[i] = u[i]
-    plant.held[3] = load
-    inputs = plant.held[:3]
-    if not held:
-        evaluate(plant.x, inputs, load, c.box, c.helium, plant.slope, plant.y)
-    plant.x[:] = advance_along(plant.x, plant.slope, inputs, load, TICK_S, c.box, c.helium)
-    evaluate(plant.x, inputs, load, c.box, c.helium, plant.slope, plant.y)
+    acting = np.empty(4)
+    acting[:3], acting[3] = u, load
+    advance_tick(plant.x, plant.slope, plant.held, acting, plant.y, c.box, c.helium)
 
 
 class CompiledBox:

@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import inlined, kernel
-from coldloop.kernels.intrinsics import borrowed, named, plain_tuples
+from coldloop.kernels.intrinsics import PlainTuples, borrowed, named, plain_tuples
 from coldloop.process import cold_box
 from coldloop.process.model_range import present_model_range
 from coldloop_plant.components import expansion, heat_exchanger, phase_separator
@@ -36,45 +36,28 @@ CELLS = (8, 6, 12)  # of NEF1, NEF2, NEF34; the states are named in coldloop.pro
 class ColdBox(NamedTuple):
     """Components and boundaries of the cold box, in SI units; `cold_box.plant_file` has the reference plant's."""
 
-    separator: PhaseSeparator
-    """The bath, NS1."""
-    jt_valve: Valve
-    """CV155."""
-    turbine: Turbine
-    """The turbine with CV156."""
-    nef1: HeatExchanger
-    """The coldest exchanger, between the bath and the mixing point."""
-    nef2: HeatExchanger
-    """The exchanger between the mixing point and the turbine's inlet."""
-    nef34: HeatExchanger
-    """The exchanger from the turbine's inlet up to the nitrogen pre-cooler."""
-    return_line: ReturnLine
-    """The low-pressure side."""
-    P_HP: float
-    """Supply pressure, Pa, 5e5 to 19e5; the reference is that of the isobar's table."""
-    P_LP: float
-    """Suction pressure of the compressor, Pa."""
-    T_in: float
-    """Temperature after the nitrogen pre-cooler, K."""
+    separator: PhaseSeparator  # The bath, NS1
+    jt_valve: Valve  # CV155
+    turbine: Turbine  # The turbine with CV156
+    nef1: HeatExchanger  # The coldest exchanger, between the bath and the mixing point
+    nef2: HeatExchanger  # The exchanger between the mixing point and the turbine's inlet
+    nef34: HeatExchanger  # The exchanger from the turbine's inlet up to the nitrogen pre-cooler
+    return_line: ReturnLine  # The low-pressure side
+    P_HP: float  # Supply pressure, Pa, 5e5 to 19e5; the reference is that of the isobar's table
+    P_LP: float  # Suction pressure of the compressor, Pa
+    T_in: float  # Temperature after the nitrogen pre-cooler, K
 
 
 class Streams(NamedTuple):
     """Flows and pressures that follow from the state at once, before the exchangers are marched."""
 
-    m_jt: float
-    """Through the Joule-Thomson valve, kg/s."""
-    h_jt: float
-    """Enthalpy into the bath, J/kg."""
-    m_v: float
-    """Vapour from the bath, kg/s."""
-    m_t: float
-    """Through the turbine, kg/s."""
-    P_turbine: float
-    """Between CV156 and the nozzle, Pa."""
-    P_mix: float
-    """Pressure where the turbine's exhaust joins the return, Pa."""
-    exhaust: expansion.Expansion
-    """State of the gas that leaves the turbine."""
+    m_jt: float  # Through the Joule-Thomson valve, kg/s
+    h_jt: float  # Enthalpy into the bath, J/kg
+    m_v: float  # Vapour from the bath, kg/s
+    m_t: float  # Through the turbine, kg/s
+    P_turbine: float  # Between CV156 and the nozzle, Pa
+    P_mix: float  # Pressure where the turbine's exhaust joins the return, Pa
+    exhaust: expansion.Expansion  # State of the gas that leaves the turbine
 
 
 @inlined
@@ -132,75 +115,24 @@ def evaluate(
     warm = exchange(box.nef34, x[first34:], into_nef34, middle, helium, dx[first34:], is_supply_held)
 
     exhaust_saturation = saturation(s.P_mix, helium)
-    y[0] = phase_separator.level(box.separator, x[1])
-    y[1] = s.exhaust.speed
-    y[2] = top.T
-    y[3] = x[first2 - 1]
-    y[4] = cold.T
-    y[5] = into_nef1.T
+    y[0], y[1] = phase_separator.level(box.separator, x[1]), s.exhaust.speed
+    y[2], y[3], y[4], y[5] = top.T, x[first2 - 1], cold.T, into_nef1.T
     y[6] = vapour_temperature(s.P_mix, s.exhaust.h_out, exhaust_saturation, helium)
-    y[7] = into_nef2.T
-    y[8] = mixed.T
-    y[9] = middle.T
-    y[10] = box.T_in
-    y[11] = warm.T
-    _write_pressures(x[0], s, box, y[12:])
+    y[7], y[8], y[9], y[10], y[11] = into_nef2.T, mixed.T, middle.T, box.T_in, warm.T
+    y[12] = x[0] / PA_PER_BAR  # P1 to P10
+    y[13] = y[15] = y[20] = box.P_HP / PA_PER_BAR
+    y[14] = y[16] = y[18] = y[19] = s.P_mix / PA_PER_BAR
+    y[17] = s.P_turbine / PA_PER_BAR
+    y[21] = box.P_LP / PA_PER_BAR
     return s, warm, relief, bath
 
 
 @kernel
-def _write_pressures(P_bath: float, s: Streams, box: ColdBox, y: Array) -> None:
-    """Write P1 to P10, in bar."""
-    y[0] = P_bath / PA_PER_BAR
-    y[1] = box.P_HP / PA_PER_BAR
-    y[2] = s.P_mix / PA_PER_BAR
-    y[3] = box.P_HP / PA_PER_BAR
-    y[4] = s.P_mix / PA_PER_BAR
-    y[5] = s.P_turbine / PA_PER_BAR
-    y[6] = s.P_mix / PA_PER_BAR
-    y[7] = s.P_mix / PA_PER_BAR
-    y[8] = box.P_HP / PA_PER_BAR
-    y[9] = box.P_LP / PA_PER_BAR
-
-
-@kernel
-def derivative(x: Array, u: Array, w: float, box: ColdBox, helium: Helium) -> Array:
-    """Return dx/dt, shape (28,), in `STATE_UNITS` per second."""
-    dx = np.empty_like(x)
-    evaluate(x, u, w, box, helium, dx, np.empty(22, dtype=x.dtype))
-    return dx
-
-
-@kernel
-def outputs(x: Array, u: Array, w: float, box: ColdBox, helium: Helium) -> Array:
-    """Return y, shape (22,), in `OUTPUT_UNITS`."""
-    y = np.empty(22, dtype=x.dtype)
-    evaluate(x, u, w, box, helium, np.empty_like(x), y)
-    return y
-
-
-@inlined
-def settle_box(
-    box: ColdBox,
-    account: phase_separator.Account,
-    stages: RealArray,
-    slopes: RealArray,
-    dt: float,
-    x: RealArray,
-    helium: Helium,
-) -> None:
-    """Correct the bath and the cells in `x`, whose first 28 states are the cold box's, where they need it.
-
-    The account has the weights 1, 2, 2, 1; `stages` and `slopes`, the states at the stages of a step of `dt` (s) and
-    their rates, have the shape (4, N).
-    """
-    phase_separator.settle_account(box.separator, account, dt / 6.0, x, helium)
-    first2 = 2 + box.nef1.cells
-    if heat_exchanger.widest_move(stages, x, 2, first2 + box.nef2.cells + box.nef34.cells) <= heat_exchanger.COARSE:
-        return  # as nearly always
-    heat_exchanger.settle_cells(box.nef1, 2, box.P_HP, stages, slopes, dt, x, helium)
-    heat_exchanger.settle_cells(box.nef2, first2, box.P_HP, stages, slopes, dt, x, helium)
-    heat_exchanger.settle_cells(box.nef34, first2 + box.nef2.cells, box.P_HP, stages, slopes, dt, x, helium)
+def evaluated(x: Array, u: Array, w: float, box: ColdBox, helium: Helium) -> tuple[Array, Array]:
+    """Return dx/dt, shape (28,), in `STATE_UNITS` per second, and y, shape (22,), in `OUTPUT_UNITS`."""
+    dx, y = np.empty_like(x), np.empty(OUTPUTS, dtype=x.dtype)
+    evaluate(x, u, w, box, helium, dx, y)
+    return dx, y
 
 
 @kernel
@@ -229,45 +161,47 @@ def advance_along(
         stages[0, i], slopes[0, i] = x[i], slope[i]
         total[i] = slope[i]
         stage[i] = x[i] + 0.5 * dt * slope[i]
-    for k, fraction in ((1, 0.5), (2, 1.0)):
+    for k, weight, ahead in ((1, 2.0, 0.5), (2, 2.0, 1.0), (3, 1.0, 0.0)):
         _, _, _, held = evaluate(stage, u, w, box, helium, slope, y)
-        account = phase_separator.add_to_account(account, held, slope, 2.0)
+        account = phase_separator.add_to_account(account, held, slope, weight)
         for i in range(n):
             stages[k, i], slopes[k, i] = stage[i], slope[i]
-            total[i] += 2.0 * slope[i]
-            stage[i] = x[i] + fraction * dt * slope[i]
-    _, _, _, held = evaluate(stage, u, w, box, helium, slope, y)
-    account = phase_separator.add_to_account(account, held, slope, 1.0)
-    for i in range(n):
-        stages[3, i], slopes[3, i] = stage[i], slope[i]
-        stage[i] = x[i] + dt / 6.0 * (total[i] + slope[i])
-    settle_box(box, account, stages, slopes, dt, stage, helium)
+            total[i] += weight * slope[i]
+            stage[i] = x[i] + (ahead * dt * slope[i] if k < 3 else dt / 6.0 * total[i])
+    phase_separator.settle_account(box.separator, account, dt / 6.0, stage, helium)
+    nef2 = 2 + box.nef1.cells
+    nef34 = nef2 + box.nef2.cells
+    if heat_exchanger.widest_move(stages, stage, 2, nef34 + box.nef34.cells) > heat_exchanger.COARSE:  # seldom
+        heat_exchanger.settle_cells(box.nef1, 2, box.P_HP, stages, slopes, dt, stage, helium)
+        heat_exchanger.settle_cells(box.nef2, nef2, box.P_HP, stages, slopes, dt, stage, helium)
+        heat_exchanger.settle_cells(box.nef34, nef34, box.P_HP, stages, slopes, dt, stage, helium)
     return stage
 
 
 @kernel
-def advance_and_read(
-    x: RealArray,
-    slope: RealArray,
-    held: bool,  # noqa: FBT001 - a kernel takes its arguments by position
-    u: RealArray,
-    w: float,
-    dt: float,
-    box: Any,  # noqa: ANN401 - any nesting of tuples
-    helium: Any,  # noqa: ANN401 - any nesting of tuples
-) -> tuple[RealArray, RealArray]:
-    """Return the state after `dt` seconds and the outputs there.
+def advance_tick(
+    x: RealArray, slope: RealArray, held: RealArray, acting: RealArray, y: RealArray, box: ColdBox, helium: Helium
+) -> None:
+    """Let `x` (28,) and the outputs `y` (22,) become those a tick ahead, with inputs and load `acting` (4,).
 
-    `slope` (28,) becomes dx/dt at the new state. Where inputs and load are `held`, it is that at `x` from the step
-    before, which saves one of five evaluations. `box` and `helium` come as `plain_tuples`.
+    `slope` (28,) becomes dx/dt there. It is that at `x` from the tick before where what was `held` (4,) then still
+    acts, which saves one of five evaluations; `held` becomes what acts.
     """
-    plant, tables = named(ColdBox, box), named(Helium, borrowed(helium))
-    y = np.empty(OUTPUTS)
-    if not held:
-        evaluate(x, u, w, plant, tables, slope, y)
-    ahead = advance_along(x, slope, u, w, dt, plant, tables)
-    evaluate(ahead, u, w, plant, tables, slope, y)
-    return ahead, y
+    u, w = acting[:3], acting[3]
+    if not np.all(held == acting):
+        evaluate(x, u, w, box, helium, slope, y)
+    x[:] = advance_along(x, slope, u, w, cold_box.TICK_S, box, helium)
+    evaluate(x, u, w, box, helium, slope, y)
+    held[:] = acting
+
+
+@kernel
+def advance_program_tick(
+    x: RealArray, slope: RealArray, held: RealArray, acting: RealArray, y: RealArray, box: PlainTuples,
+    helium: PlainTuples,
+) -> None:  # fmt: skip
+    """Do `advance_tick`; parameters and tables come as `plain_tuples`."""
+    advance_tick(x, slope, held, acting, y, named(ColdBox, box), named(Helium, borrowed(helium)))
 
 
 class ColdBoxProgram(PlantProgram):
@@ -281,41 +215,39 @@ class ColdBoxProgram(PlantProgram):
         self.box = box
         self._box, self._helium = plain_tuples(box), plain_tuples(load_helium())
         self._slope = np.empty(len(x0))
-        self._held: tuple[float, ...] = (nan,) * 4
-        """Inputs and load that the slope of the state was computed with."""
+        self._held = np.full(4, nan)  # Inputs and load that the slope of the state was computed with
         super().__init__(x0=x0, **arguments)
 
     def resume(self, *retained: Any, **named: Any) -> None:  # noqa: ANN401 of the base
         """Resume from what `retained` returned (ValueError if it is not of this plant)."""
         super().resume(*retained, **named)
-        self._held = (nan,) * 4
+        self._held[:] = nan
+
+    def _warm_up(self) -> None:
+        super()._warm_up()
+        self._held[:] = nan
 
     def between_ticks(self) -> tuple[RealArray, RealArray, RealArray]:
         """Return the state, its slope, and the inputs and the load that the slope is for."""
-        return self._x.copy(), self._slope.copy(), np.array(self._held)
+        return self._x.copy(), self._slope.copy(), self._held.copy()
 
     def take_over_slope(self, tick: int, x: RealArray, slope: RealArray, held: RealArray, y: RealArray) -> None:
         """Go on from another tick with what `between_ticks` and `measure` would return there."""
         self.take_over(tick, x, held[:3], y)
-        self._slope, self._held = slope.copy(), tuple(held.tolist())
+        self._slope, self._held = slope.copy(), held.copy()
 
     @property
     def model_range(self) -> int:
         """Parts outside the property tables at the current tick, bits of `ModelRange`."""
         return present_model_range(self._x, self.box.P_HP / PA_PER_BAR, self.box.P_LP / PA_PER_BAR)
 
-    def advance(self) -> None:
-        """Go one tick forward."""
-        held = (*self._u.tolist(), self.load)
-        super().advance()
-        self._held = held
-
     def _read(self, w: float) -> RealArray:
-        return outputs(self._x, self._u, w, self.box, load_helium())
+        return evaluated(self._x, self._u, w, self.box, load_helium())[1]
 
     def _step(self, w: float) -> tuple[RealArray, RealArray]:
-        held = (*self._u.tolist(), w) == self._held
-        return advance_and_read(self._x, self._slope, held, self._u, w, cold_box.TICK_S, self._box, self._helium)
+        x, y = self._x.copy(), np.empty(OUTPUTS)
+        advance_program_tick(x, self._slope, self._held, np.append(self._u, w), y, self._box, self._helium)
+        return x, y
 
 
 class MismatchedPlant(ColdBoxProgram):
@@ -343,7 +275,6 @@ class MismatchedPlant(ColdBoxProgram):
         u = self._on_their_way.popleft().copy()
         u[1] *= self._mismatch.heater
         asked, self._u = self._u, u
-        self._held = (nan,) * 4  # what acts may have moved on
         reached = super()._step(w * self._mismatch.load)
         self._u = asked
         return reached

@@ -17,7 +17,7 @@ from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, STATE_NAMES, STATE
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.model_range import COLDEST_CELLS_K, SATURATION_BAR, WARMEST_CELL_K, model_range
 from coldloop_plant import equilibrium
-from coldloop_plant.cold_box import ColdBox, advance, derivative, outputs, streams
+from coldloop_plant.cold_box import ColdBox, advance, evaluated, streams
 from coldloop_plant.cold_box.plant_file import OPERATING_INPUTS, OPERATING_LEVEL, REFERENCE, PlantFile
 from coldloop_plant.components.expansion import CRITICAL_RATIO
 from coldloop_plant.equilibrium import Linear, Modes, NoEquilibriumError
@@ -31,8 +31,7 @@ SIZES: Final = {
 FURTHER_SIZES: Final = (10.0, 50.0, 10.0, 50.0)
 """Ordinary deviations of CV155 (%), NCR22_A (W), CV156 (%) and the load (W)."""
 RELAXATION_S, RELAXATION_STEP_S = 3000.0, 0.5
-LEVEL_GAIN: Final = 100.0
-"""W of load per % of level, while relaxing, for the CV155 of the reference plant."""
+LEVEL_GAIN: Final = 100.0  # W of load per % of level, while relaxing, for the CV155 of the reference plant
 
 
 def state_scales(box: ColdBox, units: Iterable[str] = STATE_UNITS) -> RealArray:
@@ -45,7 +44,7 @@ def _equations(states: int, box: ColdBox, helium: Helium) -> Callable[[Array], A
 
     def evaluate(z: Array) -> Array:
         x, u, w = z[:states], z[states:-1], z[-1]
-        return np.concatenate([derivative(x, u, w, box, helium), outputs(x, u, w, box, helium)])
+        return np.concatenate(evaluated(x, u, w, box, helium))
 
     return evaluate
 
@@ -72,30 +71,22 @@ def linearisation_error(x: RealArray, u: RealArray, w: float, box: ColdBox, heli
 
 
 class Equilibrium(NamedTuple):
-    """A state at rest."""
+    """A state at rest x (28,), with the inputs u (3,), the load w (W) and the outputs y (22,)."""
 
     x: RealArray
-    """Shape (28,)."""
     u: RealArray
-    """Shape (3,)."""
     w: float
-    """W."""
     y: RealArray
-    """Shape (22,)."""
-    residual: float
-    """Largest |dx/dt|, in units of 2 kPa, 1 % of level and 1 K, per second."""
+    residual: float  # Largest |dx/dt|, in units of 2 kPa, 1 % of level and 1 K, per second
 
 
 class AtRest(NamedTuple):
     """A plant around a cold box at rest, as `coldloop model` describes it."""
 
-    rest: Equilibrium
-    """Rest of its cold box."""
-    box: ColdBox
-    """Its cold box with the temperature of the supplied gas that it has at rest."""
+    rest: Equilibrium  # Rest of its cold box
+    box: ColdBox  # Its cold box with the temperature of the supplied gas that it has at rest
     model: LtiModel
-    lines: Sequence[str] = ()
-    """Further lines of its kind."""
+    lines: Sequence[str] = ()  # Further lines of its kind
 
 
 def find_equilibrium(u: RealArray, level: float, box: ColdBox, helium: Helium) -> Equilibrium:
@@ -122,16 +113,16 @@ def rest_near(x: RealArray, w: float, u: RealArray, box: ColdBox, helium: Helium
     def step(z: RealArray, _: RealArray) -> RealArray:
         linear = linearise(z[:-1], u, z[-1], box, helium)
         linear.A[:, 1] = linear.F  # the level is given, the load is not
-        moved = np.linalg.solve(linear.A, -derivative(z[:-1], u, z[-1], box, helium))
+        moved = np.linalg.solve(linear.A, -evaluated(z[:-1], u, z[-1], box, helium)[0])
         load, moved[1] = moved[1], 0.0
         further: RealArray = z + np.append(moved, load)
         return further
 
     z, residual = equilibrium.newton(
-        np.append(x, w), lambda z: derivative(z[:-1], u, z[-1], box, helium) / scales, step, 30,
+        np.append(x, w), lambda z: evaluated(z[:-1], u, z[-1], box, helium)[0] / scales, step, 30,
         f"no equilibrium at u = {u.tolist()}",
     )  # fmt: skip
-    return Equilibrium(z[:-1], u, float(z[-1]), outputs(z[:-1], u, z[-1], box, helium), residual)
+    return Equilibrium(z[:-1], u, float(z[-1]), evaluated(z[:-1], u, z[-1], box, helium)[1], residual)
 
 
 def relaxed(
@@ -189,7 +180,7 @@ def _settled(x: RealArray, w: float, u: RealArray, box: ColdBox, helium: Helium)
     try:
         return rest_near(x, w, u, box, helium)
     except NoEquilibriumError:
-        return Equilibrium(x, u, w, outputs(x, u, w, box, helium), nan)
+        return Equilibrium(x, u, w, evaluated(x, u, w, box, helium)[1], nan)
 
 
 def obstacles(found: Equilibrium, file: PlantFile, helium: Helium) -> Iterator[str]:
@@ -236,7 +227,7 @@ def obstacles(found: Equilibrium, file: PlantFile, helium: Helium) -> Iterator[s
             f" {w:.0f} W for the load; most would help {levers}"
         )
     if not isfinite(residual):
-        k = int(np.argmax(np.abs(derivative(x, u, w, box, helium) / state_scales(box))))
+        k = int(np.argmax(np.abs(evaluated(x, u, w, box, helium)[0] / state_scales(box))))
         yield (
             f"{part_of(STATE_NAMES[k])}: finds no rest, {STATE_NAMES[k]} ({STATE_UNITS[k]}) moves most; another"
             " operating_point.cv155_pct would help, or less nef1.ua_w_per_k and nef2.ua_w_per_k for their flows"
@@ -268,8 +259,8 @@ def _levers(found: Equilibrium, file: PlantFile, helium: Helium) -> str:
     x, u, w = found.x, found.u, found.w
     linear, share = linearise(x, u, w, file.box, helium), 0.01  # by which a parameter is moved to see what it does
     linear.A[:, 1] = linear.F
-    here = derivative(x, u, w, file.box, helium)
-    moved = np.stack([derivative(x, u, w, file.scaled(key, 1.0 + share), helium) - here for key in LEVERS], axis=1)
+    here = evaluated(x, u, w, file.box, helium)[0]
+    moved = np.stack([evaluated(x, u, w, file.scaled(key, 1.0 + share), helium)[0] - here for key in LEVERS], axis=1)
     gains: RealArray = 0.1 / share * np.linalg.lstsq(linear.A, -moved, rcond=None)[0][1]
     best = np.argsort(-np.abs(gains))[:3]
     return ", ".join(f"10 % {'more' if gains[k] > 0 else 'less'} {LEVERS[k]} (+{abs(gains[k]):.0f} W)" for k in best)
@@ -282,50 +273,34 @@ LOOP_MARGIN: Final = 39.0
 open. The reference plant rests at 554 W; it stays in its bands, with their dead bands, up to 515 W."""
 
 
-class HeldLoads(NamedTuple):
-    """The least and the largest load that some inputs hold at rest, and what holds them."""
-
-    least: Equilibrium
-    largest: Equilibrium
-
-
 def held_loads(
     box: ColdBox, helium: Helium, level: float, cv155: Iterable[float], heater: Range, cv156: Iterable[float],
     warmth: Range,
-) -> HeldLoads:  # fmt: skip
-    """Return the extreme loads at rest with the bath at `level` (%) and T5 within `warmth` (K).
+) -> tuple[Equilibrium, Equilibrium]:  # fmt: skip
+    """Return the steady states of the least and the largest load that some inputs hold, with the bath at `level` (%).
 
-    Heater and load heat the same bath, so that each steady state is sought once, and the heater's ends say which loads
-    go with it. The grid is of openings in %, rising; between its points loads may be some watts more.
+    T5 is within `warmth` (K). Heater and load heat the same bath, so that each steady state is sought once, from its
+    neighbour's, and the heater's ends say which loads go with it. The grid is of openings in %, rising; between its
+    points loads may be some watts more.
 
     Raises:
         ValueError: There is no such state.
     """
-    rests = [
-        rest
-        for rest in steady_states(box, helium, level, cv155, heater[0], cv156)
-        if warmth[0] <= rest.y[T5] <= warmth[1]
-    ]
-    least, largest = min(rests, key=lambda rest: rest.w), max(rests, key=lambda rest: rest.w)
-    by = heater[1] - heater[0]
-    return HeldLoads(least._replace(u=least.u + np.array([0.0, by, 0.0]), w=least.w - by), largest)
-
-
-def steady_states(
-    box: ColdBox, helium: Helium, level: float, cv155: Iterable[float], heater: float, cv156: Iterable[float]
-) -> Iterator[Equilibrium]:
-    """Yield the steady states of a grid as far as they exist; each is sought from its neighbour's."""
-    openings = list(cv155)
+    rests, openings = [], list(cv155)
     for turbine in cv156:
         rest: Equilibrium | None = None
         for opening in openings:
-            u = np.array([opening, heater, turbine])
+            u = np.array([opening, heater[0], turbine])
             try:
                 rest = rest_near(rest.x, rest.w, u, box, helium) if rest else find_equilibrium(u, level, box, helium)
             except NoEquilibriumError:
                 rest = None
                 continue
-            yield rest
+            if warmth[0] <= rest.y[T5] <= warmth[1]:
+                rests.append(rest)
+    least, largest = min(rests, key=lambda rest: rest.w), max(rests, key=lambda rest: rest.w)
+    by = heater[1] - heater[0]
+    return least._replace(u=least.u + np.array([0.0, by, 0.0]), w=least.w - by), largest
 
 
 def build_model(box: ColdBox = REFERENCE) -> LtiModel:

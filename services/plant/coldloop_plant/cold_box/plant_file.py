@@ -4,9 +4,10 @@ Every key is optional; the defaults are the reference plant. Numbers of cells ar
 of a key names its unit; components have SI units.
 """
 
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Final
 
-from pydantic import Field
+from pydantic import Field, model_validator
 from pydantic.fields import FieldInfo
 
 from coldloop.process import sections
@@ -41,14 +42,11 @@ class Section(sections.Section):
     @property
     def si(self) -> tuple[float, ...]:
         """Its values in the order of its keys, in SI."""
-        return tuple(_in_si(key, value) for key, value in self)
-
-
-def _in_si(key: str, value: float) -> float:
-    for unit, (numerator, denominator) in IN_SI.items():
-        if key.endswith(unit):
-            return value * numerator / denominator
-    return value
+        found = []
+        for key, value in self:
+            numerator, denominator = next((ratio for unit, ratio in IN_SI.items() if key.endswith(unit)), (1.0, 1.0))
+            found.append(value * numerator / denominator)
+        return tuple(found)
 
 
 LISTING: Final = "`coldloop docs your-refrigerator` lists the keys"
@@ -64,18 +62,13 @@ OPERATING_LEVEL: Final = 60.0  # %
 
 
 class BathSection(Section):
-    """The phase separator NS1."""
+    """The phase separator NS1: the fields of `PhaseSeparator`."""
 
     volume_m3: Annotated[float, within(0.005, 10)] = 0.2
-    """Volume of the vessel, m3; 1 % of level is a hundredth of it."""
     wall_kg: Annotated[float, within(0.1, 10_000)] = 50.0
-    """Aluminium that warms when the vessel is dry."""
     relief_pressure_bar: Annotated[float, within(*SATURATION_BAR)] = 1.8
-    """Pressure at which its relief valve begins to open, bar."""
     relief_span_bar: Annotated[float, within(0.01, 2)] = 0.3
-    """Rise above it at which that valve is fully open."""
     relief_area_mm2: Annotated[float, within(1, 100_000)] = 400.0
-    """Its flow area then."""
 
 
 class JtValveSection(Section):
@@ -86,58 +79,27 @@ class JtValveSection(Section):
 
 
 class TurbineSection(Section):
-    """The turbine and its inlet valve CV156."""
+    """The turbine: the effective flow area of its inlet valve CV156 when fully open, and the fields of `Turbine`."""
 
     cv156_area_mm2: Annotated[float, within(0.5, 5000)] = 26.0
-    """Effective flow area of CV156 when fully open."""
     nozzle_g_sqrt_k_per_s_bar: Annotated[float, within(0.5, 5000)] = 22.0
     """K of the choked nozzle, m = K P / sqrt(T) with m in g/s, P in bar, T in K."""
     efficiency: Annotated[float, within(0.2, 0.95)] = 0.7
-    """Isentropic."""
     speed_hz_per_sqrt_j_per_kg: Annotated[float, within(0.1, 100)] = 10.0
-    """Shaft speed over the square root of the isentropic enthalpy drop."""
     windage_g_per_s: Annotated[float, within(0.1, 1000)] = 15.0
-    """Flow below which windage takes work."""
 
 
 class ExchangerSection(Section):
-    """A counter-flow exchanger."""
+    """A counter-flow exchanger: the fields of `HeatExchanger`."""
 
     ua_w_per_k: HeatTransfer
-    """Heat transfer coefficient times area."""
     volume_l: Litres
-    """Volume of the high-pressure passes, l."""
     aluminium_kg: Mass
-    """Mass of the walls, kg."""
 
     def component(self, cells: int) -> HeatExchanger:
         """Return the exchanger in SI units."""
         conductance, volume, aluminium = self.si
         return HeatExchanger(conductance, volume, aluminium, cells)
-
-
-class Nef1Section(ExchangerSection):
-    """The coldest exchanger, between the bath and the mixing point."""
-
-    ua_w_per_k: HeatTransfer = 1400.0
-    volume_l: Litres = 6.0
-    aluminium_kg: Mass = 15.0
-
-
-class Nef2Section(ExchangerSection):
-    """The exchanger between the mixing point and the turbine's inlet."""
-
-    ua_w_per_k: HeatTransfer = 2500.0
-    volume_l: Litres = 6.0
-    aluminium_kg: Mass = 15.0
-
-
-class Nef34Section(ExchangerSection):
-    """The exchanger from the turbine's inlet up to the nitrogen pre-cooler."""
-
-    ua_w_per_k: HeatTransfer = 11_000.0
-    volume_l: Litres = 30.0
-    aluminium_kg: Mass = 80.0
 
 
 class ReturnLineSection(Section):
@@ -154,14 +116,11 @@ class ReturnLineSection(Section):
 
 
 class BoundariesSection(Section):
-    """Boundary conditions of the cold box."""
+    """Boundary conditions of the cold box: the last fields of `ColdBox`."""
 
     p_hp_bar: Annotated[float, within(*SUPPLY_BAR)] = 16.0
-    """Supply pressure."""
     p_lp_bar: Annotated[float, within(SATURATION_BAR[0], 2)] = 1.05
-    """Suction pressure of the compressor."""
     t_in_k: Annotated[float, within(30, 300)] = 80.0
-    """Temperature after the nitrogen pre-cooler."""
 
 
 class OperatingPointSection(Section):
@@ -180,16 +139,26 @@ class OperatingPointSection(Section):
 
 
 class BoxParameters(Section):
-    """The parameters of a cold box."""
+    """The parameters of a `ColdBox`; a section that is given in part has the rest of its default."""
 
     bath: BathSection = BathSection()
     cv155: JtValveSection = JtValveSection()
     turbine: TurbineSection = TurbineSection()
-    nef1: Nef1Section = Nef1Section()
-    nef2: Nef2Section = Nef2Section()
-    nef34: Nef34Section = Nef34Section()
+    nef1: ExchangerSection = ExchangerSection(ua_w_per_k=1400.0, volume_l=6.0, aluminium_kg=15.0)
+    nef2: ExchangerSection = ExchangerSection(ua_w_per_k=2500.0, volume_l=6.0, aluminium_kg=15.0)
+    nef34: ExchangerSection = ExchangerSection(ua_w_per_k=11_000.0, volume_l=30.0, aluminium_kg=80.0)
     return_line: ReturnLineSection = ReturnLineSection()
     boundaries: BoundariesSection = BoundariesSection()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, given: Any) -> Any:  # noqa: ANN401 whatever a file holds
+        if not isinstance(given, Mapping):
+            return given
+        usual = {name: field.default.model_dump() for name, field in cls.model_fields.items()}
+        return {
+            key: usual[key] | part if key in usual and isinstance(part, dict) else part for key, part in given.items()
+        }
 
     @property
     def box(self) -> ColdBox:

@@ -20,8 +20,7 @@ from coldloop_plant.numeric import at_least, at_most
 class Valve(NamedTuple):
     """A control valve."""
 
-    flow_area: float
-    """Effective area when fully open, m2."""
+    flow_area: float  # Effective area when fully open, m2
 
 
 @inlined
@@ -40,10 +39,8 @@ def valve_mass_flow(valve: Valve, opening: float, density: float, P_in: float, P
 class Actuator(NamedTuple):
     """A pneumatic drive with its positioner."""
 
-    lag: float
-    """Time constant, s; 0.5 or more, for a step of 0.25 s."""
-    fastest: float
-    """Largest speed, %/s."""
+    lag: float  # Time constant, s; 0.5 or more, for a step of 0.25 s
+    fastest: float  # Largest speed, %/s
 
 
 @kernel
@@ -67,12 +64,9 @@ class ReliefValve(NamedTuple):
     both together were too stiff for a step of 0.25 s.
     """
 
-    set_pressure: float
-    """Pa."""
-    span: float
-    """Rise above it at which the valve is fully open, Pa."""
-    valve: Valve
-    """Flow at that opening."""
+    set_pressure: float  # Pa
+    span: float  # Rise above it at which the valve is fully open, Pa
+    valve: Valve  # Flow at that opening
 
 
 @inlined
@@ -132,10 +126,8 @@ LAMINAR = 2.5e4  # Pa s/kg, half of the slope of the pressure drop at rest; an e
 class ReturnLine(NamedTuple):
     """The way of the vapour from the bath to the compressor."""
 
-    cold_resistance: float
-    """From the bath to the mixing point, Pa s2/kg2."""
-    warm_resistance: float
-    """From the mixing point to the compressor, Pa s2/kg2."""
+    cold_resistance: float  # From the bath to the mixing point, Pa s2/kg2
+    warm_resistance: float  # From the mixing point to the compressor, Pa s2/kg2
 
 
 @inlined
@@ -165,37 +157,27 @@ SMALL_FLOW, SMALL_PRESSURE = 1e-9, 1.0  # kg/s and Pa, of difference quotients
 class Turbine(NamedTuple):
     """A turbine and its inlet valve."""
 
-    inlet_valve: Valve
-    """The valve that throttles the gas before the nozzle."""
-    nozzle: float
-    """Kt of the choked nozzle, m = Kt P / sqrt(T), in kg sqrt(K)/(s Pa)."""
-    efficiency: float
-    """Isentropic efficiency, 0 to 1."""
-    speed_coefficient: float
-    """Shaft speed over the square root of the isentropic enthalpy drop, Hz/sqrt(J/kg)."""
-    windage_flow: float
-    """Flow (kg/s) below which windage takes the work: in proportion less of it reaches the brake."""
+    inlet_valve: Valve  # The valve that throttles the gas before the nozzle
+    nozzle: float  # Kt of the choked nozzle, m = Kt P / sqrt(T), in kg sqrt(K)/(s Pa)
+    efficiency: float  # Isentropic efficiency, 0 to 1
+    speed_coefficient: float  # Shaft speed over the square root of the isentropic enthalpy drop, Hz/sqrt(J/kg)
+    windage_flow: float  # Flow (kg/s) below which windage takes the work: in proportion less of it reaches the brake
 
 
 class Back(NamedTuple):
     """Conditions behind the turbine, which the exhaust meets."""
 
     line: ReturnLine
-    P_bath: float
-    """Pa."""
-    P_suction: float
-    """Pa."""
-    thinness: float
-    """Thinness of the vapour, see `return_flow`."""
+    P_bath: float  # Pa
+    P_suction: float  # Pa
+    thinness: float  # Thinness of the vapour, see `return_flow`
 
 
 class Expansion(NamedTuple):
     """Exhaust of the turbine and its shaft speed."""
 
-    h_out: float
-    """Enthalpy of the exhaust, J/kg."""
-    speed: float
-    """Shaft speed, Hz."""
+    h_out: float  # Enthalpy of the exhaust, J/kg
+    speed: float  # Shaft speed, Hz
 
 
 @inlined

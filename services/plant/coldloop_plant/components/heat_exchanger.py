@@ -21,38 +21,27 @@ TRICKLE = 1e-9  # kg/s, below which the low-pressure gas simply takes the temper
 class HeatExchanger(NamedTuple):
     """A counter-flow exchanger, cut into equal cells from the hot end to the cold end."""
 
-    UA: float
-    """Heat transfer coefficient times area, W/K."""
-    volume: float
-    """Volume of the high-pressure side, m3."""
-    aluminium: float
-    """Mass of the wall, kg."""
-    cells: int
-    """Number of cells, 1 or more."""
+    UA: float  # Heat transfer coefficient times area, W/K
+    volume: float  # Volume of the high-pressure side, m3
+    aluminium: float  # Mass of the wall, kg
+    cells: int  # Number of cells, 1 or more
 
 
 class HighPressureFlow(NamedTuple):
     """The warm stream as it enters at the hot end."""
 
-    mass_flow: float
-    """kg/s."""
-    T: float
-    """K."""
-    P: float
-    """Pa, the same all along."""
+    mass_flow: float  # kg/s
+    T: float  # K
+    P: float  # Pa, the same all along
 
 
 class LowPressureFlow(NamedTuple):
     """The cold stream as it enters at the cold end, or leaves at the hot end."""
 
-    mass_flow: float
-    """kg/s."""
-    P: float
-    """Pa, the same all along."""
-    T: float
-    """K."""
-    h: float
-    """J/kg; carried along so that energy is conserved exactly, whatever the tables' error."""
+    mass_flow: float  # kg/s
+    P: float  # Pa, the same all along
+    T: float  # K
+    h: float  # J/kg; carried along so that energy is conserved exactly, whatever the tables' error
 
 
 @inlined
@@ -168,10 +157,7 @@ def settle_cells(
     shape (4, N).
     """
     for i in range(first, first + exchanger.cells):
-        widest = abs(x[i] - stages[0, i])
-        for k in range(1, 4):
-            widest = max(widest, abs(stages[k, i] - stages[0, i]))
-        if COARSE < widest < WILD:
+        if COARSE < widest_move(stages, x, i, i + 1) < WILD:
             brought: float = 0.0
             for k in range(4):
                 weight = dt / 6.0 if k in (0, 3) else dt / 3.0

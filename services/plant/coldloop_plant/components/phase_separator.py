@@ -31,44 +31,30 @@ LEAST_PRESSURE, CRITICAL_PRESSURE = 0.05e5, 2.28e5  # Pa
 class PhaseSeparator(NamedTuple):
     """A vessel that holds boiling helium."""
 
-    volume: float
-    """m3."""
-    wall: float
-    """Aluminium of the vessel and what is in it, kg, that warms when the vessel is dry."""
-    relief_pressure: float
-    """Pressure at which the relief valve to the recovery line begins to open, Pa."""
-    relief_span: float
-    """Rise above it at which the valve is fully open, Pa."""
-    relief_area: float
-    """Its flow area then, m2."""
+    volume: float  # m3
+    wall: float  # Aluminium of the vessel and what is in it, kg, that warms when the vessel is dry
+    relief_pressure: float  # Pressure at which the relief valve to the recovery line begins to open, Pa
+    relief_span: float  # Rise above it at which the valve is fully open, Pa
+    relief_area: float  # Its flow area then, m2
 
 
 class Content(NamedTuple):
-    """Content of the vessel, and its derivatives with respect to P (per Pa) and to V_l (per m3)."""
+    """Content of the vessel, and its derivatives with respect to P (Pa) and to V_l (m3)."""
 
-    mass: float
-    """kg."""
-    energy: float
-    """Internal energy of the helium, and what the wall holds above `COLD_WALL`, J."""
+    mass: float  # kg
+    energy: float  # Internal energy of the helium, and what the wall holds above `COLD_WALL`, J
     M_P: float
-    """kg/Pa."""
     M_V: float
-    """kg/m3."""
     U_P: float
-    """J/Pa."""
     U_V: float
-    """J/m3."""
 
 
 class Outflow(NamedTuple):
     """Flow that leaves at the top of the vessel."""
 
-    T: float
-    """K."""
-    h: float
-    """J/kg; below that of saturated vapour where it carries liquid along."""
-    rho: float
-    """Density, kg/m3; of the mixture where it carries liquid along."""
+    T: float  # K
+    h: float  # J/kg; below that of saturated vapour where it carries liquid along
+    rho: float  # Density, kg/m3; of the mixture where it carries liquid along
 
 
 @inlined
@@ -190,14 +176,10 @@ class Account(NamedTuple):
     the two states keeps them to 1e-14 kg a step in ordinary operation, and not there. An account does everywhere.
     """
 
-    mass: float
-    """kg."""
-    energy: float
-    """J."""
-    inflow: float
-    """kg/s."""
-    heat: float
-    """W."""
+    mass: float  # kg
+    energy: float  # J
+    inflow: float  # kg/s
+    heat: float  # W
 
 
 @inlined

@@ -27,33 +27,22 @@ Weights = tuple[float, float, float, float]
 class Curves(NamedTuple):
     """Several functions of one variable, tabulated on the same grid."""
 
-    start: float
-    """Argument at the node of index `before`."""
-    step: float
-    """Distance between nodes."""
-    before: int
-    """Nodes before the start."""
-    nodes: RealArray
-    """Shape (nodes, functions, 2): value, slope times step."""
+    start: float  # Argument at the node of index `before`
+    step: float  # Distance between nodes
+    before: int  # Nodes before the start
+    nodes: RealArray  # Shape (nodes, functions, 2): value, slope times step
 
 
 class Surface(NamedTuple):
-    """One function of two variables, tabulated."""
+    """One function of two variables, tabulated; of each the grid is as in `Curves`, rows for the first one."""
 
     row_start: float
-    """First argument at the row of nodes of index `rows_before`."""
     row_step: float
-    """Distance between rows."""
     rows_before: int
-    """Rows before the start."""
     column_start: float
-    """Second argument at the column of nodes of index `columns_before`."""
     column_step: float
-    """Distance between columns."""
     columns_before: int
-    """Columns before the start."""
-    nodes: RealArray
-    """Shape (rows, columns, 4): value, slope along the columns, slope along the rows, mixed slope."""
+    nodes: RealArray  # Shape (rows, columns, 4): value, slope along the columns, slope along the rows, mixed slope
 
 
 @inlined
@@ -169,20 +158,17 @@ class Helium(NamedTuple):
 
 
 class Saturation(NamedTuple):
-    """Properties of boiling helium at one pressure, or their derivatives with respect to the pressure (per Pa)."""
+    """Temperature (K), densities (kg/m3), enthalpies (J/kg) and entropy (J/(kg K)) of boiling helium at one pressure.
+
+    Of the liquid (l) and the vapour (v). Or their derivatives with respect to the pressure, per Pa.
+    """
 
     T: float
-    """Temperature, K."""
     rho_l: float
-    """Density of the liquid, kg/m3."""
     rho_v: float
-    """Density of the vapour, kg/m3."""
     h_l: float
-    """Enthalpy of the liquid, J/kg."""
     h_v: float
-    """Enthalpy of the vapour, J/kg."""
     s_v: float
-    """Entropy of the vapour, J/(kg K)."""
 
 
 @cache
@@ -235,6 +221,21 @@ def thinned(P: float, density: float) -> float:
 
 
 @inlined
+def _supply(P: float, T: float, function: int, table: Curves, departure: Curves) -> tuple[float, float, int, Weights]:
+    """Return h (J/kg) and rho or rho cp, the `function` of the isobar's table, with the place of `T` there."""
+    i, t = locate(np.log(at_least(T, COLDEST)), table.start, table.step, table.before, table.nodes.shape[0])
+    weights = hermite_weights(t)
+    h = read_curve(table.nodes, i, 0, weights) + 0.0 * P
+    found = read_curve(table.nodes, i, function, weights) + 0.0 * P
+    if P != ISOBAR_PRESSURE:
+        h += _departure(P, 0, i, weights, departure)
+        found = thinned(P, found + _departure(P, function, i, weights, departure))
+    if T.real > WARMEST_ISOBAR:
+        return h + WARM_CP * (T - WARMEST_ISOBAR), found * WARMEST_ISOBAR / T, i, weights
+    return h, found, i, weights
+
+
+@inlined
 def supply_enthalpy_and_density(P: float, T: float, helium: Helium) -> tuple[float, float]:
     """Return h (J/kg) and rho (kg/m3) of the high-pressure gas at `P` (Pa, 5e5 to 19e5) and `T` (K, 2.5 to 350).
 
@@ -243,16 +244,7 @@ def supply_enthalpy_and_density(P: float, T: float, helium: Helium) -> tuple[flo
     of CoolProp from 6 to 8 K, where cp has its peak, within 0.03 K and 3 % else below 10 K, within 0.01 K and 1 % from
     there to 80 K, and above within 1e-5.
     """
-    table = helium.isobar
-    i, t = locate(np.log(at_least(T, COLDEST)), table.start, table.step, table.before, table.nodes.shape[0])
-    weights = hermite_weights(t)
-    h = read_curve(table.nodes, i, 0, weights) + 0.0 * P
-    rho = read_curve(table.nodes, i, 1, weights) + 0.0 * P
-    if P != ISOBAR_PRESSURE:
-        h += _departure(P, 0, i, weights, helium.departure)
-        rho = thinned(P, rho + _departure(P, 1, i, weights, helium.departure))
-    if T.real > WARMEST_ISOBAR:
-        return h + WARM_CP * (T - WARMEST_ISOBAR), rho * WARMEST_ISOBAR / T
+    h, rho, _, _ = _supply(P, T, 1, helium.isobar, helium.departure)
     return h, rho
 
 
@@ -263,18 +255,8 @@ def supply_cell(P: float, T: float, table: Curves, departure: Curves) -> tuple[f
     `table` and `departure` are `Helium.isobar` and `Helium.departure`. Ranges as for
     `supply_enthalpy_and_density`; rho cp is within 18 % below 10 K (9 % from 12 to 19 bar) and 6 % above.
     """
-    nodes = table.nodes
-    i, t = locate(np.log(at_least(T, COLDEST)), table.start, table.step, table.before, nodes.shape[0])
-    weights = hermite_weights(t)
-    h = read_curve(nodes, i, 0, weights) + 0.0 * P
-    rho_cp = read_curve(nodes, i, 2, weights) + 0.0 * P
-    c_wall = read_curve(nodes, i, 3, weights)
-    if P != ISOBAR_PRESSURE:
-        h += _departure(P, 0, i, weights, departure)
-        rho_cp = thinned(P, rho_cp + _departure(P, 2, i, weights, departure))
-    if T.real > WARMEST_ISOBAR:
-        return h + WARM_CP * (T - WARMEST_ISOBAR), rho_cp * WARMEST_ISOBAR / T, c_wall
-    return h, rho_cp, c_wall
+    h, rho_cp, i, weights = _supply(P, T, 2, table, departure)
+    return h, rho_cp, read_curve(table.nodes, i, 3, weights)
 
 
 @inlined
@@ -323,6 +305,13 @@ def _go_on(T: float, edge: float, row: Array) -> None:
 
 
 @inlined
+def _saturation_at(nodes: RealArray, i: int, w: Weights, step: float) -> Saturation:
+    T, rho_l, rho_v = read_curve(nodes, i, 0, w), read_curve(nodes, i, 1, w), read_curve(nodes, i, 2, w)
+    h_l, h_v, s_v = read_curve(nodes, i, 3, w), read_curve(nodes, i, 4, w), read_curve(nodes, i, 5, w)
+    return Saturation(T / step, rho_l / step, rho_v / step, h_l / step, h_v / step, s_v / step)
+
+
+@inlined
 def saturation(P: float, helium: Helium) -> Saturation:
     """Return the properties of boiling helium at `P` (Pa, 0.3e5 to 2.25e5); outside they go on with their slope."""
     table = helium.saturation
@@ -332,15 +321,7 @@ def saturation(P: float, helium: Helium) -> Saturation:
         w = (1.0 + 0.0 * t, (P - LOWEST_SATURATION) / table.step, 0.0 * t, 0.0 * t)
     elif P.real > HIGHEST_SATURATION:
         w = (0.0 * t, 0.0 * t, 1.0 + 0.0 * t, (P - HIGHEST_SATURATION) / table.step)
-    n = table.nodes
-    return Saturation(
-        read_curve(n, i, 0, w),
-        read_curve(n, i, 1, w),
-        read_curve(n, i, 2, w),
-        read_curve(n, i, 3, w),
-        read_curve(n, i, 4, w),
-        read_curve(n, i, 5, w),
-    )
+    return _saturation_at(table.nodes, i, w, 1.0)
 
 
 @inlined
@@ -349,15 +330,7 @@ def saturation_slopes(P: float, helium: Helium) -> Saturation:
     table = helium.saturation
     i, t = locate(P, table.start, table.step, table.before, table.nodes.shape[0])
     w = hermite_slope_weights(t)
-    n = table.nodes
-    return Saturation(
-        read_curve(n, i, 0, w) / table.step,
-        read_curve(n, i, 1, w) / table.step,
-        read_curve(n, i, 2, w) / table.step,
-        read_curve(n, i, 3, w) / table.step,
-        read_curve(n, i, 4, w) / table.step,
-        read_curve(n, i, 5, w) / table.step,
-    )
+    return _saturation_at(table.nodes, i, w, table.step)
 
 
 @inlined

@@ -82,10 +82,10 @@ def tabulate() -> dict[str, RealArray]:
     return {
         **curves("isobar", LOG_TEMPERATURES, _isobar),
         **curves("departure", LOG_TEMPERATURES, _departure),
-        **curves("saturation", PRESSURES, _saturation),
-        **surface("vapour", LINES, SUPERHEATS, _vapour),
+        **curves("saturation", PRESSURES, lambda P: [_property(name, "P", P, "Q", q) for name, q in SATURATION]),
+        **surface("vapour", LINES, SUPERHEATS, lambda P, log: _at_log("H", P, "T", log, SUPERHEAT_OFFSET)),
         **surface("vapour_superheat", LINES, EXCESSES, _superheat),
-        **surface("vapour_density", LINES, EXCESSES, _density),
+        **surface("vapour_density", LINES, EXCESSES, lambda P, log: np.log(_at_log("D", P, "H", log, EXCESS_OFFSET))),
         **surface("vapour_excess", LINES, ENTROPIES, _excess),
         **surface("turbine_entropy", LOG_PRESSURES, LOG_ENTHALPIES, _turbine_entropy),
     }
@@ -151,24 +151,12 @@ def _departure(log_temperature: float) -> list[float]:
     return [float(coefficient) for coefficient in cubics.T.ravel()]
 
 
-def _saturation(P: float) -> list[float]:
-    return [_property(name, "P", P, "Q", quality) for name, quality in SATURATION]
-
-
 SATURATION = (("T", 0.0), ("D", 0.0), ("D", 1.0), ("H", 0.0), ("H", 1.0), ("S", 1.0))
 
 
-def _vapour(P: float, log_superheat: float) -> float:
-    return _near_saturation("H", P, "T", float(np.exp(log_superheat)) - SUPERHEAT_OFFSET)
-
-
 def _superheat(P: float, log_excess: float) -> float:
-    T = _near_saturation("T", P, "H", float(np.exp(log_excess)) - EXCESS_OFFSET)
+    T = _at_log("T", P, "H", log_excess, EXCESS_OFFSET)
     return float(np.log(T - _property("T", "P", P, "Q", 1.0) + SUPERHEAT_OFFSET))
-
-
-def _density(P: float, log_excess: float) -> float:
-    return float(np.log(_near_saturation("D", P, "H", float(np.exp(log_excess)) - EXCESS_OFFSET)))
 
 
 def _excess(P: float, entropy_rise: float) -> float:
@@ -179,6 +167,10 @@ def _excess(P: float, entropy_rise: float) -> float:
 def _turbine_entropy(log_pressure: float, log_enthalpy: float) -> float:
     P, h = float(np.exp(log_pressure)), float(np.exp(log_enthalpy))
     return _property("S", "P", P, "H", h) + GAS_CONSTANT * log_pressure
+
+
+def _at_log(name: str, P: float, axis: str, log: float, offset: float) -> float:
+    return _near_saturation(name, P, axis, float(np.exp(log)) - offset)
 
 
 def _near_saturation(name: str, P: float, axis: str, distance: float) -> float:
