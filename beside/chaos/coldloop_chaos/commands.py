@@ -10,7 +10,7 @@ from typing import Final
 
 from coldloop.errors import LinkError, UsageError
 from coldloop.process.updating_periods import duration
-from coldloop.service.command_line import add_configuration_options
+from coldloop.service import add_configuration_options
 from coldloop_rig.cli.commands import options as common
 from coldloop_rig.interruption import run_until_interrupted
 

@@ -4,7 +4,7 @@ import argparse
 import sys
 from typing import Final
 
-from coldloop.service.command_line import add_configuration_options
+from coldloop.service import add_configuration_options
 from coldloop_rig.cli.commands.options import Command, configuration
 
 SAID: Final = {"exergy": "where a refrigerator loses the exergy that it is given"}

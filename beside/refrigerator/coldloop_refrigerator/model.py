@@ -17,7 +17,7 @@ from scipy.linalg import expm, solve_discrete_are
 from coldloop.config import load_configuration
 from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, STATION_SIGNAL_NAMES, STATION_VALVE_NAMES, TICK_S
 from coldloop.process.lti_model import LtiModel
-from coldloop.service.command_line import add_configuration_options
+from coldloop.service import add_configuration_options
 from coldloop.service.start import SECTIONS
 from coldloop_plant.cold_box import model as cold_box
 from coldloop_plant.cold_box import streams

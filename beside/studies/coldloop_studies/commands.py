@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import NOT_FINITE, UsageError
 from coldloop.process.updating_periods import duration
-from coldloop.service.command_line import add_configuration_options
+from coldloop.service import add_configuration_options
 from coldloop_rig.cli.commands.options import Command, check_load, configuration, positive_count
 
 if TYPE_CHECKING:

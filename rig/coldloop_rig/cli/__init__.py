@@ -17,7 +17,7 @@ from typing import Any, Final, NoReturn
 
 from coldloop import __version__
 from coldloop.errors import ColdloopError, UsageError, foreign, printable
-from coldloop.service.command_line import add_configuration_options
+from coldloop.service import add_configuration_options
 from coldloop_rig.interruption import INTERRUPTION
 
 OPTION: Final = "--process"

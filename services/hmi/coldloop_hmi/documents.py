@@ -17,13 +17,8 @@ from prometheus_client.core import Metric
 from coldloop import __version__
 from coldloop.process.declaration import Process
 from coldloop.process.sections import Output, Range
-from coldloop.registers import optimizer_plc
-from coldloop.registers.codec import blank
-from coldloop.registers.common import EventKind
-from coldloop.registers.control_plc import Mode
-from coldloop.registers.declaration import Kind, RegisterMap
+from coldloop.registers import codec, common, control_plc, declaration, optimizer_plc, plant
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, Prediction
-from coldloop.registers.plant import StationAlarm, StationMode, StationStatus
 from coldloop.registers.safety import AlarmAction, AlarmPriority, AlarmState
 from coldloop.service.journal import alarm_cause, alarm_word, flag_words
 from coldloop.service.monitoring import block_families, build_family, gauge
@@ -43,15 +38,15 @@ LIMITS: Final = {
 }
 """Limits at which the station's alarms begin, by signal: below, above."""
 MARKED: Final = {
-    EventKind.ALARM_RAISED.word: "alarm",
-    EventKind.LIVE_LOAD.word: "load",
-    EventKind.LOAD.word: "load",
-    EventKind.OPERATOR_MODE.word: "operator",
-    EventKind.SETPOINT.word: "operator",
-    EventKind.SENSOR_FAULT.word: "fault",
+    common.EventKind.ALARM_RAISED.word: "alarm",
+    common.EventKind.LIVE_LOAD.word: "load",
+    common.EventKind.LOAD.word: "load",
+    common.EventKind.OPERATOR_MODE.word: "operator",
+    common.EventKind.SETPOINT.word: "operator",
+    common.EventKind.SENSOR_FAULT.word: "fault",
 }
 """Kinds of events that are marked on the trends, and what as."""
-BEGUN: Final = EventKind.SESSION.word
+BEGUN: Final = common.EventKind.SESSION.word
 MOST_MARKS: Final = 1000
 EARLIER_PREDICTIONS: Final = 12
 PERIODS: Final = ("tau_u", "q")
@@ -164,7 +159,7 @@ class Signal(NamedTuple):
 
 
 @cache
-def signals_of(register_map: RegisterMap) -> tuple[Signal, ...]:
+def signals_of(register_map: declaration.RegisterMap) -> tuple[Signal, ...]:
     """Return the signals of a service, in the order of their registers."""
     found: list[Signal] = []
     digits_of = DECIMALS | decimals_by_unit(register_map.process)
@@ -176,7 +171,7 @@ def signals_of(register_map: RegisterMap) -> tuple[Signal, ...]:
             if label in seen:
                 continue
             seen.add(label)
-            floating = register.kind is Kind.F32
+            floating = register.kind is declaration.Kind.F32
             has_scale = register.unit or label.startswith(("u.", "y."))  # others may be of any size
             decimals = digits_of.get(register.unit) if floating and has_scale else None
             found.append(
@@ -196,11 +191,11 @@ def plant_document(model: image.Model) -> dict[str, Any]:
     kind = model.configuration.get(KIND, "")
     if kind != REFRIGERATOR:
         return {"kind": kind}
-    status = model.record("plant", StationStatus) or StationStatus()
+    status = model.record("plant", plant.StationStatus) or plant.StationStatus()
     return {
         "kind": kind,
-        "mode": StationMode.word_of(status.mode),
-        "alarms": flag_words(StationAlarm(status.alarms)),
+        "mode": plant.StationMode.word_of(status.mode),
+        "alarms": flag_words(plant.StationAlarm(status.alarms)),
         "bands": {
             f"{SIGNALS}{name}": [model.configuration.get(f"{ALARMS}{key}") for key in keys]
             for name, keys in LIMITS.items()
@@ -298,7 +293,7 @@ def state_document(model: image.Model, changed: Iterable[str] | None = None) -> 
     """Return the state of everything that is shown; of signals only those that have changed, if these are named."""
     process = model.process
     names = model.values if changed is None else [name for name in changed if name in model.values]
-    found = model.record("optimizer_plc", ModelDeviation) or blank(ModelDeviation, model.maps["optimizer_plc"])
+    found = model.record("optimizer_plc", ModelDeviation) or codec.blank(ModelDeviation, model.maps["optimizer_plc"])
     stale, replaced = model.stale_prefixes(), model.doubts.held | model.doubts.bad
     not_current = [f"control_plc.process.y.{name}" for i, name in enumerate(process.output_names) if replaced >> i & 1]
     document: Document = {
@@ -383,7 +378,7 @@ def trend_document(
     limits = model.limits
     begun = max((e.utc for e in model.events if e.service == "plant" and e.text.kind == BEGUN), default="")
     known = [entry for entry in model.events if entry.utc >= begun]  # not of a session before
-    marked = MARKED.keys() - ({EventKind.LOAD.word} if not process.has_load else ())
+    marked = MARKED.keys() - ({common.EventKind.LOAD.word} if not process.has_load else ())
     found = [entry for entry in known if entry.text.kind in marked and start <= entry.tick <= end]
     is_cut = len(found) > MOST_MARKS or (len(known) == model.events.maxlen and known[0].tick > start)
     return {
@@ -391,7 +386,7 @@ def trend_document(
         "time": times,
         "series": series,
         "updates": updates_document(model.updates, in_force, gaps, points, quantities, tick_s),
-        "modes": [{"from": one.start, "to": one.end, "mode": Mode.word_of(one.mode)} for one in modes],
+        "modes": [{"from": one.start, "to": one.end, "mode": control_plc.Mode.word_of(one.mode)} for one in modes],
         "doubtful": {name: found for name, found in model.trends.doubtful(start, end).items() if name in names},
         "marks": [
             {"time": entry.tick * tick_s, "kind": MARKED[entry.text.kind], "text": entry.text.sentence}
@@ -417,7 +412,7 @@ def updates_document(
     """
     found: Document = {name: [] for name in ("time", *quantities)}
     for stretch in modes:
-        if stretch.mode != Mode.MPC:
+        if stretch.mode != control_plc.Mode.MPC:
             continue
         first, last = (round(time / tick_s) for time in (stretch.start, stretch.end))
         start = bisect_left(updates, first, key=lambda one: one.tick)

@@ -80,28 +80,27 @@ class Use:
         return 2 * self.has_session + self.is_busy
 
 
+@dataclass
 class Connections:
     """Connections of one server, at most so many.
 
     A newcomer takes the place of a connection that only waits: strangers' first, and of these one from the address
     that has most of them. So idle connections or incomplete requests lock out no user.
-
-    Args:
-        most: Connections at a time.
-        now: Monotonic clock, s.
     """
 
-    def __init__(self, most: int, now: Callable[[], float]) -> None:
-        self._most = most
-        self._now = now
-        self._uses: dict[web.RequestHandler, Use] = {}  # in the order of their arrival
+    most: int
+    """Connections at a time."""
+    now: Callable[[], float]
+    """Monotonic clock, s."""
+    _uses: dict[web.RequestHandler, Use] = field(default_factory=dict, init=False)
+    """In the order of their arrival."""
 
     def newcomer(self, server: web.Server) -> asyncio.Protocol:
         """Return what serves a new connection of the server: its handler, or a refusal where none gives way."""
-        now = self._now()
+        now = self.now()
         connected = [one for one in server.connections if one.transport is not None]
         self._uses = {one: self._uses.get(one) or Use(now) for one in connected}
-        if len(connected) < self._most:
+        if len(connected) < self.most:
             return server()
         addresses = {one: str(one.peername[0]) if isinstance(one.peername, tuple) else "" for one in self._uses}
         crowd = Counter(addresses.values())
@@ -117,12 +116,12 @@ class Connections:
     @contextmanager
     def serving(self, request: web.Request, *, is_stream: bool, has_session: bool) -> Iterator[None]:
         """Keep the place of a connection while its request, received as a whole, is answered."""
-        use = self._uses.setdefault(request.protocol, Use(self._now()))
-        use.since, use.is_busy, use.is_stream, use.has_session = self._now(), True, is_stream, has_session
+        use = self._uses.setdefault(request.protocol, Use(self.now()))
+        use.since, use.is_busy, use.is_stream, use.has_session = self.now(), True, is_stream, has_session
         try:
             yield
         finally:
-            use.since, use.is_busy = self._now(), False
+            use.since, use.is_busy = self.now(), False
 
 
 class _Refused(asyncio.Protocol):
@@ -478,18 +477,16 @@ class _Queue:
     free_from: float = 0.0
 
 
+@dataclass
 class LongReads:
     """Turns of requests that compute for long; who has logged in does not wait for strangers.
 
     After a turn the event loop is free for as long as it took, before the next one of the same queue.
-
-    Args:
-        now: Monotonic clock, s.
     """
 
-    def __init__(self, now: Callable[[], float]) -> None:
-        self._now = now
-        self._queues = {False: _Queue(), True: _Queue()}
+    now: Callable[[], float]
+    """Monotonic clock, s."""
+    _queues: dict[bool, _Queue] = field(default_factory=lambda: {False: _Queue(), True: _Queue()}, init=False)
 
     @asynccontextmanager
     async def turn(self, *, has_session: bool) -> AsyncIterator[None]:
@@ -500,10 +497,9 @@ class LongReads:
         queue.waiting += 1
         try:
             async with queue.turn:
-                await asyncio.sleep(queue.free_from - self._now())
-                begun = self._now()
+                await asyncio.sleep(queue.free_from - self.now())
+                begun = self.now()
                 yield
-                ended = self._now()
-                queue.free_from = 2 * ended - begun
+                queue.free_from = 2 * self.now() - begun
         finally:
             queue.waiting -= 1

@@ -7,6 +7,7 @@ import asyncio
 import secrets
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from aiohttp import web
@@ -14,10 +15,8 @@ from aiohttp import web
 from coldloop.errors import LinkError, UsageError
 from coldloop.modbus.settings import Endpoint
 from coldloop.operating import commands, execution
-from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers import common, plant, safety
 from coldloop.registers.control_plc import LadderStatus, Mode, Operator, OperatorMode
-from coldloop.registers.plant import LoadStatus
-from coldloop.registers.safety import AlarmAction
 from coldloop.text import parsed_json, value_text
 from coldloop_hmi.documents import encoded
 from coldloop_hmi.guard import Guard, compressed_answer, cookie_name, refusal
@@ -41,7 +40,7 @@ async def read_premises(clients: execution.Clients, command: commands.Command) -
         LinkError: A service does not answer.
         UsageError: A setpoint, and another mode than manual.
     """
-    found = {"session": str((await next(iter(clients.values())).read(Identity)).session)}
+    found = {"session": str((await next(iter(clients.values())).read(common.Identity)).session)}
     match command:
         case commands.SetMode():
             mode = (await clients["control_plc"].read(LadderStatus)).mode
@@ -51,11 +50,11 @@ async def read_premises(clients: execution.Clients, command: commands.Command) -
             operator = await execution.check_manual(clients["control_plc"])
             found[f"setpoint of {command.input}"] = value_text(operator.u[command.place], command.unit)
         case commands.SetLoad() | commands.PlayLoad():
-            load, process = await clients["plant"].read(LoadStatus), command.process
+            load, process = await clients["plant"].read(plant.LoadStatus), command.process
             until = f"changing until {commands.clock_text(load.last_tick * process.tick_s)}"  # by itself
             found[process.load.title] = until if load.upcoming else value_text(load.watts, process.load.unit)
         case commands.SetFactor() | commands.SetPaused():
-            pace = await clients["plant"].read(SessionPace)
+            pace = await clients["plant"].read(common.SessionPace)
             running = f"{'paused, ' if pace.paused else ''}factor {value_text(pace.factor)}"
             found["plant time"] = running if pace.realtime else "lock-step"
     return found
@@ -156,9 +155,9 @@ class OperatorDesk:
 
     def _consequences(self, command: commands.Command) -> str:
         """Return what a command means at present, beyond its own words."""
-        pace, load = self._model.record("plant", SessionPace), self._model.record("plant", LoadStatus)
+        pace, load = self._model.record("plant", common.SessionPace), self._model.record("plant", plant.LoadStatus)
         shelved_s = 0
-        if isinstance(command, commands.TreatAlarm) and command.action == AlarmAction.SHELVE:
+        if isinstance(command, commands.TreatAlarm) and command.action == safety.AlarmAction.SHELVE:
             shelved_s = command.time_s
         if shelved_s and pace and pace.session:
             if not pace.realtime:
@@ -221,17 +220,15 @@ class OperatorDesk:
         return execution.clients_of(ends, self.process)
 
 
+@dataclass(frozen=True)
 class Commanding:
     """Answers requests that change something. Without a desk there are no commands, as in a replay."""
 
-    def __init__(
-        self, settings: HmiSection, guard: Guard, users: Users, desk: OperatorDesk | None, audit: Audit
-    ) -> None:
-        self._settings = settings
-        self._guard = guard
-        self._users = users
-        self._desk = desk
-        self._audit = audit
+    settings: HmiSection
+    guard: Guard
+    users: Users
+    desk: OperatorDesk | None
+    log: Audit
 
     def routes(self) -> list[web.AbstractRouteDef]:
         """Return what is served."""
@@ -246,13 +243,13 @@ class Commanding:
 
     async def me(self, request: web.Request) -> web.Response:
         """Answer with who is asking."""
-        session = self._guard.session(request)
+        session = self.guard.session(request)
         return web.json_response(
             {
                 "user": session.user.name if session else "",
-                "role": session.user.role.value if session else ("view" if self._settings.login.anonymous_view else ""),
-                "operates": bool(session and session.may_operate and self._desk),
-                "can_log_in": len(self._users) > 0,
+                "role": session.user.role.value if session else ("view" if self.settings.login.anonymous_view else ""),
+                "operates": bool(session and session.may_operate and self.desk),
+                "can_log_in": len(self.users) > 0,
             }
         )
 
@@ -263,22 +260,22 @@ class Commanding:
         if not isinstance(name, str) or not isinstance(password, str):
             return refusal(400, "user and password must be text")
         address = request.remote or ""
-        user = await self._guard.log_in(name, password, address, self._guard.logins)
-        self._guard.sessions.end(request.cookies.get(cookie_name(request)))
+        user = await self.guard.log_in(name, password, address, self.guard.logins)
+        self.guard.sessions.end(request.cookies.get(cookie_name(request)))
         answer = web.json_response({"user": user.name, "role": user.role.value})
         answer.set_cookie(
-            cookie_name(request), self._guard.sessions.begin(user), httponly=True, samesite="Strict", path="/",
-            secure=self._settings.https is not None,
+            cookie_name(request), self.guard.sessions.begin(user), httponly=True, samesite="Strict", path="/",
+            secure=self.settings.https is not None,
         )  # fmt: skip
-        self._audit.note("login", who=user.name, address=address, outcome="done", detail=user.role.value)
+        self.log.note("login", who=user.name, address=address, outcome="done", detail=user.role.value)
         return answer
 
     async def logout(self, request: web.Request) -> web.Response:
         """End the session."""
-        who = self._guard.who(request)
+        who = self.guard.who(request)
         if who:
-            self._audit.note("logout", who=who, address=request.remote or "", outcome="done")
-        self._guard.sessions.end(request.cookies.get(cookie_name(request)))
+            self.log.note("logout", who=who, address=request.remote or "", outcome="done")
+        self.guard.sessions.end(request.cookies.get(cookie_name(request)))
         answer = web.json_response({})
         answer.del_cookie(cookie_name(request), path="/")
         return answer
@@ -286,7 +283,7 @@ class Commanding:
     async def audit(self, request: web.Request) -> web.Response:
         """Answer with the last entries of the audit, for operators."""
         self._operator(request)
-        return compressed_answer(request, encoded({"entries": self._audit.entries[::-1]}))
+        return compressed_answer(request, encoded({"entries": self.log.entries[::-1]}))
 
     async def prepare(self, request: web.Request) -> web.Response:
         """Take a command: answer with what it would do and the token that confirms it."""
@@ -310,19 +307,19 @@ class Commanding:
             return web.json_response({"error": str(error), **preview}, status=409)
         word = "refused" if outcome.refused_because else "uncertain" if outcome.uncertain_because else "done"
         detail = f"{outcome.asked}: {' '.join(filter(None, outcome[1:]))}"
-        self._audit.note(  # by name: the login may have ended meanwhile
+        self.log.note(  # by name: the login may have ended meanwhile
             "command", who=user, address=request.remote or "", outcome=word, detail=detail
         )
         return compressed_answer(request, encoded(outcome._asdict()))
 
     def _required_desk(self) -> OperatorDesk:
-        if self._desk is None:
+        if self.desk is None:
             raise web.HTTPConflict(reason="a recorded run takes no commands")
-        return self._desk
+        return self.desk
 
     def _operator(self, request: web.Request) -> str:
         """Return the name of an operator; raise the refusal of anybody else."""
-        session = self._guard.session(request)
+        session = self.guard.session(request)
         if session is None:
             self._refuse(request, "not logged in, or the session has ended")
             raise web.HTTPUnauthorized(reason="log in first: the session has ended, or there was none")
@@ -332,8 +329,8 @@ class Commanding:
         return session.user.name
 
     def _refuse(self, request: web.Request, reason: str) -> None:
-        who = self._guard.who(request)
-        self._audit.refuse("command", who=who, address=request.remote or "", reason=reason, has_session=bool(who))
+        who = self.guard.who(request)
+        self.log.refuse("command", who=who, address=request.remote or "", reason=reason, has_session=bool(who))
 
 
 async def _document(request: web.Request) -> dict[str, Any]:

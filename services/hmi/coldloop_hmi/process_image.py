@@ -16,14 +16,9 @@ from typing import Any, Final, NamedTuple, TypeVar, cast
 
 from coldloop.process.cold_box import STATION_SIGNAL_NAMES
 from coldloop.process.declaration import Process
-from coldloop.registers import maps_of
-from coldloop.registers.codec import blank, from_words
-from coldloop.registers.common import Event, Identity, SessionPace
+from coldloop.registers import codec, common, declaration, maps_of, plant, safety
 from coldloop.registers.control_plc import LadderStatus, Mode, Plan, ProcessNow
-from coldloop.registers.declaration import Block, RegisterMap
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Prediction, UpdatingRuleStatus
-from coldloop.registers.plant import StationStatus
-from coldloop.registers.safety import Alarm
 from coldloop.service.journal import EventText, describe, utc_text
 
 STATION_NAMES: Final = ("P12", "P11")
@@ -76,18 +71,18 @@ def doubted(doubts: Doubts, process: Process) -> dict[str, Quality]:
     return {name: quality for quality, bits in every for i, name in enumerate(process.output_names) if bits >> i & 1}
 
 
-def shown_blocks(register_map: RegisterMap) -> list[Block]:
+def shown_blocks(register_map: declaration.RegisterMap) -> list[declaration.Block]:
     """Return the blocks that the page shows value by value: those with one row that mean something."""
     return [block for block in register_map.shown if block.rows == 1]
 
 
-def values_of(service: str, block: Block, record: tuple[Any, ...]) -> dict[str, float | int | str]:
+def values_of(service: str, block: declaration.Block, record: tuple[Any, ...]) -> dict[str, float | int | str]:
     """Return the values of a record by the names of their signals; texts are decoded."""
     values: dict[str, float | int | str] = {}
     prefix = f"{service}.{block.name}."
     for (name, declared), value in zip(block.fields.items(), record, strict=True):
         if declared.is_text:
-            values[prefix + name] = from_words(value)
+            values[prefix + name] = codec.from_words(value)
         elif declared.elements:
             before = prefix if declared.each else f"{prefix}{name}."
             values.update((before + element, one) for element, one in zip(declared.elements, value, strict=True))
@@ -313,7 +308,7 @@ class JournalEntry(NamedTuple):
     text: EventText
 
     @classmethod
-    def of(cls, service: str, event: Event, process: Process) -> "JournalEntry":
+    def of(cls, service: str, event: common.Event, process: Process) -> "JournalEntry":
         """Return an event of a journal."""
         return cls(service, event.number, event.boot, utc_text(event), event.tick, describe(event, process))
 
@@ -352,7 +347,7 @@ class Model:
         self.trends = TrendStore(process, kept_s)
         self.updates: deque[Optimization] = deque(maxlen=UPDATES_KEPT)
         self.predictions: deque[Prediction] = deque(maxlen=PREDICTIONS_KEPT)
-        self.alarms: list[Alarm] = []
+        self.alarms: list[safety.Alarm] = []
         self.events: deque[JournalEntry] = deque(maxlen=EVENTS_KEPT)
         self.events_told = 0
         """Events so far; the last ones are in `events`."""
@@ -387,24 +382,24 @@ class Model:
             if known != value and str(known) != str(value):  # not a number is no news either
                 self.values[name] = value
                 self.changed.add(name)
-        if isinstance(record, Identity):
+        if isinstance(record, common.Identity):
             self._identity(service, record)
         elif isinstance(record, ProcessNow):
             is_after_gap = source.was_silent or self._is_silent(source) or self.is_stopped(service)
             source.was_silent = False
             self._moved(source, record.tick)
-            station = self.record("plant", StationStatus)
+            station = self.record("plant", plant.StationStatus)
             signals = station.signals if station else ()
             self.trends.add(record, self.mode, self.doubts, signals, is_after_gap=is_after_gap)
         elif isinstance(record, Prediction):
             if record.tick and (not self.predictions or self.predictions[-1].update != record.update):
                 self.predictions.append(record)
                 self.changed.add("prediction")
-        elif isinstance(record, SessionPace):  # from now on ticks follow another clock
+        elif isinstance(record, common.SessionPace):  # from now on ticks follow another clock
             for each in self.sources.values():
                 each.moved = self.now()
 
-    def _identity(self, service: str, identity: Identity) -> None:
+    def _identity(self, service: str, identity: common.Identity) -> None:
         if service == "control_plc" and identity.session:  # one that was started again looks for its session first
             if identity.session != self._session or identity.tick + STEP_BACK < self.trends.last_tick:
                 self._session = identity.session
@@ -418,7 +413,7 @@ class Model:
         if tick != source.tick:
             source.tick, source.moved = tick, self.now()
 
-    def put_alarms(self, rows: list[Alarm]) -> None:
+    def put_alarms(self, rows: list[safety.Alarm]) -> None:
         """Take the rows of the alarms."""
         if rows != self.alarms:
             self.alarms = rows
@@ -483,7 +478,7 @@ class Model:
     @property
     def limits(self) -> OperatingLimits:
         """Bands, bounds and rates."""
-        return self.record("optimizer_plc", OperatingLimits) or blank(OperatingLimits, self.maps["optimizer_plc"])
+        return self.record("optimizer_plc", OperatingLimits) or codec.blank(OperatingLimits, self.maps["optimizer_plc"])
 
     @property
     def tick(self) -> int:
@@ -503,7 +498,7 @@ class Model:
 
     def is_stopped(self, service: str) -> bool:
         """Return whether the tick of a service does not move although its session runs in real time."""
-        pace = self.record("plant", SessionPace)
+        pace = self.record("plant", common.SessionPace)
         if pace is None or not pace.realtime or pace.paused or not pace.session or not pace.factor > 0:
             return False
         patience = max(STALE_S, 3 * self.process.tick_s / pace.factor)
@@ -515,7 +510,7 @@ class Model:
         `update` is the newest updating period: it has no say while something else than MPC drives.
         """
         stale = [f"{service}." for service in self.maps if not self.is_live(service)]
-        identity = self.record("control_plc", Identity)
+        identity = self.record("control_plc", common.Identity)
         is_looking = identity is not None and not identity.session  # for its session: nothing is measured
         if self.is_live("control_plc") and (is_looking or self.is_stopped("control_plc")):
             stale.append("control_plc.process.")

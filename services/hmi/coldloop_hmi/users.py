@@ -19,7 +19,7 @@ import sys
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
 from functools import partial
@@ -353,25 +353,21 @@ class LoginSession:
         return self.user.role is PageRole.OPERATE
 
 
+@dataclass
 class LoginSessions:
-    """LoginSessions by their tokens, of which only digests are kept.
+    """Sessions by their tokens, of which only digests are kept."""
 
-    Args:
-        now: Monotonic clock, s.
-        idle_s: A session without a request for so long ends.
-        longest_s: Every session ends after this time.
-    """
-
-    def __init__(self, now: Callable[[], float], idle_s: float, longest_s: float) -> None:
-        self._now = now
-        self._idle_s = idle_s
-        self._longest_s = longest_s
-        self._sessions: OrderedDict[str, LoginSession] = OrderedDict()
+    now: Callable[[], float]
+    """Monotonic clock, s."""
+    idle_s: float
+    """A session without a request for so long ends."""
+    longest_s: float
+    """Every session ends after this time."""
+    _sessions: OrderedDict[str, LoginSession] = field(default_factory=OrderedDict, init=False)
 
     def begin(self, user: User) -> str:
         """Begin a session; return its token. The oldest session ends when there are too many."""
-        token = secrets.token_urlsafe(32)
-        now = self._now()
+        token, now = secrets.token_urlsafe(32), self.now()
         self._sessions[_digest(token)] = LoginSession(user, now, now)
         while len(self._sessions) > MOST_SESSIONS:
             self._sessions.popitem(last=False)
@@ -388,8 +384,8 @@ class LoginSessions:
         session = self._sessions.get(key)
         if session is None:
             return None
-        now = self._now()
-        if now - session.seen > self._idle_s or now - session.began > self._longest_s:
+        now = self.now()
+        if now - session.seen > self.idle_s or now - session.began > self.longest_s:
             del self._sessions[key]
             return None
         if is_use:
@@ -406,26 +402,23 @@ def _digest(token: str) -> str:
     return hashlib.sha256(token.encode(errors="surrogatepass")).hexdigest()
 
 
+@dataclass
 class ClientLimit:
-    """A bucket of requests for each address or party.
+    """A bucket of requests for each address or party."""
 
-    Args:
-        now: Monotonic clock, s.
-        per_second: Rate at which it fills.
-        burst: Its capacity.
-    """
-
-    def __init__(self, now: Callable[[], float], per_second: float, burst: float) -> None:
-        self._now = now
-        self._per_second = per_second
-        self._burst = burst
-        self._buckets: OrderedDict[str | Party, tuple[float, float]] = OrderedDict()
+    now: Callable[[], float]
+    """Monotonic clock, s."""
+    per_second: float
+    """Rate at which it fills."""
+    burst: float
+    """Its capacity."""
+    _buckets: OrderedDict[str | Party, tuple[float, float]] = field(default_factory=OrderedDict, init=False)
 
     def allows(self, address: str | Party) -> bool:
         """Take a request of an address or a party, or refuse it."""
-        now = self._now()
-        level, since = self._buckets.pop(address, (self._burst, now))
-        level = min(self._burst, level + (now - since) * self._per_second)
+        now = self.now()
+        level, since = self._buckets.pop(address, (self.burst, now))
+        level = min(self.burst, level + (now - since) * self.per_second)
         allowed = level >= 1.0
         self._buckets[address] = (level - 1.0 if allowed else level, now)
         while len(self._buckets) > MOST_ADDRESSES:
@@ -436,7 +429,7 @@ class ClientLimit:
         """Give a request back that shall not count."""
         if address in self._buckets:
             level, since = self._buckets[address]
-            self._buckets[address] = (min(self._burst, level + 1.0), since)
+            self._buckets[address] = (min(self.burst, level + 1.0), since)
 
 
 class LoginLimit:

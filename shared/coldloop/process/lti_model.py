@@ -114,11 +114,7 @@ class LtiModel(model_file.ModelDescription):
         model_file.write_document(path, self._document())
 
     def discretised(self, period_s: float) -> DiscreteModel:
-        """Return the model sampled every `period_s` (s, positive), inputs and load held in between.
-
-        Raises:
-            ValueError: the period is not positive and finite.
-        """
+        """Return `discretise` of it: sampled every `period_s` (s), inputs and load held in between."""
         return discretise(self.A, self.B, self.F, period_s)
 
     def _document(self) -> dict[str, Any]:

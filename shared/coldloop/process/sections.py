@@ -69,8 +69,8 @@ def _usual_weight(low: float, high: float) -> float:
     return 0.01 / ((high - low) / 4) ** 2 if high > low else 1.0
 
 
-class Input(Section):
-    """A manipulated input."""
+class Signal(Section):
+    """An input, an output or a disturbance."""
 
     name: Name
     """Letters, digits and underscores; of all signals another one."""
@@ -78,6 +78,11 @@ class Input(Section):
     """Its name in an FMU, if it is not `name`."""
     unit: str = ""
     """Shown with every value; an FMU may have it."""
+
+
+class Input(Signal):
+    """A manipulated input."""
+
     description: str = Field(default_factory=lambda given: given["name"])
     """Description of its register; its name if not given."""
     at: FiniteFloat
@@ -132,15 +137,9 @@ def _usual_dead_band(given: dict[str, Any]) -> float:
     return max(3.0 * given["noise"], 0.01 * (band[1] - band[0])) if band else 0.0
 
 
-class Output(Section):
+class Output(Signal):
     """A measured output."""
 
-    name: Name
-    """Letters, digits and underscores; of all signals another one."""
-    variable: str | None = None
-    """Its name in an FMU, if it is not `name`."""
-    unit: str = ""
-    """Shown with every value; an FMU may have it."""
     range: Range
     """Range of its sensor: a reading outside is no measurement."""
     noise: PositiveFloat
@@ -246,15 +245,9 @@ class Band:
     """Setpoint of the loop less the output at the operating point, in the unit of the output."""
 
 
-class Outside(Section):
+class Outside(Signal):
     """Quantity that acts on the plant and is no input."""
 
-    name: Name
-    """Letters, digits and underscores; of all signals another one."""
-    variable: str | None = None
-    """Its name in an FMU, if it is not `name`."""
-    unit: str = ""
-    """Shown with every value; an FMU may have it."""
     at: FiniteFloat
     """At the operating point."""
     span: Limits

@@ -27,7 +27,7 @@ from coldloop import __version__
 from coldloop.config import load_configuration
 from coldloop.errors import ColdloopError
 from coldloop.kernels.cache import announce_with
-from coldloop.service.command_line import add_configuration_options
+from coldloop.service import add_configuration_options
 
 CAPACITY: Final = 1000
 """Lines that wait to be written; a line has a few hundred bytes."""
@@ -294,14 +294,8 @@ async def _until_stopped(service: Awaitable[None], *, with_parent: bool) -> int:
     except asyncio.CancelledError:
         return 0
     except BaseExceptionGroup as group:
-        raise _first_cause(group) from None
+        cause: BaseException | None = group.subgroup(ColdloopError)
+        while isinstance(cause, BaseExceptionGroup):
+            cause = cause.exceptions[0]
+        raise (cause or group) from None
     return 0
-
-
-def _first_cause(group: BaseExceptionGroup[BaseException]) -> BaseException:
-    for error in group.exceptions:
-        if isinstance(error, BaseExceptionGroup):
-            return _first_cause(error)
-        if isinstance(error, ColdloopError):
-            return error
-    return group

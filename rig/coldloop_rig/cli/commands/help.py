@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import UsageError
-from coldloop.service.command_line import add_configuration_options
+from coldloop.service import add_configuration_options
 from coldloop_rig.cli.commands.options import configuration
 
 HEADING: Final = re.compile(r"^(#+) +(.+)$")

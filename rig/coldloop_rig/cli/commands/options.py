@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from coldloop.errors import UsageError
 from coldloop.process.updating_periods import SHORTEST_TICKS
-from coldloop.service.command_line import add_configuration_options
+from coldloop.service import add_configuration_options
 from coldloop_rig.cli import process_setting
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import UsageError
-from coldloop.service.command_line import add_configuration_options
+from coldloop.service import add_configuration_options
 from coldloop.text import require_regular_file, whole_text
 from coldloop_rig.cli.commands import options as common
 from coldloop_rig.text_tables import aligned, fitted, width

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from coldloop.errors import UsageError
 from coldloop.process.updating_periods import LONGEST_TICKS
-from coldloop.service.command_line import add_configuration_options
+from coldloop.service import add_configuration_options
 from coldloop_rig.cli.commands import options as common
 from coldloop_rig.interruption import run_until_interrupted
 from coldloop_rig.text_tables import coloured, cut, fitted, width

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from coldloop.errors import NOT_FINITE, UsageError
 from coldloop.process.updating_periods import duration
-from coldloop.service.command_line import add_configuration_options
+from coldloop.service import add_configuration_options
 from coldloop_rig.cli.commands import options as common
 
 if TYPE_CHECKING:
