@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop_export.c_files import OdeExport
-from coldloop_export.golden import ITERATIONS, PER_PROBLEM, GoldenVector, paper_settings, record
+from coldloop_export.golden import PER_PROBLEM, GoldenVector, paper_settings, record
 
 GIVEN = (*PER_PROBLEM, "guess")
 
@@ -31,7 +31,9 @@ def write(model: Path, folder: Path, ticks: int, loads: Iterable[str]) -> int:
     """Write sources and files of the problems of a run of each load; return how many there are."""
     runs = [record(paper_settings(model), ticks, load) for load in loads]
     first = runs[0].vectors[0]
-    OdeExport(runs[0].method, first.problem, np.arange(1, ITERATIONS + 1)).write(folder, [first])
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in OdeExport(runs[0].method, [first]).files().items():
+        (folder / name).write_text(text, encoding="ascii")
     vectors = [each for run in runs for each in run.vectors]
     (folder / "problems").write_bytes(b"".join(map(given, vectors)))
     (folder / "answers").write_bytes(b"".join(map(found, vectors)))

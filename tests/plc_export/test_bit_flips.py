@@ -3,14 +3,13 @@
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 import pytest
 
 from coldloop.errors import UsageError
 from coldloop.process.settings import InputLimits
 from coldloop_export.c_files import GuardExport, OdeExport, OptimizerExport
 from coldloop_export.folder import flipped
-from coldloop_export.golden import ITERATIONS, GoldenVectors, GuardKernels, golden_calls
+from coldloop_export.golden import GoldenVectors, GuardKernels, golden_calls
 from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, write
 from tests.plc_export.recorded_optimizers import OPTIMISERS, recorded_updates, recorder
 
@@ -72,9 +71,9 @@ def test_a_self_test_that_fails_as_it_is_gets_one_line(tmp_path: Path) -> None:
 def test_no_change_of_the_solver_and_the_guard_is_missed(
     tmp_path: Path, recorded: GoldenVectors, compiler: tuple[str, str]
 ) -> None:
-    solver = OdeExport(recorded.method, recorded.vectors[0].problem, np.arange(1, ITERATIONS + 1))
-    guard = GuardExport(GuardKernels(InputLimits()), golden_calls(InputLimits()))
-    for name, texts in (("solver", solver.files(recorded.vectors)), ("guard", guard.files())):
+    solver = OdeExport(recorded.method, recorded.vectors)
+    guard = GuardExport(GuardKernels(InputLimits()), golden_calls(InputLimits()), 0.25)
+    for name, texts in (("solver", solver.files()), ("guard", guard.files())):
         (tmp_path / name).mkdir()
         write(tmp_path / name, texts)
         found = flipped(tmp_path / name, compiler, count=27)

@@ -14,7 +14,7 @@ from coldloop_optimizer_plc.qp.costs import matrices_of
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.interface import Costs
 from coldloop_optimizer_plc.solvers.ode import Flow, OdeMethod, solve
-from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, compiled, output
+from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, compiled, output, write
 
 REAL = re.compile(r"(?<=[ {])-?\d\.\d{9}e[+-]\d\df")
 
@@ -22,14 +22,14 @@ pytestmark = pytest.mark.skipif(not COMPILERS, reason=NO_COMPILER)
 
 
 def export_of(recorded: GoldenVectors) -> OdeExport:
-    return OdeExport(recorded.method, recorded.vectors[0].problem, np.arange(1, ITERATIONS + 1))
+    return OdeExport(recorded.method, recorded.vectors)
 
 
 @pytest.fixture(scope="module")
 def folder(recorded: GoldenVectors, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A fresh export with the golden vectors of that recorded."""
     made = tmp_path_factory.mktemp("export")
-    export_of(recorded).write(made, recorded.vectors)
+    write(made, export_of(recorded).files())
     return made
 
 
@@ -62,7 +62,7 @@ def in_double(recorded: GoldenVectors, most: int) -> GoldenVectors:
 @pytest.mark.night
 def test_double_precision_has_the_same_bits_too(recorded: GoldenVectors, tmp_path: Path) -> None:
     double = in_double(recorded, 5)
-    export_of(double).write(tmp_path, double.vectors)
+    write(tmp_path, export_of(double).files())
     assert output(compiled(tmp_path, COMPILERS[0], "-O2"))[1].endswith("\n5 golden vectors, 0 failures\n")
 
 

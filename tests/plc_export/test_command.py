@@ -136,6 +136,13 @@ def test_it_is_the_solver_of_the_process_that_is_named(processes: Processes, tmp
             ("plc", "--target", "c", "--out", "new", "--set", "optimizer_plc.program.arithmetic=float64"),
             "in single precision alone",
         ),
+        *(
+            (
+                ("plc", "--target", target, "--out", "new", "--set", f"optimizer_plc.program.solver={solver}"),
+                "with the ODE-based solver alone",
+            )
+            for target, solver in (("c", "interior-point"), ("c", "hybrid"), ("c", "fast-gradient"), ("st", "hybrid"))
+        ),
         (("plc", "--out", "new"), "--target is required"),
     ],
 )

@@ -105,9 +105,7 @@ def test_a_statement_of_more_than_a_piece_is_refused_with_file_and_line(monkeypa
 
 @pytest.fixture(scope="module")
 def solver(recorded: GoldenVectors) -> Machine:
-    return Machine(
-        *StructuredTextExport(recorded.method, recorded.vectors[0].problem, recorded.vectors[:1]).files().values()
-    )
+    return Machine(*StructuredTextExport(recorded.method, recorded.vectors[:1]).files().values())
 
 
 @pytest.mark.parametrize("work", [1, 3000, 10**9])

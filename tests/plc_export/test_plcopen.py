@@ -53,7 +53,7 @@ def texts(recorded: GoldenVectors, request: pytest.FixtureRequest) -> dict[str, 
     """The Structured Text of the output guard, or of the solver with two of the problems."""
     if request.param != "solver":
         return GuardText(GuardKernels(InputLimits()), golden_calls(InputLimits())).files()
-    return StructuredTextExport(recorded.method, recorded.vectors[0].problem, recorded.vectors[:2]).files()
+    return StructuredTextExport(recorded.method, recorded.vectors[:2]).files()
 
 
 @pytest.fixture(scope="module")

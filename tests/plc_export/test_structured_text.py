@@ -28,7 +28,7 @@ pytestmark = [
 @pytest.fixture(scope="module")
 def export(recorded: GoldenVectors) -> StructuredTextExport:
     """The export with two of the problems."""
-    return StructuredTextExport(recorded.method, recorded.vectors[0].problem, recorded.vectors[:2])
+    return StructuredTextExport(recorded.method, recorded.vectors[:2])
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 
 from coldloop.errors import ColdloopError
 from coldloop_optimizer_plc.computing_settings import OutsideSettings
-from coldloop_studies.any_process import CompareStudy
+from coldloop_studies.any_process import COMPARE
 from coldloop_studies.settings import _digest, outside_digests
 from coldloop_studies.study import StudyOptions, read_variants
 
@@ -35,14 +35,14 @@ def written(folder: Path, text: str) -> Path:
 def test_costs_are_compared_draw_by_draw(tmp_path: Path, made_up: "MakeOutcome") -> None:
     """Ratios of 2 and 2.42 have the geometric mean 2.2; their logarithms are ln 1.1 from its own, its deviation too."""
     options = StudyOptions(seeds=2, loads=("a",), variants=read_variants(written(tmp_path, FILE)))
-    asked = CompareStudy().requests(options)
+    asked = COMPARE.requests(options)
     assert [(run.load, run.updating_period_s) for run in asked] == [("a", 0), ("a@2", 0), ("a", 2.5), ("a@2", 2.5)]
     shares = (0.0, 0.0, 1.0, 3.0)
     outcomes = {
         run: made_up(J_BF=cost, outside_band_pct={"L1": share, "T5": 0.0})
         for run, cost, share in zip(asked, (1.0, 10.0, 2.0, 24.2), shares, strict=True)
     }
-    result = CompareStudy().evaluate(options, outcomes)
+    result = COMPARE.evaluate(options, outcomes)
     factor = math.exp(T_1 * math.log(1.1))
     over = f"2.200 [{2.2 / factor:.3f}, {2.2 * factor:.3f}]"
     assert f"| fixed 2.5 s | {over} | no difference is shown | 2 | 0 |" in result.remarks[0]
@@ -52,7 +52,7 @@ def test_costs_are_compared_draw_by_draw(tmp_path: Path, made_up: "MakeOutcome")
 
 def test_a_short_comparison_leaves_table_figure_and_manifest(tmp_path: Path, conducted: "Conducted") -> None:
     variants = read_variants(written(tmp_path, FILE))
-    conducted(CompareStudy(), StudyOptions(seeds=1, loads=("a",), ticks=240, variants=variants))
+    conducted(COMPARE, StudyOptions(seeds=1, loads=("a",), ticks=240, variants=variants))
     folder = tmp_path / "compare"
     rows = list(csv.DictReader((folder / "results.csv").read_text().splitlines()))
     assert [(row["variant"], row["mean tau_u (s)"] == "2.5") for row in rows] == [

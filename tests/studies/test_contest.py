@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop_studies.controllers import REFERENCE, SOLVERS, WAYS, ContestStudy
+from coldloop_studies.controllers import CONTEST, REFERENCE, SOLVERS, WAYS
 from coldloop_studies.request import Outcome, RunRequest
 from coldloop_studies.settings import settings_of
 from coldloop_studies.study import StudyOptions
@@ -14,7 +14,7 @@ from tests.studies.conftest import NOTHING
 if TYPE_CHECKING:
     from tests.studies.conftest import Conducted
 
-STUDY = ContestStudy()
+STUDY = CONTEST
 
 
 def outcome(closed: float, opened: float) -> Outcome:

@@ -12,10 +12,10 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop_studies.penalties import (
     FIRST,
     OWN,
+    PENALTIES,
     PRESETS,
     VARIANTS,
     Paired,
-    PenaltiesStudy,
     PenaltyVariant,
     end_over_best,
     misfit,
@@ -106,7 +106,7 @@ def test_the_whole_study_of_half_a_minute_has_a_row_for_each_run(
 ) -> None:
     monkeypatch.setenv("COLDLOOP__PLANT__SEED", "7")  # the environment does not count
     options = StudyOptions(quick=True, ticks=120)
-    study = PenaltiesStudy()
+    study = PENALTIES
     result = conducted(study, options)
     assert len(result.rows) == len(study.requests(options))
     text = (tmp_path / "penalties" / "section.md").read_text()

@@ -1,8 +1,7 @@
 """Solver, whole optimiser and output guard as folders of C99: sources, constants, golden vectors, self-tests."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import reduce
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -10,41 +9,38 @@ import numpy as np
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop_export import golden, tree
-from coldloop_export.c_printer import GENERATED, Array, ConstantRecords, KernelFiles, Printer, golden_files, identifier
+from coldloop_export.c_printer import GENERATED, ConstantRecords, KernelFiles, Printer, golden_files, identifier
 from coldloop_export.golden import PER_PROBLEM, GoldenCall, GoldenUpdate, GoldenVector, GuardKernels, OdeProgram, crc
 from coldloop_export.tree import ArrayType, Function, Invoke, Kind, RecordType, StructType, Type, filled, template, walk
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.interface import Costs
 from coldloop_optimizer_plc.solvers.ode import OdeMethod
 
 
-class OdeExport:
-    """The solver for the matrices of one problem, with an answer after each of some counts of iterations, as C99."""
+class OdeExport(tree.Export):
+    """The solver for the matrices of one problem as C99, with an answer after each iteration, and golden vectors."""
 
-    def __init__(self, method: OdeMethod, problem: QuadraticProblem, counts: Array) -> None:
-        self.method, self.problem, self.counts = method, problem, counts
-        self.program = OdeProgram(method, problem, counts)
-        self.printer = Printer(problem.phi.dtype.type)
-        self.real = self.printer.scalars[Kind.REAL]
-        self.entry = self.program.entry
-        self.kernels = KernelFiles(self.printer, self.program.functions, [self.entry], "solver", self._constants())
+    def __init__(self, method: OdeMethod, vectors: Sequence[GoldenVector]) -> None:
+        self.method, self.problem, self.vectors = method, vectors[0].problem, vectors
+        self.counts = np.arange(1, len(vectors[0].answer.costs) + 1)
+        program = OdeProgram(method, self.problem, self.counts)
+        self.printer = Printer(self.problem.phi.dtype.type)
+        self.real, self.entry = self.printer.scalars[Kind.REAL], program.entry
+        matrices = golden.leaves(("matrices",), method.matrices).items()
+        self.constants = {
+            "Phi": self.problem.Phi, "Gamma": self.problem.Gamma, "counts": self.counts,
+            **{"_".join(path): values for path, values in matrices},
+            "flow": np.array([float(each) for each in method.flow], self.problem.phi.dtype),
+        }  # fmt: skip
+        self.kernels = KernelFiles(self.printer, program.functions, [self.entry], "solver", self.constants)
 
     # -- files ---------------------------------------------------------------------------------------------------------
 
-    def write(self, folder: Path, vectors: Iterable[GoldenVector]) -> list[Path]:
-        """Write the files, with some golden vectors, into a folder that is made; return their paths."""
-        folder.mkdir(parents=True, exist_ok=True)
-        files = self.files(vectors)
-        for name, text in files.items():
-            (folder / name).write_text(text, encoding="ascii")
-        return [folder / name for name in files]
-
-    def files(self, vectors: Iterable[GoldenVector]) -> dict[str, str]:
-        """Return the texts of the files by their names, with some golden vectors."""
+    def files(self) -> dict[str, str]:
+        """Return the texts of the files by their names."""
         header = {"N": len(self.problem.phi), "M": len(self.problem.gamma), "K": len(self.counts),
                   "FIRST": self.counts[0], "LAST": self.counts[-1]}  # fmt: skip
-        constants = self._constants().items()
+        constants = self.constants.items()
         declared = "".join(f"extern const {self.printer.scalar(values)} {name}[{values.size}];\n"
                            for name, values in constants)  # fmt: skip
         literals = np.array([float(each.rstrip("f")) for each in self.printer.literals], self.problem.phi.dtype)
@@ -54,29 +50,21 @@ class OdeExport:
         return {
             **self.kernels.texts(), "problem.h": self._filled("problem.h", header), "problem.c": self._problem(),
             "tables.h": self._filled("tables.h", {"DECLARED": declared, "SUM": sum_}), "tables.c": tables,
-            **self._golden(list(vectors)), "self_test.c": self._filled("self_test.c", {}),
+            **self._golden(self.vectors), "self_test.c": self._filled("self_test.c", {}),
         }  # fmt: skip
 
-    def sizes(self, vectors: Iterable[GoldenVector]) -> dict[str, int]:
+    def sizes(self) -> dict[str, int]:
         """Return the bytes of what a PLC needs; the stack is that of the deepest calls, without what compilers add."""
         word = self.problem.phi.itemsize
         constants = word * len(self.printer.literals) + sum(
-            values.size * (word if values.dtype.kind == "f" else 4) for values in self._constants().values()
+            values.size * (word if values.dtype.kind == "f" else 4) for values in self.constants.values()
         )
-        arrays = (values for each in vectors for values in golden.arrays_in(each).values())
+        arrays = (values for each in self.vectors for values in golden.arrays_in(each).values())
         return {"constants": constants, "stack of `solve_problem`, arrays and numbers": stack(self.entry, word),
                 "self-test and golden vectors": word * sum(values.size for values in arrays)}  # fmt: skip
 
-    def _constants(self) -> dict[str, Array]:
-        """Return the constant arrays by name."""
-        flow = np.array([float(each) for each in self.method.flow], self.problem.phi.dtype)
-        matrices = {
-            "_".join(path): values for path, values in golden.leaves(("matrices",), self.method.matrices).items()
-        }
-        return {"Phi": self.problem.Phi, "Gamma": self.problem.Gamma, "counts": self.counts, **matrices, "flow": flow}
-
     def _problem(self) -> str:
-        constants = self._constants()
+        constants = self.constants
         sums = "\n".join(
             f"    sum = sum_of_{'reals' if values.dtype.kind == 'f' else 'integers'}(sum, {name}, {values.size});"
             for name, values in constants.items()
@@ -96,7 +84,7 @@ class OdeExport:
                 "BEFORE": none, "VECTORS": vectors}  # fmt: skip
         return self._filled("problem.c", body)
 
-    def _golden(self, vectors: list[GoldenVector]) -> dict[str, str]:
+    def _golden(self, vectors: Sequence[GoldenVector]) -> dict[str, str]:
         """Return the files of the golden vectors: inputs and results of all in a row."""
         stacked = {
             **{name: np.array([getattr(each.problem, name) for each in vectors]) for name in PER_PROBLEM},
@@ -142,7 +130,7 @@ def stack(function: Function, word: int) -> int:
 TABLES: Final = ("constants", "method", "rules", "starts")
 
 
-class OptimizerExport:
+class OptimizerExport(tree.Export):
     """The optimiser of some settings as C99, with golden updates."""
 
     def __init__(self, optimizer: OptimizerProgram, updates: Sequence[GoldenUpdate]) -> None:
@@ -216,7 +204,7 @@ def size_of(kind: Type, real: int = 4) -> int:
     return (real if scalar is Kind.REAL else 4) * count
 
 
-class GuardExport:
+class GuardExport(tree.Export):
     """The output guard for some limits as C99, with golden calls."""
 
     def __init__(self, kernels: GuardKernels, calls: Sequence[GoldenCall], tick_s: float) -> None:

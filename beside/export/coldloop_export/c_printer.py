@@ -18,8 +18,15 @@ KEYWORDS: Final = """
     restrict return short signed sizeof static struct switch typedef union unsigned void volatile while bool true false
     main y0 y1 j0 j1 gamma
 """
-INFIX: Final = {"and": "&&", "or": "||"}
-OF_MATH: Final = {"sqrt": "sqrt", "abs": "fabs", "power": "pow", "log": "log", "copysign": "copysign", "round": "rint"}
+OPERATORS: Final = {
+    "and": "({0} && {1})", "or": "({0} || {1})", "not": "(!{0})", "negative": "(-{0})", "min": "min_{kind}({0}, {1})",
+    "max": "max_{kind}({0}, {1})", "%": "floor_mod({0}, {1})", "//": "floor_div({0}, {1})",
+    **{name: f"({name}({{0}}) != 0)" for name in ("isfinite", "isinf", "isnan")},
+}  # fmt: skip
+OF_MATH: Final = {
+    "sqrt": "sqrt{}({{0}})", "abs": "fabs{}({{0}})", "power": "pow{}({{0}}, {{1}})", "log": "log{}({{0}})",
+    "copysign": "copysign{}({{0}}, {{1}})", "round": "rint{}({{0}})",
+}  # fmt: skip
 """Functions of <math.h>; rint rounds a half to the even number, as Python does."""
 
 
@@ -31,12 +38,15 @@ def identifier(name: str) -> str:
 class Printer(tree.TreePrinter):
     """Prints for one floating-point type."""
 
-    table = "literals"
+    table, truth = "literals", ("false", "true")
 
     def __init__(self, real: type[np.floating]) -> None:
         super().__init__(real)
         self.scalars = {Kind.REAL: "float" if self.single else "double", Kind.INT: "int32_t",
                         Kind.UNSIGNED: "int32_t", Kind.BOOL: "bool"}  # fmt: skip
+        self.operators = {**OPERATORS, **{name: text.format("f" * self.single) for name, text in OF_MATH.items()},
+                          "single": f"(({self.scalars[Kind.REAL]})(float){{0}})"}  # fmt: skip
+        self.kinds = {**dict.fromkeys(Kind, "int"), Kind.REAL: "real"}
         self._loops = 0
         self._results: tuple[Name, ...] = ()
         self._made: set[Name] = set()
@@ -123,26 +133,22 @@ class Printer(tree.TreePrinter):
         self._constant = {each.name for each in function.parameters if each.name not in function.written}
         unused = [f"    (void){identifier(each.name)};" for each in function.parameters
                   if each.name not in function.used]  # fmt: skip
-        lines = [*unused, *self._block(function.body, 1)]
-        body = "".join(f"{line}\n" for line in lines)
+        body = "".join(f"{line}\n" for line in (*unused, *self.body(function.body)))
         return f"/* {tree.place_of(function.source)} */\n{storage}{self.signature(function)} {{\n{body}}}\n"
 
-    def _block(self, statements: Iterable[tree.Statement], depth: int) -> Iterator[str]:
-        for statement in statements:
-            yield from self._statement(statement, depth)
-
-    def _statement(self, statement: tree.Statement, depth: int) -> Iterator[str]:  # noqa: C901, PLR0912 one case a statement
-        pad = "    " * depth
+    def statement(self, statement: tree.Statement) -> Iterator[str]:  # noqa: C901, PLR0912 one case a statement
+        """Yield the lines of a statement."""
         match statement:
             case tree.Declare(variable, value):
                 name, kind = identifier(variable.name), variable.type
                 if isinstance(kind, tree.ArrayType):
-                    yield f"{pad}{self.scalars[kind.kind]} {name}[{max(kind.size, 1)}] = {{0}};"
+                    yield f"{self.scalars[kind.kind]} {name}[{max(kind.size, 1)}] = {{0}};"
                 else:
                     initial = self._bare(value or Literal(kind, 0)) if isinstance(kind, Kind) else ""
-                    yield f"{pad}{self.declaration(kind, name)} = {initial};"
+                    yield f"{self.declaration(kind, name)} = {initial};"
             case tree.Assign(target, value):
-                yield f"{pad}{self._target(target)} = {self._bare(value)};"
+                place = f"*{target.name}" if target in self._results else self.expression(target)
+                yield f"{place} = {self._bare(value)};"
             case tree.Point(variable, part, constant):
                 root: Expression = part.array if isinstance(part, View) else part.rows
                 while isinstance(root, tree.Field):
@@ -150,68 +156,44 @@ class Printer(tree.TreePrinter):
                 fixed = constant or (isinstance(root, Name) and root.name in self._constant)
                 self._constant |= {variable.name} if fixed else set()
                 declared = self.declaration(variable.type, identifier(variable.name), constant=fixed)
-                yield f"{pad}{declared} = {self._argument(part)};"
+                yield f"{declared} = {self._argument(part)};"
             case tree.Make(variable, parts):
                 self._made.add(variable)
                 listed = ", ".join(f".{identifier(name)} = {self._argument(part)}" for name, part in parts)
-                yield f"{pad}const {self._element(variable.type)} {identifier(variable.name)} = {{{listed}}};"
+                yield f"const {self._element(variable.type)} {identifier(variable.name)} = {{{listed}}};"
             case tree.Copy(target, source):
-                yield f"{pad}*{self._argument(target)} = *{self._argument(source)};"
+                yield f"*{self._argument(target)} = *{self._argument(source)};"
             case tree.Invoke(function, arguments, results):
-                yield f"{pad}{self._call(function, (*arguments, *results), len(arguments))};"
-            case tree.For():
-                yield from self._for(statement, depth)
+                yield f"{self._call(function, (*arguments, *results), len(arguments))};"
+            case tree.For(variable, start, stop, step, body):
+                name, first, end = identifier(variable.name), self._bare(start), self._bare(stop)
+                if not isinstance(stop, Literal):
+                    self._loops += 1
+                    yield f"const int32_t stop_{self._loops} = {end};"
+                    end = f"stop_{self._loops}"
+                sign, change = ("<", f"{name} += {step}") if step > 0 else (">", f"{name} -= {-step}")
+                yield from self.nested(f"for (int32_t {name} = {first}; {name} {sign} {end}; {change}) {{", body, "}")
             case tree.While(condition, body):
-                yield f"{pad}while ({self._bare(condition)}) {{"
-                yield from self._block(body, depth + 1)
-                yield f"{pad}}}"
+                yield from self.nested(f"while ({self._bare(condition)}) {{", body, "}")
             case tree.If():
-                yield from self._if(statement, depth)
+                head, other = "if", tuple[tree.Statement, ...]((statement,))
+                while len(other) == 1 and isinstance(other[0], tree.If):
+                    yield f"{head} ({self._bare(other[0].condition)}) {{"
+                    yield from self.body(other[0].body)
+                    head, other = "} else if", other[0].other
+                yield from self.nested("} else {", other, "}") if other else "}"
             case tree.Return(value):
-                yield f"{pad}return {self._bare(value)};" if value else f"{pad}return;"
-
-    def _if(self, statement: tree.If, depth: int) -> Iterator[str]:
-        pad, head = "    " * depth, "if"
-        other: tuple[tree.Statement, ...] = (statement,)
-        while len(other) == 1 and isinstance(other[0], tree.If):
-            yield f"{pad}{head} ({self._bare(other[0].condition)}) {{"
-            yield from self._block(other[0].body, depth + 1)
-            head, other = "} else if", other[0].other
-        if other:
-            yield f"{pad}}} else {{"
-            yield from self._block(other, depth + 1)
-        yield f"{pad}}}"
-
-    def _target(self, target: tree.Target) -> str:
-        if isinstance(target, Name) and target in self._results:
-            return f"*{target.name}"
-        return self.expression(target)
-
-    def _for(self, loop: tree.For, depth: int) -> Iterator[str]:
-        pad, name = "    " * depth, identifier(loop.variable.name)
-        start, stop = self._bare(loop.start), self._bare(loop.stop)
-        if not isinstance(loop.stop, Literal):
-            self._loops += 1
-            yield f"{pad}const int32_t stop_{self._loops} = {stop};"
-            stop = f"stop_{self._loops}"
-        sign, step = ("<", f"{name} += {loop.step}") if loop.step > 0 else (">", f"{name} -= {-loop.step}")
-        yield f"{pad}for (int32_t {name} = {start}; {name} {sign} {stop}; {step}) {{"
-        yield from self._block(loop.body, depth + 1)
-        yield f"{pad}}}"
+                yield f"return {self._bare(value)};" if value else "return;"
 
     # -- expressions ---------------------------------------------------------------------------------------------------
 
-    def expression(self, expression: Expression) -> str:  # noqa: C901, PLR0911, PLR0912 one case a kind
-        """Return an expression, with parentheses around each operation."""
+    def place(self, element: tree.Element) -> str:
+        """Return the index of an element in its array."""
+        return bare(super().place(element))
+
+    def other(self, expression: Expression) -> str:  # noqa: PLR0911 one case a kind of expression
+        """Return a name, a part of something, a choice, a conversion or a call."""
         match expression:
-            case Literal(Kind.REAL, value):
-                return self.literal(value)
-            case Literal(Kind.BOOL, value):
-                return "true" if value else "false"
-            case Literal(_, value):
-                return f"{value}" if value >= 0 else f"({value})"
-            case Name(_, name):
-                return identifier(name)
             case tree.Field(_, record, name):
                 pointed = isinstance(record, Name) and record not in self._made
                 return f"{self.expression(record)}{'->' if pointed else '.'}{identifier(name)}"
@@ -219,46 +201,20 @@ class Printer(tree.TreePrinter):
                 return f"{self.expression(record)}{'->' if isinstance(record, Name) else '.'}{identifier(name)}"
             case tree.Item(_, rows, index):
                 return f"{self.expression(rows)}[{self.expression(index)}]"
-            case tree.Element(_, View(_, array), _):
-                return f"{self.expression(array)}[{bare(self.place(expression))}]"
-            case tree.Element():
-                return f"{self.expression(expression.array)}[{bare(self.place(expression))}]"
             case View():
                 return self._argument(expression)
-            case tree.Operation():
-                return self._operation(expression)
             case tree.Select(_, condition, one, other):
                 return f"({self.expression(condition)} ? {self.expression(one)} : {self.expression(other)})"
             case tree.Convert(kind, operand):
                 return f"(({self.scalars[kind]}){self.expression(operand)})"
             case tree.Invocation(_, function, arguments):
                 return self._call(function, arguments, len(arguments))
+        assert isinstance(expression, Name)  # noqa: S101 no other is left
+        return identifier(expression.name)
 
     def _bare(self, expression: Expression) -> str:
         """Return an expression that stands alone."""
         return bare(self.expression(expression))
-
-    def _operation(self, operation: tree.Operation) -> str:  # noqa: PLR0911 one case an operator
-        parts = [self.expression(each) for each in operation.operands]
-        kind = "real" if operation.operands[0].type is Kind.REAL else "int"
-        listed = ", ".join(parts)
-        match operation.operator:
-            case name if name in OF_MATH:
-                return f"{OF_MATH[name]}{'f' * self.single}({listed})"
-            case "single":
-                return f"(({self.scalars[Kind.REAL]})(float){listed})"
-            case "isfinite" | "isinf" | "isnan" as name:
-                return f"({name}({listed}) != 0)"
-            case "min" | "max" as name:
-                return f"{name}_{kind}({listed})"
-            case "%" | "//" as sign:
-                return f"{'floor_mod' if sign == '%' else 'floor_div'}({listed})"
-            case "negative":
-                return f"(-{parts[0]})"
-            case "not":
-                return f"(!{parts[0]})"
-            case sign:
-                return f"({parts[0]} {INFIX.get(sign, sign)} {parts[1]})"
 
     def _call(self, function: Function, arguments: tuple[Expression, ...], results_from: int) -> str:
         printed = []

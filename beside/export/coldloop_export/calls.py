@@ -68,8 +68,7 @@ class CallReader(expressions.ExpressionReader):
             return tree.Convert(Kind.INT, operand)
         if hasattr(called.value, "_fields"):
             made: Any = called.value
-            if len(node.args) != len(made._fields):
-                raise self.refusal(node, f"{made.__name__} has {len(made._fields)} fields")
+            self.refuse_if(len(node.args) != len(made._fields), node, f"{made.__name__} has {len(made._fields)} fields")
             parts = (self.typed(each, self.read(each)) for each in node.args)
             return Record(made.__name__, tuple(zip(made._fields, parts, strict=True)))
         if called.value in FUNCTIONS:
@@ -107,8 +106,7 @@ class CallReader(expressions.ExpressionReader):
         return Elementwise(array.type, lambda indices: expressions.element_of(array, indices))
 
     def _converted(self, node: ast.Call, kind: Kind) -> Value:
-        if len(node.args) != 1:
-            raise self.refusal(node, "a type takes one argument")
+        self.refuse_if(len(node.args) != 1, node, "a type takes one argument")
         value = self.read(node.args[0])
         if isinstance(value, Known):
             return Literal(kind, value.value)

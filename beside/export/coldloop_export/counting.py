@@ -32,9 +32,11 @@ from coldloop_rig.plc_sizing.plc import CallCost
 COUNTED: Final = {"+", "-", "*", "/", "sqrt", "power", "log"}
 INTEGERS: Final = {Kind.INT: np.int64, Kind.UNSIGNED: np.int64, Kind.BOOL: np.bool_}
 KINDS: Final = [Kind.REAL, *INTEGERS]
-CALLED: Final = {
-    "sqrt": "np.sqrt", "abs": "abs", "log": "_log", "copysign": "np.copysign", "round": "np.rint", "not": "not ",
-    "negative": "-", "single": "_single", "isfinite": "np.isfinite", "isinf": "np.isinf", "isnan": "np.isnan",
+OPERATORS: Final = {
+    "not": "(not {0})", "negative": "(-{0})", "power": "({0} ** {1})", "sqrt": "np.sqrt({0})", "abs": "abs({0})",
+    "log": "_log({0})", "copysign": "np.copysign({0}, {1})", "round": "np.rint({0})", "single": "_single({0})",
+    "min": "min({0}, {1})", "max": "max({0}, {1})",  # the first of two equal ones, as in the kernels
+    **{name: f"np.{name}({{0}})" for name in ("isfinite", "isinf", "isnan")},
 }  # fmt: skip
 
 
@@ -53,8 +55,9 @@ class CountedProgram:
             "_part": _part, "_of": self._of, "_r": real, "_t": [real, *INTEGERS.values()],
             "_single": lambda value: real(np.float32(value)),
         }  # fmt: skip
+        printer = _Printer(real)
         for function in functions:
-            exec("\n".join(_Printer(function).lines()), self._known)  # noqa: S102 text of this file
+            exec("\n".join(printer.lines(function)), self._known)  # noqa: S102 text of this file
 
     def _of(self, count: int, value: object) -> object:
         self._count[0] += count
@@ -97,113 +100,93 @@ def _part(array: NDArray[Any], offset: int, shape: tuple[int, ...]) -> NDArray[A
     return array.reshape(-1)[offset : offset + math.prod(shape)].reshape(shape)
 
 
-class _Printer:
-    """Prints one function as Python."""
+class _Printer(tree.TreePrinter):
+    """Prints functions as Python."""
 
-    def __init__(self, function: Function) -> None:
-        self.function = function
-        self._numbers = [each.name for each in function.results if isinstance(each.type, Kind)]
+    truth, kinds, operators = ("False", "True"), dict.fromkeys(Kind, ""), OPERATORS
 
-    def lines(self) -> Iterator[str]:
-        names = [each.name for each in self.function.parameters]
-        names += [each.name for each in self.function.results if isinstance(each.type, ArrayType)]
-        yield f"def {self.function.name}({', '.join(names)}):"
-        yield from self._body(self.function.body)
-        if not self.function.value:
-            yield f" return ({''.join(f'{each}, ' for each in self._numbers)})"
+    def lines(self, function: Function) -> Iterator[str]:
+        """Yield the lines of a function."""
+        arrays = (each for each in function.results if isinstance(each.type, ArrayType))
+        numbers = "".join(f"{each.name}, " for each in function.results if isinstance(each.type, Kind))
+        self._end = f"return ({numbers})"
+        yield f"def {function.name}({', '.join(each.name for each in (*function.parameters, *arrays))}):"
+        yield from self.body(function.body)
+        yield f"    {self._end}"
 
-    def _body(self, statements: Sequence[Statement]) -> list[str]:
-        return [f" {line}" for each in statements for line in self._statement(each)] or [" pass"]
-
-    def _statement(self, statement: Statement) -> Iterator[str]:  # noqa: C901, PLR0912 one case a statement
-        if not isinstance(statement, tree.While) and (count := sum(map(operations_in, expressions_of(statement)))):
+    def statement(self, statement: Statement) -> Iterator[str]:  # noqa: C901 one case a statement
+        """Yield the lines of a statement."""
+        if count := operations_in(statement):
             yield f"_n[0] += {count}"
         match statement:
             case Declare(tree.Name(ArrayType(kind, shape), name), _):
                 yield f"{name} = np.zeros({shape}, _t[{KINDS.index(kind)}])"
             case Declare(variable, value):
-                yield f"{variable.name} = {self._of(value or tree.Literal(variable.type, 0))}"  # type: ignore[arg-type]
+                yield f"{variable.name} = {self.expression(value or tree.Literal(variable.type, 0))}"  # type: ignore[arg-type]
             case tree.Assign(target, value):
-                yield f"{self._target(target)} = {self._of(value)}"
+                text = self.expression(target)
+                place = text.removeprefix("int(").removesuffix(")") if text.startswith("int(") else text
+                yield f"{place} = {self.expression(value)}"
             case tree.Point(variable, part):
-                yield f"{variable.name} = {self._of(part)}"
+                yield f"{variable.name} = {self.expression(part)}"
             case tree.Make(variable, parts):
-                yield f"{variable.name} = SimpleNamespace({', '.join(f'{n}={self._of(part)}' for n, part in parts)})"
+                listed = ", ".join(f"{name}={self.expression(part)}" for name, part in parts)
+                yield f"{variable.name} = SimpleNamespace({listed})"
             case tree.Copy(target, source):
-                yield f"_copy({self._of(target)}, {self._of(source)})"
+                yield f"_copy({self.expression(target)}, {self.expression(source)})"
             case tree.Invoke(function, arguments, results):
                 passed = (*arguments, *(each for each in results if isinstance(each.type, ArrayType)))
                 numbers = [each.name for each in results if isinstance(each.type, Kind)]
                 to = f"{', '.join(numbers)}, = " if numbers else ""
-                yield to + self._call(function, passed)
+                yield f"{to}{function.name}({self._listed(passed)})"
             case For(variable, start, stop, step, body):
-                yield f"for {variable.name} in range({self._of(start)}, {self._of(stop)}, {step}):"
-                yield from self._body(body)
+                yield f"for {variable.name} in range({self._listed((start, stop))}, {step}):"
+                yield from self.body(body)
             case tree.While(condition, body):
-                yield "while True:"
-                yield f" _n[0] += {operations_in(condition)}"
-                yield f" if not {self._of(condition)}: break"
-                yield from self._body(body)
+                yield f"while {self._conditional(condition)}:"
+                yield from self.body(body)
             case tree.If(condition, body, other):
-                yield f"if {self._of(condition)}:"
-                yield from self._body(body)
-                yield "else:"
-                yield from self._body(other)
-            case Return(None):
-                yield f"return ({''.join(f'{each}, ' for each in self._numbers)})"
-            case Return(value) if value:
-                yield f"return {self._of(value)}"
+                yield from self.nested(f"if {self.expression(condition)}:", body, "    pass")
+                yield from self.nested("else:", other, "    pass")
+            case Return(value):
+                yield f"return {self.expression(value)}" if value else self._end
 
-    def _target(self, target: Expression) -> str:
-        text = self._of(target)
-        return text.removeprefix("int(").removesuffix(")") if text.startswith("int(") else text
+    def literal(self, value: float) -> str:
+        """Return a number with a point."""
+        return f"_r({'np.' if not math.isfinite(value) else ''}{float(value)!r})"
 
-    def _call(self, function: Function, arguments: Iterable[Expression]) -> str:
-        return f"{function.name}({', '.join(map(self._of, arguments))})"
-
-    def _of(self, expression: Expression) -> str:  # noqa: C901, PLR0911 one case a kind of expression
+    def expression(self, expression: Expression) -> str:  # noqa: C901, PLR0911 one case a kind of expression
+        """Return an expression, with parentheses around each operation."""
         match expression:
-            case tree.Literal(Kind.REAL, value):
-                return f"_r({'np.' if not math.isfinite(value) else ''}{float(value)!r})"
-            case tree.Literal(_, value):
-                return repr(value)
             case tree.Name(_, name):
                 return name
             case tree.Field(_, record, name):
-                return f"{self._of(record)}.{name}"
+                return f"{self.expression(record)}.{name}"
             case tree.View(ArrayType(_, shape), array, offset):
-                return f"_part({self._of(array)}, {self._of(offset)}, {shape})"
+                return f"_part({self._listed((array, offset))}, {shape})"
             case tree.Item(_, rows, index):
-                return f"{self._of(rows)}[{self._of(index)}]"
+                return f"{self.expression(rows)}[{self.expression(index)}]"
             case tree.Member(kind, struct, name):
-                return integer(kind, f"{self._of(struct)}[{name!r}]")
+                return integer(kind, f"{self.expression(struct)}[{name!r}]")
             case tree.Element(kind, array, indices):
-                return integer(kind, f"{self._of(array)}[{', '.join(map(self._of, indices))}]")
-            case Operation():
-                return self._operation(expression)
+                return integer(kind, f"{self.expression(array)}[{self._listed(indices)}]")
+            case Operation(_, "and" | "or" as name, (one, other)):
+                return f"({self.expression(one)} {name} {self._conditional(other)})"
             case tree.Select(_, condition, one, other):
-                return f"({self._conditional(one)} if {self._of(condition)} else {self._conditional(other)})"
+                return f"({self._conditional(one)} if {self.expression(condition)} else {self._conditional(other)})"
             case tree.Convert(kind, operand):
-                return f"{'_r' if kind is Kind.REAL else 'int'}({self._of(operand)})"
+                return f"{'_r' if kind is Kind.REAL else 'int'}({self.expression(operand)})"
             case tree.Invocation(_, function, arguments):
-                return self._call(function, arguments)
+                return f"{function.name}({self._listed(arguments)})"
+        return super().expression(expression)
 
-    def _operation(self, operation: Operation) -> str:
-        parts = [self._of(each) for each in operation.operands]
-        match operation.operator:
-            case "min" | "max" as name:
-                return f"{name}({', '.join(parts)})"  # the first of two equal ones, as in the kernels
-            case "and" | "or" as name:
-                return f"({parts[0]} {name} {self._conditional(operation.operands[1])})"
-            case name if name in CALLED:
-                return f"({CALLED[name]}({', '.join(parts)}))"
-            case sign:
-                return f"({parts[0]} {'**' if sign == 'power' else sign} {parts[1]})"
+    def _listed(self, expressions: Iterable[Expression]) -> str:
+        return ", ".join(map(self.expression, expressions))
 
     def _conditional(self, expression: Expression) -> str:
         """Return an expression that counts its operations where it is computed."""
         count = operations_in(expression)
-        return f"_of({count}, {self._of(expression)})" if count else self._of(expression)
+        return f"_of({count}, {self.expression(expression)})" if count else self.expression(expression)
 
 
 def integer(kind: Kind, text: str) -> str:
@@ -211,39 +194,17 @@ def integer(kind: Kind, text: str) -> str:
     return f"int({text})" if kind in {Kind.INT, Kind.UNSIGNED} else text
 
 
-def expressions_of(statement: Statement) -> Iterator[Expression]:
-    """Yield the expressions that a statement computes once."""
-    match statement:
-        case Declare(_, value) | Return(value):
-            yield from [value] if value else []
-        case tree.Assign(target, value):
-            yield from (target, value)
-        case tree.Point(_, part):
-            yield part
-        case tree.Make(_, parts):
-            yield from (part for _, part in parts)
-        case tree.Invoke(_, arguments, _):
-            yield from arguments
+def operations_in(node: object) -> int:
+    """Return the operations of what a node computes once, without those that it may not come to."""
+    match node:
+        case tree.Select(_, once) | tree.If(once) | Operation(_, "and" | "or", (once, _)):
+            return operations_in(once)
         case For(_, start, stop):
-            yield from (start, stop)
-        case tree.If(condition):
-            yield condition
-
-
-def operations_in(expression: Expression) -> int:
-    """Return the operations of an expression, without those that it may not come to."""
-    match expression:
-        case tree.Select(_, condition, _, _):
-            return operations_in(condition)
-        case Operation(_, "and" | "or", (one, _)):
-            return operations_in(one)
-        case Operation(Kind.REAL, operator, operands):
-            return (operator in COUNTED) + sum(map(operations_in, operands))
-        case Operation(_, _, operands) | tree.Invocation(_, _, operands):
-            return sum(map(operations_in, operands))
-        case tree.Convert(_, operand):
-            return operations_in(operand)
-    return 0
+            return operations_in((start, stop))
+        case tree.While():
+            return 0
+    own = isinstance(node, Operation) and node.type is Kind.REAL and node.operator in COUNTED
+    return own + sum(map(operations_in, tree.parts_of(node)))
 
 
 REAL: Final = real_of(Arithmetic.FLOAT32)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from ctypes import CDLL, c_bool
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from pydantic import BaseModel
@@ -37,9 +37,7 @@ from coldloop_optimizer_plc.rules import UpdatingRule
 from coldloop_optimizer_plc.runtime import serve
 from coldloop_optimizer_plc.settings import SHOWN, OptimizerSettings, ProgramSettings
 from coldloop_rig import PYTHON
-
-if TYPE_CHECKING:
-    from coldloop_rig.settings import Settings
+from coldloop_rig.settings import Settings
 
 PREFIX: Final = "export:"
 FOLDER: Final = "optimizer"
@@ -94,8 +92,7 @@ class ExportedProgram(OptimizerProgram):
     def plan(self, update: Update) -> Plan:
         """Take an update and decide the updating period that begins there.
 
-        Raises:
-            UsageError: A tick or a number is beyond what the export holds.
+        Raises UsageError if a tick or a number is beyond what the export holds.
         """
         self._update["numbers"] = np.array((update.update, update.tick, update.playing)).astype(np.int32)
         self._update["reals"] = (update.load, *update.u_before, *update.u, *update.y, *update.x)
@@ -148,7 +145,7 @@ class _Manifest(BaseModel, extra="ignore", strict=True):
     files: dict[str, str]
 
 
-def manifest_of(settings: "Settings", texts: Mapping[str, str], cost: Mapping[str, Any]) -> str:
+def manifest_of(settings: Settings, texts: Mapping[str, str], cost: Mapping[str, Any]) -> str:
     """Return the manifest of an export of these files: model, settings, register maps, what it costs, digests."""
     return json.dumps({
         "format": FORMAT, "coldloop": __version__, **_identity(settings), **cost,
@@ -156,7 +153,7 @@ def manifest_of(settings: "Settings", texts: Mapping[str, str], cost: Mapping[st
     }, indent=1)  # fmt: skip
 
 
-def _identity(settings: "Settings") -> dict[str, Any]:
+def _identity(settings: Settings) -> dict[str, Any]:
     shown = selected(settings, SHOWN)
     del shown["optimizer_plc.program.updating_period_s"]  # the session's
     return {
@@ -166,7 +163,7 @@ def _identity(settings: "Settings") -> dict[str, Any]:
     }
 
 
-def exported_optimizer(given: str, settings: "Settings") -> tuple[str, ...]:
+def exported_optimizer(given: str, settings: Settings) -> tuple[str, ...]:
     """Return the command of our service with an exported optimiser, which is compiled where needed.
 
     Args:
@@ -176,13 +173,20 @@ def exported_optimizer(given: str, settings: "Settings") -> tuple[str, ...]:
     Raises:
         UsageError: It is none, or of another model or other settings, or cannot be compiled, or fails its self-test.
     """
+
+    def refusal(why: str) -> UsageError:
+        return UsageError(f"--optimizer {given}: {why}")
+
     if not given.startswith(PREFIX):
-        raise UsageError(f"--optimizer {given}: give export: and the folder that coldloop export plc --target c wrote")
-    sources = _checked(given, Path(given.removeprefix(PREFIX)), settings)
-    return (*PYTHON, "-m", "coldloop_export.exported_optimizer", str(_compiled(given, sources)))
+        raise refusal("give export: and the folder that coldloop export plc --target c wrote")
+    sources = _checked(refusal, Path(given.removeprefix(PREFIX)), settings)
+    return (*PYTHON, "-m", "coldloop_export.exported_optimizer", str(_compiled(refusal, sources)))
 
 
-def _checked(given: str, folder: Path, settings: "Settings") -> dict[str, bytes]:
+Refusal: TypeAlias = Callable[[str], UsageError]
+
+
+def _checked(refusal: Refusal, folder: Path, settings: Settings) -> dict[str, bytes]:
     """Return the sources of an export, by name, whose digests its manifest has."""
     try:
         manifest = held_file(folder, f"{FOLDER}/{MANIFEST}", "export it again")
@@ -190,40 +194,34 @@ def _checked(given: str, folder: Path, settings: "Settings") -> dict[str, bytes]
     except (UsageError, ValueError):
         solver = (folder / "kernels.c").exists() or (folder / "kernels.st").exists()
         what = "has the solver alone, without the optimiser: export it again" if solver else "is no export"
-        raise UsageError(f"--optimizer {given}: {what} (coldloop export plc --target c --out FOLDER)") from None
+        raise refusal(f"{what} (coldloop export plc --target c --out FOLDER)") from None
     ours = _identity(settings)
     if found.format != FORMAT or found.register_maps != ours["register_maps"]:
-        raise UsageError(
-            f"--optimizer {given}: it was exported by Coldloop {found.coldloop}, whose registers are others than"
-            f" those of {__version__}: export it again"
-        )
+        others = f"whose registers are others than those of {__version__}: export it again"
+        raise refusal(f"it was exported by Coldloop {found.coldloop}, {others}")
     if found.model_digest != ours["model_digest"]:
-        raise UsageError(
-            f"--optimizer {given}: it has the model {found.model_digest[:8]}, the run {ours['model_digest'][:8]} of"
-            f" {settings.model.file}: export it again"
-        )
+        run = f"the run {ours['model_digest'][:8]} of {settings.model.file}"
+        raise refusal(f"it has the model {found.model_digest[:8]}, {run}: export it again")
     for key in sorted({*found.settings, *ours["settings"]}):
         theirs, own = found.settings.get(key), ours["settings"].get(key)
         if theirs != own:
-            raise UsageError(
-                f"--optimizer {given}: it has {key} = {theirs}, the run {own}: set it, or export the optimiser again"
-            )
+            raise refusal(f"it has {key} = {theirs}, the run {own}: set it, or export the optimiser again")
     if "optimizer.c" not in found.files:
-        raise UsageError(f"--optimizer {given}: it is not in C: export it with --target c")
+        raise refusal("it is not in C: export it with --target c")
     sources = {}
     for name, digest in found.files.items():
         place = held_file(folder / FOLDER, name, "export it again")
         sources[name] = read_bytes(place, "export it again", most=MOST_BYTES)
         if hashlib.sha256(sources[name]).hexdigest() != digest:
-            raise UsageError(f"--optimizer {given}: {FOLDER}/{name} is not as it was exported: export it again")
+            raise refusal(f"{FOLDER}/{name} is not as it was exported: export it again")
     return sources
 
 
-def _compiled(given: str, sources: Mapping[str, bytes]) -> Path:
+def _compiled(refusal: Refusal, sources: Mapping[str, bytes]) -> Path:
     """Return the library in our own cache, compiled there from these sources and tested where it is not there yet."""
     compiler = next((name for name in ("cc", "gcc", "clang") if shutil.which(name)), None)
     if compiler is None:
-        raise UsageError(f"--optimizer {given}: there is no C compiler (cc) to compile it: on Debian, install gcc")
+        raise refusal("there is no C compiler (cc) to compile it: on Debian, install gcc")
     cache = find_cache_folder("exports")
     cache.chmod(0o700)
     content = sorted((name, hashlib.sha256(source).hexdigest()) for name, source in sources.items())
@@ -233,31 +231,26 @@ def _compiled(given: str, sources: Mapping[str, bytes]) -> Path:
             for name, source in sources.items():
                 (Path(made) / name).parent.mkdir(parents=True, exist_ok=True)
                 (Path(made) / name).write_bytes(source)
-            _make(given, compiler, Path(made))
+            _make(refusal, compiler, Path(made))
             (Path(made) / LIBRARY).replace(library)
     return library
 
 
-def _make(given: str, compiler: str, folder: Path) -> None:
+def _make(refusal: Refusal, compiler: str, folder: Path) -> None:
     """Compile and test the sources in a folder of our own; `LIBRARY` is there then."""
     code, test = [folder / name for name in ("kernels.c", "constants.c", "optimizer.c")], folder / "self_test"
-    _compile(given, compiler, test, *code, folder / "golden.c", folder / "self_test.c")
-    tested = _run(test)
-    if tested.returncode:
-        first = tested.stdout.partition("\n")[0]
-        raise UsageError(f"--optimizer {given}: as {compiler} compiles it, its self-test fails: {first}")
-    _compile(given, compiler, folder / LIBRARY, "-shared", *code)
-
-
-def _compile(given: str, compiler: str, *into: str | Path) -> None:
-    done = _run(compiler, *FLAGS, "-o", *into, "-lm")
-    if done.returncode:
-        why = next((line for line in done.stderr.splitlines() if "error" in line), "no reason given")
-        raise UsageError(f"--optimizer {given}: it cannot be compiled: {why}")
-
-
-def _run(*command: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 ours
+    commands: tuple[tuple[str | Path, ...], ...] = (
+        (compiler, *FLAGS, "-o", test, *code, folder / "golden.c", folder / "self_test.c", "-lm"), (test,),
+        (compiler, *FLAGS, "-o", folder / LIBRARY, "-shared", *code, "-lm"),
+    )  # fmt: skip
+    for command in commands:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 ours
+        if done.returncode and command == (test,):
+            said = done.stdout.partition("\n")[0]
+            raise refusal(f"as {compiler} compiles it, its self-test fails: {said}")
+        if done.returncode:
+            why = next((line for line in done.stderr.splitlines() if "error" in line), "no reason given")
+            raise refusal(f"it cannot be compiled: {why}")
 
 
 def start() -> int:

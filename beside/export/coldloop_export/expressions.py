@@ -47,6 +47,11 @@ class Source:
             f"{self.file}:{line}: {why}; an exported kernel has a smaller Python (`coldloop docs plc-export`)"
         )
 
+    def refuse_if(self, wrong: object, node: ast.AST, why: str) -> None:
+        """Raise the error for a node if it is wrong."""
+        if wrong:
+            raise self.refusal(node, why)
+
     def _assigned(self) -> tuple[set[str], set[str]]:
         """Return the variables, and those that are assigned in one place."""
         names = [node.id for node in ast.walk(self.definition) if isinstance(node, ast.Name)
@@ -156,7 +161,7 @@ class ExpressionReader:
 
     def __init__(self, source: Source, platform: frozenset[str], *, double: bool) -> None:
         self.source, self.platform, self.double = source, platform, double
-        self.refusal = source.refusal
+        self.refusal, self.refuse_if = source.refusal, source.refuse_if
         self.scopes: list[dict[str, Value]] = [{}]
         self.before: list[tree.Statement] = []
         """Statements that an expression needs before it: calls whose results are arrays."""
@@ -185,8 +190,7 @@ class ExpressionReader:
             raise self.refusal(
                 node, "a literal without a type would be computed in double: z.dtype.type(...) gives it one"
             )
-        if abs(int(known.value)) > 2**31 - 1:
-            raise self.refusal(node, "an integer beyond 32 bits")
+        self.refuse_if(abs(int(known.value)) > 2**31 - 1, node, "an integer beyond 32 bits")
         return Literal(Kind.INT, int(known.value))
 
     def of_kind(self, node: ast.expr, kind: Kind) -> Expression:
@@ -222,8 +226,7 @@ class ExpressionReader:
         return cast("Value", method(node))
 
     def _constant(self, node: ast.Constant) -> Value:
-        if not isinstance(node.value, int | float):
-            raise self.refusal(node, f"{node.value!r} is not a number")
+        self.refuse_if(not isinstance(node.value, int | float), node, f"{node.value!r} is not a number")
         return Known(node.value)
 
     def _name(self, node: ast.Name) -> Value:
@@ -233,8 +236,7 @@ class ExpressionReader:
                 if isinstance(value, Name):
                     self.used.add(value.name)
                 return value
-        if node.id in self.source.assigned:
-            raise self.refusal(node, f"{node.id} may have no value here")
+        self.refuse_if(node.id in self.source.assigned, node, f"{node.id} may have no value here")
         meaning = self.source.meanings.get(node.id, getattr(builtins, node.id, None))
         if meaning is None:
             raise self.refusal(node, f"{node.id} is not known")
@@ -286,8 +288,7 @@ class ExpressionReader:
         if isinstance(node.slice, ast.Slice):
             return self._sliced(node, node.slice, array, array.type)
         places = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
-        if len(places) > len(shape):
-            raise self.refusal(node, "more indices than the array has")
+        self.refuse_if(len(places) > len(shape), node, "more indices than the array has")
         indices = tuple(self.index(place, length) for place, length in zip(places, shape, strict=False))
         if len(indices) == len(shape):
             return tree.Element(kind, cast("Name", array), indices)
@@ -302,21 +303,18 @@ class ExpressionReader:
     def _sliced(self, node: ast.Subscript, part: ast.Slice, array: tree.Storage, whole: ArrayType) -> View:
         if not (part.lower or part.upper or part.step):
             return view_of(whole, array, ZERO)
-        if len(whole.shape) != 1 or part.step:
-            raise self.refusal(node, "only arrays of one dimension are cut, without a step")
+        self.refuse_if(len(whole.shape) != 1 or part.step, node, "only arrays of one dimension are cut, without a step")
         length = whole.size
         first = self.known_integer(part.lower) if part.lower else 0
         end = self.known_integer(part.upper) if part.upper else length
         first, end = (place + length if place < 0 else place for place in (first, end))
-        if not 0 <= first <= end <= length:
-            raise self.refusal(node, f"{first} to {end} of an array of length {length}")
+        self.refuse_if(not 0 <= first <= end <= length, node, f"{first} to {end} of an array of length {length}")
         return view_of(ArrayType(whole.kind, (end - first,)), array, Literal(Kind.INT, first))
 
     def index(self, node: ast.expr, length: int) -> Expression:
         """Return an index, which does not count from the end."""
         index = self.scalar(node)
-        if index.type not in {Kind.INT, Kind.UNSIGNED}:
-            raise self.refusal(node, "an index is an integer")
+        self.refuse_if(index.type not in {Kind.INT, Kind.UNSIGNED}, node, "an index is an integer")
         if isinstance(index, Literal) and not 0 <= index.value < length:
             raise self.refusal(node, f"index {index.value} of an array of length {length}")
         return index
@@ -338,8 +336,7 @@ class ExpressionReader:
         return self.each(node, negative, (value,))
 
     def _binop(self, node: ast.BinOp) -> Value:
-        if type(node.op) not in BINARY:
-            raise self.refusal(node, "this operator is not in the subset")
+        self.refuse_if(type(node.op) not in BINARY, node, "this operator is not in the subset")
         sign, compute = BINARY[type(node.op)]
         one, other = self.read(node.left), self.read(node.right)
         if isinstance(one, Known) and isinstance(other, Known):
@@ -379,8 +376,7 @@ class ExpressionReader:
             raise self.refusal(node, "this is not a number")
         if not shapes:
             return combine(cast("tuple[Expression, ...]", parts))
-        if len(shapes) > 1:
-            raise self.refusal(node, "arrays of different shapes")
+        self.refuse_if(len(shapes) > 1, node, "arrays of different shapes")
 
         def at(indices: tuple[Expression, ...]) -> Expression:
             return combine(tuple(element_of(part, indices) for part in parts))
@@ -392,8 +388,7 @@ class ExpressionReader:
         operands = [node.left, *node.comparators]
         compared = []
         for sign, *both in zip(node.ops, operands, operands[1:], strict=False):
-            if type(sign) not in COMPARISONS:
-                raise self.refusal(node, "this comparison is not in the subset")
+            self.refuse_if(type(sign) not in COMPARISONS, node, "this comparison is not in the subset")
             read = [self.read(each) for each in both]
             real = any(each.type is Kind.REAL for each in read)
             one, other = (
@@ -419,8 +414,7 @@ class ExpressionReader:
         self.conditional += 1
         one, other = self.scalar(node.body), self.scalar(node.orelse)
         self.conditional -= 1
-        if one.type is not other.type:
-            raise self.refusal(node, f"{named(one.type)} or {named(other.type)}")
+        self.refuse_if(one.type is not other.type, node, f"{named(one.type)} or {named(other.type)}")
         return tree.Select(cast("Kind", one.type), condition, one, other)
 
 
@@ -433,10 +427,8 @@ def is_exact(value: Value) -> TypeGuard[Known]:
 
 def added(one: Expression, other: Expression) -> Expression:
     """Return the sum of two integers; nothing is added to 0."""
-    if one == ZERO:
-        return other
-    if other == ZERO:
-        return one
+    if ZERO in (one, other):
+        return other if one == ZERO else one
     if isinstance(one, Literal) and isinstance(other, Literal):
         return Literal(Kind.INT, one.value + other.value)
     return Operation(Kind.INT, "+", (one, other))

@@ -16,8 +16,6 @@ from pathlib import Path
 from random import Random
 from typing import Any, Final, TypedDict
 
-import numpy as np
-
 from coldloop import __version__
 from coldloop.errors import UsageError
 from coldloop.process.settings import RateReference
@@ -88,26 +86,20 @@ def export_plc(
 def solver(target: str, settings: Settings, ticks: int | None, profile: PlcProfile | None) -> dict[str, str]:
     """Return the files of the solver by their names, with its golden vectors.
 
-    Raises:
-        UsageError: No input moves in so many ticks.
+    Raises UsageError if no input moves in so many ticks.
     """
     recorded = golden.record(settings, ticks or golden.TICKS)
     vectors = telling(recorded, ticks)
-    problem, each = vectors[0].problem, len(vectors[0].answer.costs)
-    if target == "c":
-        export = OdeExport(recorded.method, problem, np.arange(1, each + 1))
-        texts, needed, parts = export.files(vectors), export.sizes(vectors), dict[str, str]()
-    else:
-        text = st_files.StructuredTextExport(recorded.method, problem, vectors)
-        texts = in_format(target, "solver.xml", text.files(), "the ODE-based solver, golden vectors and a self-test")
-        needed, parts = text.sizes(), {**text_parts(target, text.outputs), "AT_ONCE": str(st_files.AT_ONCE)}
+    problem, each, given = vectors[0].problem, len(vectors[0].answer.costs), (recorded.method, vectors)
+    export = OdeExport(*given) if target == "c" else st_files.StructuredTextExport(*given)
+    texts = in_format(target, "solver.xml", export.files(), "the ODE-based solver, golden vectors and a self-test")
     count = counting.counted_iterations(recorded.method, vectors)
     iterations = len(vectors) * each
-    cost = ExportCost(variables=len(problem.phi), operations={ITERATION: count.recorded}, bytes=needed,
+    cost = ExportCost(variables=len(problem.phi), operations={ITERATION: count.recorded}, bytes=export.sizes(),
                       self_test={"iterations": iterations, "operations": count.total}, **cut(target),
                       longest_period_s=settings.process.sampling_period_s)  # fmt: skip
     readme = filled(template(f"{language(target)}/readme_solver.md"), {
-        **parts, "COST": cost_text(cost, profile), "RECORDED": str(iterations),
+        **text_parts(target, export.outputs), "COST": cost_text(cost, profile), "RECORDED": str(iterations),
         "PROBLEM": problem_layout(*problem_of(settings)),
         "OPTIMIZER": ALONE if settings.process.forecasts else BESIDE,
         "N": str(len(problem.phi)), "M": str(len(problem.gamma)), "K": str(each),
@@ -126,21 +118,18 @@ def whole_optimizer(
     run = ticks or golden.TICKS, golden.LOAD
     updates, recorded = recorder.record(*run, 0.0), recorder.problems()
     updates = [*updates, *recorder.record(*run, fixed_ticks * process.tick_s)]  # the first half is adaptive
-    if target == "c":
-        export = OptimizerExport(recorder.optimizer, updates)
-        texts, needed, parts, name = export.files(), export.sizes(), dict[str, str](), "c/readme_optimizer.md"
-    else:
-        text = st_files.OptimizerText(recorder.optimizer, updates)
-        texts = in_format(target, f"{OPTIMIZER}.xml", text.files(), "the whole optimiser and a self-test")
+    given = recorder.optimizer, updates
+    export = OptimizerExport(*given) if target == "c" else st_files.OptimizerText(*given)
+    texts = in_format(target, f"{OPTIMIZER}.xml", export.files(), "the whole optimiser and a self-test")
+    if target != "c":
         texts["registers.md"] = st_files.register_table(control_map(process)) + "\n"
-        needed, name = text.sizes(), "structured_text/optimizer/readme.md"
-        parts = {**text_parts(target, text.outputs), "DIGEST": str(recorder.optimizer.model_digest)}
     count = counting.counted_iterations(recorded.method, telling(recorded, ticks))
     others = counting.counted_updates(recorder.optimizer, updates[:COUNTED])
     cost = ExportCost(variables=len(recorded.vectors[0].guess), operations={**others, ITERATION: count.recorded},
-                      bytes=needed, **cut(target), longest_period_s=process.sampling_period_s)  # fmt: skip
-    texts[README] = filled(template(name), {
-        **parts, "COST": cost_text(cost, profile),
+                      bytes=export.sizes(), **cut(target), longest_period_s=process.sampling_period_s)  # fmt: skip
+    texts[README] = filled(template(f"{language(target)}/{OPTIMIZER}/readme.md"), {
+        **text_parts(target, export.outputs), "COST": cost_text(cost, profile),
+        "DIGEST": str(recorder.optimizer.model_digest),
         "GOLDEN": str(len(updates)), "COUNTED": str(min(COUNTED, len(updates))),
         "FILES": ", ".join(f"`{name}`" for name in texts if not name.endswith(".md")),
     })  # fmt: skip
@@ -157,9 +146,8 @@ def output_guard(target: str, settings: Settings) -> dict[str, str]:
     counts = counting.counted_guard(kernels, calls)
     counts["judgement"] = counts["judgement"].model_copy(update={"worst": counting.counted_longest(kernels)})
     cost = ExportCost(variables=len(process.inputs), operations=counts, bytes=export.sizes())
-    said = {} if target == "c" else text_parts(target, st_files.GuardText.outputs)
     texts[README] = filled(template(f"{language(target)}/{GUARD}/readme.md"), {
-        **{each: st_files.of_guard(text) for each, text in said.items()},
+        **{each: st_files.of_guard(text) for each, text in text_parts(target, export.outputs).items()},
         "COST": cost_text(cost), "GOLDEN": str(len(calls)), "ROWS": str(SEQUENCE_ROWS),
         "FILES": ", ".join(f"`{each}`" for each in texts),
         "LIMITS": markdown_table(("input", "low", "high", f"most in {process.sampling_period_s:g} s"), [
@@ -173,11 +161,7 @@ def output_guard(target: str, settings: Settings) -> dict[str, str]:
 
 
 def telling(recorded: golden.GoldenVectors, ticks: int | None) -> list[golden.GoldenVector]:
-    """Return the problems that are golden vectors.
-
-    Raises:
-        UsageError: There are none.
-    """
+    """Return the problems that are golden vectors. Raises UsageError if there are none."""
     vectors = recorded.telling()
     if not vectors:
         raise UsageError(f"--ticks: no input moves within {ticks} ticks, so nothing would be tested; record more")
@@ -200,9 +184,11 @@ def in_format(target: str, name: str, texts: dict[str, str], content: str) -> di
 
 
 def text_parts(target: str, outputs: Sequence[str]) -> dict[str, str]:
-    """Return what a README of Structured Text says of loading, of calls, and of a self-test's outputs."""
+    """Return what a README of Structured Text says of loading, of calls, and of a self-test's outputs; of C nothing."""
+    if target == "c":
+        return {}
     xml = target == "plcopen"
-    return {"LOAD": template(f"structured_text/load_{target}.md").rstrip(),
+    return {"LOAD": template(f"structured_text/load_{target}.md").rstrip(), "AT_ONCE": str(st_files.AT_ONCE),
             "HEAD": "in the documentation of `cl_self_test`" if xml else "at the head of `self_test.st`",
             "WORK": f"{st_files.WORK:,}", "PIECE": f"{PIECE:,}", "VERDICT": verdict_table(outputs)}  # fmt: skip
 
@@ -244,8 +230,7 @@ def problem_layout(problem: PredictiveProblem, prediction: PredictionModel) -> s
 def refuse_taken(folder: Path) -> None:
     """Reject a folder that is not empty, a path that is no folder, and one where no folder can be made.
 
-    Raises:
-        UsageError: It is so.
+    Raises UsageError if it is so.
     """
     if not str(folder).isprintable():
         raise UsageError(f"{str(folder)!a}: a name that cannot be printed; choose another --out")
@@ -262,8 +247,7 @@ def refuse_taken(folder: Path) -> None:
 def write_whole(folder: Path, texts: Mapping[str, str]) -> None:
     """Write files into a folder that appears with all of them, or not at all.
 
-    Raises:
-        UsageError: It cannot be written, or something has been put there meanwhile.
+    Raises UsageError if it cannot be written, or something has been put there meanwhile.
     """
     draft = None
     try:
@@ -307,11 +291,7 @@ reads them."""
 
 
 def require_compiler() -> None:
-    """Check that programs can be compiled and looked into.
-
-    Raises:
-        UsageError: There is no gcc, or no readelf.
-    """
+    """Check that programs can be compiled and looked into. Raises UsageError if there is no gcc, or no readelf."""
     if not (shutil.which("gcc") and shutil.which("readelf")):
         raise UsageError("--score: needs gcc and readelf: on Debian, install gcc")
 
@@ -319,8 +299,7 @@ def require_compiler() -> None:
 def scored(texts: Mapping[str, str]) -> dict[str, dict[str, Flips]]:
     """Return what the self-tests of an export in C find, by program and level of optimisation.
 
-    Raises:
-        UsageError: A self-test fails without a change.
+    Raises UsageError if a self-test fails without a change.
     """
     with tempfile.TemporaryDirectory() as made:
         found = {}

@@ -33,7 +33,7 @@ from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.qp.linear_algebra import real_of
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.rules import DECISIONS, UpdatingRule, decide_by, make_rule
-from coldloop_optimizer_plc.settings import ProgramSettings
+from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
 from coldloop_optimizer_plc.solvers.interface import KERNELS, Answer, Costs, solve_by
 from coldloop_optimizer_plc.solvers.ode import OdeMethod, solve
 from coldloop_plant.load import find_load
@@ -236,11 +236,9 @@ def update_tables(golden: Sequence[GoldenUpdate]) -> dict[str, Array]:
 
 
 def refuse(settings: ProgramSettings) -> None:
-    """Refuse what cannot be exported.
-
-    Raises:
-        UsageError: It is asked for.
-    """
+    """Refuse a solver or an arithmetic that cannot be exported. Raises UsageError."""
+    if settings.solver is not SolverName.ODE:
+        raise UsageError("export plc: with the ODE-based solver alone: --set optimizer_plc.program.solver=ode")
     if settings.arithmetic is not Arithmetic.FLOAT32:
         raise UsageError("export plc: in single precision alone: --set optimizer_plc.program.arithmetic=float32")
 
@@ -273,8 +271,7 @@ class _ListeningOptimizer(OptimizerProgram):
 class UpdateRecorder:
     """Records runs of an optimiser that can be exported.
 
-    Raises:
-        UsageError: The settings ask for something that is not exported.
+    Raises UsageError if the settings ask for something that is not exported.
     """
 
     def __init__(self, settings: Settings) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import reduce
 from itertools import groupby
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -28,7 +28,6 @@ from coldloop_export.st_pausing import ANEW, PIECE, Pausing, an_answer_in_calls,
 from coldloop_export.st_printer import Constants, interface_names, memory, portable, scalar_of, section, sum_of
 from coldloop_export.tree import ArrayType, Block, Kind, Literal, Name, Path, RecordType, filled, template, type_of
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.ode import OdeMethod
 from coldloop_rig.text_tables import markdown_table
 
@@ -46,19 +45,17 @@ NOTES: Final = {
 GENERATED: Final = "(* Written by Coldloop from the kernels of its optimiser; changes belong there. *)\n"
 
 
-class StructuredTextExport:
+class StructuredTextExport(tree.Export):
     """The solver for the matrices of one problem in single precision, cut into calls, with golden vectors.
 
-    Raises:
-        UnfitKernelError: A kernel uses what is not in the subset, or a matrix is too large.
+    Raises UnfitKernelError if a kernel uses what is not in the subset, or a matrix is too large.
     """
 
-    outputs: ClassVar[tuple[str, ...]] = ("iteration", "element", "iterations_done", "total_us", "longest_us")
-    """Outputs of the self-test besides those that every self-test has."""
+    outputs = ("iteration", "element", "iterations_done", "total_us", "longest_us")
 
-    def __init__(self, method: OdeMethod, problem: QuadraticProblem, vectors: Iterable[GoldenVector]) -> None:
+    def __init__(self, method: OdeMethod, vectors: Sequence[GoldenVector]) -> None:
         self.vectors = [bounded(method, each) for each in vectors]
-        program = golden.OdeProgram(method, problem, np.arange(1, len(self.vectors[0].answer.costs) + 1))
+        program = golden.OdeProgram(method, vectors[0].problem, np.arange(1, len(self.vectors[0].answer.costs) + 1))
         constants = {path: np.asarray(values) for path, values in program.constants().items()}
         self.printer = st_printer.StructuredTextPrinter(st_printer.types_in(constants))
         function, lowering = one_iteration_a_call(program.entry), Lowering(constants)
@@ -77,12 +74,11 @@ class StructuredTextExport:
 
     def files(self) -> dict[str, str]:
         """Return the texts of the files by their names, in the order in which they are loaded."""
-        vectors = "\n".join(self._golden(number, each) for number, each in enumerate(self.vectors))
-        test = self._self_test()
-        functions, lists = template("structured_text/functions.st"), self.constants.configuration()
-        texts = {"types.st": self.printer.types(), "functions.st": functions, "kernels.st": self.kernels,
-                 "golden.st": vectors, "self_test.st": test, "configuration.st": lists}  # fmt: skip
-        return {name: GENERATED + portable(text) for name, text in texts.items()}
+        return with_types(self.printer, {
+            "functions.st": template("structured_text/functions.st"), "kernels.st": self.kernels,
+            "golden.st": "\n".join(self._golden(number, each) for number, each in enumerate(self.vectors)),
+            "self_test.st": self._self_test(), "configuration.st": self.constants.configuration(),
+        })  # fmt: skip
 
     def sizes(self) -> dict[str, int]:
         """Return the bytes of what a PLC needs."""
@@ -136,6 +132,11 @@ class StructuredTextExport:
         })  # fmt: skip
 
 
+def with_types(printer: st_printer.StructuredTextPrinter, texts: Mapping[str, str]) -> dict[str, str]:
+    """Return texts as files, before them the types of arrays that they use."""
+    return {name: GENERATED + portable(text) for name, text in {"types.st": printer.types(), **texts}.items()}
+
+
 def bounded(method: OdeMethod, vector: GoldenVector) -> GoldenVector:
     """Return a golden vector with the largest number for an infinite bound, which has no literal, and its answer."""
     most, problem = np.finfo(np.float32).max, vector.problem
@@ -153,11 +154,10 @@ JOB: Final[Path] = (*STATE, "job")
 """Number of the one that is under way; 0 is none."""
 
 
-class OptimizerText:
+class OptimizerText(tree.Export):
     """The optimiser of some settings, with its solver cut into calls, and golden updates."""
 
-    outputs: ClassVar[tuple[str, ...]] = ("element",)
-    """Outputs of the self-test besides those that every self-test has."""
+    outputs = ("element",)
 
     def __init__(self, optimizer: OptimizerProgram, updates: Sequence[golden.GoldenUpdate]) -> None:
         kernels, self.golden, self._process = OptimizerKernels(optimizer), updates, optimizer.process
@@ -201,13 +201,11 @@ class OptimizerText:
     def files(self) -> dict[str, str]:
         """Return the texts of the files by their names, in the order in which they are loaded."""
         pages = list(self._pages())
-        texts = {
-            "types.st": "", "functions.st": template("structured_text/functions.st"), "kernels.st": self._kernels,
+        return with_types(self.printer, {
+            "functions.st": template("structured_text/functions.st"), "kernels.st": self._kernels,
             "optimizer.st": self._interface(), "golden.st": "\n".join(pages),
             "self_test.st": self._self_test(len(pages)), "configuration.st": self.constants.configuration(self.state),
-        }  # fmt: skip
-        texts["types.st"] = self.printer.types()
-        return {name: GENERATED + portable(text) for name, text in texts.items()}
+        })  # fmt: skip
 
     def sizes(self) -> dict[str, int]:
         """Return the bytes of what a PLC needs; blocks are an instance of each of the interface."""
@@ -344,11 +342,8 @@ def of_guard(text: str) -> str:
     return re.sub(r"\bcl_(?!guard_)", "cg_", text)
 
 
-class GuardText:
+class GuardText(tree.Export):
     """The output guard for some limits as Structured Text, with golden calls."""
-
-    outputs: ClassVar[tuple[str, ...]] = ()
-    """Outputs of the self-test besides those that every self-test has."""
 
     def __init__(self, kernels: golden.GuardKernels, calls: Sequence[GoldenCall]) -> None:
         self._tables = golden.tables_of(calls)
@@ -371,13 +366,12 @@ class GuardText:
     def files(self) -> dict[str, str]:
         """Return the texts of the files by their names, in the order in which they are loaded."""
         functions = ("functions.st", "output_guard/functions_lreal.st")
-        texts = {
-            "types.st": "", "functions.st": "\n".join(template(f"structured_text/{each}") for each in functions),
+        texts = with_types(self.printer, {
+            "functions.st": "\n".join(template(f"structured_text/{each}") for each in functions),
             "kernels.st": self._kernels, "output_guard.st": self._interface(), "self_test.st": self._self_test(),
             "configuration.st": self.constants.configuration(self.state),
-        }  # fmt: skip
-        texts["types.st"] = self.printer.types()
-        return {name: GENERATED + of_guard(portable(text)) for name, text in texts.items()}
+        })  # fmt: skip
+        return {name: of_guard(text) for name, text in texts.items()}
 
     def sizes(self) -> dict[str, int]:
         """Return the bytes of what a PLC needs."""

@@ -12,9 +12,8 @@ from types import MappingProxyType
 from typing import Final, NamedTuple, TypeAlias, cast
 
 from coldloop_export import tree
+from coldloop_export.expressions import ZERO, added
 from coldloop_export.tree import ArrayType, Assign, Element, Expression, If, Kind, Literal, Name, Operation, Path
-
-ZERO = Literal(Kind.INT, 0)
 
 
 class Part(NamedTuple):
@@ -88,15 +87,6 @@ def part_of(place: Place, name: str, kind: tree.Type) -> Place:
         case Entry() if isinstance(kind, Kind):
             return member(place, kind, name)
     raise AssertionError(place)  # a kernel that is read has no other
-
-
-def summed(one: Expression, other: Expression) -> Expression:
-    """Return the sum of two integers."""
-    if ZERO in {one, other}:
-        return other if one == ZERO else one
-    if isinstance(one, Literal) and isinstance(other, Literal):
-        return Literal(Kind.INT, one.value + other.value)
-    return Operation(Kind.INT, "+", (one, other))
 
 
 Bindings = Mapping[str, Place]
@@ -382,7 +372,7 @@ class FunctionLowering:
         whole, before = cast("Part", place)
         pieces = self.lowering.split.get(tuple(whole.name.split(".")))
         if not pieces:
-            return Part(whole, self._captured(summed(before, offset)))
+            return Part(whole, self._captured(added(before, offset)))
         copy = self._temporary(ArrayType(kind.kind, (kind.size,)), "part")
         statements: tuple[tree.Statement, ...] = ()
         first = 0

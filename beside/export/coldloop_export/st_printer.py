@@ -13,7 +13,7 @@ import numpy as np
 from coldloop_export import tree
 from coldloop_export.golden import Array
 from coldloop_export.st_lowering import Split
-from coldloop_export.tree import ArrayType, Block, Call, Convert, Kind, Literal, Name, Path, Statement, Type, type_of
+from coldloop_export.tree import ArrayType, Block, Call, Convert, Kind, Name, Path, Statement, Type, type_of
 from coldloop_rig.text_tables import markdown_table
 
 LONGEST: Final = 32
@@ -103,11 +103,15 @@ def verdict_table(outputs: Sequence[str]) -> str:
 SCALARS: Final = {Kind.REAL: "REAL", Kind.INT: "DINT", Kind.UNSIGNED: "DINT", Kind.BOOL: "BOOL"}
 DOUBLE: Final = {**SCALARS, Kind.REAL: "LREAL"}
 BYTES: Final = {"REAL": 4, "LREAL": 8, "DINT": 4, "BOOL": 1}
-INFIX: Final = {"and": "AND", "or": "OR", "==": "=", "!=": "<>"}
-FUNCTIONS: Final = {
-    "sqrt": "SQRT", "abs": "ABS", "power": "EXPT", "log": "LN", "round": f"{PREFIX}round",
-    "copysign": f"{PREFIX}copysign", "%": f"{PREFIX}floor_mod", "//": f"{PREFIX}floor_div",
+OPERATORS: Final = {
+    "and": "({0} AND {1})", "or": "({0} OR {1})", "==": "({0} = {1})", "!=": "({0} <> {1})", "not": "(NOT {0})",
+    "negative": "(-{0})", "sqrt": "SQRT({0})", "abs": "ABS({0})", "power": "EXPT({0}, {1})", "log": "LN({0})",
+    "min": "cl_min_{kind}({0}, {1})", "max": "cl_max_{kind}({0}, {1})", "round": "cl_round({0})",
+    "copysign": "cl_copysign({0}, {1})", "%": "cl_floor_mod({0}, {1})", "//": "cl_floor_div({0}, {1})",
+    "isinf": "(NOT cl_is_finite({0}))", "isnan": "(NOT cl_is_finite({0}))", "isfinite": "cl_is_finite({0})",
+    "single": "{0}",
 }  # fmt: skip
+OF_DOUBLE: Final = {"isfinite": "cl_is_finite_lreal({0})", "single": "REAL_TO_LREAL(LREAL_TO_REAL({0}))"}
 NO_NOTES: Final[Mapping[str, str]] = {}
 TABLE: Final = f"{PREFIX}literals"
 LARGEST: Final = np.finfo(np.float32).max
@@ -122,11 +126,13 @@ class StructuredTextPrinter(tree.TreePrinter):
         real: Single or double precision.
     """
 
-    table = TABLE
+    table, truth = TABLE, ("FALSE", "TRUE")
 
     def __init__(self, variables: Mapping[Path, Type], real: type[np.floating] = np.float32) -> None:
         super().__init__(real)
         self.scalars = SCALARS if self.single else DOUBLE
+        self.operators = OPERATORS if self.single else {**OPERATORS, **OF_DOUBLE}
+        self.kinds = {kind: scalar.lower() for kind, scalar in self.scalars.items()}
         self.globals = variables
         self.arrays: dict[str, str] = {}
         """Definition of each type of arrays, by its name."""
@@ -177,7 +183,7 @@ class StructuredTextPrinter(tree.TreePrinter):
         outputs = self._declared([*block.outputs, *(each for each in block.variables if each.name in notes)])
         outside = {global_name(path): self.type(self.globals[path]) for path in block.constants}
         variables = self._declared([each for each in block.variables if each.name not in notes])
-        body = [*self._body(block.body, 1)]
+        body = [*self.body(block.body)]
         variables |= {self._instance(each): block_name(each) for each in block.called}
         if self._uses_literals:
             outside[TABLE] = f"{TABLE}_table"
@@ -204,11 +210,8 @@ class StructuredTextPrinter(tree.TreePrinter):
 
     # -- statements ----------------------------------------------------------------------------------------------------
 
-    def _body(self, statements: Iterable[Statement], depth: int) -> Iterator[str]:
-        for statement in statements:
-            yield from ("    " * depth + line for line in self._statement(statement))
-
-    def _statement(self, statement: Statement) -> Iterator[str]:  # noqa: C901 one case a statement
+    def statement(self, statement: Statement) -> Iterator[str]:  # noqa: C901 one case a statement
+        """Yield the lines of a statement."""
         match statement:
             case tree.Assign(target, value):
                 yield f"{self.expression(target)} := {self.expression(value)};"
@@ -220,31 +223,25 @@ class StructuredTextPrinter(tree.TreePrinter):
                 paused = interface_names(call.block, self.type)[busy]
                 yield f"IF (NOT {self._instance(call.block)}.{paused}) THEN"
                 yield from ("    " + line for line in self._taken(call))
-                yield from self._body(following, 1)
+                yield from self.body(following)
                 yield "END_IF;"
             case tree.Switch(number, cases):
                 yield f"CASE {self._local(number)} OF"
                 for case, body in cases:
                     yield f"    {case}:"
-                    yield from self._body(body, 2)
+                    yield from (f"    {line}" for line in self.body(body))
                 yield "END_CASE;"
             case tree.Count(variable, first, last, step, body):
                 by = f" BY {step}" if step != 1 else ""
                 bounds = f"{self.expression(first)} TO {self.expression(last)}{by}"
-                yield f"FOR {self._local(variable)} := {bounds} DO"
-                yield from self._body(body, 1)
-                yield "END_FOR;"
+                yield from self.nested(f"FOR {self._local(variable)} := {bounds} DO", body, "END_FOR;")
             case tree.While(condition, body):
-                yield f"WHILE {self.expression(condition)} DO"
-                yield from self._body(body, 1)
-                yield "END_WHILE;"
+                yield from self.nested(f"WHILE {self.expression(condition)} DO", body, "END_WHILE;")
             case tree.If(condition, body, other):
-                yield f"IF {self.expression(condition)} THEN"
-                yield from self._body(body, 1)
+                yield from self.nested(f"IF {self.expression(condition)} THEN", body, "ELSE" if other else "END_IF;")
                 if other:
-                    yield "ELSE"
-                    yield from self._body(other, 1)
-                yield "END_IF;"
+                    yield from self.body(other)
+                    yield "END_IF;"
             case tree.Return():
                 yield "RETURN;"
 
@@ -263,23 +260,12 @@ class StructuredTextPrinter(tree.TreePrinter):
 
     # -- expressions ---------------------------------------------------------------------------------------------------
 
-    def expression(self, expression: tree.Expression) -> str:  # noqa: C901, PLR0911 one case a kind of expression
-        """Return an expression, with parentheses around each operation."""
+    def other(self, expression: tree.Expression) -> str:
+        """Return a name or a conversion."""
         match expression:
-            case Literal(Kind.REAL, value):
-                return self.literal(value)
-            case Literal(Kind.BOOL, value):
-                return "TRUE" if value else "FALSE"
-            case Literal(_, value):
-                return f"{value}" if value >= 0 else f"({value})"
             case Name(_, name):
                 path = tuple(name.split("."))
                 return global_name(path) if path in self.globals else self._local(expression)
-            case tree.Element(_, array, _):
-                whole = array.array if isinstance(array, tree.View) else array
-                return f"{self.expression(whole)}[{self.place(expression)}]"
-            case tree.Operation():
-                return self._operation(expression)
             case Convert(Kind.REAL, operand):
                 return f"DINT_TO_{self.scalars[Kind.REAL]}({self.expression(operand)})"
             case Convert(Kind.BOOL, operand):
@@ -289,26 +275,6 @@ class StructuredTextPrinter(tree.TreePrinter):
             case Convert(_, operand):
                 return self.expression(operand)
         raise AssertionError(expression)  # lowering leaves no other
-
-    def _operation(self, operation: tree.Operation) -> str:  # noqa: PLR0911 one case an operator
-        parts = [self.expression(each) for each in operation.operands]
-        match operation.operator:
-            case "min" | "max" as name:
-                return f"{PREFIX}{name}_{self.type(operation.type).lower()}({', '.join(parts)})"
-            case "isfinite":
-                return f"{PREFIX}is_finite{'' if self.single else '_lreal'}({parts[0]})"
-            case "isinf" | "isnan":
-                return f"(NOT {PREFIX}is_finite({parts[0]}))"
-            case "single":
-                return parts[0] if self.single else f"REAL_TO_LREAL(LREAL_TO_REAL({parts[0]}))"
-            case name if name in FUNCTIONS:
-                return f"{FUNCTIONS[name]}({', '.join(parts)})"
-            case "negative":
-                return f"(-{parts[0]})"
-            case "not":
-                return f"(NOT {parts[0]})"
-            case sign:
-                return f"({parts[0]} {INFIX.get(sign, sign)} {parts[1]})"
 
 
 def interface_names(block: Block, type_of: Callable[[Type], str]) -> dict[Name, str]:

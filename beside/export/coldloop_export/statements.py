@@ -77,8 +77,7 @@ class KernelReader(CallReader):
         if isinstance(value, Known) and kind is Kind.REAL and isinstance(value.value, float):
             return Literal(kind, value.value)
         typed = self.typed(node, value)
-        if typed.type is not kind:
-            raise self.refusal(target, f"an element of type {kind.value} gets a value of another")
+        self.refuse_if(typed.type is not kind, target, f"an element of type {kind.value} gets a value of another")
         return cast("Expression", typed)
 
     def _side_by_side(self, target: ast.Tuple, value: ast.Tuple) -> list[Statement]:
@@ -118,8 +117,7 @@ class KernelReader(CallReader):
         targets, returned = [target], [function.returned]
         if isinstance(target, ast.Tuple):
             targets, returned = target.elts, [part for _, part in getattr(function.returned, "parts", ())]
-        if len(targets) != len(returned):
-            raise self.refusal(value, f"{function.name} has {max(len(returned), 1)} results")
+        self.refuse_if(len(targets) != len(returned), value, f"{function.name} has {max(len(returned), 1)} results")
         taken: dict[Name, Name] = {}
         declared: list[Statement] = []
         behind: list[tuple[ast.expr, Value]] = []
@@ -155,8 +153,7 @@ class KernelReader(CallReader):
         if found is not None:
             if not isinstance(found, Name) or found.type != kind:
                 raise self.refusal(node, f"{node.id} has another type already")
-            if node.id in self.loop_variables:
-                raise self.refusal(node, f"{node.id} counts a loop")
+            self.refuse_if(node.id in self.loop_variables, node, f"{node.id} counts a loop")
             if found in self.parameters and not isinstance(kind, Kind):
                 raise self.refusal(node, SAME)
             return found, []
@@ -167,8 +164,7 @@ class KernelReader(CallReader):
     def _into_name(self, target: ast.Name, value: Value, node: ast.expr) -> list[Statement]:
         once = target.id in self.source.assigned_once
         if isinstance(value, Record):
-            if not (once and value.name):
-                raise self.refusal(target, "a record is made once, and has a type with a name")
+            self.refuse_if(not (once and value.name), target, "a record is made once, and has a type with a name")
             self.scopes[-1][target.id] = self.recorded(node, value, target.id)
             return []
         if isinstance(value, View | tree.Item) and once:
@@ -234,8 +230,7 @@ class KernelReader(CallReader):
         if not isinstance(value.type, ArrayType):
             number = self.of_type(target, kind.kind, value, node)
             value = Elementwise(kind, lambda _indices: number)
-        if value.type != kind:
-            raise self.refusal(target, "a row gets an array of its type and length")
+        self.refuse_if(value.type != kind, target, "a row gets an array of its type and length")
         whole = value
         row = self._row(target, place)
         return self._elementwise(Elementwise(kind, lambda indices: element_of(whole, indices)), row)
@@ -330,8 +325,7 @@ class KernelReader(CallReader):
             start = Literal(Kind.UNSIGNED, 0)
         if start.type is not stop.type or start.type not in {Kind.INT, Kind.UNSIGNED} or not step:
             raise self.refusal(node, f"a loop from {named(start.type)} to {named(stop.type)}")
-        if any(name in scope for scope in self.scopes):
-            raise self.refusal(node, f"{name} is a variable already")
+        self.refuse_if(any(name in scope for scope in self.scopes), node, f"{name} is a variable already")
         variable = Name(start.type, name)
         self.loop_variables.append(name)
         self.scopes.append({name: variable})
@@ -379,8 +373,7 @@ class KernelReader(CallReader):
         self, node: ast.Return, results: tuple[Name, ...], returned: Returned | None, value: Kind | None
     ) -> None:  # fmt: skip
         """Note the types of what is returned, which are the same at each return."""
-        if self.returns not in {None, (results, returned, value)}:
-            raise self.refusal(node, "results of different types")
+        self.refuse_if(self.returns not in {None, (results, returned, value)}, node, "results of different types")
         self.returns = results, returned, value
 
     def _returned(self, node: ast.Return, part: Value, kept: list[Value]) -> Returned:
@@ -450,8 +443,7 @@ class Program:
     def function(self, kernel: Kernel, types: tuple[Type, ...]) -> tree.Function:
         """Return the function of a kernel for arguments of these types.
 
-        Raises:
-            UnfitKernelError: The kernel, or one that it calls, is not in the subset.
+        Raises UnfitKernelError if the kernel, or one that it calls, is not in the subset.
         """
         key = (kernel, types)
         if key not in self._known:

@@ -1,11 +1,11 @@
 """The typed tree between the kernels' Python and what is printed from it: functions of fixed shapes, no Python left."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
 from importlib.resources import files
 from math import prod
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias, dataclass_transform
 
 import numpy as np
 
@@ -29,6 +29,13 @@ def place_of(source: str) -> str:
     return "/".join(source.split("/")[-3:])
 
 
+class Export:
+    """Part of an export for a target: solver, whole optimiser or output guard."""
+
+    outputs: tuple[str, ...] = ()
+    """Outputs of the self-test in Structured Text besides those that every self-test has."""
+
+
 class Kind(Enum):
     """Types of scalars."""
 
@@ -40,8 +47,16 @@ class Kind(Enum):
     BOOL = "bool"
 
 
-@dataclass(frozen=True)
-class ArrayType:
+@dataclass_transform(frozen_default=True)
+class Node:
+    """Type, expression or statement; its classes are frozen dataclasses."""
+
+    def __init_subclass__(cls) -> None:
+        """Make a class one."""
+        dataclass(frozen=True)(cls)
+
+
+class ArrayType(Node):
     """An array whose shape is known when it is printed."""
 
     kind: Kind
@@ -53,24 +68,21 @@ class ArrayType:
         return prod(self.shape)
 
 
-@dataclass(frozen=True)
-class StructType:
+class StructType(Node):
     """A record of numbers, all of which may be written to: an element of a structured array."""
 
     name: str
     fields: tuple[tuple[str, Kind], ...]
 
 
-@dataclass(frozen=True)
-class RowsType:
+class RowsType(Node):
     """An array of such records."""
 
     struct: StructType
     length: int
 
 
-@dataclass(frozen=True)
-class RecordType:
+class RecordType(Node):
     """A NamedTuple: constant, and so are its arrays, unless it is a state. Or a dataclass, which is one."""
 
     name: str
@@ -86,24 +98,21 @@ Type: TypeAlias = Kind | ArrayType | StructType | RowsType | RecordType
 # -- expressions -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Literal:
+class Literal(Node):
     """A number of a stated type."""
 
     type: Kind
     value: float
 
 
-@dataclass(frozen=True)
-class Name:
+class Name(Node):
     """A parameter or a variable."""
 
     type: Type
     name: str
 
 
-@dataclass(frozen=True)
-class Field:
+class Field(Node):
     """A field of a record."""
 
     type: Type
@@ -111,8 +120,7 @@ class Field:
     name: str
 
 
-@dataclass(frozen=True)
-class View:
+class View(Node):
     """A part of an array in a row, from the element `offset` on; all dimensions counted."""
 
     type: ArrayType
@@ -120,8 +128,7 @@ class View:
     offset: "Expression"
 
 
-@dataclass(frozen=True)
-class Item:
+class Item(Node):
     """A record of numbers in an array of them."""
 
     type: StructType
@@ -129,8 +136,7 @@ class Item:
     index: "Expression"
 
 
-@dataclass(frozen=True)
-class Member:
+class Member(Node):
     """A number of a record of numbers."""
 
     type: Kind
@@ -138,8 +144,7 @@ class Member:
     name: str
 
 
-@dataclass(frozen=True)
-class Element:
+class Element(Node):
     """An element of an array."""
 
     type: Kind
@@ -147,8 +152,7 @@ class Element:
     indices: tuple["Expression", ...]
 
 
-@dataclass(frozen=True)
-class Operation:
+class Operation(Node):
     """An operator with one or two operands, in Python's spelling; or the name of a function, such as sqrt."""
 
     type: Kind
@@ -156,8 +160,7 @@ class Operation:
     operands: tuple["Expression", ...]
 
 
-@dataclass(frozen=True)
-class Select:
+class Select(Node):
     """The one or the other; only that one is computed."""
 
     type: Kind
@@ -166,16 +169,14 @@ class Select:
     other: "Expression"
 
 
-@dataclass(frozen=True)
-class Convert:
+class Convert(Node):
     """A number or a truth value as another type."""
 
     type: Kind
     operand: "Expression"
 
 
-@dataclass(frozen=True)
-class Invocation:
+class Invocation(Node):
     """The result of a function with one scalar result that writes to no argument."""
 
     type: Kind
@@ -191,24 +192,21 @@ Target: TypeAlias = Name | Element | Member | Field
 # -- statements --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Declare:
+class Declare(Node):
     """A new variable; without a value it is zero everywhere."""
 
     variable: Name
     value: Expression | None = None
 
 
-@dataclass(frozen=True)
-class Assign:
+class Assign(Node):
     """A new value of a variable, of an element or of a number in a record."""
 
     target: Target
     value: Expression
 
 
-@dataclass(frozen=True)
-class Point:
+class Point(Node):
     """A name for a part of an array, or for a record in one."""
 
     variable: Name
@@ -216,24 +214,21 @@ class Point:
     constant: bool
 
 
-@dataclass(frozen=True)
-class Make:
+class Make(Node):
     """A new constant record, of numbers and of arrays that have names."""
 
     variable: Name
     parts: tuple[tuple[str, Expression], ...]
 
 
-@dataclass(frozen=True)
-class Copy:
+class Copy(Node):
     """All numbers of a record become those of another."""
 
     target: Item | Name
     source: Item | Name
 
 
-@dataclass(frozen=True)
-class Invoke:
+class Invoke(Node):
     """A call for what it writes; results go to variables."""
 
     function: "Function"
@@ -241,8 +236,7 @@ class Invoke:
     results: tuple[Name, ...]
 
 
-@dataclass(frozen=True)
-class For:
+class For(Node):
     """A counted loop; bounds are computed once."""
 
     variable: Name
@@ -252,16 +246,14 @@ class For:
     body: tuple["Statement", ...]
 
 
-@dataclass(frozen=True)
-class While:
+class While(Node):
     """A loop."""
 
     condition: Expression
     body: tuple["Statement", ...]
 
 
-@dataclass(frozen=True)
-class If:
+class If(Node):
     """A decision."""
 
     condition: Expression
@@ -269,15 +261,13 @@ class If:
     other: tuple["Statement", ...]
 
 
-@dataclass(frozen=True)
-class Return:
+class Return(Node):
     """The end of a function, with its value where it has one that is not a result parameter."""
 
     value: Expression | None = None
 
 
-@dataclass(frozen=True)
-class Count:
+class Count(Node):
     """A counted loop that includes its last value; only in blocks (`lowering.py`)."""
 
     variable: Name
@@ -287,8 +277,7 @@ class Count:
     body: tuple["Statement", ...]
 
 
-@dataclass(frozen=True)
-class Call:
+class Call(Node):
     """A call of a block, with its arguments by name and the variables that get its outputs; only in blocks."""
 
     block: "Block"
@@ -297,8 +286,7 @@ class Call:
     """Variable, output."""
 
 
-@dataclass(frozen=True)
-class PausingCall:
+class PausingCall(Node):
     """A call of a block that may pause: its outputs are taken, and what follows is done, once it is no longer busy."""
 
     call: Call
@@ -309,8 +297,7 @@ class PausingCall:
     following: tuple["Statement", ...]
 
 
-@dataclass(frozen=True)
-class Switch:
+class Switch(Node):
     """Statements for each value of a number; only in blocks that pause (`st_pausing.py`)."""
 
     number: Name
@@ -324,8 +311,7 @@ Statement: TypeAlias = (
 # -- results -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Group:
+class Group(Node):
     """Results that belong together: a tuple, or a NamedTuple of this name with its fields."""
 
     name: str
@@ -383,18 +369,18 @@ class Block:
         return list(dict.fromkeys(node.block for node in walk(self.body) if isinstance(node, Call)))
 
 
+def parts_of(node: object) -> tuple[object, ...]:
+    """Return the elements of a tuple, or the fields of a node; not what is called."""
+    if is_dataclass(node):
+        node = tuple(getattr(node, each.name) for each in fields(node))
+    return tuple(part for part in node if not isinstance(part, Function | Block)) if isinstance(node, tuple) else ()
+
+
 def walk(node: object) -> Iterator[object]:
     """Yield a node and those below it; not what is called."""
     yield node
-    if isinstance(node, tuple):
-        parts: Iterator[object] = iter(node)
-    elif is_dataclass(node):
-        parts = (getattr(node, each.name) for each in fields(node))
-    else:
-        return
-    for part in parts:
-        if not isinstance(part, Function | Block):
-            yield from walk(part)
+    for part in parts_of(node):
+        yield from walk(part)
 
 
 KINDS = {"f": Kind.REAL, "i": Kind.INT, "u": Kind.UNSIGNED, "b": Kind.BOOL}
@@ -437,14 +423,24 @@ def type_of(value: object, records: str = "") -> Type:  # noqa: PLR0911 one case
     raise UnfitKernelError(f"an argument of type {type(value).__name__} cannot be exported: arrays, records, numbers")
 
 
+def spelt(operators: Mapping[str, str], operator: str, operands: Iterable[str], **parts: str) -> str:
+    """Return an operation by the format of its operator; one without a format stands between its operands."""
+    return operators.get(operator, f"({{0}} {operator} {{1}})").format(*operands, **parts)
+
+
 class TreePrinter:
-    """Prints expressions of the tree for one floating-point type.
+    """Prints the tree for one floating-point type.
 
     Numbers with a point are elements of a constant array, which the self-test sums up with the other constants.
     """
 
     table: str
     """Name of that array."""
+    truth: ClassVar[tuple[str, str]]
+    """False, true."""
+    operators: Mapping[str, str]
+    """Formats of operators and functions (`spelt`); `kind` is the type of the operands in `kinds`."""
+    kinds: Mapping[Kind, str]
 
     def __init__(self, real: type[np.floating]) -> None:
         self.single = real is np.float32
@@ -454,9 +450,40 @@ class TreePrinter:
         """Return a number with a point such that it is read back with the same bits."""
         raise NotImplementedError
 
-    def expression(self, expression: Expression) -> str:
-        """Return an expression."""
+    def statement(self, statement: Statement) -> Iterator[str]:
+        """Yield the lines of a statement."""
         raise NotImplementedError
+
+    def body(self, statements: Iterable[Statement]) -> Iterator[str]:
+        """Yield the lines of statements, indented."""
+        for statement in statements:
+            yield from (f"    {line}" for line in self.statement(statement))
+
+    def nested(self, head: str, statements: Iterable[Statement], end: str) -> Iterator[str]:
+        """Yield the lines of statements between two others."""
+        yield head
+        yield from self.body(statements)
+        yield end
+
+    def other(self, expression: Expression) -> str:
+        """Return an expression that is not the same in every language."""
+        raise NotImplementedError
+
+    def expression(self, expression: Expression) -> str:
+        """Return an expression, with parentheses around each operation."""
+        match expression:
+            case Literal(Kind.REAL, value):
+                return self.literal(value)
+            case Literal(Kind.BOOL, value):
+                return self.truth[bool(value)]
+            case Literal(_, value):
+                return f"{value}" if value >= 0 else f"({value})"
+            case Element(_, array):
+                return f"{self.expression(array.array if isinstance(array, View) else array)}[{self.place(expression)}]"
+            case Operation(_, operator, operands):
+                kind = self.kinds[operands[0].type]  # type: ignore[index]
+                return spelt(self.operators, operator, map(self.expression, operands), kind=kind)
+        return self.other(expression)
 
     def literal(self, value: float) -> str:
         """Return the element of the table that has this value."""

@@ -16,6 +16,7 @@ from coldloop_rig.figures.plot import COLOURS
 from coldloop_rig.plc_sizing import intervals
 from coldloop_rig.plc_sizing.intervals import ADAPTIVE, Interval, geometric_mean, mean_ratio, require_costs
 from coldloop_rig.text_tables import Cell, markdown_table
+from coldloop_studies import study
 from coldloop_studies.drawing import legend_outside, panels, ratio_rows, ratio_scale, spans_decade
 from coldloop_studies.request import RunRequest
 from coldloop_studies.settings import settings_of
@@ -26,52 +27,49 @@ Array = NDArray[np.float64]
 VARIANT_COLUMNS: Final = ("variant", "load", "mean tau_u (s)", "J_BF", "J_BF over the reference")
 
 
-class CompareStudy:
-    """Variants of a file under the same draws; the first is the reference."""
-
-    name = "compare"
-    title = "Variants of one's own (--variants FILE), paired over draws"
-
-    def requests(self, options: StudyOptions) -> list[RunRequest]:
-        """Return every variant under every draw."""
-        drawn = loads(options, *options.hours)
-        return [_variant_run(load, variant) for variant in options.variants for load in drawn]
-
-    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Compare the cost of each variant with that of the first, draw by draw, and say what leaves its band."""
-        drawn, variants = loads(options, *options.hours), options.variants
-        shares = tuple(f"{one.name} outside (%)" for one in options.process.banded)
-        result = StudyResult((*VARIANT_COLUMNS, *shares), [], {})
-        found = [[outcomes[_variant_run(load, variant)].indicators for load in drawn] for variant in variants]
-        costs = np.array([[run.J_BF for run in runs] for runs in found])
-        require_costs(costs)
-        ratios = [mean_ratio(row, costs[0]) for row in costs]  # paired by draw
-        reference, summary = variants[0].name, []
-        for variant, runs, over, ratio in zip(variants, found, costs / costs[0], ratios, strict=True):
-            outside = np.array([[*run.outside_band_pct.values()] for run in runs])
-            result.rows += [
-                (variant.name, load.name, run.tau_u_mean, run.J_BF, float(one), *map(float, each))
-                for load, run, one, each in zip(drawn, runs, over, outside, strict=True)
-            ]
-            means = (f"{share:.3g}" for share in outside.mean(axis=0))
-            is_reference = variant is variants[0]
-            words = ratio.in_words("costs less", "costs more", "one draw has no interval")
-            said = ("1", "the reference") if is_reference else (ratio.text(), words)
-            summary.append((variant.name, *said, *means))
-            if not is_reference:
-                what = f"J_BF of {variant.name} over that of {reference} {ratio.text()}, {words}; by draw"
-                result.values[what] = over.tolist()
-        header = ("variant", f"J_BF over that of {reference}", "in words", *shares)
-        caption = (
-            f"Geometric mean of {len(drawn)} paired runs with its 95 % interval; shares of the time outside, their mean"
-        )
-        changes = [(one.name, ", ".join(f"`{each}`" for each in one.assignments[1:]) or "defaults") for one in variants]
-        result.remarks += [
-            markdown_table(header, summary, caption),
-            markdown_table(("variant", "settings"), changes, "What each variant changes of the defaults"),
+def _compare(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+    """Compare the cost of each variant with that of the first, draw by draw, and say what leaves its band."""
+    drawn, variants = loads(options, *options.hours), options.variants
+    shares = tuple(f"{one.name} outside (%)" for one in options.process.banded)
+    result = StudyResult((*VARIANT_COLUMNS, *shares), [], {})
+    found = [[outcomes[_variant_run(load, variant)].indicators for load in drawn] for variant in variants]
+    costs = np.array([[run.J_BF for run in runs] for runs in found])
+    require_costs(costs)
+    ratios = [mean_ratio(row, costs[0]) for row in costs]  # paired by draw
+    reference, summary = variants[0].name, []
+    for variant, runs, over, ratio in zip(variants, found, costs / costs[0], ratios, strict=True):
+        outside = np.array([[*run.outside_band_pct.values()] for run in runs])
+        result.rows += [
+            (variant.name, load.name, run.tau_u_mean, run.J_BF, float(one), *map(float, each))
+            for load, run, one, each in zip(drawn, runs, over, outside, strict=True)
         ]
-        result.figures["variants over the reference"] = _variants_figure(variants, ratios, costs / costs[0])
-        return result
+        means = (f"{share:.3g}" for share in outside.mean(axis=0))
+        is_reference = variant is variants[0]
+        words = ratio.in_words("costs less", "costs more", "one draw has no interval")
+        said = ("1", "the reference") if is_reference else (ratio.text(), words)
+        summary.append((variant.name, *said, *means))
+        if not is_reference:
+            what = f"J_BF of {variant.name} over that of {reference} {ratio.text()}, {words}; by draw"
+            result.values[what] = over.tolist()
+    header = ("variant", f"J_BF over that of {reference}", "in words", *shares)
+    caption = (
+        f"Geometric mean of {len(drawn)} paired runs with its 95 % interval; shares of the time outside, their mean"
+    )
+    changes = [(one.name, ", ".join(f"`{each}`" for each in one.assignments[1:]) or "defaults") for one in variants]
+    result.remarks += [
+        markdown_table(header, summary, caption),
+        markdown_table(("variant", "settings"), changes, "What each variant changes of the defaults"),
+    ]
+    result.figures["variants over the reference"] = _variants_figure(variants, ratios, costs / costs[0])
+    return result
+
+
+COMPARE: Final = study.Study(
+    "compare", "Variants of one's own (--variants FILE), paired over draws",
+    lambda options: [_variant_run(load, variant) for variant in options.variants
+                     for load in loads(options, *options.hours)], _compare,
+)  # fmt: skip
+"""Variants of a file under the same draws; the first is the reference."""
 
 
 def _variant_run(load: Load, variant: Variant) -> RunRequest:
@@ -120,52 +118,45 @@ def periods(process: Process) -> tuple[float, ...]:
     return (ADAPTIVE, *intervals.fixed_periods(process))
 
 
-class PeriodsStudy:
-    """Closed-loop cost against the updating period, fixed and adaptive."""
+def _periods(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+    """Compare the adaptive period, in each regime, with the best fixed one of other draws, if there are any."""
+    process, drawn, summary = options.process, loads(options, *"abcdef"), []
+    result = StudyResult((*COLUMNS, *(f"{one.name} outside (%)" for one in process.banded)), [], {})
+    tried, named = periods(process), _other_rule(process)[1]
+    costs, means, training = {}, {}, np.array([load.draw == 1 for load in drawn])
+    labels: list[Cell] = ["adaptive", *tried[1:], named]
+    for regime, settings in _regimes(process).items():
+        found = [[outcomes[run].indicators for run in _runs(load, process, settings)] for load in drawn]
+        rows = [
+            [(regime, load.name, label, run.tau_u_mean, run.J_BF, *run.outside_band_pct.values())
+             for label, run in zip(labels, runs, strict=True)]
+            for load, runs in zip(drawn, found, strict=True)
+        ]  # fmt: skip
+        result.rows += [row for of_load in rows for row in of_load[:-1]] + [of_load[-1] for of_load in rows]
+        every = np.array([[run.J_BF for run in runs] for runs in found]).T
+        costs[regime] = every[:-1]
+        means[regime] = float(np.mean([runs[0].tau_u_mean for runs in found]))
+        best, ratio = judged(costs[regime], training)
+        _, of_other = judged(np.vstack((every[-1], every[1:-1])), training)
+        result.note(f"{regime}: J_BF of the adaptive period over fixed {tried[best]:g} s", ratio.value)
+        cells = f"{means[regime]:.2f}", f"{tried[best]:g}", ratio.text(), intervals.pays(ratio), of_other.text()
+        summary.append((regime, *cells))
+    fresh = training.any() and not training.all()
+    chosen = "on the first draws, judged on the others" if fresh else "on the same, which favours it"
+    title = f"J_BF of the adaptive period over the best fixed one, chosen {chosen}"
+    result.remarks.append(markdown_table((*SUMMARY, f"{named} over it"), summary, title))
+    texts = [tuple(cell if isinstance(cell, str) else f"{cell:.4g}" for cell in row) for row in result.rows]
+    result.remarks.append(markdown_table(result.columns, texts, "All runs"))
+    result.figures["cost against period"] = _periods_figure(costs, means, tried[1:])
+    return result
 
-    name = "periods"
-    title = "Cost against updating period of any process, fixed and adaptive"
 
-    def requests(self, options: StudyOptions) -> list[RunRequest]:
-        """Return every period under every draw, in each regime, and the rule that is not the default."""
-        return [
-            run
-            for regime in _regimes(options.process).values()
-            for load in loads(options, *"abcdef")
-            for run in _runs(load, options.process, regime)
-        ]
-
-    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Compare the adaptive period, in each regime, with the best fixed one of other draws, if there are any."""
-        process, drawn, summary = options.process, loads(options, *"abcdef"), []
-        result = StudyResult((*COLUMNS, *(f"{one.name} outside (%)" for one in process.banded)), [], {})
-        tried, named = periods(process), _other_rule(process)[1]
-        costs, means, training = {}, {}, np.array([load.draw == 1 for load in drawn])
-        labels: list[Cell] = ["adaptive", *tried[1:], named]
-        for regime, settings in _regimes(process).items():
-            found = [[outcomes[run].indicators for run in _runs(load, process, settings)] for load in drawn]
-            rows = [
-                [(regime, load.name, label, run.tau_u_mean, run.J_BF, *run.outside_band_pct.values())
-                 for label, run in zip(labels, runs, strict=True)]
-                for load, runs in zip(drawn, found, strict=True)
-            ]  # fmt: skip
-            result.rows += [row for of_load in rows for row in of_load[:-1]] + [of_load[-1] for of_load in rows]
-            every = np.array([[run.J_BF for run in runs] for runs in found]).T
-            costs[regime] = every[:-1]
-            means[regime] = float(np.mean([runs[0].tau_u_mean for runs in found]))
-            best, ratio = judged(costs[regime], training)
-            _, of_other = judged(np.vstack((every[-1], every[1:-1])), training)
-            result.note(f"{regime}: J_BF of the adaptive period over fixed {tried[best]:g} s", ratio.value)
-            cells = f"{means[regime]:.2f}", f"{tried[best]:g}", ratio.text(), intervals.pays(ratio), of_other.text()
-            summary.append((regime, *cells))
-        fresh = training.any() and not training.all()
-        chosen = "on the first draws, judged on the others" if fresh else "on the same, which favours it"
-        title = f"J_BF of the adaptive period over the best fixed one, chosen {chosen}"
-        result.remarks.append(markdown_table((*SUMMARY, f"{named} over it"), summary, title))
-        texts = [tuple(cell if isinstance(cell, str) else f"{cell:.4g}" for cell in row) for row in result.rows]
-        result.remarks.append(markdown_table(result.columns, texts, "All runs"))
-        result.figures["cost against period"] = _periods_figure(costs, means, tried[1:])
-        return result
+PERIODS: Final = study.Study(
+    "periods", "Cost against updating period of any process, fixed and adaptive",
+    lambda options: [run for regime in _regimes(options.process).values() for load in loads(options, *"abcdef")
+                     for run in _runs(load, options.process, regime)], _periods,
+)  # fmt: skip
+"""Closed-loop cost against the updating period, fixed and adaptive."""
 
 
 def judged(costs: Array, training: NDArray[np.bool_]) -> tuple[int, Interval]:

@@ -17,7 +17,7 @@ from coldloop_rig.text_tables import markdown_table
 from coldloop_studies import study
 from coldloop_studies.drawing import cost_bars, ratio_rows
 from coldloop_studies.request import Procedure, RunRequest, Series
-from coldloop_studies.study import NOISE, PROGRAM, TUNED, Load, Outcomes, StudyOptions, StudyResult, loads
+from coldloop_studies.study import NOISE, PROGRAM, TUNED, Load, Outcomes, Study, StudyOptions, StudyResult, loads
 from coldloop_studies.updating_period import ADAPTIVE, INTERRUPT, RULE, Policy
 
 CASES: Final = {
@@ -27,36 +27,30 @@ CASES: Final = {
 }
 
 
-class ClassicalStudy:
-    """Two PI loops against MPC."""
-
-    name = "classical"
-    title = "The classical loops as a baseline (section IV-A)"
-
-    def requests(self, options: StudyOptions) -> list[RunRequest]:
-        """Return every case under every draw."""
-        return [request for load in loads(options, *"abcdef") for request in _classical_runs(load)]
-
-    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Compare closed-loop costs and bands."""
-        result = StudyResult(("load", "case", "J_BF", "L1 outside (%)", "T5 outside (%)"), [], {})
-        table = []
-        for load in loads(options, *"abcdef"):
-            runs = [outcomes[request].indicators for request in _classical_runs(load)]
-            rows = [(run.J_BF, *run.outside_band_pct.values()) for run in runs]
-            result.rows += [(load.name, label, *row) for label, row in zip(CASES, rows, strict=True)]
-            table.append((load.name, *(f"{cost:,.0f} ({L1:.1f} / {T5:.1f})" for cost, L1, T5 in rows)))
-            result.note("J_BF of the classical loops over MPC at 2.5 s", runs[0].J_BF / runs[1].J_BF)
-        result.figures["closed-loop cost"] = cost_bars(result, CASES, 0.25, logarithmic=True)
-        caption = "**J_BF (time outside the bands, %: L1 / T5)**"
-        result.remarks.append(markdown_table(("hour", *CASES), table, caption))
-        return result
+def _classical_runs(load: Load) -> dict[str, RunRequest]:
+    return {label: load.request(period, *assignments) for label, (period, assignments) in CASES.items()}
 
 
-def _classical_runs(load: Load) -> list[RunRequest]:
-    return [load.request(period, *assignments) for period, assignments in CASES.values()]
+def _classical(found: study.Found[str]) -> StudyResult:
+    """Compare closed-loop costs and bands."""
+    result = StudyResult(("load", "case", "J_BF", "L1 outside (%)", "T5 outside (%)"), [], {})
+    table = []
+    for load, runs in found:
+        rows = [(run.indicators.J_BF, *run.indicators.outside_band_pct.values()) for run in runs.values()]
+        result.rows += [(load.name, label, *row) for label, row in zip(CASES, rows, strict=True)]
+        table.append((load.name, *(f"{cost:,.0f} ({L1:.1f} / {T5:.1f})" for cost, L1, T5 in rows)))
+        result.note("J_BF of the classical loops over MPC at 2.5 s", rows[0][0] / rows[1][0])
+    result.figures["closed-loop cost"] = cost_bars(result, CASES, 0.25, logarithmic=True)
+    caption = "**J_BF (time outside the bands, %: L1 / T5)**"
+    result.remarks.append(markdown_table(("hour", *CASES), table, caption))
+    return result
 
 
+CLASSICAL: Final = study.study_of_loads(
+    "classical", "The classical loops as a baseline (section IV-A)", lambda options: loads(options, *"abcdef"),
+    _classical_runs, _classical,
+)  # fmt: skip
+"""Two PI loops against MPC."""
 SOLVERS: Final = {
     "ODE": (),
     "ODE as printed": (f"{PROGRAM}preset=as-printed",),
@@ -75,50 +69,43 @@ REFERENCE: Final = ("ODE", "Algorithm 1")
 """Solver and way that the others are compared with."""
 
 
-class ContestStudy:
-    """Every solver under every way to choose the updating period."""
-
-    name = "contest"
-    title = "Beyond the paper: solvers and rules in the closed loop"
-
-    def requests(self, options: StudyOptions) -> list[RunRequest]:
-        """Return all runs."""
-        return [
-            request for solver in SOLVERS for way in WAYS
-            for hours in _groups(options).values() for request in _under(hours, solver, way)
+def _contest(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+    """Compare both costs with those of the ODE-based solver under Algorithm 1, hour by hour."""
+    result = StudyResult(("load", "solver", "way", "tau_u mean (s)", "J per time", "J_BF"), [], {})
+    over = f"over that of {' under '.join(REFERENCE)}"
+    for title, hours in _groups(options).items():
+        found = {
+            (solver, way.label): [outcomes[request].indicators for request in _under(hours, solver, way)]
+            for solver in SOLVERS for way in WAYS
+        }  # fmt: skip
+        result.rows += [
+            (load.name, *key, runs[place].tau_u_mean, runs[place].J_open_mean, runs[place].J_BF)
+            for place, load in enumerate(hours) for key, runs in found.items()
         ]  # fmt: skip
+        for indicator, cost in (("J_BF", "J_BF"), ("J_open_mean", "mean open-loop cost")):
+            costs = {key: np.array([getattr(run, indicator) for run in runs]) for key, runs in found.items()}
+            means = {key: mean_ratio(values, costs[REFERENCE]) for key, values in costs.items()}
+            worst = {key: float((values / costs[REFERENCE]).max()) for key, values in costs.items()}
+            keys = {way.label: [(solver, way.label) for solver in SOLVERS] for way in WAYS}
+            rows = [(label, *(f"{means[key].text()} ({worst[key]:.2f})" for key in row)) for label, row in keys.items()]
+            caption = (
+                f"**{title}, {cost}** {over}, geometric mean of {len(hours)} hours with its 95 % interval; in "
+                "brackets the worst hour."
+            )
+            result.remarks.append(markdown_table(("way", *SOLVERS), rows, caption))
+            drawn = {solver: {way.label: means[solver, way.label] for way in WAYS} for solver in SOLVERS}
+            result.figures[f"{title}, {cost}"] = ratio_rows(drawn, f"{cost} {over} (1)", 4.0, 0.16, len(SOLVERS))
+            for key, mean in means.items():
+                result.values[f"{cost} over ODE, Algorithm 1, {title}: {', '.join(key)}"] = [mean.value]
+    return result
 
-    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Compare both costs with those of the ODE-based solver under Algorithm 1, hour by hour."""
-        result = StudyResult(("load", "solver", "way", "tau_u mean (s)", "J per time", "J_BF"), [], {})
-        over = f"over that of {' under '.join(REFERENCE)}"
-        for title, hours in _groups(options).items():
-            found = {
-                (solver, way.label): [outcomes[request].indicators for request in _under(hours, solver, way)]
-                for solver in SOLVERS for way in WAYS
-            }  # fmt: skip
-            result.rows += [
-                (load.name, *key, runs[place].tau_u_mean, runs[place].J_open_mean, runs[place].J_BF)
-                for place, load in enumerate(hours) for key, runs in found.items()
-            ]  # fmt: skip
-            for indicator, cost in (("J_BF", "J_BF"), ("J_open_mean", "mean open-loop cost")):
-                costs = {key: np.array([getattr(run, indicator) for run in runs]) for key, runs in found.items()}
-                means = {key: mean_ratio(values, costs[REFERENCE]) for key, values in costs.items()}
-                worst = {key: float((values / costs[REFERENCE]).max()) for key, values in costs.items()}
-                keys = {way.label: [(solver, way.label) for solver in SOLVERS] for way in WAYS}
-                rows = [
-                    (label, *(f"{means[key].text()} ({worst[key]:.2f})" for key in row)) for label, row in keys.items()
-                ]
-                caption = (
-                    f"**{title}, {cost}** {over}, geometric mean of {len(hours)} hours with its 95 % interval; in "
-                    "brackets the worst hour."
-                )
-                result.remarks.append(markdown_table(("way", *SOLVERS), rows, caption))
-                drawn = {solver: {way.label: means[solver, way.label] for way in WAYS} for solver in SOLVERS}
-                result.figures[f"{title}, {cost}"] = ratio_rows(drawn, f"{cost} {over} (1)", 4.0, 0.16, len(SOLVERS))
-                for key, mean in means.items():
-                    result.values[f"{cost} over ODE, Algorithm 1, {title}: {', '.join(key)}"] = [mean.value]
-        return result
+
+CONTEST: Final = Study(
+    "contest", "Beyond the paper: solvers and rules in the closed loop",
+    lambda options: [request for solver in SOLVERS for way in WAYS for hours in _groups(options).values()
+                     for request in _under(hours, solver, way)], _contest,
+)  # fmt: skip
+"""Every solver under every way to choose the updating period."""
 
 
 def _groups(options: StudyOptions) -> dict[str, list[Load]]:
@@ -309,43 +296,40 @@ COLUMNS: Final = (
 )  # fmt: skip
 
 
-class RobustnessStudy:
-    """Controllers on plants that are off; on the same ones fixed periods and rules, under the paper's preset."""
-
-    name = "robustness"
-    title = "Beyond the paper: plants that differ from their model"
-
-    def requests(self, options: StudyOptions) -> list[RunRequest]:
-        """Return every controller, and every policy, under every condition and load."""
-        return [request for *_, request in _cases(options)]
-
-    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Say what controllers hold; compare costs of policies with those of a fixed period."""
-        result = StudyResult(COLUMNS, [], {})
-        runs: dict[tuple[str, str], list[Indicators]] = {}
-        for condition, name, load, request in _cases(options):
-            run, minutes = outcomes[request].indicators, load.ticks * TICK_S / 60
-            outside = tuple(run.outside_band_pct.values())
-            result.rows.append((condition, load.name, name, minutes, run.J_open_mean, *outside, run.J_BF))
-            runs.setdefault((condition, name), []).append(run)
-        found = {key: HoursUnder.of(some) for key, some in runs.items()}
-        over = {
-            controller: {condition: over_own(found, condition, controller)[0] for condition in CONTROLLER_CONDITIONS}
-            for controller in CONTROLLERS
+def _robustness(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+    """Say what controllers hold; compare costs of policies with those of a fixed period."""
+    result = StudyResult(COLUMNS, [], {})
+    runs: dict[tuple[str, str], list[Indicators]] = {}
+    for condition, name, load, request in _cases(options):
+        run, minutes = outcomes[request].indicators, load.ticks * TICK_S / 60
+        outside = tuple(run.outside_band_pct.values())
+        result.rows.append((condition, load.name, name, minutes, run.J_open_mean, *outside, run.J_BF))
+        runs.setdefault((condition, name), []).append(run)
+    found = {key: HoursUnder.of(some) for key, some in runs.items()}
+    over = {
+        controller: {condition: over_own(found, condition, controller)[0] for condition in CONTROLLER_CONDITIONS}
+        for controller in CONTROLLERS
+    }
+    what = f"J_BF over that of the same controller on the plant {NOMINAL} (1)"
+    result.figures["controllers on plants that are off"] = ratio_rows(over, what, 8.0, 0.27, 3)
+    result.remarks += controllers_remarks(options, found)
+    for indicator, cost in (("J_BF", "J_BF"), ("J_open_mean", "open loop")):
+        costs = {key: np.array([getattr(run, indicator) for run in some]) for key, some in runs.items()}
+        ratios = {
+            policy: {each: mean_ratio(costs[each, policy], costs[each, USUAL]) for each in RULE_CONDITIONS}
+            for policy in POLICIES
         }
-        what = f"J_BF over that of the same controller on the plant {NOMINAL} (1)"
-        result.figures["controllers on plants that are off"] = ratio_rows(over, what, 8.0, 0.27, 3)
-        result.remarks += controllers_remarks(options, found)
-        for indicator, cost in (("J_BF", "J_BF"), ("J_open_mean", "open loop")):
-            costs = {key: np.array([getattr(run, indicator) for run in some]) for key, some in runs.items()}
-            ratios = {
-                policy: {each: mean_ratio(costs[each, policy], costs[each, USUAL]) for each in RULE_CONDITIONS}
-                for policy in POLICIES
-            }
-            what = f"{cost} over that of {USUAL} (1)"
-            result.figures[f"policies under {cost}"] = ratio_rows(ratios, what, 6.5, 0.13, 3)
-            result.remarks.append(_policy_table(ratios, cost, costs))
-        return result
+        what = f"{cost} over that of {USUAL} (1)"
+        result.figures[f"policies under {cost}"] = ratio_rows(ratios, what, 6.5, 0.13, 3)
+        result.remarks.append(_policy_table(ratios, cost, costs))
+    return result
+
+
+ROBUSTNESS: Final = Study(
+    "robustness", "Beyond the paper: plants that differ from their model",
+    lambda options: [request for *_, request in _cases(options)], _robustness,
+)  # fmt: skip
+"""Controllers on plants that are off; on the same ones fixed periods and rules, under the paper's preset."""
 
 
 def _cases(options: StudyOptions) -> Iterator[Case]:

@@ -203,8 +203,7 @@ class Workers:
 def checked_requests(study: Study, options: StudyOptions, folder: Path) -> Sequence[RunRequest]:
     """Return the runs of a study, all of which can be done, and make its folders.
 
-    Raises:
-        UsageError: A run is too short, a solver is not there, or the folders cannot be written to.
+    Raises UsageError if a run is too short, a solver is not there, or the folders cannot be written to.
     """
     requests = study.requests(options)
     for request in requests:
@@ -355,8 +354,7 @@ def _bar(title: str, total: int) -> Iterator[Progress]:
 def conduct(study: Study, options: StudyOptions, workers: Workers, folder: Path) -> StudyResult:
     """Do the missing runs of a study and write its files to `folder / study.name`.
 
-    Raises:
-        ColdloopError: A run failed, or a file cannot be written.
+    Raises ColdloopError if a run failed, or a file cannot be written.
     """
     requests = checked_requests(study, options, folder)
     outcomes = perform_all(requests, Store(folder / RUNS), workers, study.name)
@@ -470,8 +468,7 @@ def unique(requests: Sequence[RunRequest]) -> list[RunRequest]:
 def conduct_shard(study: Study, options: StudyOptions, workers: Workers, folder: Path, shard: Shard) -> int:
     """Do the missing runs of a shard; return how many runs it has.
 
-    Raises:
-        ColdloopError: A run failed, or a file cannot be written.
+    Raises ColdloopError if a run failed, or a file cannot be written.
     """
     requests = checked_requests(study, options, folder)
     path = folder / study.name / f"shard-{shard.number}-of-{shard.of}.json"

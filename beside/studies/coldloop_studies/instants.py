@@ -74,8 +74,7 @@ def candidates(design: ControlDesign) -> dict[str, ControlDesign]:
 def judged(settings: Settings, names: Sequence[str], done: Callable[[int, int], None]) -> list[Judged]:
     """Return the sets with what they cost under some loads; `done` is called with the number of sets done and of all.
 
-    Raises:
-        StudyError: The loop costs nothing.
+    Raises StudyError if the loop costs nothing.
     """
     sets, ticks = candidates(settings.optimizer_plc.program.design), settings.process.ticks_per_sample
     found: list[Judged] = []

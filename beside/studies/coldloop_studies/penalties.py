@@ -20,7 +20,7 @@ from coldloop_studies import drawing
 from coldloop_studies.drawing import above_lowest, hour_panels, legend_outside, panels, paper
 from coldloop_studies.request import RunRequest, Series
 from coldloop_studies.solver_comparison import PairedSums, paired_loads, paired_request, throttled
-from coldloop_studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, first_and_fresh, loads
+from coldloop_studies.study import PROGRAM, Load, Outcomes, Study, StudyOptions, StudyResult, first_and_fresh, loads
 from coldloop_studies.updating_period import FEW, NINE, is_inside
 
 TUNED: Final = "tuned"
@@ -125,8 +125,7 @@ def paired(load: Load, variant: PenaltyVariant | None, power: float) -> RunReque
 def paired_sums(options: StudyOptions, outcomes: Outcomes) -> Paired:
     """Gather what presets, variants and qpOASES, which is no variant, gave on the same problems.
 
-    Raises:
-        StudyError: A profile costs less than the optimum.
+    Raises StudyError if a profile costs less than the optimum.
     """
     powers = {variant: sorted(powers_of(variant, options)) for variant in (None, *variants(options))}
     return PairedSums(
@@ -235,60 +234,60 @@ COLUMNS: Final = (
 )  # fmt: skip
 
 
-class PenaltiesStudy:
-    """Both presets, and each with one thing changed at a time."""
+def _penalties_requests(options: StudyOptions) -> list[RunRequest]:
+    found = [
+        paired(load, variant, power)
+        for load in paired_loads(options)  # a worker has the problems of a load at hand
+        for variant in (None, *variants(options))
+        for power in powers_of(variant, options)
+    ]
+    found += [closed(load, variant) for variant in variants(options) for load in _closed_loads(options)]
+    for load in hours(options):
+        for variant in _timed_variants(load, options):
+            found += _period_runs(load, variant, options)
+    return found
 
-    name = "penalties"
-    title = "Penalties, start and devices of the ODE-based solver: two presets"
 
-    def requests(self, options: StudyOptions) -> list[RunRequest]:
-        """Return all runs: paired problems, load by load, the closed loop at 5 s, fixed periods."""
-        found = [
-            paired(load, variant, power)
-            for load in paired_loads(options)  # a worker has the problems of a load at hand
-            for variant in (None, *variants(options))
-            for power in powers_of(variant, options)
-        ]
-        found += [closed(load, variant) for variant in variants(options) for load in _closed_loads(options)]
-        for load in hours(options):
-            for variant in _timed_variants(load, options):
-                found += _period_runs(load, variant, options)
-        return found
-
-    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Compare the variants with the lowest cost, with converged qpOASES and with the paper's points."""
-        found = paired_sums(options, outcomes)
-        loops = {
-            variant: np.array([outcomes[closed(load, variant)].indicators.J_BF for load in _closed_loads(options)])
-            for variant in variants(options)
-        }
-        timed: dict[PenaltyVariant, PeriodCosts] = {}
-        for load in hours(options):
-            for variant in _timed_variants(load, options):
-                runs = [outcomes[request].indicators for request in _period_runs(load, variant, options)]
-                timed.setdefault(variant, {})[load] = {
-                    cost: np.array([getattr(run, cost) for run in runs]) for cost in COSTS
-                }
-        figures = {"total cost": _figure(found), "periods": _period_figure(timed, periods(options))}
-        result = StudyResult(COLUMNS, _rows(options, found, loops, timed), figures)
-        for preset, variant in PRESETS.items():
-            result.values |= {
-                f"{preset}: crossing in total cost": found.crossings(None, variant),
-                f"{preset}: c1 at P = 1": [one.c1 for one in found.sums[variant, NOMINAL]],
-                f"{preset}: c2 at P = 1": [one.c2 for one in found.sums[variant, NOMINAL]],
+def _penalties(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+    """Compare the variants with the lowest cost, with converged qpOASES and with the paper's points."""
+    found = paired_sums(options, outcomes)
+    loops = {
+        variant: np.array([outcomes[closed(load, variant)].indicators.J_BF for load in _closed_loads(options)])
+        for variant in variants(options)
+    }
+    timed: dict[PenaltyVariant, PeriodCosts] = {}
+    for load in hours(options):
+        for variant in _timed_variants(load, options):
+            runs = [outcomes[request].indicators for request in _period_runs(load, variant, options)]
+            timed.setdefault(variant, {})[load] = {
+                cost: np.array([getattr(run, cost) for run in runs]) for cost in COSTS
             }
-            tables = {cost: _hours_by_title(timed[variant], cost) for cost in COSTS}
-            for title in tables["J_BF"]:
-                for cost, kind in COSTS.items():
-                    name = f"{preset}: interior optimum, share of {title}, {kind}"
-                    result.values[name] = [share_inside(tables[cost][title]).value]
-        result.remarks += [
-            _crossing_text(found),
-            *(_table(preset, options, found, loops) for preset in PRESETS),
-            *_start_table(options, found),
-            *_period_remarks(timed, periods(options)),
-        ]
-        return result
+    figures = {"total cost": _figure(found), "periods": _period_figure(timed, periods(options))}
+    result = StudyResult(COLUMNS, _rows(options, found, loops, timed), figures)
+    for preset, variant in PRESETS.items():
+        result.values |= {
+            f"{preset}: crossing in total cost": found.crossings(None, variant),
+            f"{preset}: c1 at P = 1": [one.c1 for one in found.sums[variant, NOMINAL]],
+            f"{preset}: c2 at P = 1": [one.c2 for one in found.sums[variant, NOMINAL]],
+        }
+        tables = {cost: _hours_by_title(timed[variant], cost) for cost in COSTS}
+        for title in tables["J_BF"]:
+            for cost, kind in COSTS.items():
+                name = f"{preset}: interior optimum, share of {title}, {kind}"
+                result.values[name] = [share_inside(tables[cost][title]).value]
+    result.remarks += [
+        _crossing_text(found),
+        *(_table(preset, options, found, loops) for preset in PRESETS),
+        *_start_table(options, found),
+        *_period_remarks(timed, periods(options)),
+    ]
+    return result
+
+
+PENALTIES: Final = Study(
+    "penalties", "Penalties, start and devices of the ODE-based solver: two presets", _penalties_requests, _penalties
+)
+"""Both presets, and each with one thing changed at a time."""
 
 
 def _rows(

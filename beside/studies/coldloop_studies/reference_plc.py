@@ -5,7 +5,6 @@ this machine to stand beside the paper's laptop.
 """
 
 import time
-from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -27,8 +26,8 @@ from coldloop_rig.plc_sizing.budget import estimator_memory, footprint
 from coldloop_rig.plc_sizing.operations import dense_sizes
 from coldloop_rig.text_tables import Cell, markdown_table
 from coldloop_studies.drawing import panels, paper
-from coldloop_studies.request import RunRequest, Series
-from coldloop_studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
+from coldloop_studies.request import Series
+from coldloop_studies.study import PROGRAM, Found, Outcomes, Study, StudyOptions, StudyResult, loads, study_of_loads
 
 SPEED: Final = "Mflop/s from n = 50 on"
 SLOW_DOWN: Final = "slow-down against the laptop, sizes 40 to 125"
@@ -39,51 +38,46 @@ SIZES: Final = dense_sizes(N, 94, 21)
 """Sizes of the paper's problem, zeros counted."""
 
 
-class CholeskyStudy:
-    """The speed curve, the time of an iteration of each solver, and the memory."""
+def _cholesky(_options: StudyOptions, _outcomes: Outcomes) -> StudyResult:
+    """Fit the curve and count."""
+    times = reference.cholesky_times()
+    curve = reference.reference_curve()
+    here = np.array([_seconds_here(int(n)) for n in times.size])
+    rows: list[tuple[Cell, ...]] = [
+        (int(n), plc * 1e3, curve.time_s(n) * 1e3, laptop * 1e6, own * 1e6)
+        for n, plc, laptop, own in zip(*(v.tolist() for v in (*times, here)), strict=True)
+    ]
+    columns = ("n", "PLC (ms), paper", "PLC (ms), fitted", "laptop (us), paper", "here (us)")
+    large = times.size[times.size >= 50]
+    modelled = np.array([curve.time_s(n) for n in times.size.tolist()])
+    prediction, estimator = PredictionModel(load_model(SHIPPED_MODELS["cold-box"])), EstimatorSettings()
+    design, limits, real = ControlDesign(), InputLimits(), real_of(Arithmetic.FLOAT32)
+    reduced, trivial = (
+        footprint(PredictiveProblem(prediction, one, limits, real), estimator_memory(prediction, estimator),
+                  SolverName.ODE) for one in (design, trivial_design(design))
+    )  # fmt: skip
+    values = {
+        SPEED: float(np.mean([operations.dense_cholesky(n).flops / curve.time_s(n) / 1e6 for n in large.tolist()])),
+        SLOW_DOWN: float((modelled / times.laptop_s)[times.size >= 40].mean()),
+        "tau_1 of the ODE-based solver (s)": _counted_s(curve, operations.ode(SIZES, ACTIVE.mean)),
+        "tau_1 of qpOASES by the paper's route (s)": reference.QPOASES_ON_LAPTOP_S * reference.slow_down(times, N),
+        "memory of the trivial problem over that of the PLC": trivial.total / reference.MEMORY_BYTES,
+        "memory of the reduced problem over that of the PLC": reduced.total / reference.MEMORY_BYTES,
+    }
+    return StudyResult(
+        columns,
+        rows,
+        {"cholesky times": _speed_figure(rows)},
+        {name: [value] for name, value in values.items()},
+        [_remark(curve, float(np.abs(reference.residuals(curve, times)).max())), _iterations(curve)],
+    )
 
-    name = "cholesky"
-    title = "The reference PLC: speed, time of an iteration, memory (figure performance_automate)"
 
-    def requests(self, options: StudyOptions) -> Sequence[RunRequest]:
-        """Return nothing."""
-        del options
-        return ()
-
-    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Fit the curve and count."""
-        del options, outcomes
-        times = reference.cholesky_times()
-        curve = reference.reference_curve()
-        here = np.array([_seconds_here(int(n)) for n in times.size])
-        rows: list[tuple[Cell, ...]] = [
-            (int(n), plc * 1e3, curve.time_s(n) * 1e3, laptop * 1e6, own * 1e6)
-            for n, plc, laptop, own in zip(*(v.tolist() for v in (*times, here)), strict=True)
-        ]
-        columns = ("n", "PLC (ms), paper", "PLC (ms), fitted", "laptop (us), paper", "here (us)")
-        large = times.size[times.size >= 50]
-        modelled = np.array([curve.time_s(n) for n in times.size.tolist()])
-        prediction, estimator = PredictionModel(load_model(SHIPPED_MODELS["cold-box"])), EstimatorSettings()
-        design, limits, real = ControlDesign(), InputLimits(), real_of(Arithmetic.FLOAT32)
-        reduced, trivial = (
-            footprint(PredictiveProblem(prediction, one, limits, real), estimator_memory(prediction, estimator),
-                      SolverName.ODE) for one in (design, trivial_design(design))
-        )  # fmt: skip
-        values = {
-            SPEED: float(np.mean([operations.dense_cholesky(n).flops / curve.time_s(n) / 1e6 for n in large.tolist()])),
-            SLOW_DOWN: float((modelled / times.laptop_s)[times.size >= 40].mean()),
-            "tau_1 of the ODE-based solver (s)": _counted_s(curve, operations.ode(SIZES, ACTIVE.mean)),
-            "tau_1 of qpOASES by the paper's route (s)": reference.QPOASES_ON_LAPTOP_S * reference.slow_down(times, N),
-            "memory of the trivial problem over that of the PLC": trivial.total / reference.MEMORY_BYTES,
-            "memory of the reduced problem over that of the PLC": reduced.total / reference.MEMORY_BYTES,
-        }
-        return StudyResult(
-            columns,
-            rows,
-            {"cholesky times": _speed_figure(rows)},
-            {name: [value] for name, value in values.items()},
-            [_remark(curve, float(np.abs(reference.residuals(curve, times)).max())), _iterations(curve)],
-        )
+CHOLESKY: Final = Study(
+    "cholesky", "The reference PLC: speed, time of an iteration, memory (figure performance_automate)", lambda _: (),
+    _cholesky,
+)  # fmt: skip
+"""The speed curve, the time of an iteration of each solver, and the memory."""
 
 
 def _seconds_here(n: int) -> float:
@@ -153,47 +147,37 @@ def _speed_figure(rows: list[tuple[Cell, ...]]) -> Figure:
 INPUTS: Final = {"CV155": "%", "NCR22_A": "W", "CV156": "%"}
 
 
-class SinglePrecision:
-    """Double and single precision, tick by tick."""
-
-    name = "single-precision"
-    title = "Single against double precision (section IV-D)"
-
-    def requests(self, options: StudyOptions) -> list[RunRequest]:
-        """Return both arithmetics under every draw."""
-        return [request for load in _loads(options) for request in _both(load)]
-
-    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Compare costs and inputs."""
-        result = StudyResult(("load", "J_BF double", "J_BF single", *(f"largest difference of {name} ({unit})"
-                              for name, unit in INPUTS.items())), [], {})  # fmt: skip
-        for load in _loads(options):
-            double, single = (outcomes[request] for request in _both(load))
-            apart = {name: single.series(name) - double.series(name) for name in INPUTS}
-            largest = [float(np.abs(each).max()) for each in apart.values()]
-            change = single.indicators.J_BF / double.indicators.J_BF - 1.0
-            result.rows.append((load.name, double.indicators.J_BF, single.indicators.J_BF, *largest))
-            result.note("change of J_BF in single precision", change)
-            for (name, unit), value in zip(INPUTS.items(), largest, strict=True):
-                result.note(f"largest difference of {name} ({unit}) in single precision", value)
-            if not result.figures:
-                with panels(3, 1, 4.0, sharex=True) as (figure, axes):
-                    for place, (name, unit), colour in zip(axes, INPUTS.items(), COLOURS, strict=False):
-                        hours = double.series("time_s") / 3600
-                        place.plot(hours, apart[name], color=colour, linewidth=0.7, label=name)
-                        place.set_ylabel(f"single - double ({unit})")
-                        legend_above(place)
-                    axes[-1].set_xlabel("plant time (h)")
-                result.figures["difference of the inputs"] = figure
-        return result
+def _single_precision(found: Found[str]) -> StudyResult:
+    """Compare costs and inputs."""
+    result = StudyResult(("load", "J_BF double", "J_BF single", *(f"largest difference of {name} ({unit})"
+                          for name, unit in INPUTS.items())), [], {})  # fmt: skip
+    for load, runs in found:
+        double, single = runs.values()
+        apart = {name: single.series(name) - double.series(name) for name in INPUTS}
+        largest = [float(np.abs(each).max()) for each in apart.values()]
+        change = single.indicators.J_BF / double.indicators.J_BF - 1.0
+        result.rows.append((load.name, double.indicators.J_BF, single.indicators.J_BF, *largest))
+        result.note("change of J_BF in single precision", change)
+        for (name, unit), value in zip(INPUTS.items(), largest, strict=True):
+            result.note(f"largest difference of {name} ({unit}) in single precision", value)
+        if not result.figures:
+            with panels(3, 1, 4.0, sharex=True) as (figure, axes):
+                for place, (name, unit), colour in zip(axes, INPUTS.items(), COLOURS, strict=False):
+                    hours = double.series("time_s") / 3600
+                    place.plot(hours, apart[name], color=colour, linewidth=0.7, label=name)
+                    place.set_ylabel(f"single - double ({unit})")
+                    legend_above(place)
+                axes[-1].set_xlabel("plant time (h)")
+            result.figures["difference of the inputs"] = figure
+    return result
 
 
-def _loads(options: StudyOptions) -> list[Load]:
-    """Return two hours of each draw: rounding changes single steps, so more draws say more than longer runs."""
-    return loads(options, "8h", longest_ticks=2 * HOUR_TICKS)
-
-
-def _both(load: Load) -> list[RunRequest]:
-    return [
-        load.request(2.5, f"{PROGRAM}arithmetic={arithmetic}", trace_ticks=1) for arithmetic in ("float64", "float32")
-    ]
+SINGLE_PRECISION: Final = study_of_loads(
+    "single-precision", "Single against double precision (section IV-D)",
+    # two hours of each draw: rounding changes single steps, so more draws say more than longer runs
+    lambda options: loads(options, "8h", longest_ticks=2 * HOUR_TICKS),
+    lambda load: {kind: load.request(2.5, f"{PROGRAM}arithmetic={kind}", trace_ticks=1)
+                  for kind in ("float64", "float32")},
+    _single_precision,
+)  # fmt: skip
+"""Double and single precision, tick by tick."""

@@ -17,7 +17,7 @@ from coldloop_rig.results.recording import CONTROL
 from coldloop_rig.text_tables import Cell
 from coldloop_studies.drawing import cost_bars, over_time
 from coldloop_studies.request import Outcome, RunRequest
-from coldloop_studies.study import TUNED, Load, Outcomes, StudyOptions, StudyResult, loads
+from coldloop_studies.study import TUNED, Found, Load, Outcomes, Study, StudyOptions, StudyResult, loads, study_of_loads
 
 REFRIGERATOR: Final = "plant.kind=refrigerator"
 PLANTS: Final = {
@@ -34,33 +34,21 @@ COUPLING_COLUMNS: Final = (
 COUPLING_SHOWN: Final = {"load": "load (W)", "P12": "HP (bar)", "P11": "LP (bar)", "T9": "T9 (K)", "T5": "T5 (K)"}
 
 
-class CouplingStudy:
-    """The cold box alone against the whole refrigerator."""
-
-    name = "coupling"
-    title = "Beyond the paper: the whole refrigerator under MPC"
-
-    def requests(self, options: StudyOptions) -> list[RunRequest]:
-        """Return every plant under every draw."""
-        return [request for load in loads(options, *"abcdef") for request in _coupled_runs(load).values()]
-
-    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Compare closed-loop costs, bands, updating periods and what the pressures do."""
-        result = StudyResult(COUPLING_COLUMNS, [], {}, always_shown=True)
-        for load in loads(options, *"abcdef"):
-            runs = {plant: outcomes[request] for plant, request in _coupled_runs(load).items()}
-            alone, *_ = runs.values()
-            for plant, run in runs.items():
-                i = run.indicators
-                result.rows.append((load.name, plant, i.J_BF, *i.outside_band_pct.values(), i.tau_u_mean, *warm(run)))
-                if run is not alone:
-                    ratio = run.indicators.J_BF / alone.indicators.J_BF
-                    result.note(f"J_BF on the {plant}, over the cold box alone", ratio)
-            if "pressures" not in result.figures:
-                title = f"hour {Path(load.name).name}"
-                result.figures["pressures"] = over_time(title, list(runs.items()), COUPLING_SHOWN, 6.0)
-        result.figures["closed-loop cost"] = cost_bars(result, PLANTS, 0.19)
-        return result
+def _coupling(found: Found[str]) -> StudyResult:
+    """Compare closed-loop costs, bands, updating periods and what the pressures do."""
+    result = StudyResult(COUPLING_COLUMNS, [], {}, always_shown=True)
+    for load, runs in found:
+        alone, *_ = runs.values()
+        for plant, run in runs.items():
+            i = run.indicators
+            result.rows.append((load.name, plant, i.J_BF, *i.outside_band_pct.values(), i.tau_u_mean, *warm(run)))
+            if run is not alone:
+                result.note(f"J_BF on the {plant}, over the cold box alone", i.J_BF / alone.indicators.J_BF)
+        if "pressures" not in result.figures:
+            title = f"hour {Path(load.name).name}"
+            result.figures["pressures"] = over_time(title, list(runs.items()), COUPLING_SHOWN, 6.0)
+    result.figures["closed-loop cost"] = cost_bars(result, PLANTS, 0.19)
+    return result
 
 
 def warm(run: Outcome) -> tuple[Cell, ...]:
@@ -76,8 +64,11 @@ def _range(run: Outcome, name: str, digits: int) -> str:
     return f"{series.min():.{digits}f}..{series.max():.{digits}f}"
 
 
-def _coupled_runs(load: Load) -> dict[str, RunRequest]:
-    return {plant: load.request(0.0, *settings, trace_ticks=TRACE_TICKS) for plant, settings in PLANTS.items()}
+COUPLING: Final = study_of_loads(
+    "coupling", "Beyond the paper: the whole refrigerator under MPC", lambda options: loads(options, *"abcdef"),
+    lambda load: {plant: load.request(0.0, *own, trace_ticks=TRACE_TICKS) for plant, own in PLANTS.items()}, _coupling,
+)  # fmt: skip
+"""The cold box alone against the whole refrigerator."""
 
 
 def _events(*events: tuple[int, str, float]) -> tuple[str, ...]:
@@ -121,28 +112,25 @@ SHOWN: Final = {
 }  # fmt: skip
 
 
-class DisturbancesStudy:
-    """Events of a refrigerator, with LQ and PI at the station, MPC and loops at the cold box."""
+def _disturbances(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+    """Tabulate bands, pressures, modes and alarms of each run."""
+    result = StudyResult(COLUMNS, [], {}, always_shown=True)
+    for name, event in CASES.items():
+        for load in _loads(event, options):
+            runs = {pair: outcomes[request] for pair, request in _runs(event, load).items()}
+            result.rows += [(f"{name} ({load.name})", *pair, *_measures(run)) for pair, run in runs.items()]
+            if load.draw == 1:
+                labelled = [(", ".join(pair), run) for pair, run in runs.items()]
+                result.figures[name] = over_time("", labelled, SHOWN, 8.0)
+    return result
 
-    name = "disturbances"
-    title = "Beyond the paper: what happens to a refrigerator"
 
-    def requests(self, options: StudyOptions) -> list[RunRequest]:
-        """Return every event with every pair of controllers."""
-        under = [(event, load) for event in CASES.values() for load in _loads(event, options)]
-        return [run for event, load in under for run in _runs(event, load).values()]
-
-    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Tabulate bands, pressures, modes and alarms of each run."""
-        result = StudyResult(COLUMNS, [], {}, always_shown=True)
-        for name, event in CASES.items():
-            for load in _loads(event, options):
-                runs = {pair: outcomes[request] for pair, request in _runs(event, load).items()}
-                result.rows += [(f"{name} ({load.name})", *pair, *_measures(run)) for pair, run in runs.items()]
-                if load.draw == 1:
-                    labelled = [(", ".join(pair), run) for pair, run in runs.items()]
-                    result.figures[name] = over_time("", labelled, SHOWN, 8.0)
-        return result
+DISTURBANCES: Final = Study(
+    "disturbances", "Beyond the paper: what happens to a refrigerator",
+    lambda options: [run for event in CASES.values() for load in _loads(event, options)
+                     for run in _runs(event, load).values()], _disturbances,
+)  # fmt: skip
+"""Events of a refrigerator, with LQ and PI at the station, MPC and loops at the cold box."""
 
 
 def _loads(event: Case, options: StudyOptions) -> list[Load]:

@@ -24,27 +24,25 @@ from coldloop_rig.plc_sizing.operations import dense_cholesky
 from coldloop_rig.plc_sizing.plc import cholesky_times
 from coldloop_rig.results.folders import write_json, writing
 from coldloop_rig.text_tables import markdown_table
-from coldloop_studies.any_process import CompareStudy, PeriodsStudy
-from coldloop_studies.controllers import ClassicalStudy, ContestStudy, RobustnessStudy
+from coldloop_studies.any_process import COMPARE, PERIODS
+from coldloop_studies.controllers import CLASSICAL, CONTEST, ROBUSTNESS
 from coldloop_studies.drawing import published_comparison, published_periods
 from coldloop_studies.execution import Workers, conduct, section
-from coldloop_studies.penalties import PenaltiesStudy
-from coldloop_studies.reference_plc import SLOW_DOWN, SPEED, CholeskyStudy, SinglePrecision
-from coldloop_studies.refrigerator import CouplingStudy, DisturbancesStudy
+from coldloop_studies.penalties import PENALTIES
+from coldloop_studies.reference_plc import CHOLESKY, SINGLE_PRECISION, SLOW_DOWN, SPEED
+from coldloop_studies.refrigerator import COUPLING, DISTURBANCES
 from coldloop_studies.settings import settings_of
-from coldloop_studies.solver_comparison import SolverComparison, measures
-from coldloop_studies.study import USUAL_DRAWS, Study, StudyOptions, StudyResult
-from coldloop_studies.trajectories import BUS, COURSES, TradeOff
-from coldloop_studies.updating_period import UpdatingPeriodStudy, is_inside
+from coldloop_studies.solver_comparison import SOLVER_COMPARISON, measures
+from coldloop_studies.study import USUAL_DRAWS, StudyOptions, StudyResult
+from coldloop_studies.trajectories import BUS, COURSES, TRADE_OFF
+from coldloop_studies.updating_period import UPDATING_PERIOD, is_inside
 
-_REPORTED: Final[tuple[Study, ...]] = (
-    CholeskyStudy(), *COURSES[:2], SolverComparison(), COURSES[2], UpdatingPeriodStudy(), *BUS, TradeOff(),
-    ClassicalStudy(), SinglePrecision(), CouplingStudy(), DisturbancesStudy(),
-)  # fmt: skip
-STUDIES: Final = {study.name: study for study in _REPORTED}
+STUDIES: Final = {study.name: study for study in (
+    CHOLESKY, *COURSES[:2], SOLVER_COMPARISON, COURSES[2], UPDATING_PERIOD, *BUS, TRADE_OFF, CLASSICAL,
+    SINGLE_PRECISION, COUPLING, DISTURBANCES,
+)}  # fmt: skip
 """Studies of the report, in the order of the paper."""
-_APART: Final[tuple[Study, ...]] = (RobustnessStudy(), ContestStudy(), PenaltiesStudy(), PeriodsStudy(), CompareStudy())
-APART: Final = {study.name: study for study in _APART}
+APART: Final = {study.name: study for study in (ROBUSTNESS, CONTEST, PENALTIES, PERIODS, COMPARE)}
 """Studies that are too long for the report."""
 
 TOLERANCES: Final = Path(__file__).with_name("tolerances.toml")
@@ -409,8 +407,7 @@ READING = (
 def reproduce(options: StudyOptions, workers: Workers, out: Path) -> tuple[str, int]:
     """Do all studies and write the report; return what to print, and in how many runs updates had no answer.
 
-    Raises:
-        ColdloopError: A study failed, or the report cannot be written.
+    Raises ColdloopError if a study failed, or the report cannot be written.
     """
     began = time.monotonic()
     results = {name: conduct(study, options, workers, out) for name, study in STUDIES.items()}

@@ -218,8 +218,7 @@ SHORTEST_TICKS = 60
 def check(request: RunRequest) -> None:
     """Find out, before any run is done, what would make one fail.
 
-    Raises:
-        UsageError: A run is too short, or a solver is not there.
+    Raises UsageError if a run is too short, or a solver is not there.
     """
     program = settings_of(request.assignments).optimizer_plc.program
     if request.ticks < SHORTEST_TICKS:

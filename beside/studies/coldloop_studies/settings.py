@@ -22,8 +22,7 @@ def settings_of(assignments: tuple[str, ...]) -> Settings:
 def outside_digests(settings: OutsideSettings) -> dict[str, str]:
     """Return the digest of each outside part that the settings name, by `part name`.
 
-    Raises:
-        ConfigurationError: A part is not installed, or cannot be imported.
+    Raises ConfigurationError if a part is not installed, or cannot be imported.
     """
     names = {part: getattr(settings, part) for part in Part}
     return {f"{part} {name}": _digest(part, name) for part, name in names.items() if name}

@@ -21,7 +21,7 @@ from coldloop_studies import drawing
 from coldloop_studies.drawing import above_lowest, legend_outside, panels, paper, spread
 from coldloop_studies.paired_run import HARSH, INTERIOR_POINT_ITERATIONS
 from coldloop_studies.request import Outcome, Procedure, RunRequest, Series
-from coldloop_studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
+from coldloop_studies.study import PROGRAM, Load, Outcomes, Study, StudyOptions, StudyResult, loads
 
 UNLIMITED = 50.0
 """Power at which qpOASES makes 526 recalculations in a period: more than any problem takes."""
@@ -87,8 +87,7 @@ class Sums(NamedTuple):
 class PairedSums(Generic[S]):
     """Sums of all draws, by solver, power (rising) and draw, of the outcomes of the requests that `request` makes.
 
-    Raises:
-        StudyError: A profile costs less than the optimum.
+    Raises StudyError if a profile costs less than the optimum.
     """
 
     def __init__(
@@ -156,8 +155,7 @@ class PairedSums(Generic[S]):
 def watch(run: Outcome, cost: Series, what: str) -> None:
     """Make sure that no profile costs less than the best one that can be played.
 
-    Raises:
-        StudyError: One does: the study, or the optimum, is wrong. `what` is for the message.
+    Raises StudyError if one does: the study, or the optimum, is wrong. `what` is for the message.
     """
     bound = run.column("lowest")
     below = np.flatnonzero(cost < bound - 1e-9 * (1.0 + np.abs(bound)))  # what rounding may do
@@ -217,8 +215,7 @@ def harsh_request(load: Load, solver: str) -> RunRequest:
 def harsh_ratios(options: StudyOptions, outcomes: Outcomes) -> dict[str, dict[int, Series]]:
     """Return the costs of all harsh problems over the lowest: by solver and by iterations of the interior-point solver.
 
-    Raises:
-        StudyError: A profile costs less than the optimum.
+    Raises StudyError if a profile costs less than the optimum.
     """
     found = {}
     for solver in HARSH_SOLVERS:
@@ -277,64 +274,64 @@ INDICATORS: Final = ("J_dev", "J_cst", "J_total", "c1", "c2", "J_BF")
 COLUMNS: Final = ("part", "load", "solver", "power", *INDICATORS, "J_total over the lowest")
 
 
-class SolverComparison:
-    """Open loop, paired, and closed loop, two solvers at 18 powers and the others at some; harsh problems."""
+def _comparison_requests(options: StudyOptions) -> list[RunRequest]:
+    paired = [
+        paired_request(load, solver, power)
+        for load in paired_loads(options)  # a worker has the problems of a load at hand
+        for solver in LABELS
+        for power in powers_of(solver, options)
+    ]
+    harsh = [harsh_request(load, solver) for load in _harsh_loads(options) for solver in HARSH_SOLVERS]
+    closed = [
+        throttled(load, solver, power)
+        for power in sorted(_paper_powers(options), reverse=True)
+        for solver in SOLVERS
+        for load in _closed_loads(options)
+    ]
+    return [*paired, *harsh, *closed]
 
-    name = "solver-comparison"
-    title = "Solvers against computing power (figure solv_cmp)"
 
-    def requests(self, options: StudyOptions) -> list[RunRequest]:
-        """Return the problems of all solvers, then every solver of the paper in the closed loop, long runs first."""
-        paired = [
-            paired_request(load, solver, power)
-            for load in paired_loads(options)  # a worker has the problems of a load at hand
-            for solver in LABELS
-            for power in powers_of(solver, options)
-        ]
-        harsh = [harsh_request(load, solver) for load in _harsh_loads(options) for solver in HARSH_SOLVERS]
-        closed = [
-            throttled(load, solver, power)
-            for power in sorted(_paper_powers(options), reverse=True)
-            for solver in SOLVERS
-            for load in _closed_loads(options)
-        ]
-        return [*paired, *harsh, *closed]
-
-    @np.errstate(divide="ignore", invalid="ignore")  # under a load that never steps nothing costs anything
-    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Compare costs with those of converged qpOASES, with the lowest there are, and with the paper's."""
-        powers = np.array(_paper_powers(options))
-        paired = open_loop(options, outcomes)
-        tables: list[Table] = [paired.table(draw) for draw in range(len(paired.loads))]
-        closed: list[Table] = [
-            {solver: {"J_BF": np.array([outcomes[throttled(load, solver, power)].indicators.J_BF
-                                        for power in powers.tolist()])} for solver in SOLVERS}
-            for load in _closed_loads(options)
+@np.errstate(divide="ignore", invalid="ignore")  # under a load that never steps nothing costs anything
+def _comparison(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+    """Compare costs with those of converged qpOASES, with the lowest there are, and with the paper's."""
+    powers = np.array(_paper_powers(options))
+    paired = open_loop(options, outcomes)
+    tables: list[Table] = [paired.table(draw) for draw in range(len(paired.loads))]
+    closed: list[Table] = [
+        {solver: {"J_BF": np.array([outcomes[throttled(load, solver, power)].indicators.J_BF
+                                    for power in powers.tolist()])} for solver in SOLVERS}
+        for load in _closed_loads(options)
+    ]  # fmt: skip
+    result = StudyResult(COLUMNS, [], {"indicators": _figure(powers, tables, closed)})
+    with panels(1, 1, 3.0) as (figure, (place,)):
+        for (solver, some), colour in zip(paired.powers.items(), COLOURS, strict=False):
+            intervals = [paired.interval(solver, power) for power in some]
+            above_lowest(place, some, intervals, colour, LABELS[solver])
+        legend_outside(figure, place)
+    result.figures["paired open loop"] = figure
+    for load, table in zip(paired.loads, tables, strict=True):
+        result.rows += [
+            ("paired", load.name, solver, power, *(columns[name][i] for name in INDICATORS[:-1]), np.nan,
+             columns["J_total"][i] / columns["lowest"][i])
+            for solver, columns in table.items() for i, power in enumerate(paired.powers[solver])
         ]  # fmt: skip
-        result = StudyResult(COLUMNS, [], {"indicators": _figure(powers, tables, closed)})
-        with panels(1, 1, 3.0) as (figure, (place,)):
-            for (solver, some), colour in zip(paired.powers.items(), COLOURS, strict=False):
-                intervals = [paired.interval(solver, power) for power in some]
-                above_lowest(place, some, intervals, colour, LABELS[solver])
-            legend_outside(figure, place)
-        result.figures["paired open loop"] = figure
-        for load, table in zip(paired.loads, tables, strict=True):
-            result.rows += [
-                ("paired", load.name, solver, power, *(columns[name][i] for name in INDICATORS[:-1]), np.nan,
-                 columns["J_total"][i] / columns["lowest"][i])
-                for solver, columns in table.items() for i, power in enumerate(paired.powers[solver])
-            ]  # fmt: skip
-            result.note_all(_open_loop_measures(powers, table))
-        nothing = (np.nan,) * (len(INDICATORS) - 1)
-        for load, table in zip(_closed_loads(options), closed, strict=True):
-            result.rows += [
-                ("closed", load.name, solver, power, *nothing, table[solver]["J_BF"][i], np.nan)
-                for solver in SOLVERS for i, power in enumerate(powers.tolist())
-            ]  # fmt: skip
-            result.note_all(_closed_loop_measures(powers, table))
-        result.values |= harsh_values(harsh_ratios(options, outcomes))
-        result.remarks += [open_loop_table(paired), harsh_table(options, outcomes)]
-        return result
+        result.note_all(_open_loop_measures(powers, table))
+    nothing = (np.nan,) * (len(INDICATORS) - 1)
+    for load, table in zip(_closed_loads(options), closed, strict=True):
+        result.rows += [
+            ("closed", load.name, solver, power, *nothing, table[solver]["J_BF"][i], np.nan)
+            for solver in SOLVERS for i, power in enumerate(powers.tolist())
+        ]  # fmt: skip
+        result.note_all(_closed_loop_measures(powers, table))
+    result.values |= harsh_values(harsh_ratios(options, outcomes))
+    result.remarks += [open_loop_table(paired), harsh_table(options, outcomes)]
+    return result
+
+
+SOLVER_COMPARISON: Final = Study(
+    "solver-comparison", "Solvers against computing power (figure solv_cmp)", _comparison_requests, _comparison
+)
+"""Open loop, paired, and closed loop, two solvers at 18 powers and the others at some; harsh problems."""
 
 
 def _closed_loads(options: StudyOptions) -> list[Load]:

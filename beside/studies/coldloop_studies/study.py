@@ -1,9 +1,9 @@
 """A study: its extent, its loads, its runs, and the evaluation of their outcomes."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, TypeVar
 
 from matplotlib.figure import Figure
 
@@ -173,22 +173,36 @@ class StudyResult:
             self.note(claim, value)
 
 
-class Study(Protocol):
+@dataclass(frozen=True)
+class Study:
     """A question, its runs, and its answer."""
 
-    @property
-    def name(self) -> str:
-        """Name of the study in the command."""
+    name: str
+    """Name of the study in the command."""
+    title: str
+    """Heading of its section in the report."""
+    requests: Callable[[StudyOptions], Sequence[RunRequest]]
+    """Returns the runs that are needed."""
+    evaluate: Callable[[StudyOptions, Outcomes], StudyResult]
+    """Returns what the outcomes say."""
 
-    @property
-    def title(self) -> str:
-        """Heading of its section in the report."""
 
-    def requests(self, options: StudyOptions) -> Sequence[RunRequest]:
-        """Return the runs that are needed."""
+Key = TypeVar("Key")
+Found = Iterable[tuple[Load, dict[Key, Outcome]]]
+"""Outcomes of the same runs under each load; read when they are wanted, once."""
 
-    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Return what the outcomes say."""
+
+def study_of_loads(
+    name: str, title: str, drawn: Callable[[StudyOptions], Sequence[Load]],
+    runs: Callable[[Load], dict[Key, RunRequest]], evaluate: Callable[[Found[Key]], StudyResult],
+) -> Study:  # fmt: skip
+    """Return a study of the same runs under each of its loads."""
+    return Study(
+        name, title, lambda options: [run for load in drawn(options) for run in runs(load).values()],
+        lambda options, outcomes: evaluate(
+            (load, {key: outcomes[run] for key, run in runs(load).items()}) for load in drawn(options)
+        ),
+    )  # fmt: skip
 
 
 OWN: Final = "studies run in one process, in lock-step; leave it out"

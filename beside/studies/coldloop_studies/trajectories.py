@@ -6,7 +6,6 @@ tick has the period that is in force then, and counts once.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from coldloop.process.cold_box import COLD_BOX, SAMPLING_PERIOD_S, TICK_S
 from coldloop_rig.figures.plot import COLOURS, DASHES, legend_above
 from coldloop_rig.text_tables import markdown_table
+from coldloop_studies import study
 from coldloop_studies.drawing import legend_outside, panels, spread, time_panels
 from coldloop_studies.request import Outcome, RunRequest, Series
 from coldloop_studies.solver_comparison import UNLIMITED, throttled
@@ -26,53 +26,37 @@ TRACE_TICKS = 4
 BANDS = tuple((band.low, band.high) for band in COLD_BOX.bands)
 
 
-@dataclass(frozen=True)
-class TrajectoryStudy:
-    """Runs of several solvers under the same load, drawn over each other."""
+def _course(name: str, title: str, *cases: tuple[str, str, float]) -> study.Study:
+    """Return a study of solvers under the same load, drawn over each other; a case has label, solver and power."""
 
-    name: str
-    title: str
-    cases: tuple[tuple[str, str, float], ...]
-    """Label, solver, power."""
-
-    def requests(self, options: StudyOptions) -> list[RunRequest]:
-        """Return a run of every case under every draw."""
-        return [request for load in loads(options, "d") for request in self._runs(load)]
-
-    def _runs(self, load: Load) -> list[RunRequest]:
-        return [throttled(load, solver, power, TRACE_TICKS) for _, solver, power in self.cases]
-
-    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Compare closed-loop costs, bands and iterations."""
+    def evaluate(found: study.Found[str]) -> StudyResult:
         result = StudyResult(
             ("load", "case", "J_BF", "L1 outside (%)", "T5 outside (%)", "furthest outside", "iterations after a step",
              "iterations in quiet"), [], {},
         )  # fmt: skip
-        for load in loads(options, "d"):
-            runs = [outcomes[request] for request in self._runs(load)]
-            labelled = [(label, run) for (label, _, _), run in zip(self.cases, runs, strict=True)]
+        for load, runs in found:
             if not result.figures:
-                result.figures["time courses"] = time_panels(labelled, BANDS)
-            for label, run in labelled:
+                result.figures["time courses"] = time_panels(list(runs.items()), BANDS)
+            costs = []
+            for label, run in runs.items():
+                i, far = run.indicators, furthest_outside(run)
                 after, quiet = iterations_by_event(run, load)
-                result.rows.append(
-                    (load.name, label, run.indicators.J_BF, *run.indicators.outside_band_pct.values(),
-                     furthest_outside(run), after, quiet)
-                )  # fmt: skip
-            self._judge(result, load, runs)
+                result.rows.append((load.name, label, i.J_BF, *i.outside_band_pct.values(), far, after, quiet))
+                costs.append(i.J_BF)
+            if len(runs) == 1:
+                result.note(f"{name}: furthest outside", far)
+                result.note(f"{name}: time outside", max(i.outside_band_pct.values()))
+                result.note(f"{name}: iterations", after / quiet if quiet else np.nan)
+            else:
+                result.note(f"{name}: J_BF", costs[0] / costs[-1])
+            if len(runs) > 2:
+                result.note(f"{name}: J_BF of qpOASES over ODE", costs[1] / costs[0])
         return result
 
-    def _judge(self, result: StudyResult, load: Load, runs: Sequence[Outcome]) -> None:
-        costs = [run.indicators.J_BF for run in runs]
-        if len(runs) == 1:
-            after, quiet = iterations_by_event(runs[0], load)
-            result.note(f"{self.name}: furthest outside", furthest_outside(runs[0]))
-            result.note(f"{self.name}: time outside", max(runs[0].indicators.outside_band_pct.values()))
-            result.note(f"{self.name}: iterations", after / quiet if quiet else np.nan)
-        else:
-            result.note(f"{self.name}: J_BF", costs[0] / costs[-1])
-        if len(runs) > 2:
-            result.note(f"{self.name}: J_BF of qpOASES over ODE", costs[1] / costs[0])
+    return study.study_of_loads(
+        name, title, lambda options: loads(options, "d"),
+        lambda load: {label: throttled(load, solver, power, TRACE_TICKS) for label, solver, power in cases}, evaluate,
+    )  # fmt: skip
 
 
 def furthest_outside(run: Outcome) -> float:
@@ -118,12 +102,11 @@ def _seconds_since_step(run: Outcome, load: Load) -> Series:
 _UNLIMITED_QPOASES = ("qpOASES, unlimited", "qpoases", UNLIMITED)
 _THROTTLED_QPOASES = ("qpOASES, 10 iterations", "qpoases", 1.0)
 COURSES: Final = (
-    TrajectoryStudy("unlimited", "The scheme with qpOASES and no limit of iterations (figure working_mpc)",
-                    (_UNLIMITED_QPOASES,)),
-    TrajectoryStudy("limited", "qpOASES limited to 10 iterations (figure not_working_mpc)",
-                    (_THROTTLED_QPOASES, _UNLIMITED_QPOASES)),
-    TrajectoryStudy("trajectories", "The ODE-based solver, limited qpOASES and unlimited qpOASES (figure mult_solv)",
-                    (("ODE, 20 iterations", "ode", 1.0), _THROTTLED_QPOASES, _UNLIMITED_QPOASES)),
+    _course("unlimited", "The scheme with qpOASES and no limit of iterations (figure working_mpc)", _UNLIMITED_QPOASES),
+    _course("limited", "qpOASES limited to 10 iterations (figure not_working_mpc)", _THROTTLED_QPOASES,
+            _UNLIMITED_QPOASES),
+    _course("trajectories", "The ODE-based solver, limited qpOASES and unlimited qpOASES (figure mult_solv)",
+            ("ODE, 20 iterations", "ode", 1.0), _THROTTLED_QPOASES, _UNLIMITED_QPOASES),
 )  # fmt: skip
 """Studies of runs against time."""
 
@@ -218,60 +201,53 @@ def response_figure(runs_of: Mapping[str, Sequence[Run]]) -> Figure:
     return figure
 
 
-@dataclass(frozen=True)
-class ExperimentStudy:
-    """Runs on the bus, three services and Modbus/TCP, each repeated in one process."""
+RIGS: Final = {"networked": True, "one process": False}
 
-    name: str
-    title: str
-    cases: tuple[tuple[str, float], ...]
-    """Label and updating period, s; 0 is adaptive."""
 
-    def requests(self, options: StudyOptions) -> list[RunRequest]:
-        """Return each case on the bus and in one process, under the first draw."""
-        return [run for load in _first(options) for _, period in self.cases for run in _both(load, period)]
+def _experiment(name: str, title: str, periods_s: Mapping[str, float]) -> study.Study:
+    """Return a study of runs on the bus, three services and Modbus/TCP, each repeated in one process.
 
-    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Compare traces, bands and updating periods."""
+    `periods_s` has the updating period (s) of each case; 0 is adaptive.
+    """
+
+    def runs(load: Load) -> dict[tuple[str, str], RunRequest]:
+        return {(case, rig): load.request(period_s, networked=networked, trace_ticks=TRACE_TICKS)
+                for case, period_s in periods_s.items() for rig, networked in RIGS.items()}  # fmt: skip
+
+    def evaluate(found: study.Found[tuple[str, str]]) -> StudyResult:
         result = StudyResult(
             ("load", "case", "rig", "J_BF", "L1 outside (%)", "T5 outside (%)", "tau_u mean (s)",
              "tau_u mean per update (s)", "trace"), [], {},
         )  # fmt: skip
-        for load in _first(options):
-            labelled = []
-            for label, period in self.cases:
-                networked, alone = (outcomes[request] for request in _both(load, period))
-                labelled.append((label, networked))
-                for rig, run in (("networked", networked), ("one process", alone)):
-                    i = run.indicators
-                    result.rows.append(
-                        (load.name, label, rig, i.J_BF, *i.outside_band_pct.values(), i.tau_u_mean,
-                         i.tau_u_mean_per_update, run.trace_sha256)
-                    )  # fmt: skip
-                same = networked.trace_sha256 == alone.trace_sha256
-                result.note(f"{self.name}: same trace, {label}", same)
+        for load, done in found:
+            for (case, rig), run in done.items():
+                i = run.indicators
+                result.rows.append((load.name, case, rig, i.J_BF, *i.outside_band_pct.values(), i.tau_u_mean,
+                                    i.tau_u_mean_per_update, run.trace_sha256))  # fmt: skip
+            for case, period_s in periods_s.items():
+                networked, alone = (done[case, rig] for rig in RIGS)
+                result.note(f"{name}: same trace, {case}", networked.trace_sha256 == alone.trace_sha256)
                 outside = max(networked.indicators.outside_band_pct.values())
-                result.note(f"{self.name}: time outside the bands, {label}", outside)
-                if not period:
-                    for what, value in response([(networked, load)], label).items():
-                        result.note(f"{self.name}: {what}", value)
+                result.note(f"{name}: time outside the bands, {case}", outside)
+                if not period_s:
+                    responses = response([(networked, load)], case)
+                    result.note_all({f"{name}: {what}": value for what, value in responses.items()})
             if not result.figures:
-                result.figures["time courses"] = time_panels(labelled, BANDS)
+                result.figures["time courses"] = time_panels(
+                    [(case, done[case, "networked"]) for case in periods_s], BANDS
+                )
         return result
 
+    def drawn(options: StudyOptions) -> list[Load]:
+        return [load for load in loads(options, "2h") if load.draw == 1]
 
-def _first(options: StudyOptions) -> list[Load]:
-    return [load for load in loads(options, "2h") if load.draw == 1]
-
-
-def _both(load: Load, period_s: float) -> Sequence[RunRequest]:
-    return [load.request(period_s, networked=networked, trace_ticks=TRACE_TICKS) for networked in (True, False)]
+    return study.study_of_loads(name, title, drawn, runs, evaluate)
 
 
 BUS: Final = (
-    ExperimentStudy("plc-2h", "Two hours on the bus at tau_u = 5 s (figure scenario_exp)", (("5 s", 5.0),)),
-    ExperimentStudy("adaptive-2h", "Two hours on the bus, 2.5 s against adaptive (figure diff_upt)",
-                    (("2.5 s", 2.5), ("adaptive", 0.0))),
+    _experiment("plc-2h", "Two hours on the bus at tau_u = 5 s (figure scenario_exp)", {"5 s": 5.0}),
+    _experiment("adaptive-2h", "Two hours on the bus, 2.5 s against adaptive (figure diff_upt)",
+                {"2.5 s": 2.5, "adaptive": 0.0}),
 )  # fmt: skip
 """Studies of runs on the bus."""
 SOLVERS: Final = {"ode": "ODE", "qpoases": "qpOASES", "fast-gradient": "fast gradient", "osqp": "OSQP"}
@@ -280,39 +256,32 @@ SOLVERS: Final = {"ode": "ODE", "qpoases": "qpOASES", "fast-gradient": "fast gra
 COLUMNS: Final = ("load", "solver", "tau_u (s)", "E", "D", "share of load steps with E > D")
 
 
-class TradeOff:
-    """E for each solver and D, against tau_u, in the first period after load steps."""
+def _trade_off(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+    """Average E and D over the events of each run."""
+    periods = _periods(options)
+    result = StudyResult(COLUMNS, [], {})
+    curves: dict[str, list[list[tuple[float, float]]]] = {solver: [] for solver in SOLVERS}
+    for load in loads(options, "c"):
+        for solver, label in SOLVERS.items():
+            runs = [outcomes[_request(load, solver, period)] for period in periods]
+            points = [won_and_lost(run, load) for run in runs]
+            curves[solver].append(points)
+            result.rows += [
+                (load.name, label, period, *point, share_falling(run, load))
+                for period, point, run in zip(periods, points, runs, strict=True)
+            ]
+        for what, value in _discriminating(load, periods, outcomes).items():
+            result.note(what, value)
+    result.figures["efficiency and degradation"] = _trade_off_figure(periods, curves)
+    return result
 
-    name = "trade-off"
-    title = "What a period wins and loses (figures compareSf and twocases)"
 
-    def requests(self, options: StudyOptions) -> list[RunRequest]:
-        """Return every solver at every period."""
-        return [
-            _request(load, solver, period)
-            for load in loads(options, "c")
-            for solver in SOLVERS
-            for period in _periods(options)
-        ]
-
-    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Average E and D over the events of each run."""
-        periods = _periods(options)
-        result = StudyResult(COLUMNS, [], {})
-        curves: dict[str, list[list[tuple[float, float]]]] = {solver: [] for solver in SOLVERS}
-        for load in loads(options, "c"):
-            for solver, label in SOLVERS.items():
-                runs = [outcomes[_request(load, solver, period)] for period in periods]
-                points = [won_and_lost(run, load) for run in runs]
-                curves[solver].append(points)
-                result.rows += [
-                    (load.name, label, period, *point, share_falling(run, load))
-                    for period, point, run in zip(periods, points, runs, strict=True)
-                ]
-            for what, value in _discriminating(load, periods, outcomes).items():
-                result.note(what, value)
-        result.figures["efficiency and degradation"] = _trade_off_figure(periods, curves)
-        return result
+TRADE_OFF: Final = study.Study(
+    "trade-off", "What a period wins and loses (figures compareSf and twocases)",
+    lambda options: [_request(load, solver, period) for load in loads(options, "c") for solver in SOLVERS
+                     for period in _periods(options)], _trade_off,
+)  # fmt: skip
+"""E for each solver and D, against tau_u, in the first period after load steps."""
 
 
 def _periods(options: StudyOptions) -> tuple[float, ...]:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from coldloop_rig.figures.plot import ACCENT, INK, THIRD
 from coldloop_rig.plc_sizing.intervals import geometric_mean
 from coldloop_rig.text_tables import Cell, markdown_table
-from coldloop_studies import drawing
+from coldloop_studies import drawing, study
 from coldloop_studies.request import Outcome, RunRequest, Series
 from coldloop_studies.study import NOISE, PROGRAM, Load, Outcomes, StudyOptions, StudyResult, first_and_fresh, loads
 from coldloop_studies.trajectories import response, response_figure, response_table
@@ -74,51 +74,51 @@ COLUMNS: Final = (
 )  # fmt: skip
 
 
-class UpdatingPeriodStudy:
-    """Six hours, nine periods and the rules; further draws of the six families are hours never used for tuning."""
+def _updating_period_requests(options: StudyOptions) -> list[RunRequest]:
+    main: list[RunRequest] = []
+    for load in loads(options, *options.hours):
+        main += [*_fixed_runs(load, options).values(), *_policy_runs(load).values()]
+    return main + [request for *_, runs in _variants(options) for request in runs.values()]
 
-    name = "updating-period"
-    title = "Cost against updating period (figure tu_opt)"
 
-    def requests(self, options: StudyOptions) -> list[RunRequest]:
-        """Return all runs; variants under the first draw only."""
-        main: list[RunRequest] = []
-        for load in loads(options, *options.hours):
-            main += [*_fixed_runs(load, options).values(), *_policy_runs(load).values()]
-        return main + [request for *_, runs in _variants(options) for request in runs.values()]
+def _updating_period(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+    """Rank fixed periods and rules in each hour."""
+    result = StudyResult(COLUMNS, [], {})
+    hours: dict[str, _Hour] = {}
+    for load in loads(options, *options.hours):
+        fixed = {period: outcomes[run] for period, run in _fixed_runs(load, options).items()}
+        policies = {label: outcomes[run] for label, run in _policy_runs(load).items()}
+        hours[load.name] = _Hour(load, fixed, policies)
+        labelled = {f"fixed {period:g} s": run for period, run in fixed.items()} | policies
+        result.rows += [_row("", load.name, label, run) for label, run in labelled.items()]
+    for variant, load, runs in _variants(options):
+        result.rows += [_row(variant.label, load.name, label, outcomes[run]) for label, run in runs.items()]
+    groups = first_and_fresh(hour.load for hour in hours.values())
+    first, fresh = (
+        {load.name: hours[load.name] for load in groups.get(title, ())} for title in ("hours", "fresh hours")
+    )
+    result.figures["cost against period"] = _figure(first, fresh)
+    responses = {p.label: [(hour.policies[p.label], hour.load) for hour in hours.values()] for p in RESPONDING}
+    result.figures["period after a load step"] = response_figure(responses)
+    _judge(result, "hours", first)
+    if fresh:
+        _judge(result, "fresh hours", fresh)
+    if printed := [list(runs.values()) for variant, _, runs in _variants(options) if variant is AS_PRINTED]:
+        costs = ([outcomes[one].indicators.J_open_mean for one in runs[: len(NINE)]] for runs in printed)
+        share = _share(map(is_inside, costs))
+        result.values["interior optimum from 1 to 5 s, share of hours, as printed"] = [share]
+    for policy in (LITERAL, OWN_INTERRUPT):
+        found = response(responses[policy.label], policy.label)
+        result.values |= {name: [value] for name, value in found.items()}
+    result.remarks += [_table("Hours of the first draw", first), *([_table("Fresh hours", fresh)] if fresh else [])]
+    result.remarks += [response_table(responses), _variant_table(result)]
+    return result
 
-    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Rank fixed periods and rules in each hour."""
-        result = StudyResult(COLUMNS, [], {})
-        hours: dict[str, _Hour] = {}
-        for load in loads(options, *options.hours):
-            fixed = {period: outcomes[run] for period, run in _fixed_runs(load, options).items()}
-            policies = {label: outcomes[run] for label, run in _policy_runs(load).items()}
-            hours[load.name] = _Hour(load, fixed, policies)
-            labelled = {f"fixed {period:g} s": run for period, run in fixed.items()} | policies
-            result.rows += [_row("", load.name, label, run) for label, run in labelled.items()]
-        for variant, load, runs in _variants(options):
-            result.rows += [_row(variant.label, load.name, label, outcomes[run]) for label, run in runs.items()]
-        groups = first_and_fresh(hour.load for hour in hours.values())
-        first, fresh = (
-            {load.name: hours[load.name] for load in groups.get(title, ())} for title in ("hours", "fresh hours")
-        )
-        result.figures["cost against period"] = _figure(first, fresh)
-        responses = {p.label: [(hour.policies[p.label], hour.load) for hour in hours.values()] for p in RESPONDING}
-        result.figures["period after a load step"] = response_figure(responses)
-        _judge(result, "hours", first)
-        if fresh:
-            _judge(result, "fresh hours", fresh)
-        if printed := [list(runs.values()) for variant, _, runs in _variants(options) if variant is AS_PRINTED]:
-            costs = ([outcomes[one].indicators.J_open_mean for one in runs[: len(NINE)]] for runs in printed)
-            share = _share(map(is_inside, costs))
-            result.values["interior optimum from 1 to 5 s, share of hours, as printed"] = [share]
-        for policy in (LITERAL, OWN_INTERRUPT):
-            found = response(responses[policy.label], policy.label)
-            result.values |= {name: [value] for name, value in found.items()}
-        result.remarks += [_table("Hours of the first draw", first), *([_table("Fresh hours", fresh)] if fresh else [])]
-        result.remarks += [response_table(responses), _variant_table(result)]
-        return result
+
+UPDATING_PERIOD: Final = study.Study(
+    "updating-period", "Cost against updating period (figure tu_opt)", _updating_period_requests, _updating_period
+)
+"""Six hours, nine periods and the rules; further draws of the six families are hours never used for tuning."""
 
 
 def _row(variant: str, load: str, policy: str, run: Outcome) -> tuple[Cell, ...]:
