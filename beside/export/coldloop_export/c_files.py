@@ -34,8 +34,6 @@ class OdeExport(tree.Export):
         }  # fmt: skip
         self.kernels = KernelFiles(self.printer, program.functions, [self.entry], "solver", self.constants)
 
-    # -- files ---------------------------------------------------------------------------------------------------------
-
     def files(self) -> dict[str, str]:
         """Return the texts of the files by their names."""
         header = {"N": len(self.problem.phi), "M": len(self.problem.gamma), "K": len(self.counts),
@@ -93,7 +91,7 @@ class OdeExport(tree.Export):
             "points": np.array([each.answer.points for each in vectors]),
             "costs": np.array([each.answer.costs for each in vectors]),
             "iterations": np.array([each.answer.iterations for each in vectors]),
-        }  # fmt: skip
+        }
         sum_ = reduce(lambda before, values: crc(values, before), stacked.values(), 0)
         declared = {f"golden_{name}[{values.size}]": values.ravel() for name, values in stacked.items()}
         return golden_files(self.printer, sum_, declared, N_GOLDEN=len(vectors))
@@ -146,8 +144,6 @@ class OptimizerExport(tree.Export):
             records |= {f"rules[{ticks}]": rule, f"starts[{ticks}]": starts}
         self._initial = {name: self.constants.printed(name, record) for name, record in records.items()}
 
-    # -- files ---------------------------------------------------------------------------------------------------------
-
     def files(self) -> dict[str, str]:
         """Return the texts of the files by their names."""
         process = self._process
@@ -163,8 +159,6 @@ class OptimizerExport(tree.Export):
         return {"constants": self.constants.bytes(), "state": size_of(self.state_type),
                 "stack, arrays and numbers": max(stack(each, 4) for each in self.kernels.entries)}  # fmt: skip
 
-    # -- constants -----------------------------------------------------------------------------------------------------
-
     def _constants(self) -> dict[str, str]:
         """Return the parts of the files of constants."""
         kernels, initial = self.kernels, self._initial
@@ -178,8 +172,6 @@ class OptimizerExport(tree.Export):
             "OF_CONSTANTS": initial["constants"], "OF_METHOD": initial["method"],
             **self.constants.parts(self._kernels),
         }  # fmt: skip
-
-    # -- golden updates ------------------------------------------------------------------------------------------------
 
     def _golden_files(self) -> dict[str, str]:
         integers, reals = golden.update_tables(self._golden).values()
@@ -233,8 +225,7 @@ class GuardExport(tree.Export):
 
     def _golden_files(self) -> dict[str, str]:
         sum_ = reduce(lambda before, values: crc(values.view(np.int32), before), self._tables.values(), 0)
-        declared = {f"golden_{name}[{len(values)}][{values.shape[1]}]": values
-                    for name, values in self._tables.items()}  # fmt: skip
+        declared = {f"golden_{name}[{len(values)}][{values.shape[1]}]": values for name, values in self._tables.items()}
         integers, _, rows = self._tables.values()
         return golden_files(Printer(np.float32), sum_, declared, N_GOLDEN=len(integers), N_GOLDEN_ROWS=len(rows),
                             GOLDEN_INTEGERS=integers.shape[1])  # fmt: skip

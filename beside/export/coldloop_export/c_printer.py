@@ -7,8 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop_export import tree
-from coldloop_export.golden import crc
+from coldloop_export import golden, tree
 from coldloop_export.tree import Expression, Function, Kind, Literal, Name, RecordType, RowsType, StructType, Type, View
 
 Array = NDArray[Any]
@@ -20,14 +19,12 @@ KEYWORDS: Final = """
 """
 OPERATORS: Final = {
     "and": "({0} && {1})", "or": "({0} || {1})", "not": "(!{0})", "negative": "(-{0})", "min": "min_{kind}({0}, {1})",
-    "max": "max_{kind}({0}, {1})", "%": "floor_mod({0}, {1})", "//": "floor_div({0}, {1})",
-    **{name: f"({name}({{0}}) != 0)" for name in ("isfinite", "isinf", "isnan")},
+    "max": "max_{kind}({0}, {1})", "%": "floor_mod({0}, {1})", "//": "floor_div({0}, {1})", "sqrt": "sqrt@F@({0})",
+    "abs": "fabs@F@({0})", "power": "pow@F@({0}, {1})", "log": "log@F@({0})", "copysign": "copysign@F@({0}, {1})",
+    "round": "rint@F@({0})",  # a half to the even number, as Python does
+    "single": "((@REAL@)(float){0})", **{name: f"({name}({{0}}) != 0)" for name in ("isfinite", "isinf", "isnan")},
 }  # fmt: skip
-OF_MATH: Final = {
-    "sqrt": "sqrt{}({{0}})", "abs": "fabs{}({{0}})", "power": "pow{}({{0}}, {{1}})", "log": "log{}({{0}})",
-    "copysign": "copysign{}({{0}}, {{1}})", "round": "rint{}({{0}})",
-}  # fmt: skip
-"""Functions of <math.h>; rint rounds a half to the even number, as Python does."""
+"""Formats of operators and of functions of <math.h>, with @F@ for the suffix of single precision."""
 
 
 def identifier(name: str) -> str:
@@ -44,15 +41,13 @@ class Printer(tree.TreePrinter):
         super().__init__(real)
         self.scalars = {Kind.REAL: "float" if self.single else "double", Kind.INT: "int32_t",
                         Kind.UNSIGNED: "int32_t", Kind.BOOL: "bool"}  # fmt: skip
-        self.operators = {**OPERATORS, **{name: text.format("f" * self.single) for name, text in OF_MATH.items()},
-                          "single": f"(({self.scalars[Kind.REAL]})(float){{0}})"}  # fmt: skip
+        precision = {"F": "f" * self.single, "REAL": self.scalars[Kind.REAL]}
+        self.operators = {name: tree.filled(text, precision) for name, text in OPERATORS.items()}
         self.kinds = {**dict.fromkeys(Kind, "int"), Kind.REAL: "real"}
         self._loops = 0
         self._results: tuple[Name, ...] = ()
         self._made: set[Name] = set()
         self._constant: set[str] = set()
-
-    # -- numbers -------------------------------------------------------------------------------------------------------
 
     def number(self, value: float) -> str:
         """Return a number as a literal with a point, which keeps its bits; a non-finite one as a macro."""
@@ -61,8 +56,6 @@ class Printer(tree.TreePrinter):
         if np.isnan(value):
             return "NAN"
         return f"{np.float32(value):.9e}f" if self.single else f"{value:.17e}"
-
-    # -- types ---------------------------------------------------------------------------------------------------------
 
     def declaration(self, kind: Type, name: str, *, constant: bool = True) -> str:
         """Return the declaration of a parameter or of a field."""
@@ -92,8 +85,6 @@ class Printer(tree.TreePrinter):
             return f"{self._element(kind)} {name}[{length}]"
         return self.declaration(kind, name)
 
-    # -- constant arrays -----------------------------------------------------------------------------------------------
-
     def scalar(self, values: Array) -> str:
         """Return the type of an array's elements."""
         return self.scalars[Kind.REAL] if values.dtype.kind == "f" else "int32_t"
@@ -113,8 +104,6 @@ class Printer(tree.TreePrinter):
     def _rows(self, values: Array, width: int) -> Iterator[str]:
         printed = [self.number(each) if values.dtype.kind == "f" else str(int(each)) for each in values]
         yield from (", ".join(printed[place : place + width]) for place in range(0, len(printed), width))
-
-    # -- functions -----------------------------------------------------------------------------------------------------
 
     def signature(self, function: Function) -> str:
         """Return the head of a function."""
@@ -184,8 +173,6 @@ class Printer(tree.TreePrinter):
                 yield from self.nested("} else {", other, "}") if other else "}"
             case tree.Return(value):
                 yield f"return {self._bare(value)};" if value else "return;"
-
-    # -- expressions ---------------------------------------------------------------------------------------------------
 
     def place(self, element: tree.Element) -> str:
         """Return the index of an element in its array."""
@@ -336,7 +323,7 @@ class ConstantRecords:
         """Arrays of constants, by name."""
         self.real, self.type = np.dtype(np.float32 if printer.single else np.float64), printer.scalars[Kind.REAL]
         self._sums: list[str] = []
-        self._sum = crc(np.array([float(each.rstrip("f")) for each in printer.literals], self.real))
+        self._sum = golden.crc(np.array([float(each.rstrip("f")) for each in printer.literals], self.real))
 
     def printed(self, path: str, value: object) -> str:
         """Return the initial value of a record, a number or an array, whose arrays and numbers are noted."""
@@ -347,7 +334,7 @@ class ConstantRecords:
         array = np.asarray(value)
         array = array if array.size else np.zeros(1, array.dtype)  # C has no array without elements
         real = array.dtype.kind == "f"
-        self._sum = crc(array.astype(self.real if real else np.int32), self._sum)
+        self._sum = golden.crc(array.astype(self.real if real else np.int32), self._sum)
         function, kind = ("sum_of_reals", self.type) if real else ("sum_of_integers", "int32_t")
         if array.ndim:
             name = path.replace(".", "_")

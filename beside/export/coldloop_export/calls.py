@@ -193,7 +193,7 @@ class CallReader(expressions.ExpressionReader):
 
     def received(
         self, node: ast.AST, function: Function, arguments: tuple[Expression, ...], returned: Returned, name: str
-    ) -> Value:  # fmt: skip
+    ) -> Value:
         """Return the results of a call as they belong together, in new variables; its statement goes before."""
         taken: dict[Name, Name] = {}
         value = self._taken(node, function, arguments, returned, name, taken)

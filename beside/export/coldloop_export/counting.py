@@ -18,13 +18,10 @@ from coldloop_control_plc.output_limits import GuardState, Limits, beginning
 from coldloop_export import golden, tree
 from coldloop_export.golden import ITERATIONS, Array, Call, GoldenCall, GoldenUpdate, GoldenVector, GuardKernels
 from coldloop_export.tree import ArrayType, Declare, Expression, For, Function, Kind, Operation, Return, Statement
-from coldloop_optimizer_plc.computing_settings import Arithmetic
-from coldloop_optimizer_plc.decisions import Latched
+from coldloop_optimizer_plc import computing_settings, decisions, scheme, settings
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.qp.linear_algebra import real_of
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
-from coldloop_optimizer_plc.scheme import empty_state
-from coldloop_optimizer_plc.settings import ProgramSettings
 from coldloop_optimizer_plc.solvers.interface import Costs
 from coldloop_optimizer_plc.solvers.ode import OdeMethod, ode_solver
 from coldloop_rig.plc_sizing.plc import CallCost
@@ -207,7 +204,7 @@ def operations_in(node: object) -> int:
     return own + sum(map(operations_in, tree.parts_of(node)))
 
 
-REAL: Final = real_of(Arithmetic.FLOAT32)
+REAL: Final = real_of(computing_settings.Arithmetic.FLOAT32)
 NEAR: Final = REAL(0.01)
 """Distance from the guess to bounds that are to cut a step."""
 FAR: Final = REAL(1e6)
@@ -266,7 +263,7 @@ def counted_iterations(method: OdeMethod, vectors: Sequence[GoldenVector]) -> It
     return IterationCounts(counter.unconstrained(), cost_of(found, worst), worst, sum(found))
 
 
-def counter_of(problem: PredictiveProblem, program: ProgramSettings) -> Counter:
+def counter_of(problem: PredictiveProblem, program: settings.ProgramSettings) -> Counter:
     """Return what counts the iterations of the ODE-based solver for a problem in single precision."""
     method = ode_solver(program.ode, program.penalties).method
     m, zero = len(problem.Gamma), np.zeros(problem.size, REAL)
@@ -286,7 +283,7 @@ def counted_updates(optimizer: OptimizerProgram, updates: Iterable[GoldenUpdate]
     program = CountedProgram(kernels.functions)
     c, method = kernels.constants["constants"], kernels.constants["method"]
     x, z, process = len(optimizer.state.belief.x), len(optimizer.state.sent.z), optimizer.process
-    empty = partial(empty_state, x, len(process.inputs), len(process.outputs), z, REAL)
+    empty = partial(scheme.empty_state, x, len(process.inputs), len(process.outputs), z, REAL)
     state = empty()
     noted = {name: program.noting(name) for name in (take, "pose", "warm_start", "deliver")}
     for each in updates:
@@ -347,8 +344,8 @@ def _guard_state(limits: Limits) -> GuardState:
     return state
 
 
-def latched(of: GoldenUpdate) -> Latched:
+def latched(of: GoldenUpdate) -> decisions.Latched:
     """Return an update as the kernels take it."""
     update = of.update
     u_before, u, y, x, ahead = (np.array(each, REAL) for each in (update.u_before, update.u, update.y, update.x, ()))
-    return Latched(update.update, update.tick, update.playing, REAL(update.load), u_before, u, y, x, ahead)
+    return decisions.Latched(update.update, update.tick, update.playing, REAL(update.load), u_before, u, y, x, ahead)

@@ -169,8 +169,6 @@ class ExpressionReader:
         self.loop_variables: list[str] = []
         self.used: set[str] = set()
 
-    # -- kinds of results ----------------------------------------------------------------------------------------------
-
     def scalar(self, node: ast.expr) -> Expression:
         """Return a typed scalar."""
         value = self.read(node)
@@ -215,8 +213,6 @@ class ExpressionReader:
         if not isinstance(value, Known) or not isinstance(value.value, int):
             raise self.refusal(node, "a length that is not known before a run")
         return value.value
-
-    # -- one method a kind of node -------------------------------------------------------------------------------------
 
     def read(self, node: ast.expr) -> Value:
         """Return what an expression is."""
@@ -369,7 +365,7 @@ class ExpressionReader:
 
     def each(
         self, node: ast.expr, combine: Callable[[tuple[Expression, ...]], Expression], parts: tuple[Value, ...]
-    ) -> Value:  # fmt: skip
+    ) -> Value:
         """Return an operation on numbers, or the array of it where there are arrays of one shape."""
         shapes = {part.type.shape for part in parts if isinstance(part.type, ArrayType)}
         if any(isinstance(part, Untyped) for part in parts):

@@ -109,9 +109,7 @@ def solver(target: str, settings: Settings, ticks: int | None, profile: PlcProfi
     return {**texts, README: readme, MANIFEST: json.dumps(manifest, indent=1)}
 
 
-def whole_optimizer(
-    target: str, settings: Settings, ticks: int | None, profile: PlcProfile | None
-) -> dict[str, str]:  # fmt: skip
+def whole_optimizer(target: str, settings: Settings, ticks: int | None, profile: PlcProfile | None) -> dict[str, str]:
     """Return the files of the whole optimiser by their names, with its golden updates."""
     recorder, process = golden.UpdateRecorder(settings), settings.process
     fixed_ticks = max(SHORTEST_TICKS, process.ticks_per_sample // 2)

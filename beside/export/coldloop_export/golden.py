@@ -26,13 +26,10 @@ from coldloop_control_plc import output_limits
 from coldloop_control_plc.output_limits import Limits, admit, begin, beginning, copy_state, in_range, judge, plain
 from coldloop_export.statements import Program
 from coldloop_export.tree import ArrayType, Function, Kind, Type, type_of
-from coldloop_optimizer_plc import decisions, scheme
-from coldloop_optimizer_plc.computing_settings import Arithmetic
-from coldloop_optimizer_plc.decisions import Latched, Starts
+from coldloop_optimizer_plc import computing_settings, decisions, rules, scheme
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.qp.linear_algebra import real_of
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
-from coldloop_optimizer_plc.rules import DECISIONS, UpdatingRule, decide_by, make_rule
 from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
 from coldloop_optimizer_plc.solvers.interface import KERNELS, Answer, Costs, solve_by
 from coldloop_optimizer_plc.solvers.ode import OdeMethod, solve
@@ -88,21 +85,21 @@ class OptimizerKernels:
     """Functions of the optimiser, and what they compute with, for the settings of a program."""
 
     def __init__(self, optimizer: OptimizerProgram) -> None:
-        real = real_of(Arithmetic.FLOAT32)
-        self.rules = [make_rule(optimizer.settings, optimizer.budget, ticks, real)
+        real = real_of(computing_settings.Arithmetic.FLOAT32)
+        self.rules = [rules.make_rule(optimizer.settings, optimizer.budget, ticks, real)
                       for ticks in range(optimizer.budget.longest_ticks + 1)]  # fmt: skip
         """The rule for each fixed updating period in ticks; that for 0 adapts it."""
-        self.starts = [Starts(rule.first, rule.after_interruption()) for rule in self.rules]
+        self.starts = [decisions.Starts(rule.first, rule.after_interruption()) for rule in self.rules]
         self.constants: Mapping[str, Any] = {
             "constants": optimizer.constants._replace(fixed_ticks=0), "method": optimizer.method,
         }  # fmt: skip
         process = optimizer.process
         sizes = (len(process.inputs), len(process.inputs), len(process.outputs), len(process.states), 0)
-        latched = Latched(0, 0, 0, real(0.0), *(np.zeros(size, real) for size in sizes))
+        latched = decisions.Latched(0, 0, 0, real(0.0), *(np.zeros(size, real) for size in sizes))
         c, method, m = self.constants["constants"], self.constants["method"], optimizer.state
         generic = {
             cast("Callable[..., Any]", of): {kind.__name__: kernel for kind, kernel in kernels.items()}
-            for of, kernels in ((solve_by, KERNELS), (decide_by, DECISIONS))
+            for of, kernels in ((solve_by, KERNELS), (rules.decide_by, rules.DECISIONS))
         }
         program = Program(frozenset({"power", "log"}), generic)  # that root, and the logarithms of the rules
         self.entries: list[Function] = [
@@ -194,7 +191,7 @@ def record(settings: Settings, ticks: int = TICKS, load: str = LOAD) -> GoldenVe
 
 def answered(method: OdeMethod, problem: QuadraticProblem, guess: Array) -> GoldenVector:
     """Return a problem with what the kernels answer, in single precision."""
-    real = real_of(Arithmetic.FLOAT32)
+    real = real_of(computing_settings.Arithmetic.FLOAT32)
     none, counts = Costs(real(np.inf), real(np.inf)), np.arange(1, ITERATIONS + 1)
     return GoldenVector(problem, guess, solve(method, problem, guess, counts, none))
 
@@ -239,14 +236,14 @@ def refuse(settings: ProgramSettings) -> None:
     """Refuse a solver or an arithmetic that cannot be exported. Raises UsageError."""
     if settings.solver is not SolverName.ODE:
         raise UsageError("export plc: with the ODE-based solver alone: --set optimizer_plc.program.solver=ode")
-    if settings.arithmetic is not Arithmetic.FLOAT32:
+    if settings.arithmetic is not computing_settings.Arithmetic.FLOAT32:
         raise UsageError("export plc: in single precision alone: --set optimizer_plc.program.arithmetic=float32")
 
 
 class _ListeningOptimizer(OptimizerProgram):
     """Keeps every problem with its guess, and every update with its answers."""
 
-    def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
+    def restart(self, updating_period_s: float, rule: rules.UpdatingRule | None = None) -> None:
         """Reset."""
         self.problems: list[tuple[QuadraticProblem, Array]] = []
         self.updates: list[GoldenUpdate] = []

@@ -70,8 +70,6 @@ class StructuredTextExport(tree.Export):
         used = {path for each in lowering.blocks for path in each.constants}
         self.constants = Constants({path: values for path, values in constants.items() if path in used}, self.printer)
 
-    # -- files ---------------------------------------------------------------------------------------------------------
-
     def files(self) -> dict[str, str]:
         """Return the texts of the files by their names, in the order in which they are loaded."""
         return with_types(self.printer, {
@@ -89,8 +87,6 @@ class StructuredTextExport(tree.Export):
             "an instance of `cl_solver`, with its problem": memory(self.solver) + 4 * problem,
             "self-test and golden vectors": 4 * vector * (len(self.vectors) + 1),
         }
-
-    # -- golden vectors and self-test ----------------------------------------------------------------------------------
 
     def _golden(self, number: int, vector: GoldenVector) -> str:
         """Return the block that copies a golden vector to where the self-test has it."""
@@ -196,8 +192,6 @@ class OptimizerText(tree.Export):
         return Block("clear", "coldloop_optimizer_plc/scheme.py", "Make the state zero.", (), (), (), (at,),
                      tuple(self.state), body)  # fmt: skip
 
-    # -- files ---------------------------------------------------------------------------------------------------------
-
     def files(self) -> dict[str, str]:
         """Return the texts of the files by their names, in the order in which they are loaded."""
         pages = list(self._pages())
@@ -225,8 +219,6 @@ class OptimizerText(tree.Export):
             "LATCHED": passed, "TICK_S": str(process.tick_s), "UNIT": process.load.unit, "BEGIN": begun,
             "PIECE": str(PIECE), "LOAD_STEP": interface_names(take, self.printer.type)[take.outputs[0]],
         })  # fmt: skip
-
-    # -- golden updates and self-test ----------------------------------------------------------------------------------
 
     def _golden_arrays(self) -> dict[str, Array]:
         """Return integers, numbers and rows of the golden updates, and the sum over each of them, a row each."""

@@ -166,8 +166,6 @@ class FunctionLowering:
             tuple(variables.values()), tuple(self.constants), body,
         )  # fmt: skip
 
-    # -- statements ----------------------------------------------------------------------------------------------------
-
     def _body(self, statements: Sequence[tree.Statement]) -> tuple[tree.Statement, ...]:
         result: list[tree.Statement] = []
         for place, statement in enumerate(statements):
@@ -283,8 +281,6 @@ class FunctionLowering:
         passed[name] = number
         return Name(number.type, name)
 
-    # -- expressions ---------------------------------------------------------------------------------------------------
-
     def _expression(self, expression: Expression) -> Expression:  # noqa: PLR0911 one case a kind of expression
         match expression:
             case Name() | tree.Field() | tree.Member():
@@ -328,8 +324,6 @@ class FunctionLowering:
             if not isinstance(index, Literal) and not 0 <= reached.start <= reached.stop <= length:
                 return False
         return True
-
-    # -- places --------------------------------------------------------------------------------------------------------
 
     def _place(self, expression: Expression) -> Place:
         match expression:

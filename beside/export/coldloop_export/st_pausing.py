@@ -12,8 +12,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import Final, TypeVar
 
-from coldloop_export import tree
-from coldloop_export.counting import COUNTED
+from coldloop_export import counting, tree
 from coldloop_export.tree import Assign, Block, Call, Function, If, Invoke, Kind, Literal, Name, Operation, Statement
 
 Node = TypeVar("Node")
@@ -172,8 +171,6 @@ class Pausing:
             block, inputs=(*block.inputs, ANEW), shared=(*block.shared, REMAINING), outputs=(*block.outputs, BUSY),
             variables=(*block.variables, STEP, CALL_ANEW, *steps.kept), body=body,
         )  # fmt: skip
-
-    # -- operations ----------------------------------------------------------------------------------------------------
 
     def bound(self, statements: Sequence[Statement]) -> float:
         """Return how many operations statements take at most; infinity where that is not known."""
@@ -374,7 +371,7 @@ def charge(operations: int, times: tree.Expression = ONE) -> tuple[Statement, ..
 
 def operations_in(node: object) -> int:
     """Return the operations in what is computed once; both operands of a logical operator are."""
-    return sum(isinstance(each, Operation) and each.type is Kind.REAL and each.operator in COUNTED
+    return sum(isinstance(each, Operation) and each.type is Kind.REAL and each.operator in counting.COUNTED
                for each in tree.walk(node))  # fmt: skip
 
 

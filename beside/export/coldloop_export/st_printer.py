@@ -10,9 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from coldloop_export import tree
+from coldloop_export import st_lowering, tree
 from coldloop_export.golden import Array
-from coldloop_export.st_lowering import Split
 from coldloop_export.tree import ArrayType, Block, Call, Convert, Kind, Name, Path, Statement, Type, type_of
 from coldloop_rig.text_tables import markdown_table
 
@@ -138,8 +137,6 @@ class StructuredTextPrinter(tree.TreePrinter):
         """Definition of each type of arrays, by its name."""
         self._names, self._notes, self._uses_literals = Names(), NO_NOTES, False
 
-    # -- numbers and types ---------------------------------------------------------------------------------------------
-
     def number(self, value: float) -> str:
         """Return an initial value with enough digits for its bits; the largest one in the place of a non-finite one.
 
@@ -173,8 +170,6 @@ class StructuredTextPrinter(tree.TreePrinter):
         return "".join(f"TYPE\n    {name} : {definition};\nEND_TYPE\n"
                        for name, definition in sorted(self.arrays.items()))  # fmt: skip
 
-    # -- blocks --------------------------------------------------------------------------------------------------------
-
     def block(self, block: Block, notes: Mapping[str, str] = NO_NOTES) -> str:
         """Return a function block; variables that have a note are outputs, too."""
         self._names, self._uses_literals = Names(), False
@@ -207,8 +202,6 @@ class StructuredTextPrinter(tree.TreePrinter):
 
     def _instance(self, block: Block) -> str:
         return self._names(block, f"do_{block.name}")
-
-    # -- statements ----------------------------------------------------------------------------------------------------
 
     def statement(self, statement: Statement) -> Iterator[str]:  # noqa: C901 one case a statement
         """Yield the lines of a statement."""
@@ -257,8 +250,6 @@ class StructuredTextPrinter(tree.TreePrinter):
         """Yield the assignments of what a call puts out."""
         instance, inside = self._instance(call.block), interface_names(call.block, self.type)
         yield from (f"{self._local(variable)} := {instance}.{inside[output]};" for variable, output in call.results)
-
-    # -- expressions ---------------------------------------------------------------------------------------------------
 
     def other(self, expression: tree.Expression) -> str:
         """Return a name or a conversion."""
@@ -438,7 +429,7 @@ def configuration(lists: Iterable[str]) -> str:
     return tree.filled(tree.template("structured_text/configuration.st"), {"LISTS": "".join(lists)})
 
 
-def in_pieces(constants: Mapping[Path, Array]) -> tuple[dict[Path, Array], Split]:
+def in_pieces(constants: Mapping[Path, Array]) -> tuple[dict[Path, Array], st_lowering.Split]:
     """Return constants with those that are larger than a list in pieces of whole rows; and which these are."""
     found: dict[Path, Array] = {}
     split: dict[Path, list[tuple[Path, int]]] = {}

@@ -37,11 +37,7 @@ class KernelReader(CallReader):
         where = f"{self.source.file}:{definition.lineno}"
         results, returned, value = self.returns or ((), None, None)
         summary = (ast.get_docstring(definition) or "").partition("\n")[0]
-        return tree.Function(
-            name, where, summary, self.parameters, written, self.used, results, returned, value, body
-        )  # fmt: skip
-
-    # -- assignments ---------------------------------------------------------------------------------------------------
+        return tree.Function(name, where, summary, self.parameters, written, self.used, results, returned, value, body)
 
     def assigned(self, target: ast.expr, value: ast.expr) -> list[Statement]:
         """Return what an assignment is."""
@@ -103,8 +99,6 @@ class KernelReader(CallReader):
             statements += new
         return statements
 
-    # -- results of calls ----------------------------------------------------------------------------------------------
-
     def _several(self, target: ast.expr, value: ast.Call, kernel: Kernel) -> list[Statement]:
         """Return the call of a kernel whose results go where they are to."""
         function, arguments = self.call(value, kernel)
@@ -134,8 +128,6 @@ class KernelReader(CallReader):
         for one, got in behind:
             self.before += self.into(one, got, value)
         return []
-
-    # -- variables -----------------------------------------------------------------------------------------------------
 
     def _choice(self, target: ast.Name, value: ast.IfExp) -> list[Statement]:
         """Return the decision between two new arrays; nothing where it is between numbers."""
@@ -212,8 +204,6 @@ class KernelReader(CallReader):
             inner = tree.For(variable, expressions.ZERO, Literal(Kind.INT, length), 1, (inner,))
         return [inner]
 
-    # -- elements ------------------------------------------------------------------------------------------------------
-
     def _into_part(self, target: ast.Subscript, value: Value, node: ast.expr) -> list[Statement]:
         """Return the assignment to an element, to a part of an array, or to a record in an array."""
         place = self.read(target)
@@ -253,8 +243,6 @@ class KernelReader(CallReader):
         if not isinstance(value.at(first_of(value)), Literal):
             self.before += self.store(variable, value)
         return variable
-
-    # -- statements ----------------------------------------------------------------------------------------------------
 
     def block(self, nodes: list[ast.stmt], *, new_scope: bool = True) -> tuple[Statement, ...]:
         """Return the statements of a block; what it declares is not known behind it."""
@@ -371,7 +359,7 @@ class KernelReader(CallReader):
 
     def _agree(
         self, node: ast.Return, results: tuple[Name, ...], returned: Returned | None, value: Kind | None
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Note the types of what is returned, which are the same at each return."""
         self.refuse_if(self.returns not in {None, (results, returned, value)}, node, "results of different types")
         self.returns = results, returned, value

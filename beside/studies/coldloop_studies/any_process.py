@@ -10,15 +10,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.declaration import Process
+from coldloop.process import cold_box, declaration
 from coldloop_rig.figures.plot import COLOURS
 from coldloop_rig.plc_sizing import intervals
-from coldloop_rig.plc_sizing.intervals import ADAPTIVE, Interval, geometric_mean, mean_ratio, require_costs
 from coldloop_rig.text_tables import Cell, markdown_table
-from coldloop_studies import study
+from coldloop_studies import request, study
 from coldloop_studies.drawing import legend_outside, panels, ratio_rows, ratio_scale, spans_decade
-from coldloop_studies.request import RunRequest
 from coldloop_studies.settings import settings_of
 from coldloop_studies.study import NOISE, PROGRAM, TUNED, Load, Outcomes, StudyOptions, StudyResult, Variant, loads
 
@@ -34,8 +31,8 @@ def _compare(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
     result = StudyResult((*VARIANT_COLUMNS, *shares), [], {})
     found = [[outcomes[_variant_run(load, variant)].indicators for load in drawn] for variant in variants]
     costs = np.array([[run.J_BF for run in runs] for runs in found])
-    require_costs(costs)
-    ratios = [mean_ratio(row, costs[0]) for row in costs]  # paired by draw
+    intervals.require_costs(costs)
+    ratios = [intervals.mean_ratio(row, costs[0]) for row in costs]  # paired by draw
     reference, summary = variants[0].name, []
     for variant, runs, over, ratio in zip(variants, found, costs / costs[0], ratios, strict=True):
         outside = np.array([[*run.outside_band_pct.values()] for run in runs])
@@ -65,19 +62,22 @@ def _compare(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
 
 
 COMPARE: Final = study.Study(
-    "compare", "Variants of one's own (--variants FILE), paired over draws",
-    lambda options: [_variant_run(load, variant) for variant in options.variants
-                     for load in loads(options, *options.hours)], _compare,
-)  # fmt: skip
+    "compare",
+    "Variants of one's own (--variants FILE), paired over draws",
+    lambda options: [
+        _variant_run(load, variant) for variant in options.variants for load in loads(options, *options.hours)
+    ],
+    _compare,
+)
 """Variants of a file under the same draws; the first is the reference."""
 
 
-def _variant_run(load: Load, variant: Variant) -> RunRequest:
+def _variant_run(load: Load, variant: Variant) -> request.RunRequest:
     period_s = settings_of((*load.settings, *variant.assignments)).optimizer_plc.program.updating_period_s
     return load.request(period_s, *variant.assignments)
 
 
-def _variants_figure(variants: tuple[Variant, ...], ratios: list[Interval], by_draw: Array) -> Figure:
+def _variants_figure(variants: tuple[Variant, ...], ratios: list[intervals.Interval], by_draw: Array) -> Figure:
     """Draw a row for each variant: its mean with the interval, and each draw."""
     label = "geometric mean, 95 % interval"
     rows = {variant.name: ratio for variant, ratio in zip(variants[1:], ratios[1:], strict=True)}
@@ -104,18 +104,18 @@ COLUMNS: Final = ("regime", "load", "tau_u (s)", "mean tau_u (s)", "J_BF")
 SUMMARY: Final = ("regime", "mean of adaptive (s)", "best fixed (s)", "adaptive over it", "in words")
 
 
-def _regimes(process: Process) -> dict[str, tuple[str, ...]]:
-    return {NOMINAL: (), **(OF_COLD_BOX if process == COLD_BOX else {})}
+def _regimes(process: declaration.Process) -> dict[str, tuple[str, ...]]:
+    return {NOMINAL: (), **(OF_COLD_BOX if process == cold_box.COLD_BOX else {})}
 
 
-def _other_rule(process: Process) -> tuple[str, str]:
+def _other_rule(process: declaration.Process) -> tuple[str, str]:
     """Return the rule that is not the default: its name in the settings, and in words."""
     return ("algorithm-1", "Algorithm 1") if process.tuned.get("adaptive") else ("contraction", "contraction rule")
 
 
-def periods(process: Process) -> tuple[float, ...]:
+def periods(process: declaration.Process) -> tuple[float, ...]:
     """Return the updating periods that are compared, s, the adaptive one first."""
-    return (ADAPTIVE, *intervals.fixed_periods(process))
+    return (intervals.ADAPTIVE, *intervals.fixed_periods(process))
 
 
 def _periods(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
@@ -152,14 +152,20 @@ def _periods(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
 
 
 PERIODS: Final = study.Study(
-    "periods", "Cost against updating period of any process, fixed and adaptive",
-    lambda options: [run for regime in _regimes(options.process).values() for load in loads(options, *"abcdef")
-                     for run in _runs(load, options.process, regime)], _periods,
-)  # fmt: skip
+    "periods",
+    "Cost against updating period of any process, fixed and adaptive",
+    lambda options: [
+        run
+        for regime in _regimes(options.process).values()
+        for load in loads(options, *"abcdef")
+        for run in _runs(load, options.process, regime)
+    ],
+    _periods,
+)
 """Closed-loop cost against the updating period, fixed and adaptive."""
 
 
-def judged(costs: Array, training: NDArray[np.bool_]) -> tuple[int, Interval]:
+def judged(costs: Array, training: NDArray[np.bool_]) -> tuple[int, intervals.Interval]:
     """Return which fixed period is the best, and the cost of the adaptive one over its.
 
     Args:
@@ -169,16 +175,16 @@ def judged(costs: Array, training: NDArray[np.bool_]) -> tuple[int, Interval]:
     Raises:
         StudyError: A loop costs nothing.
     """
-    require_costs(costs)
+    intervals.require_costs(costs)
     if training.all() or not training.any():
         return intervals.over_best_fixed(costs)
     best, _ = intervals.over_best_fixed(costs[:, training])
-    return best, mean_ratio(costs[0, ~training], costs[best, ~training])
+    return best, intervals.mean_ratio(costs[0, ~training], costs[best, ~training])
 
 
-def _runs(load: Load, process: Process, settings: tuple[str, ...]) -> list[RunRequest]:
+def _runs(load: Load, process: declaration.Process, settings: tuple[str, ...]) -> list[request.RunRequest]:
     """Return the run of each of `periods`, and that of the rule that is not the default."""
-    other = load.request(ADAPTIVE, TUNED, f"{PROGRAM}adaptive.rule={_other_rule(process)[0]}", *settings)
+    other = load.request(intervals.ADAPTIVE, TUNED, f"{PROGRAM}adaptive.rule={_other_rule(process)[0]}", *settings)
     return [*(load.request(period, TUNED, *settings) for period in periods(process)), other]
 
 
@@ -189,7 +195,9 @@ def _periods_figure(costs: dict[str, Array], means: dict[str, float], fixed_s: t
         for place, (regime, by_period) in zip(places, costs.items(), strict=True):
             over = by_period[1:] / by_period[0]
             place.plot(fixed_s, over, "-", color=COLOURS[0], alpha=0.25, linewidth=0.8)
-            place.plot(fixed_s, [geometric_mean(one) for one in over], ".-", color=COLOURS[0], label="geometric mean")
+            place.plot(
+                fixed_s, [intervals.geometric_mean(one) for one in over], ".-", color=COLOURS[0], label="geometric mean"
+            )
             place.plot(means[regime], 1.0, "*", color=COLOURS[1], markersize=9, label="adaptive, at its mean period")
             place.axhline(1.0, color=COLOURS[1], linewidth=0.8)
             ratio_scale(place, "y", over)

@@ -47,9 +47,12 @@ def _classical(found: study.Found[str]) -> StudyResult:
 
 
 CLASSICAL: Final = study.study_of_loads(
-    "classical", "The classical loops as a baseline (section IV-A)", lambda options: loads(options, *"abcdef"),
-    _classical_runs, _classical,
-)  # fmt: skip
+    "classical",
+    "The classical loops as a baseline (section IV-A)",
+    lambda options: loads(options, *"abcdef"),
+    _classical_runs,
+    _classical,
+)
 """Two PI loops against MPC."""
 SOLVERS: Final = {
     "ODE": (),
@@ -101,10 +104,17 @@ def _contest(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
 
 
 CONTEST: Final = Study(
-    "contest", "Beyond the paper: solvers and rules in the closed loop",
-    lambda options: [request for solver in SOLVERS for way in WAYS for hours in _groups(options).values()
-                     for request in _under(hours, solver, way)], _contest,
-)  # fmt: skip
+    "contest",
+    "Beyond the paper: solvers and rules in the closed loop",
+    lambda options: [
+        request
+        for solver in SOLVERS
+        for way in WAYS
+        for hours in _groups(options).values()
+        for request in _under(hours, solver, way)
+    ],
+    _contest,
+)
 """Every solver under every way to choose the updating period."""
 
 
@@ -326,9 +336,11 @@ def _robustness(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
 
 
 ROBUSTNESS: Final = Study(
-    "robustness", "Beyond the paper: plants that differ from their model",
-    lambda options: [request for *_, request in _cases(options)], _robustness,
-)  # fmt: skip
+    "robustness",
+    "Beyond the paper: plants that differ from their model",
+    lambda options: [request for *_, request in _cases(options)],
+    _robustness,
+)
 """Controllers on plants that are off; on the same ones fixed periods and rules, under the paper's preset."""
 
 
@@ -351,7 +363,7 @@ def _cases(options: StudyOptions) -> Iterator[Case]:
 
 def _policy_table(
     ratios: Mapping[str, Mapping[str, Interval]], cost: str, costs: Mapping[tuple[str, str], Series]
-) -> str:  # fmt: skip
+) -> str:
     others = [policy for policy in POLICIES if policy != USUAL]
     caption = (
         f"**Preset `paper`: {cost}** over that of {USUAL} under the same condition, geometric mean of "

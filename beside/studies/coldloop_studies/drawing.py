@@ -117,14 +117,12 @@ def time_panels(outcomes: Sequence[tuple[str, Outcome]], bands: Sequence[tuple[f
         for (name, what), edge in zip(limited, edges, strict=True):
             together = np.concatenate([outcome.series(name) for _, outcome in outcomes])
             limit(place[name], together, edge, f"{what} {ends_text(*edge)}")
-        place["cost"].set_yscale("log")
-        place["cost"].set_ylim(bottom=1e-4)
+        place["cost"].set(yscale="log", ylim=(1e-4, None))
         for (name, label), letter in zip(shown, "abcdefghi", strict=False):
             place[name].set_ylabel(label)
             place[name].set_title(f"({letter})", loc="left", pad=3)
         legend_outside(figure, place["cost"])
-        axes[-1].set_xlabel("plant time (h)")
-        axes[-1].set_xlim(0, float(first.series("time_s")[-1]) / 3600)
+        axes[-1].set(xlabel="plant time (h)", xlim=(0, float(first.series("time_s")[-1]) / 3600))
     return figure
 
 
@@ -174,8 +172,7 @@ def cost_bars(result: StudyResult, cases: Iterable[str], width: float, *, logari
         if logarithmic:
             ratio_scale(place, "y", [float(row[2]) for row in result.rows])
         place.set_xticks(range(len(names)), names, rotation=0 if len(names) < 9 else 60)
-        place.set_xlabel("load")
-        place.set_ylabel("$J^{BF}$ (1)")
+        place.set(xlabel="load", ylabel="$J^{BF}$ (1)")
         legend_outside(figure, place)
     return figure
 
@@ -237,10 +234,8 @@ def above_lowest(axes: Axes, powers: ArrayLike, totals: Sequence[Interval], colo
     value, low, high = np.maximum(np.transpose(totals) - 1.0, LEAST_DRAWN)
     axes.plot(powers, value, color=colour, linestyle=DASHES.get(colour, "-"), marker=".", label=label)
     axes.fill_between(np.asarray(powers), low, high, color=colour, alpha=0.18, linewidth=0)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.set_xlabel("normalised power $P$ (1)")
-    axes.set_ylabel("total cost over the lowest, less 1 (1)")
+    labels = {"xlabel": "normalised power $P$ (1)", "ylabel": "total cost over the lowest, less 1 (1)"}
+    axes.set(xscale="log", yscale="log", **labels)
 
 
 def hour_panels(

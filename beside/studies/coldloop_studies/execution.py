@@ -18,12 +18,12 @@ import logging
 import os
 import platform
 import re
-import signal
 import time
-from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from pathlib import Path
+from signal import default_int_handler
 from typing import Any, Final, Self
 
 from distributed import Client, LocalCluster, as_completed
@@ -84,23 +84,19 @@ class StoredOutcomes(Mapping[RunRequest, Outcome]):
     """The outcomes of some requests, read when they are wanted: a large study has more than memory holds."""
 
     def __init__(self, store: Store, requests: Sequence[RunRequest]) -> None:
-        self._store = store
         self._requests = dict.fromkeys(requests)
-        self._recent: OrderedDict[RunRequest, Outcome] = OrderedDict()
+        self._store, self._read = store, lru_cache(REMEMBERED)(self._found)
 
     def __getitem__(self, request: RunRequest) -> Outcome:
         """Return an outcome. Raises ResultsError if its file is gone, or is not whole any more."""
         if request not in self._requests:
             raise KeyError(request)
-        if request not in self._recent:
-            outcome = self._store.find(request)
-            if outcome is None:
-                raise ResultsError(f"{self._store.path(request)}: gone or damaged since it was written; do it again")
-            self._recent[request] = outcome
-            if len(self._recent) > REMEMBERED:
-                self._recent.popitem(last=False)
-        self._recent.move_to_end(request)
-        return self._recent[request]
+        return self._read(request)
+
+    def _found(self, request: RunRequest) -> Outcome:
+        if (outcome := self._store.find(request)) is None:
+            raise ResultsError(f"{self._store.path(request)}: gone or damaged since it was written; do it again")
+        return outcome
 
     def __iter__(self) -> Iterator[RunRequest]:
         """Go through the requests, in the order in which they were given."""
@@ -223,13 +219,20 @@ def perform_all(requests: Sequence[RunRequest], store: Store, workers: Workers, 
     outcomes = StoredOutcomes(store, requests)
     agenda = _Agenda(store, outcomes)
     first = agenda.next()
-    if first:
-        with workers.connected() as client, INTERRUPTION.passed_to(_end_workers), _bar(title, len(outcomes)) as bar:
-            task = bar.task_ids[0]
-            bar.update(task, completed=agenda.done)
+    bar = Progress(
+        TextColumn("{task.description}"), BarColumn(bar_width=32), MofNCompleteColumn(), TextColumn("runs"),
+        TimeElapsedColumn(), TimeRemainingColumn(), console=make_console(), refresh_per_second=2,
+    )  # fmt: skip
+    if first:  # a signal unwinds here, so that the workers of a local cluster end: this thread only waits for them
+        with (
+            workers.connected() as client,
+            INTERRUPTION.passed_to(lambda by: default_int_handler(by, None)),
+            bar,
+        ):
+            task = bar.add_task(title, total=len(outcomes), completed=len(agenda.done))
             for request in _done(client, store, agenda, first):
-                agenda.note(request)
-                bar.update(task, completed=agenda.done)
+                agenda.done.add(request)
+                bar.update(task, completed=len(agenda.done))
     return outcomes
 
 
@@ -237,29 +240,19 @@ class _Agenda:
     """Remaining runs: of each family the run with the largest limit, then those that it does not determine."""
 
     def __init__(self, store: Store, outcomes: StoredOutcomes) -> None:
-        self._store = store
-        self._outcomes = outcomes
-        self._families = families(outcomes)
+        self._store, self._outcomes, self._families = store, outcomes, families(outcomes)
         self._family = {request: family for family in self._families for request in family}
-        self._done = {request for request in outcomes if store.find(request) is not None}
         self._begun: set[RunRequest] = set()
-
-    @property
-    def done(self) -> int:
-        """Number of requests whose outcome is there."""
-        return len(self._done)
-
-    def note(self, request: RunRequest) -> None:
-        """Note that a run was done."""
-        self._done.add(request)
+        self.done = {request for request in outcomes if store.find(request) is not None}
+        """Requests whose outcome is there."""
 
     def next(self, after: RunRequest | None = None) -> list[RunRequest]:
         """Return what may be begun now that `after` was done, or at all; outcomes that are known are copied."""
         found = self._families if after is None else [self._family[after]]
         wanted: list[RunRequest] = []
         for family in found:
-            known = [request for request in family if request in self._done]
-            missing = [request for request in family if request not in self._done | self._begun]
+            known = [request for request in family if request in self.done]
+            missing = [request for request in family if request not in self.done | self._begun]
             if known[:1] == family[:1]:
                 wanted += [request for request in missing if not self._copied(request, known)]
             else:
@@ -275,13 +268,8 @@ class _Agenda:
             if text is None:
                 return False
             self._store.keep(request, text)
-        self._done.add(request)
+        self.done.add(request)
         return True
-
-
-def _end_workers(_: signal.Signals) -> None:
-    """Unwind, so that the workers of a local cluster end; this thread only waits for them."""
-    raise KeyboardInterrupt
 
 
 def _done(client: Client, store: Store, agenda: _Agenda, first: Sequence[RunRequest]) -> Iterator[RunRequest]:
@@ -340,17 +328,6 @@ def _first_line(error: BaseException) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
-@contextlib.contextmanager
-def _bar(title: str, total: int) -> Iterator[Progress]:
-    columns = (
-        TextColumn("{task.description}"), BarColumn(bar_width=32), MofNCompleteColumn(), TextColumn("runs"),
-        TimeElapsedColumn(), TimeRemainingColumn(),
-    )  # fmt: skip
-    with Progress(*columns, console=make_console(), refresh_per_second=2) as bar:
-        bar.add_task(title, total=total)
-        yield bar
-
-
 def conduct(study: Study, options: StudyOptions, workers: Workers, folder: Path) -> StudyResult:
     """Do the missing runs of a study and write its files to `folder / study.name`.
 
@@ -376,22 +353,16 @@ def conduct(study: Study, options: StudyOptions, workers: Workers, folder: Path)
         "dependencies": {name: installed_version(name) for name in requested.LIBRARIES}, "programs": programs_digest(),
         "outside": outside, "options": asdict(options), "runs": runs,
     }  # fmt: skip
-    with writing(folder / study.name):
-        _write(study, result, folder / study.name)
-        write_json(folder / study.name / "manifest.json", manifest)
+    table, own = io.StringIO(), folder / study.name
+    csv.writer(table, lineterminator="\n").writerows([result.columns, *result.rows])
+    with writing(own):
+        whole_text(own / "results.csv", table.getvalue())
+        for name, figure in result.figures.items():
+            for suffix in (".png", ".pdf"):
+                save_figure(figure, (own / figure_file(name)).with_suffix(suffix))
+        whole_text(own / "section.md", f"# {study.title}\n\n{section(result)}")
+        write_json(own / "manifest.json", manifest)
     return result
-
-
-def _write(study: Study, result: StudyResult, folder: Path) -> None:
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(result.columns)
-    writer.writerows(result.rows)
-    whole_text(folder / "results.csv", table.getvalue())
-    for name, figure in result.figures.items():
-        save_figure(figure, folder / figure_file(name))
-        save_figure(figure, (folder / figure_file(name)).with_suffix(".pdf"))
-    whole_text(folder / "section.md", f"# {study.title}\n\n{section(result)}")
 
 
 def figure_file(name: str) -> str:

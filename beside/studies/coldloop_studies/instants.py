@@ -150,8 +150,7 @@ def drawn(found: Sequence[Judged], names: Sequence[str]) -> Figure:
                           linestyle="", label=label)  # fmt: skip
         loss.set_ylabel("loss: J_BF over the fullest (1)")
         iterations.set_ylabel(f"iterations in {found[0].design.process.sampling_period_s:g} s (1)")
-        iterations.set_xlabel("variables (1)")
-        iterations.set_xscale("log")  # the fullest set has several times the variables of the others
+        iterations.set(xlabel="variables (1)", xscale="log")  # the fullest set has several times those of the others
         marks = [mark for mark in (10, 20, 50, 100, 200, 500) if sizes[0] <= mark <= sizes[-1]]
         iterations.set_xticks(marks, map(str, marks))
         iterations.minorticks_off()

@@ -19,14 +19,12 @@ from coldloop.errors import StudyError
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.settings import InputLimits
 from coldloop.safety.writers import InputSequence
-from coldloop_optimizer_plc.computing_settings import PlcBudget
+from coldloop_optimizer_plc import computing_settings, rules, solvers
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.qp.costs import indicators
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, prediction_of
 from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
-from coldloop_optimizer_plc.rules import UpdatingRule
 from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
-from coldloop_optimizer_plc.solvers import Solver, make_solver
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.results.indicators import Indicators
@@ -177,7 +175,7 @@ class ProblemSequence(NamedTuple):
 class _ListeningOptimizer(OptimizerProgram):
     """Keeps parameters and profile of every problem."""
 
-    def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
+    def restart(self, updating_period_s: float, rule: rules.UpdatingRule | None = None) -> None:
         """Reset."""
         self.heard: list[LoopProblem] = []
         super().restart(updating_period_s, rule)
@@ -229,12 +227,12 @@ SETTLING: Final = {SolverName.QPOASES: 500, SolverName.OSQP: 400}
 
 def paired_run(sequence: ProblemSequence, program: ProgramSettings) -> Columns:
     """Let a solver go through all problems with its own hot starts; return costs as played, a row a problem."""
-    solver, problem, penalised = make_solver(program), sequence.problem, sequence.solved_with(program)
+    solver, problem, penalised = solvers.make_solver(program), sequence.problem, sequence.solved_with(program)
     z = problem.hold(np.zeros(len(problem.design.input_scale)))
     columns: Columns = {name: [] for name in ("iterations", "j_dev", "j_cst", "violation", "lowest")}
     for (parameters, _), lowest in zip(sequence.recorded, sequence.lowest.tolist(), strict=True):
         qp, ticks = problem.at(parameters), parameters.elapsed_ticks
-        iterations = PlcBudget(program.budget, solver.tau_1_s).iterations(ticks)
+        iterations = computing_settings.PlcBudget(program.budget, solver.tau_1_s).iterations(ticks)
         answer = solver.solve(penalised.at(parameters), problem.shifted(z, ticks), (iterations,))
         z = penalised.within_first_rate(answer.z, parameters)
         cost = sequence.profiles.cost(qp, z, parameters)
@@ -250,7 +248,7 @@ def harsh_run(sequence: ProblemSequence, program: ProgramSettings) -> Columns:
     The guess is the shifted profile that the converged loop played; `count_2` ... say how many iterations the time of
     2, 4, 6 and 8 of the interior-point solver holds, `after_2` ... what the profile then costs.
     """
-    solver, problem, penalised = make_solver(program), sequence.problem, sequence.solved_with(program)
+    solver, problem, penalised = solvers.make_solver(program), sequence.problem, sequence.solved_with(program)
     counts = equal_counts(program, solver)
     names = ("lowest", "guess", *(f"{what}_{k}" for k in counts for what in ("count", "after")))
     columns: Columns = {name: [] for name in names}
@@ -275,7 +273,7 @@ def harsh_run(sequence: ProblemSequence, program: ProgramSettings) -> Columns:
     return columns
 
 
-def equal_counts(program: ProgramSettings, solver: Solver) -> dict[int, int]:
+def equal_counts(program: ProgramSettings, solver: solvers.Solver) -> dict[int, int]:
     """Return the iterations of a solver that take as long as 2, 4, 6 and 8 of the interior-point solver."""
     iteration_s = program.interior_point.tau_1_s
     return {k: math.floor(k * iteration_s / solver.tau_1_s + 1e-9) for k in INTERIOR_POINT_ITERATIONS}

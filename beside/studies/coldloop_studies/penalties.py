@@ -16,12 +16,11 @@ from coldloop_plant.load import HOUR_TICKS
 from coldloop_rig.figures.plot import ACCENT, DASHES, INK, THIRD
 from coldloop_rig.plc_sizing.intervals import Interval, crossing, interval_of_share, jackknife, mean_ratio
 from coldloop_rig.text_tables import Cell, markdown_table
-from coldloop_studies import drawing
+from coldloop_studies import drawing, updating_period
 from coldloop_studies.drawing import above_lowest, hour_panels, legend_outside, panels, paper
 from coldloop_studies.request import RunRequest, Series
 from coldloop_studies.solver_comparison import PairedSums, paired_loads, paired_request, throttled
 from coldloop_studies.study import PROGRAM, Load, Outcomes, Study, StudyOptions, StudyResult, first_and_fresh, loads
-from coldloop_studies.updating_period import FEW, NINE, is_inside
 
 TUNED: Final = "tuned"
 AS_PRINTED: Final = Preset.AS_PRINTED.value
@@ -150,7 +149,7 @@ def hours(options: StudyOptions) -> list[Load]:
 
 def periods(options: StudyOptions) -> tuple[float, ...]:
     """Return the updating periods, s."""
-    return FEW if options.quick else NINE
+    return updating_period.FEW if options.quick else updating_period.NINE
 
 
 def _timed_variants(load: Load, options: StudyOptions) -> list[PenaltyVariant]:
@@ -175,7 +174,7 @@ def _hours_by_title(costs: PeriodCosts, cost: str) -> dict[str, Series]:
 
 def share_inside(table: Series) -> Interval:
     """Return the share of hours, rows of `table`, whose best period is inside, with its interval over the hours."""
-    return interval_of_share(sum(map(is_inside, table)), len(table))
+    return interval_of_share(sum(map(updating_period.is_inside, table)), len(table))
 
 
 def end_over_best(table: Series, end: int) -> Interval:

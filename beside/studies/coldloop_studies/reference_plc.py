@@ -13,17 +13,14 @@ from matplotlib.figure import Figure
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.settings import SHIPPED_MODELS, InputLimits
 from coldloop_optimizer_plc.computing_settings import Arithmetic, EstimatorSettings
-from coldloop_optimizer_plc.qp import linear_algebra
-from coldloop_optimizer_plc.qp.linear_algebra import real_of
+from coldloop_optimizer_plc.qp import linear_algebra, problem
 from coldloop_optimizer_plc.qp.prediction import PredictionModel
-from coldloop_optimizer_plc.qp.problem import PredictiveProblem
 from coldloop_optimizer_plc.settings import ControlDesign, SolverName, trivial_design
 from coldloop_plant.load import HOUR_TICKS
 from coldloop_rig.figures.plot import COLOURS, legend_above
 from coldloop_rig.plc_sizing import operations
 from coldloop_rig.plc_sizing import plc as reference
 from coldloop_rig.plc_sizing.budget import estimator_memory, footprint
-from coldloop_rig.plc_sizing.operations import dense_sizes
 from coldloop_rig.text_tables import Cell, markdown_table
 from coldloop_studies.drawing import panels, paper
 from coldloop_studies.request import Series
@@ -34,7 +31,7 @@ SLOW_DOWN: Final = "slow-down against the laptop, sizes 40 to 125"
 ACTIVE: Final = operations.ACTIVE_ROWS
 N: Final = 49
 """Variables of the paper's problem."""
-SIZES: Final = dense_sizes(N, 94, 21)
+SIZES: Final = operations.dense_sizes(N, 94, 21)
 """Sizes of the paper's problem, zeros counted."""
 
 
@@ -51,9 +48,9 @@ def _cholesky(_options: StudyOptions, _outcomes: Outcomes) -> StudyResult:
     large = times.size[times.size >= 50]
     modelled = np.array([curve.time_s(n) for n in times.size.tolist()])
     prediction, estimator = PredictionModel(load_model(SHIPPED_MODELS["cold-box"])), EstimatorSettings()
-    design, limits, real = ControlDesign(), InputLimits(), real_of(Arithmetic.FLOAT32)
+    design, limits, real = ControlDesign(), InputLimits(), linear_algebra.real_of(Arithmetic.FLOAT32)
     reduced, trivial = (
-        footprint(PredictiveProblem(prediction, one, limits, real), estimator_memory(prediction, estimator),
+        footprint(problem.PredictiveProblem(prediction, one, limits, real), estimator_memory(prediction, estimator),
                   SolverName.ODE) for one in (design, trivial_design(design))
     )  # fmt: skip
     values = {
@@ -74,9 +71,11 @@ def _cholesky(_options: StudyOptions, _outcomes: Outcomes) -> StudyResult:
 
 
 CHOLESKY: Final = Study(
-    "cholesky", "The reference PLC: speed, time of an iteration, memory (figure performance_automate)", lambda _: (),
+    "cholesky",
+    "The reference PLC: speed, time of an iteration, memory (figure performance_automate)",
+    lambda _: (),
     _cholesky,
-)  # fmt: skip
+)
 """The speed curve, the time of an iteration of each solver, and the memory."""
 
 
@@ -137,8 +136,7 @@ def _speed_figure(rows: list[tuple[Cell, ...]]) -> Figure:
         paper(computers, table[:, 0], table[:, 3], COLOURS[1], "laptop, paper")
         computers.plot(table[:, 0], table[:, 4], "--", color=COLOURS[2], label="this machine")
         for place, unit in ((plc, "ms"), (computers, "us")):
-            place.set_yscale("log")
-            place.set_ylabel(f"factorisation ({unit})")
+            place.set(yscale="log", ylabel=f"factorisation ({unit})")
             place.legend(loc="lower right")
         computers.set_xlabel("size of the matrix (1)")
     return figure
@@ -173,11 +171,13 @@ def _single_precision(found: Found[str]) -> StudyResult:
 
 
 SINGLE_PRECISION: Final = study_of_loads(
-    "single-precision", "Single against double precision (section IV-D)",
+    "single-precision",
+    "Single against double precision (section IV-D)",
     # two hours of each draw: rounding changes single steps, so more draws say more than longer runs
     lambda options: loads(options, "8h", longest_ticks=2 * HOUR_TICKS),
-    lambda load: {kind: load.request(2.5, f"{PROGRAM}arithmetic={kind}", trace_ticks=1)
-                  for kind in ("float64", "float32")},
+    lambda load: {
+        kind: load.request(2.5, f"{PROGRAM}arithmetic={kind}", trace_ticks=1) for kind in ("float64", "float32")
+    },
     _single_precision,
-)  # fmt: skip
+)
 """Double and single precision, tick by tick."""

@@ -65,9 +65,12 @@ def _range(run: Outcome, name: str, digits: int) -> str:
 
 
 COUPLING: Final = study_of_loads(
-    "coupling", "Beyond the paper: the whole refrigerator under MPC", lambda options: loads(options, *"abcdef"),
-    lambda load: {plant: load.request(0.0, *own, trace_ticks=TRACE_TICKS) for plant, own in PLANTS.items()}, _coupling,
-)  # fmt: skip
+    "coupling",
+    "Beyond the paper: the whole refrigerator under MPC",
+    lambda options: loads(options, *"abcdef"),
+    lambda load: {plant: load.request(0.0, *own, trace_ticks=TRACE_TICKS) for plant, own in PLANTS.items()},
+    _coupling,
+)
 """The cold box alone against the whole refrigerator."""
 
 
@@ -126,10 +129,13 @@ def _disturbances(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
 
 
 DISTURBANCES: Final = Study(
-    "disturbances", "Beyond the paper: what happens to a refrigerator",
-    lambda options: [run for event in CASES.values() for load in _loads(event, options)
-                     for run in _runs(event, load).values()], _disturbances,
-)  # fmt: skip
+    "disturbances",
+    "Beyond the paper: what happens to a refrigerator",
+    lambda options: [
+        run for event in CASES.values() for load in _loads(event, options) for run in _runs(event, load).values()
+    ],
+    _disturbances,
+)
 """Events of a refrigerator, with LQ and PI at the station, MPC and loops at the cold box."""
 
 

@@ -251,9 +251,7 @@ def perform(request: RunRequest) -> str:
     return _outcome(recorder.recording(), settings, request.trace_ticks).to_json()
 
 
-@lru_cache(maxsize=1)
-def _rig(assignments: tuple[str, ...]) -> OneProcessRig:
-    return OneProcessRig(settings_of(assignments))
+_rig = lru_cache(maxsize=1)(lambda assignments: OneProcessRig(settings_of(assignments)))
 
 
 def _outcome(recording: Recording, settings: Settings, trace_ticks: int) -> Outcome:

@@ -18,7 +18,6 @@ from coldloop_rig.figures.plot import COLOURS
 from coldloop_rig.plc_sizing.intervals import Interval, crossing, interval_of_mean, jackknife
 from coldloop_rig.text_tables import markdown_table
 from coldloop_studies import drawing
-from coldloop_studies.drawing import above_lowest, legend_outside, panels, paper, spread
 from coldloop_studies.paired_run import HARSH, INTERIOR_POINT_ITERATIONS
 from coldloop_studies.request import Outcome, Procedure, RunRequest, Series
 from coldloop_studies.study import PROGRAM, Load, Outcomes, Study, StudyOptions, StudyResult, loads
@@ -303,11 +302,11 @@ def _comparison(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         for load in _closed_loads(options)
     ]  # fmt: skip
     result = StudyResult(COLUMNS, [], {"indicators": _figure(powers, tables, closed)})
-    with panels(1, 1, 3.0) as (figure, (place,)):
+    with drawing.panels(1, 1, 3.0) as (figure, (place,)):
         for (solver, some), colour in zip(paired.powers.items(), COLOURS, strict=False):
             intervals = [paired.interval(solver, power) for power in some]
-            above_lowest(place, some, intervals, colour, LABELS[solver])
-        legend_outside(figure, place)
+            drawing.above_lowest(place, some, intervals, colour, LABELS[solver])
+        drawing.legend_outside(figure, place)
     result.figures["paired open loop"] = figure
     for load, table in zip(paired.loads, tables, strict=True):
         result.rows += [
@@ -387,20 +386,19 @@ def _figure(powers: Series, paired: Sequence[Table], closed: Sequence[Table]) ->
         "c1": "(d) $c_1$ (%, K)", "c2": "(e) $c_2$ (%, K)", "J_BF": "(f) $J^{BF}$, relative (1)",
     }  # fmt: skip
     theirs = drawing.published_comparison()
-    with panels(3, 2, 7.5, sharex=True) as (figure, axes):
+    with drawing.panels(3, 2, 7.5, sharex=True) as (figure, axes):
         for place, name in zip(axes, INDICATORS, strict=True):
             relative, tables = name.startswith("J"), closed if name == "J_BF" else paired
             for solver, colour in zip(SOLVERS, COLOURS, strict=False):
                 ours = [table[solver][name] / (table["qpoases"][name][-1] if relative else 1.0) for table in tables]
-                spread(place, powers, ours, colour, f"{SOLVERS[solver]}, here")
+                drawing.spread(place, powers, ours, colour, f"{SOLVERS[solver]}, here")
                 base = theirs["qpoases"][name][-1] if relative else 1.0
-                paper(place, theirs[solver]["normalized_power"], theirs[solver][name] / base, colour,
+                drawing.paper(place, theirs[solver]["normalized_power"], theirs[solver][name] / base, colour,
                       f"{SOLVERS[solver]}, paper")  # fmt: skip
-            place.set_xscale("log")
-            place.set_ylabel(labels[name])
+            place.set(xscale="log", ylabel=labels[name])
             if drawing.spans_decade(np.concatenate([np.ravel(line.get_ydata()) for line in place.lines])):
                 place.set_yscale("log")
-        legend_outside(figure, axes[0])
+        drawing.legend_outside(figure, axes[0])
         for place in axes[-2:]:
             place.set_xlabel("normalised power $P$ (1)")
     return figure

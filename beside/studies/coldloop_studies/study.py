@@ -198,11 +198,13 @@ def study_of_loads(
 ) -> Study:  # fmt: skip
     """Return a study of the same runs under each of its loads."""
     return Study(
-        name, title, lambda options: [run for load in drawn(options) for run in runs(load).values()],
+        name,
+        title,
+        lambda options: [run for load in drawn(options) for run in runs(load).values()],
         lambda options, outcomes: evaluate(
             (load, {key: outcomes[run] for key, run in runs(load).items()}) for load in drawn(options)
         ),
-    )  # fmt: skip
+    )
 
 
 OWN: Final = "studies run in one process, in lock-step; leave it out"

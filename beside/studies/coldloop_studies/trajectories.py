@@ -195,8 +195,7 @@ def response_figure(runs_of: Mapping[str, Sequence[Run]]) -> Figure:
             means = [held_periods(runs).mean(span) for span in pairwise(EDGES_S.tolist())]
             place.stairs(means, edges, color=colour, linestyle=DASHES[colour], baseline=None, label=policy)
         place.set_xlabel(f"time since the load step (s); the last is from {EDGES_S[-2]:g} s on")
-        place.set_ylabel("mean updating period (s), by time")
-        place.set_ylim(bottom=0)
+        place.set(ylabel="mean updating period (s), by time", ylim=(0, None))
         legend_outside(figure, place)
     return figure
 
@@ -211,8 +210,11 @@ def _experiment(name: str, title: str, periods_s: Mapping[str, float]) -> study.
     """
 
     def runs(load: Load) -> dict[tuple[str, str], RunRequest]:
-        return {(case, rig): load.request(period_s, networked=networked, trace_ticks=TRACE_TICKS)
-                for case, period_s in periods_s.items() for rig, networked in RIGS.items()}  # fmt: skip
+        return {
+            (case, rig): load.request(period_s, networked=networked, trace_ticks=TRACE_TICKS)
+            for case, period_s in periods_s.items()
+            for rig, networked in RIGS.items()
+        }
 
     def evaluate(found: study.Found[tuple[str, str]]) -> StudyResult:
         result = StudyResult(
@@ -222,8 +224,18 @@ def _experiment(name: str, title: str, periods_s: Mapping[str, float]) -> study.
         for load, done in found:
             for (case, rig), run in done.items():
                 i = run.indicators
-                result.rows.append((load.name, case, rig, i.J_BF, *i.outside_band_pct.values(), i.tau_u_mean,
-                                    i.tau_u_mean_per_update, run.trace_sha256))  # fmt: skip
+                result.rows.append(
+                    (
+                        load.name,
+                        case,
+                        rig,
+                        i.J_BF,
+                        *i.outside_band_pct.values(),
+                        i.tau_u_mean,
+                        i.tau_u_mean_per_update,
+                        run.trace_sha256,
+                    )
+                )
             for case, period_s in periods_s.items():
                 networked, alone = (done[case, rig] for rig in RIGS)
                 result.note(f"{name}: same trace, {case}", networked.trace_sha256 == alone.trace_sha256)
@@ -277,10 +289,16 @@ def _trade_off(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
 
 
 TRADE_OFF: Final = study.Study(
-    "trade-off", "What a period wins and loses (figures compareSf and twocases)",
-    lambda options: [_request(load, solver, period) for load in loads(options, "c") for solver in SOLVERS
-                     for period in _periods(options)], _trade_off,
-)  # fmt: skip
+    "trade-off",
+    "What a period wins and loses (figures compareSf and twocases)",
+    lambda options: [
+        _request(load, solver, period)
+        for load in loads(options, "c")
+        for solver in SOLVERS
+        for period in _periods(options)
+    ],
+    _trade_off,
+)
 """E for each solver and D, against tau_u, in the first period after load steps."""
 
 
@@ -319,11 +337,11 @@ def _discriminating(load: Load, periods: tuple[float, ...], outcomes: Outcomes) 
     }
     short, long = f"{periods[0]:g} s", f"{periods[-1]:g} s"
     return {
-        f"share of load steps after which E > D at {short}: ODE less qpOASES":
-            share["ode", periods[0]] - share["qpoases", periods[0]],
-        f"share of load steps after which E > D at {long} less that at {short}: qpOASES":
-            share["qpoases", periods[-1]] - share["qpoases", periods[0]],
-    }  # fmt: skip
+        f"share of load steps after which E > D at {short}: ODE less qpOASES": share["ode", periods[0]]
+        - share["qpoases", periods[0]],
+        f"share of load steps after which E > D at {long} less that at {short}: qpOASES": share["qpoases", periods[-1]]
+        - share["qpoases", periods[0]],
+    }
 
 
 def _trade_off_figure(periods: tuple[float, ...], curves: dict[str, list[list[tuple[float, float]]]]) -> Figure:

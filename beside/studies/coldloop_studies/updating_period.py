@@ -11,10 +11,9 @@ from matplotlib.figure import Figure
 from coldloop_rig.figures.plot import ACCENT, INK, THIRD
 from coldloop_rig.plc_sizing.intervals import geometric_mean
 from coldloop_rig.text_tables import Cell, markdown_table
-from coldloop_studies import drawing, study
+from coldloop_studies import drawing, study, trajectories
 from coldloop_studies.request import Outcome, RunRequest, Series
 from coldloop_studies.study import NOISE, PROGRAM, Load, Outcomes, StudyOptions, StudyResult, first_and_fresh, loads
-from coldloop_studies.trajectories import response, response_figure, response_table
 
 NINE: Final = tuple(drawing.published_periods()["a"]["tau_u_s"].tolist())
 """Periods of the paper, s."""
@@ -69,9 +68,7 @@ VARIANTS: Final = (
 )
 
 
-COLUMNS: Final = (
-    "variant", "load", "policy", "tau_u mean (s)", "J per time", "J_BF", "tau_u mean per update (s)",
-)  # fmt: skip
+COLUMNS: Final = ("variant", "load", "policy", "tau_u mean (s)", "J per time", "J_BF", "tau_u mean per update (s)")
 
 
 def _updating_period_requests(options: StudyOptions) -> list[RunRequest]:
@@ -99,7 +96,7 @@ def _updating_period(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
     )
     result.figures["cost against period"] = _figure(first, fresh)
     responses = {p.label: [(hour.policies[p.label], hour.load) for hour in hours.values()] for p in RESPONDING}
-    result.figures["period after a load step"] = response_figure(responses)
+    result.figures["period after a load step"] = trajectories.response_figure(responses)
     _judge(result, "hours", first)
     if fresh:
         _judge(result, "fresh hours", fresh)
@@ -108,10 +105,10 @@ def _updating_period(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         share = _share(map(is_inside, costs))
         result.values["interior optimum from 1 to 5 s, share of hours, as printed"] = [share]
     for policy in (LITERAL, OWN_INTERRUPT):
-        found = response(responses[policy.label], policy.label)
+        found = trajectories.response(responses[policy.label], policy.label)
         result.values |= {name: [value] for name, value in found.items()}
     result.remarks += [_table("Hours of the first draw", first), *([_table("Fresh hours", fresh)] if fresh else [])]
-    result.remarks += [response_table(responses), _variant_table(result)]
+    result.remarks += [trajectories.response_table(responses), _variant_table(result)]
     return result
 
 
