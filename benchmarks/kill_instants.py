@@ -8,7 +8,7 @@ from pathlib import Path
 from coldloop.config import Configuration, load_configuration
 from coldloop.process.cold_box import TICK_S
 from coldloop.session import TimeMode
-from coldloop_chaos.faults import ChaosPlan, Kill, Pause
+from coldloop_chaos.faults import ChaosPlan, ProcessStop
 from coldloop_chaos.report import ChaosProgress, Evaluation, perform, summary_lines, write_report
 from coldloop_rig.results.folders import claim_folder
 from coldloop_rig.settings import Settings
@@ -29,7 +29,7 @@ def make_plan(options: argparse.Namespace) -> ChaosPlan:
             "duration_s": options.outage,
             "offset_ms": draw.uniform(0, IN_FLIGHT_MS),
         }
-        faults.append(Kill(kind="kill", **values) if options.signal == "kill" else Pause(kind="pause", **values))
+        faults.append(ProcessStop(kind="kill" if options.signal == "kill" else "pause", **values))
     duration_s = (options.count + 2) * options.gap
     draws = int(duration_s // (HOURS * 3600)) + 1
     return ChaosPlan(

@@ -8,15 +8,15 @@ from coldloop.registers.common import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.plant import PlantSample
 from coldloop.registers.safety import AlarmKind
-from coldloop_chaos.faults import Kill, Reset
+from coldloop_chaos.faults import LinkCut, ProcessStop
 from coldloop_chaos.report import Evaluation, RaisedAlarm, evaluate, table
 from coldloop_chaos.sequencer import ChaosTrace, Mark
 from coldloop_optimizer_plc.settings import ControlDesign
 
 TICKS = 400
 RATE = (0.5, 10.0, 0.1)
-KILL = Kill(kind="kill", process="optimizer", at_s=25, duration_s=25)
-RESET = Reset(kind="reset", link="plant", at_s=75, duration_s=0.25)
+KILL = ProcessStop(kind="kill", process="optimizer", at_s=25, duration_s=25)
+RESET = LinkCut(kind="reset", link="plant", at_s=75, duration_s=0.25)
 
 
 def sample(

@@ -9,8 +9,8 @@ from coldloop_chaos.faults import (
     SPREAD_S,
     ChaosPlan,
     FrameLoss,
-    Kill,
-    Reset,
+    LinkCut,
+    ProcessStop,
     find_plan,
     parsed_plan,
     shipped_plans,
@@ -91,8 +91,8 @@ def drawing(seed: int) -> ChaosPlan:
     return ChaosPlan(
         name="x", description="x", duration_s=3600, every_s=600, seed=seed,
         draw=(
-            Kill(kind="kill", process="optimizer", duration_s=60),
-            Reset(kind="reset", link="plant", duration_s=1),
+            ProcessStop(kind="kill", process="optimizer", duration_s=60),
+            LinkCut(kind="reset", link="plant", duration_s=1),
             FrameLoss(kind="drop", link="plant", share=0.1, duration_s=1),
         ),
     )  # fmt: skip

@@ -15,7 +15,7 @@ from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import Grant
 from coldloop.registers.declaration import Block
-from coldloop_chaos.faults import Delay, Direction, FrameDamage, FrameLoss, Freeze, Reset
+from coldloop_chaos.faults import Delay, Direction, FrameDamage, FrameLoss, LinkCut
 from coldloop_chaos.proxy import MOST_FROZEN, LinkProxy
 from tests.harness.records import CONTROL_MAP
 
@@ -71,7 +71,7 @@ async def test_an_undisturbed_proxy_is_not_noticed() -> None:
 async def test_a_reset_is_noticed_at_once_and_new_connections_are_reset_too_until_it_ends() -> None:
     async with line() as it:
         await it.client.read(Grant)
-        fault = Reset(kind="reset", **COMMON)
+        fault = LinkCut(kind="reset", **COMMON)
         it.proxy.begin(fault)
         for _ in range(2):
             with pytest.raises(PeerUnreachableError):
@@ -85,7 +85,7 @@ async def test_a_raw_client_sees_rst_and_not_an_ordinary_end() -> None:
         reader, writer = await raw(it.proxy)
         writer.write(READ_THREE)
         await reader.readexactly(9 + 6)
-        it.proxy.begin(Reset(kind="reset", **COMMON))
+        it.proxy.begin(LinkCut(kind="reset", **COMMON))
         with pytest.raises(ConnectionResetError):
             await reader.read()
         writer.close()
@@ -94,7 +94,7 @@ async def test_a_raw_client_sees_rst_and_not_an_ordinary_end() -> None:
 async def test_what_is_sent_into_a_frozen_link_arrives_when_it_thaws() -> None:
     async with line() as it:
         await it.client.read(Grant)
-        fault = Freeze(kind="freeze", **COMMON)
+        fault = LinkCut(kind="freeze", **COMMON)
         it.proxy.begin(fault)
         writing = asyncio.create_task(it.client.write(Grant(7)))
         reader, writer = await raw(it.proxy)
@@ -125,7 +125,7 @@ async def test_a_lost_answer_is_a_time_out_and_a_lost_request_is_never_served() 
 
 async def test_who_tries_again_and_again_while_nothing_passes_does_not_use_up_all_files() -> None:
     async with line() as it, asyncio.timeout(60.0):
-        fault = Freeze(kind="freeze", **COMMON)
+        fault = LinkCut(kind="freeze", **COMMON)
         it.proxy.begin(fault)
         calls = [await raw(it.proxy) for _ in range(MOST_FROZEN + 40)]
         for reader, _ in calls[:40]:

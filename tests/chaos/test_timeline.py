@@ -1,10 +1,10 @@
 """When faults begin and end."""
 
-from coldloop_chaos.faults import Freeze, Kill
+from coldloop_chaos.faults import LinkCut, ProcessStop
 from coldloop_chaos.sequencer import Timeline
 
-KILL = Kill(kind="kill", process="optimizer", at_s=10, duration_s=20)
-FREEZE = Freeze(kind="freeze", link="plant", at_s=15, duration_s=5)
+KILL = ProcessStop(kind="kill", process="optimizer", at_s=10, duration_s=20)
+FREEZE = LinkCut(kind="freeze", link="plant", at_s=15, duration_s=5)
 
 
 def test_faults_may_lie_within_each_other() -> None:

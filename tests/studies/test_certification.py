@@ -13,9 +13,8 @@ from coldloop_optimizer_plc.settings import SolverName
 from coldloop_optimizer_plc.solvers import Answer, make_solver
 from coldloop_rig.plc_sizing.intervals import (
     LONGEST,
-    Needs,
     Problem,
-    _certificate,
+    failed,
     failure_bound,
     iterations_needed,
     scenario_needs,
@@ -93,10 +92,10 @@ def test_what_a_problem_needs(costs: tuple[float, ...], needed: int) -> None:
 
 
 def test_a_certificate_counts_scenarios() -> None:
-    """19 fit: of four problems at random one fails, of four worst ones two; the most that any needed is 40."""
-    needs = [Needs(5, 2), Needs(19, 19), Needs(20, 3), Needs(40, 25)]
-    found = _certificate(SolverName.ODE, 19, needs, 0.05)
-    assert found == (SolverName.ODE, 19, 1, failure_bound(1, 4, 0.05), 40, 2, failure_bound(2, 4, 0.05))
+    """19 fit: of four problems at random one fails, of four worst ones two."""
+    at_random, worst = (2, 19, 3, 25), (5, 19, 20, 40)
+    assert failed(at_random, 19, 0.05) == ("1 of 4", f"{100 * failure_bound(1, 4, 0.05):.1f} %")
+    assert failed(worst, 19, 0.05) == ("2 of 4", f"{100 * failure_bound(2, 4, 0.05):.1f} %")
 
 
 def test_scenarios_repeat_and_differ() -> None:

@@ -147,16 +147,10 @@ class Reorder(ShareFault):
     """Longest wait for a frame that overtakes it, ms of real time."""
 
 
-class Reset(LinkFault):
-    """All connections are reset (RST), and new ones while the fault lasts."""
+class LinkCut(LinkFault):
+    """All connections are reset (RST), and new ones while the fault lasts; or they stay open, and nothing passes."""
 
-    kind: Literal["reset"]
-
-
-class Freeze(LinkFault):
-    """Nothing passes; the connections stay open."""
-
-    kind: Literal["freeze"]
+    kind: Literal["reset", "freeze"]
 
 
 class Flip(ShareFault):
@@ -190,16 +184,10 @@ class ProcessFault(Fault):
         return frozenset({SERVICE_OF[self.process]})
 
 
-class Kill(ProcessFault):
-    """SIGKILL, and a new start at the end."""
+class ProcessStop(ProcessFault):
+    """SIGKILL, and a new start at the end; or SIGSTOP, and SIGCONT at the end."""
 
-    kind: Literal["kill"]
-
-
-class Pause(ProcessFault):
-    """SIGSTOP, and SIGCONT at the end."""
-
-    kind: Literal["pause"]
+    kind: Literal["kill", "pause"]
 
 
 class Restart(ProcessFault):
@@ -262,10 +250,10 @@ class WrongModel(Fault):
 
 
 AnyLinkFault = Annotated[
-    Delay | ExceptionAnswer | Flip | FrameDamage | FrameLoss | Freeze | Reorder | Reset, Field(discriminator="kind")
+    Delay | ExceptionAnswer | Flip | FrameDamage | FrameLoss | LinkCut | Reorder, Field(discriminator="kind")
 ]
 AnyFault = Annotated[
-    AnyLinkFault | Kill | Pause | Restart | Clock | Sensor | BoundaryFault | WrongModel, Field(discriminator="kind")
+    AnyLinkFault | ProcessStop | Restart | Clock | Sensor | BoundaryFault | WrongModel, Field(discriminator="kind")
 ]
 
 

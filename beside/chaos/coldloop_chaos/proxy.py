@@ -157,16 +157,16 @@ class LinkProxy:
     def begin(self, fault: faults.LinkFault) -> None:
         """Disturb the link."""
         self._faults.append(fault)
-        if isinstance(fault, faults.Freeze):
+        if fault.kind == "freeze":
             self._flowing.clear()
-        elif isinstance(fault, faults.Reset):
+        elif fault.kind == "reset":
             for writer in tuple(self._open):
                 reset(writer)
 
     def end(self, fault: faults.LinkFault) -> None:
         """Stop disturbing it."""
         self._faults.remove(fault)
-        if not any(isinstance(other, faults.Freeze) for other in self._faults):
+        if not any(other.kind == "freeze" for other in self._faults):
             self._flowing.set()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -179,7 +179,7 @@ class LinkProxy:
                     one.cancel()
         ends = [writer]
         try:
-            if any(isinstance(fault, faults.Reset) for fault in self._faults):
+            if any(fault.kind == "reset" for fault in self._faults):
                 reset(writer)
                 return
             far_reader, far_writer = await asyncio.open_connection(self._target.host, self._target.port)
@@ -322,7 +322,7 @@ class LinkProxies:
     def cut(self, link: str) -> Iterator[None]:
         """Let nothing pass in a link in this context; its connections stay open."""
         proxy = self.by_link[faults.Link(link)]
-        fault = faults.Freeze(kind="freeze", link=faults.Link(link), duration_s=1.0)
+        fault = faults.LinkCut(kind="freeze", link=faults.Link(link), duration_s=1.0)
         proxy.begin(fault)
         try:
             yield

@@ -100,10 +100,8 @@ def evaluate(trace: ChaosTrace, undisturbed: Recording, rate: Numbers, design: C
         return tuple(np.max(steps[ticks], axis=0, initial=0.0).tolist()), outside_s, was_s
 
     ends = [*((later.begin, later.first_event) for later in trace.marks[1:]), (trace.ticks, len(trace.events))]
-    rows = [
-        _row(trace, mark, last_event, measured(slice(mark.begin, end)))
-        for mark, (end, last_event) in zip(trace.marks, ends, strict=False)
-    ]
+    windows = zip(trace.marks, ends, strict=False)
+    rows = [_row(trace, mark, last, measured(slice(mark.begin, end))) for mark, (end, last) in windows]
     return Evaluation(rows, *measured(slice(None)), trace.missing)
 
 
@@ -289,10 +287,8 @@ def _cells(rows: Sequence[Row], process: Process) -> list[list[str]]:
         first = {words[alarm.name]: alarm.after_s for alarm in reversed(row.alarms)}
         times = Counter(words[alarm.name] for alarm in row.alarms)
         alarms = [f"{name} {first[name]:g}" + (f" (x{count})" if count > 1 else "") for name, count in times.items()]
-        lasted, back = (
-            "-" if row.lasted_s is None else f"{row.lasted_s:g}",
-            "not" if row.back_s is None else f"{row.back_s:g}",
-        )
+        lasted = "-" if row.lasted_s is None else f"{row.lasted_s:g}"
+        back = "not" if row.back_s is None else f"{row.back_s:g}"
         outside = [f"{outside:g} ({was:g})" for outside, was in zip(row.outside_s, row.undisturbed_s, strict=True)]
         named = [" > ".join(modes) or "-", ", ".join(alarms) or "none"]
         cells.append([row.fault, f"{row.at_s:g}", lasted, *named, f"{row.largest_step:.3f}", *outside, back])

@@ -98,13 +98,12 @@ class Injector:
         """Bring a fault about."""
         if isinstance(fault, faults.LinkFault):
             self.links.by_link[fault.link].begin(fault)
-        elif isinstance(fault, faults.Kill):
-            await self.services.stop(faults.SERVICE_OF[fault.process], signal.SIGKILL)
-        elif isinstance(fault, faults.Restart):
-            await self.services.stop(faults.SERVICE_OF[fault.process], signal.SIGTERM)
-        elif isinstance(fault, faults.Pause | faults.Clock):
+        elif fault.kind in {"pause", "clock"}:
             for service in filter(fault.processes.__contains__, wiring.SERVICES):
                 self.services.send(service, signal.SIGSTOP)
+        elif isinstance(fault, faults.ProcessFault):
+            how = signal.SIGKILL if fault.kind == "kill" else signal.SIGTERM
+            await self.services.stop(faults.SERVICE_OF[fault.process], how)
         elif isinstance(fault, faults.Sensor):
             await self._set_sensor(fault.output, SensorFault(_SHOWN[fault.shows], fault.value or 0.0))
         elif isinstance(fault, faults.BoundaryFault):
@@ -112,21 +111,20 @@ class Injector:
             self._given_before.setdefault(fault.target, before)
         elif isinstance(fault, faults.WrongModel):
             await self.services.stop("optimizer_plc", signal.SIGTERM)
-            await self.services.start(
-                "optimizer_plc", {f"{PREFIX}MODEL__FILE": str(self.folder / WRONG_MODEL)}, may_end=True
-            )
+            model = {f"{PREFIX}MODEL__FILE": str(self.folder / WRONG_MODEL)}
+            await self.services.start("optimizer_plc", model, may_end=True)
 
     async def end(self, fault: faults.AnyFault) -> str | None:
         """Take a fault back; return the service that has been started again, if one has."""
         if isinstance(fault, faults.LinkFault):
             self.links.by_link[fault.link].end(fault)
-        elif isinstance(fault, faults.Kill | faults.Restart):
+        elif fault.kind in {"pause", "clock"}:
+            for service in filter(fault.processes.__contains__, wiring.SERVICES):
+                self.services.send(service, signal.SIGCONT)
+        elif isinstance(fault, faults.ProcessFault):
             service = faults.SERVICE_OF[fault.process]
             await self.services.start(service)
             return service
-        elif isinstance(fault, faults.Pause | faults.Clock):
-            for service in filter(fault.processes.__contains__, wiring.SERVICES):
-                self.services.send(service, signal.SIGCONT)
         elif isinstance(fault, faults.Sensor):
             await self._set_sensor(fault.output, SensorFault(SensorFaultKind.NONE, 0.0))
         elif isinstance(fault, faults.BoundaryFault):
@@ -340,10 +338,8 @@ class FaultSequencer:
             else:
                 await self._end(moment)
             self._stopped_since = time.monotonic()
-        control = self.client.control
-        self.trace.alarms = (
-            await self.client.contact(control.read_rows(Alarm, 0, len(alarms_of(control.process)))) or []
-        )
+        control, contact = self.client.control, self.client.contact
+        self.trace.alarms = await contact(control.read_rows(Alarm, 0, len(alarms_of(control.process)))) or []
         await self.client.conclude()
 
     def finish(self) -> None:

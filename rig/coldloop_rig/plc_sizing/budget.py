@@ -117,9 +117,8 @@ def capacity(size: int, needed: Footprint, memory_bytes: int, budget: PlcBudget)
     fixed = needed.estimator + needed.sequence
     room = max(memory_bytes - fixed, 0)
     time_s = max(budget.longest_ticks * budget.times.tick_s - budget.times.slots, 0.0)
-    return Capacity(
-        size * (room / (needed.total - fixed)) ** (1 / 2), size * (time_s / budget.times.iteration) ** (1 / 3)
-    )
+    by_time = size * (time_s / budget.times.iteration) ** (1 / 3)
+    return Capacity(size * (room / (needed.total - fixed)) ** (1 / 2), by_time)
 
 
 def verdict(

@@ -187,22 +187,6 @@ class Needs(NamedTuple):
     at_random: int
 
 
-class Certificate(NamedTuple):
-    """Result of N scenarios for one solver."""
-
-    solver: SolverName
-    fitting: int
-    """Iterations in the longest updating period."""
-    failures: int
-    """Scenarios whose problem at a random instant needs more than that."""
-    failure_bound: float
-    worst: int
-    """Largest need of all problems of all scenarios."""
-    run_failures: int
-    """Scenarios that have a problem which needs more than fits."""
-    run_bound: float
-
-
 def iterations_needed(solver: Solver, problem: Problem, tolerance: float, floor: float) -> int:
     """Return from which iteration on J stays within a tolerance, a share of its optimum; `LONGEST` + 1 if from none.
 
@@ -239,13 +223,10 @@ def scenario_needs(solver: Solver, problems: list[Problem], number: int, toleran
     return Needs(max(needs), needs[random.Random(number).randrange(len(needs))])  # noqa: S311
 
 
-def _certificate(name: SolverName, fitting: int, needs: list[Needs], beta: float) -> Certificate:
-    failures = sum(one.at_random > fitting for one in needs)
-    run_failures = sum(one.worst > fitting for one in needs)
-    return Certificate(
-        name, fitting, failures, failure_bound(failures, len(needs), beta), max(one.worst for one in needs),
-        run_failures, failure_bound(run_failures, len(needs), beta),
-    )  # fmt: skip
+def failed(needs: Sequence[int], fitting: int, beta: float) -> tuple[str, str]:
+    """Return in how many scenarios more iterations are needed than fit, and the bound of their share, as text."""
+    failures = sum(one > fitting for one in needs)
+    return f"{failures} of {len(needs)}", f"{100 * failure_bound(failures, len(needs), beta):.1f} %"
 
 
 def certification_table(settings: Settings, scenarios: int, tolerance_pct: float, confidence_pct: float) -> str:
@@ -266,9 +247,6 @@ def certification_table(settings: Settings, scenarios: int, tolerance_pct: float
                 needed = scenario_needs(solver, problems, number, tolerance_pct / 100.0, program.adaptive.cost_floor)
                 needs[name].append(needed)
             status.update(f"{number + 1} of {scenarios} scenarios")
-    longest = program.process.ticks_per_sample
-    fitting = {name: PlcBudget(program.budget, one.tau_1_s).iterations(longest) for name, one in solvers.items()}
-    found = [_certificate(name, fitting[name], needs[name], beta) for name in solvers]
     none_failed = 100.0 * failure_bound(0, scenarios, beta)
     power, period_s = program.budget.power, settings.process.sampling_period_s
     heading = (
@@ -281,13 +259,14 @@ def certification_table(settings: Settings, scenarios: int, tolerance_pct: float
     )
     fit = f"fit into {period_s:g} s"
     header = ("solver", fit, "problems failed", "at most", "scenarios failed", "at most", "most needed")
-    rows = [
-        (one.solver, f"{one.fitting}", f"{one.failures} of {scenarios}", f"{100 * one.failure_bound:.1f} %",
-         f"{one.run_failures} of {scenarios}", f"{100 * one.run_bound:.1f} %",
-         f"{one.worst}" if one.worst <= LONGEST else f"over {LONGEST}")
-        for one in found
-    ]  # fmt: skip
-    return heading + aligned([header, *rows], numbers=True)
+    rows: list[tuple[str, ...]] = [header]
+    for name, solver in solvers.items():
+        fitting = PlcBudget(program.budget, solver.tau_1_s).iterations(program.process.ticks_per_sample)
+        worst = [one.worst for one in needs[name]]
+        at_random = failed([one.at_random for one in needs[name]], fitting, beta)
+        most = f"{max(worst)}" if max(worst) <= LONGEST else f"over {LONGEST}"
+        rows.append((name, f"{fitting}", *at_random, *failed(worst, fitting, beta), most))
+    return heading + aligned(rows, numbers=True)
 
 
 # -- whether an adaptive period pays -----------------------------------------------------------------------------------

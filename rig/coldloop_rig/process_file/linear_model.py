@@ -102,9 +102,7 @@ def operating_point(file: Process) -> tuple[Array, Array]:
 def with_disturbances(file: Process, found: Linearised) -> Linearised:
     """Return the model with the disturbances other than the load as states, which hold, and outputs if measured."""
     n, k = len(found.A), len(file.disturbances)
-    F, G = (
-        matrix if file.has_load else np.hstack([0.0 * matrix[:, :1], matrix[:, 1:]]) for matrix in (found.F, found.G)
-    )
+    F, G = (each if file.has_load else np.hstack([0.0 * each[:, :1], each[:, 1:]]) for each in (found.F, found.G))
     shown = np.eye(k)[[one.noise is not None for one in file.disturbances]]
     zeros = np.zeros
     return found._replace(

@@ -64,10 +64,24 @@ def files_of(process: Process) -> dict[str, RunFile]:
         Column("mode", WHOLE, "1", sample["mode"].description, plant.StationMode),
         Column("alarms", WHOLE, "1", sample["alarms"].description),
     )
+    event = maps.control_plc.block_of(common.Event).fields
+    event_columns = (
+        Column("service", TEXT, "", "Whose journal: control_plc or plant"),
+        Column("number", LONG, "1", event["number"].description),
+        Column("boot", WHOLE, "1", event["boot"].description),
+        Column("utc", TEXT, "", "UTC, ISO 8601 with milliseconds"),
+        *_when(process),
+        Column("kind", TEXT, "", "What happened: mode, alarm raised, setpoint, ..."),
+        Column("subject", TEXT, "", "The new mode, the alarm, the input, ...: depends on the kind"),
+        Column("cause", TEXT, "", "Why; empty when there is no cause"),
+        Column("value", REAL, "", "A value; null when the kind has none"),
+        Column("unit", TEXT, "", "Unit of the value; empty when it has none"),
+        Column("who", TEXT, "", "Client that made the request: address, role, certificate; empty if there is none"),
+    )
     return {
         TRACE: RunFile(f"One row a tick of {process.tick_unit}", _trace(process, maps)),
         UPDATES: RunFile(updates, _updates(process, maps)),
-        EVENTS: RunFile("One row an event of the journals: modes, alarms, commands", _events(process, maps)),
+        EVENTS: RunFile("One row an event of the journals: modes, alarms, commands", event_columns),
         STATION: RunFile(station, station_columns),
     }
 
@@ -127,23 +141,6 @@ def _updates(process: Process, maps: Maps) -> tuple[Column, ...]:
             if name not in ("update", "tick", "tau_u")
         ),
     )  # fmt: skip
-
-
-def _events(process: Process, maps: Maps) -> tuple[Column, ...]:
-    event = maps.control_plc.block_of(common.Event).fields
-    return (
-        Column("service", TEXT, "", "Whose journal: control_plc or plant"),
-        Column("number", LONG, "1", event["number"].description),
-        Column("boot", WHOLE, "1", event["boot"].description),
-        Column("utc", TEXT, "", "UTC, ISO 8601 with milliseconds"),
-        *_when(process),
-        Column("kind", TEXT, "", "What happened: mode, alarm raised, setpoint, ..."),
-        Column("subject", TEXT, "", "The new mode, the alarm, the input, ...: depends on the kind"),
-        Column("cause", TEXT, "", "Why; empty when there is no cause"),
-        Column("value", REAL, "", "A value; null when the kind has none"),
-        Column("unit", TEXT, "", "Unit of the value; empty when it has none"),
-        Column("who", TEXT, "", "Client that made the request: address, role, certificate; empty if there is none"),
-    )
 
 
 def schema_document(process: Process, *, station: bool = False) -> dict[str, Any]:

@@ -245,14 +245,6 @@ class Driving(NamedTuple):
     """Outputs whose measurement was substituted."""
 
 
-class SensorFaultRecord(NamedTuple):
-    """Fault of a sensor from one tick on."""
-
-    tick: int
-    kind: int
-    value: float
-
-
 class DrivingHistory:
     """Takes events of a process in the order of each journal; returns the columns of ticks that do not come back.
 
@@ -262,7 +254,7 @@ class DrivingHistory:
     def __init__(self, process: Process) -> None:
         self.process = process
         self._states = [Driving()]
-        self._faults: dict[int, list[SensorFaultRecord]] = {output: [] for output in process.controlled}
+        self._faults: dict[int, list[Event]] = {output: [] for output in process.controlled}
         self._held = dict.fromkeys(process.controlled, math.nan)
         """Values that frozen sensors show, by output."""
 
@@ -272,7 +264,7 @@ class DrivingHistory:
             if event.kind == EventKind.SESSION:  # it begins with healthy sensors
                 self._faults = {output: [] for output in self._faults}
             elif event.kind == EventKind.SENSOR_FAULT and event.subject in self._faults:
-                self._faults[event.subject].append(SensorFaultRecord(event.tick, event.cause, event.value))
+                self._faults[event.subject].append(event)
             return
         last = self._states[-1]
         if event.kind == EventKind.MODE:
@@ -308,10 +300,10 @@ class DrivingHistory:
             values, before = y[:, output].copy(), None
             for fault, until in zip(faults, [*(later.tick for later in faults[1:]), end], strict=False):
                 begin, stop = np.clip([fault.tick - first, until - first], 0, len(values))
-                if fault.kind == SensorFaultKind.FROZEN and first <= fault.tick < end:
+                if fault.cause == SensorFaultKind.FROZEN and first <= fault.tick < end:
                     # the value shown then: the output itself, or that of the previous fault
                     self._held[output] = _shown_by(before, values[fault.tick - first], self._held[output])
-                if fault.kind and begin < stop:
+                if fault.cause and begin < stop:
                     values[begin:stop] = _shown_by(fault, 0.0, self._held[output])
                 before = fault
             columns.append(number_array(values, pa.float32(), np.isnan(values)))
@@ -325,12 +317,13 @@ class DrivingHistory:
             del faults[: max(0, bisect_right([fault.tick for fault in faults], tick) - 1)]
 
 
-def _shown_by(fault: SensorFaultRecord | None, true: float, held: float) -> float:
-    if fault is None or fault.kind == SensorFaultKind.NONE:
+def _shown_by(fault: Event | None, true: float, held: float) -> float:
+    """Return what a sensor shows by the event of its last fault."""
+    if fault is None or fault.cause == SensorFaultKind.NONE:
         return float(true)
-    if fault.kind == SensorFaultKind.NOT_A_NUMBER:
+    if fault.cause == SensorFaultKind.NOT_A_NUMBER:
         return math.nan
-    return held if fault.kind == SensorFaultKind.FROZEN else fault.value
+    return held if fault.cause == SensorFaultKind.FROZEN else fault.value
 
 
 def trace_table(

@@ -71,10 +71,8 @@ class SampleBlock(NamedTuple):
     def split(self, ticks: int) -> tuple["SampleBlock", "SampleBlock"]:
         """Return the first `ticks` ticks, and the rest."""
         parts = self[1:]
-        return (
-            SampleBlock(self.first, *(part[:ticks] for part in parts)),
-            SampleBlock(self.first + ticks, *(part[ticks:] for part in parts)),
-        )
+        head = SampleBlock(self.first, *(part[:ticks] for part in parts))
+        return head, SampleBlock(self.first + ticks, *(part[ticks:] for part in parts))
 
     @property
     def rows(self) -> NDArray[np.float32]:

@@ -401,9 +401,8 @@ def remarks(effective: Configuration[Settings]) -> list[str]:
     unused = {"q_first", "q_min", "q_max", "delta"} & adaptive.model_fields_set
     usual = AdaptiveSettings.model_fields
     if adaptive.rule is RuleName.CONTRACTION and any(getattr(adaptive, one) != usual[one].default for one in unused):
-        found.append(
-            f"adaptive.{', adaptive.'.join(sorted(unused))}: of Algorithm 1; the rule is adaptive.rule=contraction"
-        )
+        named = ", adaptive.".join(sorted(unused))
+        found.append(f"adaptive.{named}: of Algorithm 1; the rule is adaptive.rule=contraction")
     if left_out:
         found.append(f"not applied of the preset: {', '.join(left_out)}; `coldloop config` says why")
     return [*filter(None, found)]
