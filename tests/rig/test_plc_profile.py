@@ -51,8 +51,8 @@ def test_what_gives_way_first_by_hand() -> None:
     needed = Footprint(hessian=4000, problem=3000, shift=1000, solver=2000, estimator=50_000, sequence=10_000)
     budget = PlcBudget(BudgetSettings(power=1.0, preparation_slots=1), 0.59375)
     assert capacity(50, needed, 100_000, budget) == pytest.approx((100.0, 100.0))
-    assert capacity(50, needed, 59_000, budget).by_memory == 0.0
-    assert capacity(50, needed, 100_000, PlcBudget(BudgetSettings(power=0.05), 0.25)).by_time == 0.0
+    assert capacity(50, needed, 59_000, budget)[0] == 0.0
+    assert capacity(50, needed, 100_000, PlcBudget(BudgetSettings(power=0.05), 0.25))[1] == 0.0
 
 
 def test_a_plc_that_fits_is_said_so_with_what_it_does(coldloop: "Coldloop", tmp_path: Path) -> None:

@@ -194,11 +194,8 @@ class ChaosProgress(PlantTimeBar):
             return
         self._shown = now
         self._bar.start()
-        mode = Mode(ladder.mode).name if ladder is not None else "control PLC away"
-        self._bar.update(
-            self._task, completed=tick, clock=clock(tick * self._plan.process.tick_s),
-            line="  ".join([mode, *faults]),
-        )  # fmt: skip
+        line = "  ".join([Mode(ladder.mode).name if ladder is not None else "control PLC away", *faults])
+        self._bar.update(self._task, completed=tick, clock=clock(tick * self._plan.process.tick_s), line=line)
         self._bar.refresh()
 
 
@@ -268,10 +265,8 @@ def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
     for service, count in trace.log_lines.items():
         sizes = [sample.rss_mb[service] for sample in trace.resources if service in sample.rss_mb]
         if sizes:
-            lines.append(
-                f"{service}: {sizes[0]:.0f} MB at first, {max(sizes):.0f} MB at most, {sizes[-1]:.0f} MB at last; "
-                f"{count} log lines"
-            )
+            memory = f"{sizes[0]:.0f} MB at first, {max(sizes):.0f} MB at most, {sizes[-1]:.0f} MB at last"
+            lines.append(f"{service}: {memory}; {count} log lines")
     return lines
 
 
@@ -310,9 +305,8 @@ def plot_chaos(path: Path, experiment: Experiment) -> None:
         units: dict[str, list[int]] = {}  # inputs that have the same unit share a panel
         for number, unit in enumerate(process.input_units):
             units.setdefault(unit, []).append(number)
-        *panels, ribbon = figure.subplots(
-            len(bands) + len(units) + 1, 1, sharex=True, height_ratios=[*[3] * (len(bands) + len(units)), 1]
-        )
+        heights = [*[3] * (len(bands) + len(units)), 1]
+        *panels, ribbon = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
         axes: list[Axes] = panels
         controlled = zip(process.controlled, process.banded, bands, strict=True)
         for place, (output, one, band) in zip(axes, controlled, strict=False):

@@ -432,10 +432,7 @@ class FaultSequencer:
         mark.end = self.tick
 
     async def _hold_time(self, until: Callable[[LadderStatus | None], bool]) -> None:
-        """Hold plant time in lock-step until something is so, such as that the control PLC detects its optimiser again.
-
-        Without one it runs as fast as it can, and what the optimiser takes to come back says nothing in plant time.
-        """
+        """Hold plant time in lock-step until something is so; without an optimiser it runs as fast as it can."""
         since = time.monotonic()
         while time.monotonic() - since < PRESENCE_S:
             if until(await self._look()):
@@ -450,10 +447,7 @@ async def conduct(
     plan: faults.ChaosPlan, scenario: Scenario, settings: Settings, trace: ChaosTrace, progress: ShowProgress,
     recorder: Recorder, folder: Path,
 ) -> None:  # fmt: skip
-    """Run a plan on three services started for it; `trace`, a sink of the recorder, has what there was.
-
-    Raises LinkError: a service ended by itself, plant time stopped, or the run took too long.
-    """
+    """Run a plan on new services. Raises LinkError: one ended by itself, plant time stopped, or it took too long."""
     schedule, speed = plan.schedule(), plan.factor / 2 if plan.realtime else SLOWEST
     patience_s = 300.0 + plan.duration_s / speed + sum(60.0 + fault.duration_s / speed for fault in schedule)
     if any(isinstance(fault, faults.WrongModel) for fault in schedule):  # not while the clock is running

@@ -95,30 +95,22 @@ ROUNDING = 1e-9
 MANY = 1000  # number of variables from which on it is not printed
 
 
-class Capacity(NamedTuple):
-    """Largest numbers of variables for which a PLC has memory and time, where all else grows with them."""
-
-    by_memory: float
-    by_time: float
-    """Variables for which there is time for one iteration in the longest updating period."""
-
-
 def power_of(profile: PlcProfile, size: int) -> float:
     """Return P, the speed of a PLC over the reference PLC's, in loops as long as a problem has variables."""
     return profile.flops_per_s(size) / reference_curve().flops_per_s(size)
 
 
-def capacity(size: int, needed: Footprint, memory_bytes: int, budget: PlcBudget) -> Capacity:
-    """Return what a PLC has room and time for, where a problem of `size` variables needs so much memory.
+def capacity(size: int, needed: Footprint, memory_bytes: int, budget: PlcBudget) -> tuple[float, float]:
+    """Return the most variables for which a PLC has memory, and time for one iteration in the longest period.
 
-    Matrices grow with the square of the variables and the time of an iteration with their third power, as rows grow
-    with them; the estimator, the sequences and the preparation stay.
+    A problem of `size` variables needs so much. Matrices grow with the square of the variables and the time of an
+    iteration with their third power, as rows grow with them; the estimator, the sequences and the preparation stay.
     """
     fixed = needed.estimator + needed.sequence
     room = max(memory_bytes - fixed, 0)
     time_s = max(budget.longest_ticks * budget.times.tick_s - budget.times.slots, 0.0)
     by_time = size * (time_s / budget.times.iteration) ** (1 / 3)
-    return Capacity(size * (room / (needed.total - fixed)) ** (1 / 2), by_time)
+    return size * (room / (needed.total - fixed)) ** (1 / 2), by_time
 
 
 def verdict(
@@ -126,18 +118,18 @@ def verdict(
 ) -> tuple[bool, str]:
     """Return whether a PLC has memory and time for a problem, and what it can do with it; `program` has its power."""
     budget = PlcBudget(program.budget, program.iteration_s)
-    limits = capacity(problem.size, needed, profile.memory_bytes, budget)
+    by_memory, by_time = capacity(problem.size, needed, profile.memory_bytes, budget)
     problem_text = f"the problem ({problem.size} variables, {len(problem.Gamma)} rows) with {program.solver_name}"
-    if min(limits) + ROUNDING < problem.size:
+    if min(by_memory, by_time) + ROUNDING < problem.size:
         lacks = []
-        if limits.by_memory < problem.size:
+        if by_memory < problem.size:
             lacks.append(f"it takes {needed.total:,} of {profile.memory_bytes:,} bytes")
-        if limits.by_time < problem.size:
+        if by_time < problem.size:
             lacks.append(budget.too_slow())
         return False, f"{profile.name}: {problem_text} does not fit: {', and '.join(lacks)}."
     memory = f"{needed.total / 1e3:,.0f} of {profile.memory_bytes / 1e3:,.0f} kB"
     ends = budget.ladder[0], budget.ladder[-1]
-    first, then = sorted((("memory", limits.by_memory), ("time", limits.by_time)), key=lambda one: one[1])
+    first, then = sorted((("memory", by_memory), ("time", by_time)), key=lambda one: one[1])
     shortest_s, longest_s = (ticks * budget.times.tick_s for ticks in ends)
     soonest, most = (f"{count} iteration{'s' * (count != 1)}" for count in map(budget.iterations, ends))
     variables = [MANY if count >= MANY else floor(count + ROUNDING) for _, count in (first, then)]

@@ -156,21 +156,14 @@ def augmented_cost(s: QpSizes, active: float) -> Operations:
     return product(s.Phi).plus(product(s.Gamma), Operations(2 * s.n + 2 * active + 2))
 
 
-def stage_matrix(s: QpSizes, active: float) -> Operations:
-    """Return those of I + w Hess(J), upper triangle."""
-    outer = s.outer / s.m
-    row = Operations(2 * s.row + 2 * outer, WORD * (2 * s.row + 3 * outer))
-    return Operations(3 + s.triangle + s.n, 2 * WORD * s.triangle).plus(row.times(active))
-
-
 def ode(s: QpSizes, active: float = ACTIVE_ROWS.mean) -> Operations:
     """Return those of one step of TR-BDF2 that is accepted, with the same rows active at its three points."""
-    velocity = gradient(s, active).plus(Operations(s.n))
+    velocity, outer = gradient(s, active).plus(Operations(s.n)), s.outer / s.m
+    row = Operations(2 * s.row + 2 * outer, WORD * (2 * s.row + 3 * outer))  # of I + w Hess(J), its upper triangle
+    matrix = Operations(3 + s.triangle + s.n, 2 * WORD * s.triangle).plus(row.times(active))
     vectors = Operations(18 * s.n + 5)  # two stages 11n + 2, error 7n, next step size 3
-    return velocity.times(3).plus(
-        stage_matrix(s, active), cholesky(s.factor), cholesky_solve(s.factor).times(2), augmented_cost(s, active),
-        vectors,
-    )  # fmt: skip
+    solved = cholesky_solve(s.factor).times(2)
+    return velocity.times(3).plus(matrix, cholesky(s.factor), solved, augmented_cost(s, active), vectors)
 
 
 def ode_kept(s: QpSizes, active: float) -> Operations:

@@ -201,9 +201,8 @@ def _seconds(stamps: Frame, lines: Frame, table: Table, request: Request, said: 
         clear = texts.str.replace(r"(:\d\d),(?=\d)", r"\1.", regex=True)
         zoned = clear.str.contains(WITH_ZONE)
         day = bool(clear.str.match(r"\d\d?\.\d").any())  # in 31.12.2026 the day comes first, in others it may
-        ways = [
-            pd.to_datetime(clear, format="mixed", dayfirst=way, utc=True, errors="coerce") for way in (day, not day)
-        ]
+        forms: dict[str, Any] = {"format": "mixed", "utc": True, "errors": "coerce"}
+        ways = [pd.to_datetime(clear, dayfirst=way, **forms) for way in (day, not day)]
         dates = min(ways, key=lambda way: (way.isna().sum(), np.ptp(way.dropna().astype("int64"))))
         if not zoned.any() and request.zone is not None:
             dates = dates.dt.tz_localize(None).dt.tz_localize(request.zone, ambiguous="NaT", nonexistent="NaT")

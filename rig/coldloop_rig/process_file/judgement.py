@@ -189,9 +189,8 @@ def _warnings(made: Made) -> list[str]:
     for band, output in zip(process.bands, process.banded, strict=True):
         value = float(m.y0[m.output_names.index(output.name)])
         if not band.margin and not band.low <= value <= band.high:
-            found.append(
-                f"band: {output.name} rests at {number_text(value, 5)}, its band is {ends_text(band.low, band.high)}"
-            )
+            ends = ends_text(band.low, band.high)
+            found.append(f"band: {output.name} rests at {number_text(value, 5)}, its band is {ends}")
     rows = [m.output_names.index(output.name) for output in process.banded]
     reach = m.discretised(process.horizon_s).B * [one.scale for one in process.inputs]
     effect = (m.C[rows] @ reach) / [[band.high - band.low] for band in process.bands]

@@ -201,10 +201,7 @@ def _constants(file: Process, linear: Linearised) -> tuple[str, ...]:
 
 
 def _check_fits(process: Process, linear: Linearised) -> None:
-    """Check that the link exchanges a scan and an update in one request, and that sensors show the plant at rest.
-
-    Raises UsageError: one line that says what does not fit.
-    """
+    """Check that scan and update fit a request each, and sensors show the plant at rest; else raise UsageError."""
     inputs, outputs, states = len(process.inputs), len(process.outputs), len(process.states)
     words = {
         "the latched update": 12 + 2 * (2 * inputs + outputs + states),
@@ -345,11 +342,9 @@ def _steps_per_tick(file: Process, fmu: Fmu) -> int:
     fixed = slave.fixedInternalStepSize
     if not fixed and not slave.canHandleVariableCommunicationStepSize and experiment is not None:
         fixed = experiment.stepSize
-    if not fixed:
-        return file.plant.steps_per_tick or 1
-    whole = file.tick_s / float(fixed)
+    whole = file.tick_s / float(fixed) if fixed else 1.0
     steps = file.plant.steps_per_tick or max(1, round(whole))
-    if round(whole / steps) < 1 or abs(whole / steps - round(whole / steps)) > STILL:
+    if fixed and (round(whole / steps) < 1 or abs(whole / steps - round(whole / steps)) > STILL):
         raise UsageError(
             f"{fmu.path}: does steps of {float(fixed):g} s only; choose tick_s and plant.steps_per_tick for whole ones"
         )

@@ -103,14 +103,11 @@ def courses_of(file: Process, folder: Path) -> dict[str, Any]:
     """
     if not file.disturbances:
         return {}
-    courses = [
-        ([0], [one.at]) if one.course is None else _steps(one, folder / one.course, file.tick_s)
-        for one in file.disturbances
-    ]
-    return {"disturbances": [
-        {"ticks": ticks, "values": values, "measured": one.noise is not None}
-        for one, (ticks, values) in zip(file.disturbances, courses, strict=True)
-    ]}  # fmt: skip
+    found = []
+    for one in file.disturbances:
+        ticks, values = ([0], [one.at]) if one.course is None else _steps(one, folder / one.course, file.tick_s)
+        found.append({"ticks": ticks, "values": values, "measured": one.noise is not None})
+    return {"disturbances": found}
 
 
 def forecasts_of(file: Process, folder: Path) -> tuple[Forecast, ...]:

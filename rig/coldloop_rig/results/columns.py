@@ -178,10 +178,7 @@ def number_array(values: ArrayLike, kind: pa.DataType, unknown: NDArray[np.bool_
 
 
 def text_array(texts: Sequence[str | None], places: NDArray[np.int64] | None = None) -> pa.Array:
-    """Return texts as an array; null where there is none.
-
-    `places` are for each row which of the texts it has; by default each is a row.
-    """
+    """Return texts, null where there is none, as an array with a row each, or with those at `places` in its rows."""
     raw = [(text or "").encode() for text in texts]
     offsets = np.cumsum([0, *map(len, raw)], dtype=np.int32)
     known = np.packbits(np.array([text is not None for text in texts], bool), bitorder="little")

@@ -290,10 +290,7 @@ class DrivingHistory:
         return [text_array(each, places) for each in zip(*texts, strict=True)]
 
     def measured(self, ticks: NDArray[np.int64], y: NDArray[np.float32]) -> list[pa.Array]:
-        """Return what the sensors of banded outputs showed at N ticks in a row; null where it was no number.
-
-        `y` are outputs without faults, shape (N, outputs).
-        """
+        """Return what sensors of banded outputs showed, null where no number; `y` (N, outputs) is without faults."""
         first, end = int(ticks[0]), int(ticks[-1]) + 1
         columns = []
         for output, faults in self._faults.items():
@@ -329,10 +326,7 @@ def _shown_by(fault: Event | None, true: float, held: float) -> float:
 def trace_table(
     block: SampleBlock, updates: Sequence[Optimization], cost: StageCost, driving: DrivingHistory
 ) -> pa.Table:
-    """Return the trace of a block.
-
-    The updates are those whose sequence was played, from the last one before the block on; `driving` has the events.
-    """
+    """Return the trace of a block; `updates` are those played, from the last before it on; `driving` has the events."""
     ticks, process = block.first + np.arange(len(block.load)), driving.process
     outside: Any = recorded_model_range(block.x, block.station) if process.has_station else np.zeros(len(ticks))
     columns = [

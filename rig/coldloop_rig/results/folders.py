@@ -40,28 +40,25 @@ def claim_folder(folder: Path, *, force: bool) -> None:
     prepare_folder(folder)
     if fcntl is None:
         return
-    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
-    status = os.fstat(descriptor)
-    key = status.st_dev, status.st_ino
-    if key in _LOCKED:
-        os.close(descriptor)
-        return
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
-        raise UsageError(f"{folder}: another run is being written there; name another folder with --out") from None
-    except OSError:  # a file system without locks
-        os.close(descriptor)
-        return
-    _LOCKED[key] = descriptor
+    with contextlib.ExitStack() as unlocked:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+        unlocked.callback(os.close, descriptor)
+        status = os.fstat(descriptor)
+        key = status.st_dev, status.st_ino
+        if key in _LOCKED:
+            return
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UsageError(f"{folder}: another run is being written there; name another folder with --out") from None
+        except OSError:  # a file system without locks
+            return
+        _LOCKED[key] = descriptor
+        unlocked.pop_all()
 
 
 def claim_folder_of_now(parent: Path, name: str) -> Path:
-    """Make and return a new folder named after what is run and when; of two that begin in one second each has its own.
-
-    Raises UsageError: it cannot be written to.
-    """
+    """Make and return a folder named after what is run and when. Raises UsageError: it cannot be written to."""
     prepare_folder(parent)
     of_now = f"{name}-{datetime.now():%Y%m%d-%H%M%S}"  # noqa: DTZ005 the user's clock
     folder = parent / of_now

@@ -119,9 +119,10 @@ class PendingTicks:
             warm[row] = (*station.signals, station.mode, station.alarms)
         return unknown
 
-    def put_block(self, block: SampleBlock) -> None:
-        """Put ticks in a row where they belong."""
-        rows = slice(block.first - self.first, block.first - self.first + len(block.load))
+    def append(self, block: SampleBlock) -> None:
+        """Add ticks in a row."""
+        self.extend(len(block.load), block)
+        rows = slice(self.count - len(block.load), self.count)
         load, u, y, x, warm = self._parts
         load[rows, 0], u[rows], y[rows], x[rows] = block.load, block.u, block.y, block.x
         if block.station.size:
@@ -298,8 +299,7 @@ class Recorder:
         """Take ticks and their updates at once; sinks see the last one. Raises ColdloopError: the run is to stop."""
         for update in updates:
             self.update(update)
-        self._pending.extend(len(block.load), block)
-        self._pending.put_block(block)
+        self._pending.append(block)
         self.next_tick += len(block.load)
         load, u, y, x = (part[-1].tolist() for part in (block.load, block.u, block.y, block.x))
         self._taken(plant.PlantSample(self.next_tick - 1, load, tuple(u), tuple(y), tuple(x)))
@@ -340,10 +340,7 @@ class Recorder:
             _all(self._pass_on, *(sink.close for sink in self._sinks))
 
     def recording(self) -> Recording:
-        """Return what was recorded in memory, with the updates whose sequence was played within the run.
-
-        An update that a load step has cut off is not among them.
-        """
+        """Return what is in memory, with the updates whose sequence was played: none that a load step cut off."""
         self.close()
         return self._memory.recording(self.link)
 

@@ -324,9 +324,9 @@ def _mat(run: RunFolder) -> Writers:
 
     def write(path: Path) -> None:
         tables = {name: file.read() for name, file in _tables(run, MOST_IN_MEMORY).items()}
-        content: dict[str, Any] = {
-            name: {column: shown(table[column]) for column in table.column_names} for name, table in tables.items()
-        }
+        content: dict[str, Any] = {}
+        for name, table in tables.items():
+            content[name] = {column: shown(table[column]) for column in table.column_names}
         content["units"] = {name: units_of(table.schema) for name, table in tables.items()}
         content["run"] = {name: run.manifest[name] for name in ABOUT}
         with path.open("wb") as file:

@@ -94,11 +94,8 @@ def read_record(run: RunFolder, model: LtiModel) -> Record:
     gaps = int((~np.isfinite(np.hstack([inputs, y])).all(axis=1)).sum())
     if gaps:
         raise UsageError(f"{run.path}: {gaps} ticks of the trace are not known; name a run without them")
-    key = "optimizer_plc.program.estimator."
-    sensors = [
-        run.configuration[f"{key}{output.quantity}_sensor"] if output.quantity else output.noise
-        for output in process.outputs
-    ]
+    key, configured = "optimizer_plc.program.estimator.{}_sensor", run.configuration
+    sensors = [configured[key.format(one.quantity)] if one.quantity else one.noise for one in process.outputs]
     return Record(inputs, y, np.array(sensors))
 
 

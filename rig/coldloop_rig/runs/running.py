@@ -369,10 +369,9 @@ def _differences(manifest: Mapping[str, Any], run: run_folder.RunFolder, trace: 
     lines = [f"another trace: {trace} instead of {manifest['hashes']['trace_sha256']}"]
     if manifest["coldloop"] != __version__:
         lines.append(f"coldloop {__version__} instead of {manifest['coldloop']}")
-    versions = {
-        name: (folders.installed_version(name), manifest["dependencies"].get(name, "absent")) for name in DEPENDENCIES
-    }
-    lines += [f"{name} {there} instead of {then}" for name, (there, then) in versions.items() if there != then]
+    versions = ((name, folders.installed_version(name)) for name in DEPENDENCIES)
+    recorded = {name: manifest["dependencies"].get(name, "absent") for name in DEPENDENCIES}
+    lines += [f"{name} {now} instead of {recorded[name]}" for name, now in versions if now != recorded[name]]
     if misses := run.summary["deadline_misses"]:
         lines.append(f"the run missed {misses} deadlines, which depend on the machine")
     if len(lines) == 1:
