@@ -30,10 +30,8 @@ TAGS: Final = {
 VALUES: Final = {"value", "val", "wert", "valeur", "valor", "_value", "reading"}
 NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,31}")
 WITH_ZONE: Final = r":\d\d.*(?:Z|UTC|GMT|[+-]\d\d(?::?\d\d)?)$"
-SINCE_1970: Final = 1e8
-"""Seconds from which on a number is one since 1970, ..."""
-FINER: Final = (1e11, 1e14, 1e17)
-"""... and in milliseconds, microseconds, nanoseconds."""
+SINCE_1970: Final = (1e8, 1e11, 1e14, 1e17)
+"""Numbers from which on a time is since 1970, in seconds, milliseconds, microseconds, nanoseconds."""
 UNITS: Final = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
 DAYS: Final = (20_000.0, 80_000.0)
 """Range of a spreadsheet's times, days since 1900, where they are closer to each other than DAY_STEP."""
@@ -42,9 +40,8 @@ GAP: Final = 5.0  # periods without a reading beyond which a record is cut, unle
 BY_CHANGE: Final = 2.0
 """Periods between the readings of an input beyond which they are its changes, so that no reading is missing."""
 MISSING: Final = 1.5
-"""Usual periods of an input beyond which a reading is missing: if it steps there, it is not known when, ..."""
-STEP: Final = 0.1
-"""... a step being so much of its standard deviation."""
+"""Usual periods of an input beyond which a reading is missing: if it steps there, it is not known when."""
+STEP: Final = 0.1  # least step of an input, over its standard deviation
 SNAP: Final = 0.01  # part by which a usual period is off a number of two digits that is meant
 EARLY: Final = 1e-3  # part of a period by which the time of a reading may be rounded up
 FEWEST: Final = 10  # rows of a piece
@@ -224,8 +221,8 @@ def _seconds(stamps: Frame, lines: Frame, table: Table, request: Request, said: 
 def _unit_s(numbers: Array, table: Table) -> float:
     """Return the seconds that 1 is: by its size since 1970, else by the end of the name of the column."""
     largest = float(np.abs(numbers).max())
-    if largest > SINCE_1970:
-        return float(1e-3 ** sum(largest > bound for bound in FINER))
+    if largest > SINCE_1970[0]:
+        return float(1e-3 ** sum(largest > bound for bound in SINCE_1970[1:]))
     name = next((name for name in table.names if plain(name) in TIMES), "")
     named = next((factor for unit, factor in UNITS.items() if re.search(rf"[\W_]{unit}\W*$", name)), None)
     is_day = DAYS[0] < numbers.min() and largest < DAYS[1] and np.median(np.abs(np.diff(numbers))) < DAY_STEP

@@ -50,8 +50,7 @@ def _values(names: tuple[str, ...], values: Array, units: tuple[str, ...], reach
 
 def _rest(made: Made) -> list[str]:
     m, process = made.model, made.process
-    acts = m.F.any() or m.G.any()
-    load = f"; load {m.load_name} {number_text(m.w0, 5)} {m.load_unit}".rstrip() if acts else ""
+    load = f"; load {m.load_name} {number_text(m.w0, 5)} {m.load_unit}".rstrip() if m.F.any() or m.G.any() else ""
     problem = len(process.decision_instants) * (len(process.inputs) + 2 * len(process.bands))
     named = ((m.input_names, "input"), (m.output_names, "output"), (m.state_names, "state"))
     counted = ", ".join(f"{len(names)} {noun}{'s' * (len(names) != 1)}" for names, noun in named)
