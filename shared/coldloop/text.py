@@ -87,16 +87,11 @@ def _opened(path: str, flags: int) -> int:
 
 
 def held_file(folder: Path, name: str, remedy: str, error: type[ColdloopError] = UsageError) -> Path:
-    """Return the path of a regular file in a folder that somebody else has made.
-
-    Args:
-        folder: The folder.
-        name: Of the file, relative to the folder, as the folder itself may say it.
-        remedy: Ends the message.
-        error: What is raised.
+    """Return the path of a regular file in a folder that somebody else has made, which may say the name itself.
 
     Raises:
-        ColdloopError: There is none, or it is something else, or outside the folder, by its name or by a link.
+        ColdloopError: There is none, or it is something else, or outside the folder, by its name or by a link; of the
+            kind `error`, in one line that ends with `remedy`.
     """
     path = folder / name
     try:
@@ -144,7 +139,7 @@ def whole_text(path: Path, text: str, *, synced: bool = False) -> None:
 
 
 def replace_file(path: Path, data: bytes, *, synced: bool = False, private: bool = False, alone: bool = False) -> None:
-    """Let a file have this content, or the one that it had; whatever is there under its name is replaced.
+    """Let a file have this content, or the one that it had (OSError); whatever is there under its name is replaced.
 
     Args:
         path: The file.
@@ -152,9 +147,6 @@ def replace_file(path: Path, data: bytes, *, synced: bool = False, private: bool
         synced: The disk has the content before the name, and the name when this returns, also if power fails.
         private: Nobody else can read it.
         alone: No other process writes this file: the draft of one that was killed is written over.
-
-    Raises:
-        OSError: It cannot be written.
     """
 
     def write(draft: Path) -> None:

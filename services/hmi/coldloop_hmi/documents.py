@@ -386,7 +386,7 @@ def trend_document(
         "time": times,
         "series": series,
         "updates": updates_document(model.updates, in_force, gaps, points, quantities, tick_s),
-        "modes": [{"from": one.start, "to": one.end, "mode": control_plc.Mode.word_of(one.mode)} for one in modes],
+        "modes": [{"from": one.start, "to": one.end, "mode": control_plc.Mode.word_of(one.value)} for one in modes],
         "doubtful": {name: found for name, found in model.trends.doubtful(start, end).items() if name in names},
         "marks": [
             {"time": entry.tick * tick_s, "kind": MARKED[entry.text.kind], "text": entry.text.sentence}
@@ -402,7 +402,7 @@ def trend_document(
 
 
 def updates_document(
-    updates: Sequence[Optimization], modes: Sequence[image.ModeInterval], gaps: Sequence[image.Gap], points: int,
+    updates: Sequence[Optimization], modes: Sequence[image.Stretch[int]], gaps: Sequence[image.Gap], points: int,
     quantities: Sequence[str], tick_s: float,
 ) -> Document:  # fmt: skip
     """Return times, updating periods and costs of updates as far as they were in force: while MPC was active.
@@ -412,7 +412,7 @@ def updates_document(
     """
     found: Document = {name: [] for name in ("time", *quantities)}
     for stretch in modes:
-        if stretch.mode != control_plc.Mode.MPC:
+        if stretch.value != control_plc.Mode.MPC:
             continue
         first, last = (round(time / tick_s) for time in (stretch.start, stretch.end))
         start = bisect_left(updates, first, key=lambda one: one.tick)

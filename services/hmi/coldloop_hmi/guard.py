@@ -380,11 +380,7 @@ def stream_compression() -> Callable[[bytes], bytes]:
 
 
 class Stream(asyncio.Queue[bytes | None]):
-    """Messages to one browser, None at their end.
-
-    Args:
-        party: Whose browser it is.
-    """
+    """Messages to one browser of a party, None at their end."""
 
     def __init__(self, party: Party) -> None:
         super().__init__(WAITING)
@@ -407,12 +403,10 @@ class Stream(asyncio.Queue[bytes | None]):
 
 
 class Broadcast:
-    """Fans messages out.
+    """Fans messages out to `most` streams; `whole` returns the whole state as a message, for a browser that begins.
 
-    Args:
-        whole: Returns the whole state as a message, for a browser that begins.
-        most: Streams at a time. When there are so many, a user who has logged in takes the place of a stranger, and
-            within either group a party takes the place of one that has at least two more.
+    When there are so many, a user who has logged in takes the place of a stranger, and within either group a party
+    takes the place of one that has at least two more.
     """
 
     def __init__(self, whole: Callable[[], bytes], most: int) -> None:

@@ -105,13 +105,9 @@ class CommandResult(NamedTuple):
 
 
 class OperatorDesk:
-    """Takes commands and carries them out.
+    """Takes commands and carries them out at endpoints by service, which have the operator's certificate.
 
-    Args:
-        endpoints: Where the services are, with the operator's certificate, by service.
-        model: What is known of the rig.
-        now: Monotonic clock, s.
-        training: Sensor faults are allowed.
+    `model` is what is known of the rig, `now` a monotonic clock, s; sensor faults are for `training`.
     """
 
     def __init__(

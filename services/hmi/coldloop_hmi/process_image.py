@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any, Final, NamedTuple, TypeVar, cast
+from typing import Any, Final, Generic, NamedTuple, TypeVar, cast
 
 from coldloop.process.cold_box import STATION_SIGNAL_NAMES
 from coldloop.process.declaration import Process
@@ -26,6 +26,7 @@ STATION_NAMES: Final = ("P12", "P11")
 MOST_ROWS: Final = 65_536
 SPARE_ROWS: Final = 4096
 """Rows that are removed at a time, so that removing costs little."""
+T = TypeVar("T")
 R = TypeVar("R", bound=tuple[Any, ...])
 UPDATES_KEPT: Final = 20_000
 PREDICTIONS_KEPT: Final = 1000
@@ -91,20 +92,12 @@ def values_of(service: str, block: declaration.Block, record: tuple[Any, ...]) -
     return values
 
 
-class ModeInterval(NamedTuple):
-    """A stretch of plant time with one mode."""
+class Stretch(NamedTuple, Generic[T]):
+    """A stretch of plant time with one mode of the ladder, or with one quality of the reading of an output."""
 
     start: float
     end: float
-    mode: int
-
-
-class Doubtful(NamedTuple):
-    """A stretch of plant time in which the reading of an output is in doubt."""
-
-    start: float
-    end: float
-    quality: Quality
+    value: T
 
 
 class Gap(NamedTuple):
@@ -152,14 +145,10 @@ class TrendStore:
         self, process: ProcessNow, mode: int, doubts: Doubts = SOUND, station: Sequence[float] = (), *,
         is_after_gap: bool = False,
     ) -> None:  # fmt: skip
-        """Add a sample; one that is not newer than the last one is left out.
+        """Add a sample and the mode of the ladder; one that is not newer than the last one is left out.
 
-        Args:
-            process: The sample.
-            mode: Of the fail-safe ladder.
-            doubts: Outputs whose readings are in doubt.
-            station: Signals of a refrigerator's station; empty, or all 0, of a plant without.
-            is_after_gap: Between the last sample and this one nothing could be read.
+        `station` has the signals of a refrigerator's station, empty or all 0 of a plant without. `is_after_gap`:
+        between the last sample and this one nothing could be read.
         """
         if process.tick <= self.last_tick:
             return
@@ -202,27 +191,27 @@ class TrendStore:
         columns = {name: self.column(name, rows) for name in names}
         return thin(times, columns, points, tick_s, [gap.end * tick_s for gap in self.gaps(start, end)])
 
-    def modes(self, start: int, end: int) -> list[ModeInterval]:
+    def modes(self, start: int, end: int) -> list[Stretch[int]]:
         """Return the modes between two ticks, stretch by stretch."""
         rows, tick_s = self.between(start, end), self._process.tick_s
         after_gap = {gap.end * tick_s for gap in self.gaps(start, end)}
-        found: list[ModeInterval] = []
+        found: list[Stretch[int]] = []
         for tick, value in zip(self.ticks[rows.start : rows.stop], self.column("mode", rows), strict=True):
             time, mode = tick * tick_s, int(value)
             if found and time not in after_gap:
                 found[-1] = found[-1]._replace(end=time)
-            if not found or found[-1].mode != mode or time in after_gap:
-                found.append(ModeInterval(time, time, mode))
+            if not found or found[-1].value != mode or time in after_gap:
+                found.append(Stretch(time, time, mode))
         return found
 
-    def doubtful(self, start: int, end: int) -> dict[str, list[Doubtful]]:
+    def doubtful(self, start: int, end: int) -> dict[str, list[Stretch[Quality]]]:
         """Return the intervals in which readings of outputs are in doubt between two ticks, by name.
 
         Each lasts until the first sample of another quality, or a gap.
         """
         rows, tick_s = self.between(start, end), self._process.tick_s
         after_gap = {gap.end for gap in self.gaps(start, end)}
-        found: dict[str, list[Doubtful]] = {}
+        found: dict[str, list[Stretch[Quality]]] = {}
         before: dict[str, Quality] = {}
         last = 0
         for tick, doubts in zip(self.ticks[rows.start : rows.stop], self._doubts[rows.start : rows.stop], strict=True):
@@ -232,7 +221,7 @@ class TrendStore:
                     found[name][-1] = found[name][-1]._replace(end=reach)
                 for name, quality in now.items():
                     if before.get(name) != quality or tick in after_gap:
-                        found.setdefault(name, []).append(Doubtful(tick * tick_s, tick * tick_s, quality))
+                        found.setdefault(name, []).append(Stretch(tick * tick_s, tick * tick_s, quality))
                 before = now
             last = tick
         for name in before:
@@ -331,13 +320,7 @@ class Source:
 
 
 class Model:
-    """State of one rig as the page knows it.
-
-    Args:
-        process: Which process it has.
-        now: Monotonic clock, s.
-        kept_s: How much of the trends is kept, s of plant time.
-    """
+    """State of one rig as the page knows it; `kept_s` of plant time of the trends; `now` is a monotonic clock, s."""
 
     def __init__(self, process: Process, now: Callable[[], float], kept_s: float) -> None:
         self.process = process

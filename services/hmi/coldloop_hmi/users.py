@@ -68,16 +68,10 @@ class _Repeats:
 
 
 class Audit:
-    """Keeps the last entries, logs them, and appends them to a file.
+    """Keeps the last entries, logs them, and appends them to a file, if one is given.
 
-    A file that has become larger than 8 MB is set aside as `FILE.1`, and four of these are kept.
-
-    Args:
-        file: Where to; None is nowhere.
-        now: Monotonic clock, s.
-
-    Raises:
-        ConfigurationError: The file cannot be written.
+    A file that has become larger than 8 MB is set aside as `FILE.1`, and four of these are kept. `now` is a monotonic
+    clock, s. A file that cannot be written raises a ConfigurationError.
     """
 
     def __init__(self, file: Path | None, now: Callable[[], float] = time.monotonic) -> None:
@@ -102,28 +96,17 @@ class Audit:
         return list(merge(self._of_users, self._of_strangers, key=lambda entry: entry["utc"]))
 
     def note(self, what: str, *, who: str, address: str, outcome: str, detail: str = "") -> None:
-        """Add an entry.
+        """Add an entry about a login, logout, command or request: its user, its address, and in `detail` more words.
 
-        Args:
-            what: Kind of request: login, logout, command, request.
-            who: The user who has logged in.
-            address: Where the request came from.
-            outcome: done, refused, or uncertain when it is not known.
-            detail: The command in words, its result, or the reason of a refusal.
+        `outcome` is done, refused, or uncertain when it is not known.
         """
         self._sum_up()
         self._add(_entry(what, who, address, outcome, detail), self._of_users)
 
     def refuse(self, what: str, *, who: str, address: str, reason: str, detail: str = "", has_session: bool) -> None:
-        """Add a refusal, or count it where one like it has an entry already.
+        """Add a refusal, or count it where one like it has an entry already: for one reason to one user or address.
 
-        Args:
-            what: Kind of request.
-            who: The user; of a login, the name that was given.
-            address: Where the request came from.
-            reason: Why; refusals of one reason to one user or address are alike.
-            detail: More about the first one.
-            has_session: The user has logged in.
+        `who` is the user, who has logged in if `has_session`, or the name that was given. `detail` is of the first one.
         """
         self._sum_up()
         kind = _Kind(what, who, address, reason) if has_session else _Kind(what, "", address, reason)
@@ -376,9 +359,7 @@ class LoginSessions:
     def find(self, token: str | None, *, is_use: bool = True) -> LoginSession | None:
         """Return the session of a token; None when there is none, or it has ended.
 
-        Args:
-            token: What the browser sent.
-            is_use: The request counts as a sign of life; what a page asks for by itself does not.
+        `is_use`: the request counts as a sign of life; what a page asks for by itself does not.
         """
         key = _digest(token) if token else ""
         session = self._sessions.get(key)
@@ -436,10 +417,7 @@ class LoginLimit:
     """Limit of the attempts to log in: by address and name, and by address.
 
     Who has logged in from an address before comes first there: others who try from it, behind a proxy perhaps, do not
-    keep such users out. Nothing here depends on whether a name exists.
-
-    Args:
-        now: Monotonic clock, s.
+    keep such users out. Nothing here depends on whether a name exists. `now` is a monotonic clock, s.
     """
 
     def __init__(self, now: Callable[[], float]) -> None:

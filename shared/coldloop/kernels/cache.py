@@ -41,11 +41,7 @@ _MASK: Final = threading.Lock()
 
 
 class CacheFolder:
-    """A folder whose files appear whole or not at all.
-
-    Args:
-        path: Where it is.
-    """
+    """A folder whose files appear whole or not at all."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -115,11 +111,7 @@ class CacheFolder:
 def find_cache_folder(name: str = NAME) -> Path:
     """Return a folder for a cache that only this user can write to: its files are loaded as code.
 
-    Args:
-        name: Of the cache: kernels, or processes, which are model files.
-
-    Raises:
-        ConfigurationError: Others can write to the one that the environment names.
+    `name` is what is kept, such as kernels. ConfigurationError: others can write to the one that the environment names.
     """
     chosen = os.environ.get("COLDLOOP_CACHE_DIR")
     roots = [Path(tempfile.gettempdir()) / f"coldloop-cache-{os.getuid() if hasattr(os, 'getuid') else 0}"]
@@ -156,9 +148,7 @@ def find_cache_folder(name: str = NAME) -> Path:
 def _is_closed(folder: Path, *, sticky: bool = False) -> bool:
     """Return whether only this user and an administrator can write to a folder; the user's own group is left alone.
 
-    Args:
-        folder: Which one.
-        sticky: Others may write to it if they cannot replace what this user has in it, as in /tmp.
+    `sticky`: others may write to it if they cannot replace what this user has in it, as in /tmp.
     """
     if not hasattr(os, "getuid"):  # Windows has no such modes
         return True

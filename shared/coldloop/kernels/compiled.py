@@ -121,9 +121,6 @@ class KernelCache:
 
     Without the lock two processes compile the same kernel. Locks are taken from callers to what they call, so no two
     processes wait for each other.
-
-    Args:
-        dispatcher: The kernel.
     """
 
     def __init__(self, dispatcher: Any) -> None:  # noqa: ANN401

@@ -113,20 +113,14 @@ class Reference(NamedTuple):
 
 
 class Describer:
-    """Describes one object.
-
-    Args:
-        compiled: It is referred to by compiled code.
-
-    Attributes:
-        references: The objects that it refers to, in the order in which the description names them.
-        finished: No module that it refers to is being imported, so that all names are there.
-    """
+    """Describes one object; `compiled`: it is referred to by compiled code."""
 
     def __init__(self, *, compiled: bool) -> None:
         self.compiled = compiled
         self.references: list[Reference] = []
+        """Objects that it refers to, in the order in which the description names them."""
         self.finished = True
+        """No module that it refers to is being imported, so that all names are there."""
 
     def describe(self, holder: Any) -> Plain:  # noqa: ANN401 anything
         """Return the description of an object that counts for itself: a function, a class or an instance of ours."""
@@ -351,9 +345,7 @@ _lock: Final = threading.RLock()
 def digest(*roots: Any, compiled: bool = False) -> str:  # noqa: ANN401 functions, kernels, classes, data
     """Return a digest of functions, classes and data, and of all that they reach; a path counts as the file's content.
 
-    Args:
-        roots: What the digest is of.
-        compiled: They are used by compiled code, for which a class is the layout of its data.
+    `compiled`: they are used by compiled code, for which a class is the layout of its data.
     """
     with _lock:
         description, references, nodes = _described(roots, compiled=compiled)

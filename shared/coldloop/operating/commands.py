@@ -37,6 +37,14 @@ def clock_text(seconds: float) -> str:
 class _Command(ProcessSettings):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
+    @property
+    def text(self) -> str:
+        """The command in words."""
+        return self._words()
+
+    def _words(self) -> str:
+        raise NotImplementedError
+
 
 class SetMode(_Command):
     """Operating mode. The change to manual is bumpless: setpoints begin at the applied inputs."""
@@ -44,9 +52,7 @@ class SetMode(_Command):
     kind: Literal["mode"]
     mode: Literal["auto", "classical", "manual"]
 
-    @property
-    def text(self) -> str:
-        """The command in words."""
+    def _words(self) -> str:
         return {
             "auto": "Hand over to automatic: MPC, and the fail-safe ladder when MPC is unavailable",
             "classical": "Switch to the classical loops",
@@ -71,9 +77,7 @@ class SetSetpoint(_Command):
         """Unit of the value."""
         return self.process.inputs[self.place].unit
 
-    @property
-    def text(self) -> str:
-        """The command in words."""
+    def _words(self) -> str:
         return f"Move the setpoint of {self.input} to {value_text(self.value, self.unit)}"
 
 
@@ -85,9 +89,7 @@ class SetLoad(_Command):
     tick: Annotated[int, Field(ge=0, le=LAST_TICK)] = 0
     """0 is the next one."""
 
-    @property
-    def text(self) -> str:
-        """The command in words."""
+    def _words(self) -> str:
         load, tick_s = self.process.load, self.process.tick_s
         begin = clock_text(self.tick * tick_s) if self.tick else "the next tick"
         return f"Change the {load.title} to {value_text(self.watts, load.unit)} from {begin} on"
@@ -114,9 +116,7 @@ class PlayLoad(_Command):
         """The load in the file."""
         return load_profile_of(self.content, "load file", self.process)
 
-    @property
-    def text(self) -> str:
-        """The command in words."""
+    def _words(self) -> str:
         times = self.profile.times
         length = duration_text(times[-1] * self.process.tick_s)
         return f"Play a load of {len(times)} steps, {length} long, from now on; its last value is held"
@@ -128,9 +128,7 @@ class SetFactor(_Command):
     kind: Literal["factor"]
     factor: Annotated[float, Field(ge=0.01, le=10_000)]
 
-    @property
-    def text(self) -> str:
-        """The command in words."""
+    def _words(self) -> str:
         return f"Run plant time {value_text(self.factor)} times as fast as real time"
 
 
@@ -140,9 +138,7 @@ class SetPaused(_Command):
     kind: Literal["pause"]
     paused: bool
 
-    @property
-    def text(self) -> str:
-        """The command in words."""
+    def _words(self) -> str:
         return "Pause plant time" if self.paused else "Resume plant time"
 
 
@@ -165,9 +161,7 @@ class TreatAlarm(_Command):
             raise ValueError(f"unknown alarm {alarm}")
         return alarm
 
-    @property
-    def text(self) -> str:
-        """The command in words."""
+    def _words(self) -> str:
         name = "all alarms" if self.alarm == ALL_ALARMS else f"alarm {alarm_word(self.alarm, self.process)}"
         time = f" for {duration_text(self.time_s)}" if self.action == AlarmAction.SHELVE and self.time_s else ""
         return f"{AlarmAction(self.action).word.capitalize()}: {name}{time}"
@@ -181,9 +175,7 @@ class FaultSensor(_Command):
     fault: Annotated[int, Field(ge=0, le=3)]
     value: float = 0.0
 
-    @property
-    def text(self) -> str:
-        """The command in words."""
+    def _words(self) -> str:
         value = f" ({value_text(self.value)})" if self.fault == SensorFaultKind.VALUE else ""
         return f"Training: sensor of {self.output}: {SensorFaultKind(self.fault).word}{value}"
 

@@ -47,17 +47,9 @@ ALL_SERVICES: Final = Maps._fields
 
 
 class LoadStream:
-    """Keeps the plant supplied with the steps of a load.
+    """Keeps the plant supplied with the steps of the load of a session, of which it has `sent` already.
 
-    Args:
-        plant: Client of the plant.
-        session: Whose load it is.
-        load: All of it.
-        sent: Steps that the plant has already.
-        begin: Tick of the session at which the load begins.
-
-    Raises:
-        UsageError: A step is beyond the last tick of a session.
+    The load begins at tick `begin`. A step beyond the last tick of a session raises a UsageError.
     """
 
     def __init__(
@@ -431,10 +423,6 @@ async def set_pace(clients: Clients, command: commands.SetFactor | commands.SetP
 
 async def write_pace(clients: Mapping[str, RegisterClient], pace: SessionPace) -> None:
     """Write the time base of a session: the plant first, then those who follow it. An optimiser may be in none yet.
-
-    Args:
-        clients: By service, the plant's first.
-        pace: To be written.
 
     Raises:
         LinkError: One refuses, or does not answer; or the control PLC is not in the session of the plant.

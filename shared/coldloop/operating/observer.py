@@ -74,17 +74,11 @@ async def last_update(optimizer: RegisterClient) -> Optimization | None:
 
 
 class SampleReader:
-    """Reads the plant's history as it grows.
+    """Reads the plant's history in a session as it grows, from tick `first` on, before tick `end`.
 
-    Args:
-        client: Of the plant.
-        subscriber: Takes the ticks.
-        session: Whose ticks they are.
-        end: Tick before which reading ends.
-        first: First tick to be read.
-        realtime: Ticks come one by one; otherwise some are waited for.
-        tolerant: Ticks that are not kept any more are left out, and the plant may go back after a restart. Each tick
-            is read as soon as possible, for a plant that is killed takes its history with it.
+    With `realtime` ticks come one by one; otherwise some are waited for. With `tolerant` ticks that are not kept any
+    more are left out, and the plant may go back after a restart; each tick is then read as soon as possible, for a
+    plant that is killed takes its history with it.
     """
 
     def __init__(
@@ -147,15 +141,10 @@ class SampleReader:
 
 
 class UpdateReader:
-    """Reads the optimiser's history as it grows.
+    """Reads the optimiser's history as it grows, in a session; None is the present one, whichever that is.
 
-    Args:
-        client: Of the optimiser.
-        take: Takes the updates.
-        session: Whose updates they are; None is the present one, whichever that is.
-        first: Number of the first one to be read; None begins with the last ones.
-        tolerant: Updates that are not kept any more are left out, and their numbers may go back after a restart.
-        most: Updates that are read at once; when there are more, only the newest are.
+    It begins with number `first`; None begins with the last ones. With `tolerant` updates that are not kept any more
+    are left out, and their numbers may go back after a restart. Of more than `most` new ones only the newest are read.
     """
 
     def __init__(
@@ -216,15 +205,10 @@ class UpdateReader:
 
 
 class JournalReader:
-    """Reads a journal incrementally, from a given event on.
+    """Reads the events of some kinds (all when empty) of a journal incrementally, from event number `first` on.
 
-    Args:
-        client: Of the service.
-        first: Number of the first event to read.
-        kinds: Kinds of events to read; all when empty.
-        queries: Read all that is kept, by queries. They are for operators: to a client without that role, and without
-            queries, only the last events are readable.
-        most: Of the last events, how many are read at once.
+    With `queries` it reads all that is kept. They are for operators: to a client without that role, and without
+    queries, only the last events are readable, at most `most` at once.
     """
 
     def __init__(

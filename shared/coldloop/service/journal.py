@@ -37,10 +37,8 @@ ANY_SUBJECT: Final = 0xFFFF
 class Journal:
     """Numbers events and keeps the last ones.
 
-    Args:
-        boot: Number of this start of the service, from 1.
-        count: Number of the last event before it.
-        now: Time, seconds since 1970 UTC.
+    `boot` is the number of this start of the service, from 1, `count` that of the last event before it; `now` returns
+    the time, seconds since 1970 UTC.
     """
 
     def __init__(self, *, boot: int = 1, count: int = 0, now: Callable[[], float] = time.time) -> None:

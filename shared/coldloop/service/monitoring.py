@@ -152,12 +152,7 @@ KEPT_S: Final = 0.2
 
 
 class MetricsServer:
-    """Answers one request a connection.
-
-    Args:
-        settings: Where it listens; port 0 is off.
-        bank: The registers that are shown.
-    """
+    """Answers one request a connection with the registers of a bank; port 0 is off."""
 
     def __init__(self, settings: MetricsSettings, bank: RegisterBank) -> None:
         self._settings = settings
