@@ -5,20 +5,15 @@ import io
 import os
 import sys
 from pathlib import Path
-from typing import Final
 
 from coldloop_rig.interruption import INTERRUPTION
-
-OBJECTS_MADE: Final = 100_000
-"""Before the interpreter looks for cycles; by default 700, which takes 0.2 s of a run of two hours to find none: what
-is made at the start, modules and types, stays."""
 
 
 def main() -> int:
     """Run the command line; return its exit code."""
     _open_closed_streams()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: more threads wait for each other
-    gc.set_threshold(OBJECTS_MADE)
+    gc.set_threshold(100_000)  # with 700, the default, a run of two hours looks for cycles for 0.2 s and finds none
     with INTERRUPTION:
         from coldloop_rig.cli import main as run  # noqa: PLC0415 this takes time
     code = run()

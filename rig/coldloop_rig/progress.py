@@ -13,10 +13,6 @@ from coldloop.registers.plant import PlantSample
 from coldloop_rig.results.recording import Sink
 
 REFRESH_S: Final = 0.1
-NARROW: Final = 72
-"""Columns that the bar with speed and remaining time needs."""
-WIDE: Final = 120
-"""Columns that the live line needs besides."""
 
 
 class PlantTimeBar:
@@ -51,10 +47,10 @@ class RunProgress(PlantTimeBar, Sink):
     def __init__(self, ticks: int, process: Process) -> None:
         console = make_console()
         columns: list[ProgressColumn] = [TextColumn("{task.fields[clock]}"), TaskProgressColumn()]
-        if console.width >= NARROW:
+        if console.width >= 72:  # columns that the bar with speed and remaining time needs
             columns.insert(1, BarColumn(bar_width=24))
             columns += [TextColumn("{task.fields[speed]}"), TimeRemainingColumn()]
-        if console.is_terminal and console.width >= WIDE:
+        if console.is_terminal and console.width >= 120:
             columns.append(TextColumn("[dim]{task.fields[line]}"))
         self._bar = Progress(*columns, console=console, auto_refresh=False)
         self._task = self._bar.add_task("", total=ticks, clock="0:00:00", speed="", line="")

@@ -68,11 +68,9 @@ def execute_chaos(options: argparse.Namespace) -> int:
     retained = "the states are retained in the folder of the results"
     ineffective = {
         **{key: f"the plan has its own value; change it with {option}" for key, option in OF_PLAN.items()},
-        **dict.fromkeys(common.PLACES, common.OWN_PORTS),
         **dict.fromkeys(("plant.retain.file", "control_plc.retain.file"), retained),
-        "session.autostart": "it begins a session",
     }
-    common.refuse_ineffective(effective, ineffective)
+    common.refuse_ineffective(effective, common.OWN_PORTS, ineffective)
     from coldloop_chaos.report import ChaosProgress, perform, plot_chaos, summary_lines, table, write_report
     from coldloop_rig.results.folders import claim_folder, claim_folder_of_now, writing
     from coldloop_rig.runs.running import plain_arguments

@@ -137,17 +137,16 @@ GROUPS: Final = {
     },
 }
 COMMANDS: Final = {name: said for group in GROUPS.values() for name, said in group.items()}
-MODULES: Final = {
-    "runs": ("run", "record", "rerun", "plot", "report", "compare"),
-    "rig": ("up", "down", "status", "set", "fault", "page"),
-    "bus": ("events", "certificates", "registers"),
-    "plant": ("new", "process", "import", "budget", "model", "identify"),
-    "help": ("docs", "config", "completion"),
+MODULE_OF: Final = {
+    **dict.fromkeys(("run", "record", "rerun", "plot", "report", "compare"), "runs"),
+    **dict.fromkeys(("up", "down", "status", "set", "fault", "page"), "rig"),
+    **dict.fromkeys(("events", "certificates", "registers"), "bus"),
+    **dict.fromkeys(("new", "process", "import", "budget", "model", "identify"), "plant"),
+    **dict.fromkeys(("docs", "config", "completion"), "help"),
 }
+"""Modules of `coldloop_rig.cli.commands`: `_declare_NAME` declares a command's options, `execute_NAME` does it."""
 BROKEN: Final = "commands that cannot be loaded"
 """Group in `coldloop --help` of commands whose package is damaged, or for another version."""
-MODULE_OF: Final = {name: module for module, names in MODULES.items() for name in names}
-"""Modules of `coldloop_rig.cli.commands`: `_declare_NAME` declares a command's options, `execute_NAME` does it."""
 VERSION: Final = f"coldloop {__version__} (Python {platform.python_version()})"
 EXTRAS: Final = {
     "CoolProp": "tables", "aiohttp": "hmi", "casadi": "qpoases", "distributed": "studies", "fmpy": "fmu",
@@ -248,13 +247,10 @@ def command_groups() -> dict[str, dict[str, str]]:
 def _by_group() -> str:
     groups = command_groups()
     width = max(len(name) for commands in groups.values() for name in commands) + 2
-    return (
-        "\n".join(
-            f"{group}:\n" + "".join(f"  {name:{width}}{said}\n" for name, said in commands.items())
-            for group, commands in groups.items()
-        )
-        + "\ncoldloop COMMAND --help shows the options of one."
-    )
+    texts = [
+        f"{group}:\n" + "".join(f"  {n:{width}}{said}\n" for n, said in each.items()) for group, each in groups.items()
+    ]
+    return "\n".join([*texts, "coldloop COMMAND --help shows the options of one."])
 
 
 def _print_version(_: argparse.Namespace) -> int:
@@ -317,7 +313,6 @@ def _execute(parser: argparse.ArgumentParser, given: Sequence[str]) -> int:
 
 
 def _complete() -> NoReturn:
-    """Print the shell's completions of the line."""
     from argcomplete import autocomplete  # noqa: PLC0415 only a shell needs it
 
     words = os.environ.get("COMP_LINE", "").split()

@@ -56,9 +56,8 @@ class Authority:
         """Return an authority that is valid from a day ago, as clocks differ, and for so many days from now."""
         now = datetime.now(UTC)
         key = ec.generate_private_key(ec.SECP256R1())
-        builder = _draft(name, name, key, now + timedelta(days=days)).add_extension(
-            x509.BasicConstraints(ca=True, path_length=0), critical=True
-        )
+        builder = _draft(name, name, key, now + timedelta(days=days))
+        builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         builder = builder.add_extension(_key_usage(signs_certificates=True), critical=True)
         return cls(Pair(_signed(builder, key.public_key(), key), key))
 
@@ -161,9 +160,7 @@ CLIENTS = {**{role.value: role.value for role in Role}, "reader": None}
 """Clients and their roles."""
 CONFIGURATION = "tls.toml"
 REVOCATIONS = "ca.crl"
-OURS = "name the folder of `coldloop certificates`"
 MADE = "name a certificate that `coldloop certificates` has made"
-KEY = "the key of the authority is needed to revoke"
 OWNERS = {
     "plant.server.tls": "plant", "control_plc.server.tls": "control_plc", "optimizer_plc.server.tls": "optimizer_plc",
     "control_plc.plant.tls": "control", "optimizer_plc.control_plc.tls": "optimizer", "rig.tls": "operator",
@@ -211,12 +208,13 @@ def revoke(out: Path, names: Sequence[str], days: int) -> tuple[int, Path]:
         UsageError: The folder has no such certificate, list or key of the authority.
         ResultsError: The list cannot be written.
     """
+    needed, ours = "the key of the authority is needed to revoke", "name the folder of `coldloop certificates`"
     certificate = _loaded(out / "ca.crt", MADE, x509.load_pem_x509_certificate)
-    key = _loaded(out / "ca.key", KEY, partial(load_pem_private_key, password=None))
+    key = _loaded(out / "ca.key", needed, partial(load_pem_private_key, password=None))
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise UsageError(f"{out / 'ca.key'}: not a key that `coldloop certificates` has made")
     authority = Authority(Pair(certificate, key))
-    revoked = list(_loaded(out / REVOCATIONS, OURS, x509.load_pem_x509_crl))
+    revoked = list(_loaded(out / REVOCATIONS, ours, x509.load_pem_x509_crl))
     present = {each.serial_number for each in revoked}
     certificates = [_loaded(out / f"{name}.crt", MADE, x509.load_pem_x509_certificate) for name in names]
     revoked += [revoked_now(each) for each in certificates if each.serial_number not in present]

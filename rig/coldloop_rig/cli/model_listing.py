@@ -52,10 +52,16 @@ def describe_model(
     texts = [f"{v.real:.4f}" if abs(v.imag) < 1e-12 else f"{v.real:.4f}{v.imag:+.4f}i" for v in values]
     held = model.discretised(HORIZON_S)
     effects = np.column_stack([model.C @ held.B + model.D, model.C @ held.F + model.G])
+    given = zip(model.input_names, rest.u, model.input_units, strict=True)
+    inputs = ", ".join(f"{name} {value:g} {unit}" for name, value, unit in given)
+    found_outputs = zip(model.output_names, rest.y, model.output_units, strict=True)
+    outputs = [f"{name} {value:.4f} {unit}" for name, value, unit in found_outputs]
     signals = zip((*model.input_names, model.load_name), (*model.input_units, model.load_unit), strict=True)
     kink = "kink       derivatives differ on both sides: the second law limits cells of NEF1 or NEF2; less UA there"
     lines = [
-        *_equilibrium_lines(model, rest), *lines_of_kind,
+        f"operating point: {inputs}, load {rest.w:.2f} W; cold power {rest.w + rest.u[1]:.2f} W",
+        f"residual   {rest.residual:.2e} per second (2 kPa, 1 % of level, 1 K)",
+        *(f"outputs    {'  '.join(outputs[i : i + 6])}" for i in range(0, len(outputs), 6)), *lines_of_kind,
         *(f"eigenvalues {'  '.join(texts[i : i + 10])} /s" for i in range(0, len(texts), 10)),
         f"derivatives within {error:.1e} of extrapolated central differences (scaled)",
         *(f"after {HORIZON_S:g} s of +1 {unit} {name}: L1 {effects[L1, i]:+.5f} %, T5 {effects[T5, i]:+.5f} K"
@@ -67,18 +73,6 @@ def describe_model(
         lines.append(f"in use     sha256 {configured.digest} ({in_use})")
         lines += [f"           {printable(configured.note)}"] if configured.note else []
     return model, "\n".join(lines) + "\n", box
-
-
-def _equilibrium_lines(model: LtiModel, rest: cold_box.Equilibrium) -> list[str]:
-    given = zip(model.input_names, rest.u, model.input_units, strict=True)
-    found = zip(model.output_names, rest.y, model.output_units, strict=True)
-    inputs = ", ".join(f"{name} {value:g} {unit}" for name, value, unit in given)
-    outputs = [f"{name} {value:.4f} {unit}" for name, value, unit in found]
-    return [
-        f"operating point: {inputs}, load {rest.w:.2f} W; cold power {rest.w + rest.u[1]:.2f} W",
-        f"residual   {rest.residual:.2e} per second (2 kPa, 1 % of level, 1 K)",
-        *(f"outputs    {'  '.join(outputs[i : i + 6])}" for i in range(0, len(outputs), 6)),
-    ]
 
 
 def held_line(box: ColdBox, level: float, design: ControlDesign, limits: InputLimits) -> str:

@@ -120,7 +120,6 @@ FORMATS: Final = {"table": as_table, "markdown": as_markdown, "csv": as_csv, "js
 
 UNITS: Final = {"%": "percent", "K": "kelvin", "W": "watt"}
 """Grafana's names of units; others are in the title of the panel."""
-DATASOURCE: Final = {"type": "prometheus", "uid": "${datasource}"}
 
 
 class Panel(NamedTuple):
@@ -154,10 +153,22 @@ def board(process: Process) -> str:
     """Return the dashboard of a process, as JSON to import."""
     period = Panel(f"Updating period, ticks of {process.tick_unit}", "short",
                    (("coldloop_update_tau_u", "tau_u"), ("coldloop_update_iterations", "iterations")))  # fmt: skip
-    panels = [
-        *_laid_out(STATE, "stat", 0, 4, 4),
-        *_laid_out((*_of_process(process), period, *OPTIMISER), "timeseries", 4, 2, 7),
+    prefix, limits = "coldloop_control_plc_process", "coldloop_optimizer_plc_operating_limits_output"
+    named = []  # outputs with their bands, then the inputs by unit, those in the unit of the load with it
+    for one in process.banded:
+        element = f'{{element="{one.name}"}}'
+        bounds = ((f"{limits}_{end}{element}", end) for end in ("low", "high"))
+        named.append((one.name, one.unit, [(f"{prefix}_y{element}", one.name), *bounds]))
+    curves = {process.load.unit: [(f"{prefix}_load", "load")]}
+    for each in sorted(process.inputs, key=lambda each: each.unit):
+        curves.setdefault(each.unit, []).append((f'{prefix}_u{{element="{each.name}"}}', each.name))
+    with_load = curves.pop(process.load.unit)
+    named += [*(("Inputs", unit, pairs) for unit, pairs in curves.items()), ("Load", process.load.unit, with_load)]
+    plots = [
+        Panel(title if unit in UNITS or not unit else f"{title} ({unit})", UNITS.get(unit, "short"), tuple(pairs))
+        for title, unit, pairs in named
     ]
+    panels = [*_laid_out(STATE, "stat", 0, 4, 4), *_laid_out((*plots, period, *OPTIMISER), "timeseries", 4, 2, 7)]
     document = {
         "title": "Coldloop", "uid": "coldloop", "schemaVersion": 39, "version": 1, "editable": True, "refresh": "5s",
         "time": {"from": "now-30m", "to": "now"}, "tags": ["coldloop"],
@@ -168,24 +179,6 @@ def board(process: Process) -> str:
     return json.dumps(document, indent=1) + "\n"
 
 
-def _of_process(process: Process) -> Iterable[Panel]:
-    """Yield outputs with their bands, then the inputs by unit, those in the unit of the load with it."""
-    prefix, limits = "coldloop_control_plc_process", "coldloop_optimizer_plc_operating_limits_output"
-    found = []
-    for one in process.banded:
-        element = f'{{element="{one.name}"}}'
-        bounds = ((f"{limits}_{end}{element}", end) for end in ("low", "high"))
-        found.append((one.name, one.unit, [(f"{prefix}_y{element}", one.name), *bounds]))
-    curves = {process.load.unit: [(f"{prefix}_load", "load")]}
-    for each in sorted(process.inputs, key=lambda each: each.unit):
-        curves.setdefault(each.unit, []).append((f'{prefix}_u{{element="{each.name}"}}', each.name))
-    with_load = curves.pop(process.load.unit)
-    found += [("Inputs", unit, pairs) for unit, pairs in curves.items()]
-    for title, unit, pairs in (*found, ("Load", process.load.unit, with_load)):
-        known = UNITS.get(unit)
-        yield Panel(title if known or not unit else f"{title} ({unit})", known or "short", tuple(pairs))
-
-
 def _laid_out(panels: Sequence[Panel], kind: str, top: int, across: int, height: int) -> Iterable[dict[str, Any]]:
     """Yield panels in rows of so many."""
     width = 24 // across  # in Grafana's units
@@ -193,7 +186,7 @@ def _laid_out(panels: Sequence[Panel], kind: str, top: int, across: int, height:
         yield {
             "type": kind, "title": panel.title,
             "gridPos": {"x": place % across * width, "y": top + place // across * height, "w": width, "h": height},
-            "datasource": DATASOURCE,
+            "datasource": {"type": "prometheus", "uid": "${datasource}"},
             "fieldConfig": {
                 "defaults": {"unit": panel.unit, "custom": {"lineInterpolation": "stepAfter", "fillOpacity": 0}},
                 "overrides": [],

@@ -36,11 +36,8 @@ PAUSES_S: Final = (1.0, 2.0, 4.0, 8.0, 16.0)
 STEADY_S: Final = 60.0
 """Time without an exit after which the pauses start from the first one again, s."""
 T = TypeVar("T")
-STOP_GRACE_S = 5.0
 MOST_LOG_BYTES = 2**26
 """Size of a file that a service writes, its log among them: a write beyond it fails."""
-EXIT_S = 2.0
-"""Longest time that a process may take to end after it has closed its connections, s."""
 
 
 async def show_compiling(logs: Sequence[Path]) -> None:
@@ -166,7 +163,6 @@ class LocalServices:
         self._showing: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
-        """Start them."""
         self._logs.mkdir(parents=True, exist_ok=True)
         for service in self.services:
             self.log(service).unlink(missing_ok=True)
@@ -240,7 +236,7 @@ class LocalServices:
         try:
             await asyncio.wait({task, death}, return_when=asyncio.FIRST_COMPLETED)
             if task.done() and not task.cancelled() and isinstance(task.exception(), LinkError):
-                await asyncio.wait({death}, timeout=EXIT_S)  # it closes its connections before its process ends
+                await asyncio.wait({death}, timeout=2.0)  # its service may end, which closes connections first
             if death.done():  # first: work that needs the service may fail in the same turn
                 dead = death.result()
                 raise LinkError(f"the {dead} service {self.end_of(dead)}")
@@ -303,9 +299,9 @@ def terminate(process: asyncio.subprocess.Process) -> None:
 
 
 async def wait_for_end(process: asyncio.subprocess.Process) -> None:
-    """Wait for the end of a process; one that does not end is made to."""
+    """Wait for the end of a process; one that has not ended after 5 s is made to."""
     try:
-        async with asyncio.timeout(STOP_GRACE_S):
+        async with asyncio.timeout(5.0):
             await process.wait()
     except TimeoutError:
         process.kill()

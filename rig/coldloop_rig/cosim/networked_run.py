@@ -14,7 +14,6 @@ import coldloop_optimizer_plc.settings
 import coldloop_plant.settings
 from coldloop.config import MOST_SHOWN, Configuration, flattened, load_configuration
 from coldloop.errors import LinkError, UsageError
-from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.settings import Endpoint
 from coldloop.registers.common import ConfigurationDigest, ConfigurationLine, configuration_of, lines_of
 from coldloop.service.start import run_event_loop
@@ -37,9 +36,6 @@ OF_SESSION: Final = (
     "session.mode", "session.factor", "plant.load", "plant.seed", "optimizer_plc.program.updating_period_s",
 )  # fmt: skip
 """Keys that a rig takes from the client that begins a session."""
-OF_CLIENT: Final = ("model.", "rig.")
-"""Sections that concern the client. The model of a rig is compared with ours when it is connected to."""
-SOURCE: Final = "the rig"
 ATTACH_PATIENCE_S: Final = 5.0
 
 
@@ -58,28 +54,6 @@ FILES: Final = frozenset(_files(Settings))
 """Keys whose value names a file: the rig's values are compared and never opened."""
 
 
-async def read_configuration(client: RegisterClient, shown: Sequence[str]) -> dict[str, Any]:
-    """Return what the registers of a service show of its configuration, by dotted key.
-
-    Args:
-        client: Of the service.
-        shown: Keys and sections that it may show.
-
-    Raises:
-        LinkError: It does not answer, or its text is not whole, or it shows something else.
-    """
-    digest = await client.read(ConfigurationDigest)
-    lines = await client.read_rows(ConfigurationLine, 0, lines_of(digest.length))
-    try:
-        values = flattened(configuration_of(digest, lines))
-    except ValueError as error:
-        raise LinkError(f"{client.peer}: its configuration cannot be read: {error}") from None
-    for key in values:
-        if not f"{key}.".startswith(tuple(f"{one}." for one in shown)):
-            raise LinkError(f"{client.peer}: its configuration has {_text(key)}, which it has not to show")
-    return values
-
-
 def _text(value: object) -> str:
     """Return a value of a rig as a message can show it."""
     text = str(value)
@@ -87,54 +61,29 @@ def _text(value: object) -> str:
 
 
 async def running_configuration(client: session.SessionClient) -> dict[str, Any]:
-    """Return what the services of a rig run, by dotted key, without what belongs to a session.
+    """Return what the services of a rig run by their registers, by dotted key, without what belongs to a session.
 
     Raises:
-        LinkError: A service does not answer.
+        LinkError: A service does not answer, or its text is not whole, or it shows what it has not to.
         UsageError: Two services run different limits.
     """
     running: dict[str, Any] = {}
     for service, one in client.clients.items():
-        shown = await read_configuration(one, SHOWN[service])
-        for key in running.keys() & shown.keys():
-            if running[key] != shown[key]:
+        digest = await one.read(ConfigurationDigest)
+        lines = await one.read_rows(ConfigurationLine, 0, lines_of(digest.length))
+        try:
+            shown = flattened(configuration_of(digest, lines))
+        except ValueError as error:
+            raise LinkError(f"{one.peer}: its configuration cannot be read: {error}") from None
+        for key, value in shown.items():
+            if not f"{key}.".startswith(tuple(f"{permitted}." for permitted in SHOWN[service])):
+                raise LinkError(f"{one.peer}: its configuration has {_text(key)}, which it has not to show")
+            if running.setdefault(key, value) != value:
+                others = _text(running[key])
                 raise UsageError(
-                    f"{one.peer} runs {key} = {_text(shown[key])}, another one {_text(running[key])}: give all "
-                    "of them the same"
+                    f"{one.peer} runs {key} = {_text(value)}, another one {others}: give all of them the same"
                 )
-        running |= shown
     return {key: value for key, value in running.items() if key not in OF_SESSION}
-
-
-def attached(effective: Configuration[Settings], running: Mapping[str, Any]) -> Configuration[Settings]:
-    """Return a configuration with what a rig really runs.
-
-    Args:
-        effective: What the user asks for.
-        running: What the rig runs.
-
-    Raises:
-        UsageError: The user asks for something that the rig does not run, and that a client cannot change.
-    """
-    asked = {key: value for key, value, _ in effective.effective()}
-    for given, source in effective.sources.items():
-        covered = [key for key in running if f"{key}.".startswith(f"{given}.")]
-        for key in covered:
-            if asked.get(key) != running[key]:
-                raise UsageError(
-                    f"{source}: the rig runs {key} = {_text(running[key])}, which a client does not change; drop it, "
-                    "or start the rig with it"
-                )
-        if not covered and source.startswith("--") and not given.startswith((*OF_SESSION, *OF_CLIENT)):
-            raise UsageError(f"{source}: a rig that is up has its own {given}, which a client does not change; drop it")
-    for key in FILES & running.keys():
-        if asked.get(key) != running[key]:
-            raise UsageError(
-                f"the rig runs {key} = {_text(running[key])}: name the same file here with --set {key}=FILE"
-            )
-    values = {key: (value, source) for key, value, source in effective.effective() if value is not None}
-    values |= {key: (value, SOURCE) for key, value in running.items() if key not in FILES}
-    return load_configuration(Settings, environment={}, options=values)
 
 
 def as_attached(effective: Configuration[Settings], endpoints: Sequence[Endpoint]) -> Configuration[Settings]:
@@ -145,7 +94,27 @@ def as_attached(effective: Configuration[Settings], endpoints: Sequence[Endpoint
         LinkError: A service does not answer.
         ModelFileError: One runs another model than ours.
     """
-    return attached(effective, _read(effective, endpoints, "runs", running_configuration))
+    running = _read(effective, endpoints, "runs", running_configuration)
+    asked = {key: value for key, value, _ in effective.effective()}
+    for given, source in effective.sources.items():
+        covered = [key for key in running if f"{key}.".startswith(f"{given}.")]
+        for key in covered:
+            if asked.get(key) != running[key]:
+                raise UsageError(
+                    f"{source}: the rig runs {key} = {_text(running[key])}, which a client does not change; drop it, "
+                    "or start the rig with it"
+                )
+        # The model of a rig is compared with ours when it is connected to, and `rig` is the client's section.
+        if not covered and source.startswith("--") and not given.startswith((*OF_SESSION, "model.", "rig.")):
+            raise UsageError(f"{source}: a rig that is up has its own {given}, which a client does not change; drop it")
+    for key in FILES & running.keys():
+        if asked.get(key) != running[key]:
+            raise UsageError(
+                f"the rig runs {key} = {_text(running[key])}: name the same file here with --set {key}=FILE"
+            )
+    values = {key: (value, source) for key, value, source in effective.effective() if value is not None}
+    values |= {key: (value, "the rig") for key, value in running.items() if key not in FILES}
+    return load_configuration(Settings, environment={}, options=values)
 
 
 def session_under_way(effective: Configuration[Settings], endpoints: Sequence[Endpoint], ticks: int) -> Scenario:
@@ -162,7 +131,6 @@ def _read(
     effective: Configuration[Settings], endpoints: Sequence[Endpoint], what: str,
     work: Callable[[session.SessionClient], Awaitable[T]],
 ) -> T:  # fmt: skip
-    """Return what is read from a rig that is up."""
     found: list[T] = []
 
     async def read() -> int:

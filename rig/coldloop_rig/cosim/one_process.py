@@ -62,9 +62,8 @@ class Programs(NamedTuple):
         actuators = as_transmitted(control.begin_scan(), to_plant)
         u = actuators.u
         plant.apply(u)
-        measurement = as_transmitted(
-            Measurement(plant.tick, plant.load, plant.measure(), plant.state, actuators.session, u), to_plant
-        )
+        measured = Measurement(plant.tick, plant.load, plant.measure(), plant.state, actuators.session, u)
+        measurement = as_transmitted(measured, to_plant)
         if plant.station is not None:
             recorder.station(as_transmitted(plant.station, to_plant))
         recorder.sample(PlantSample(plant.tick, measurement.load, u, measurement.y, measurement.x))

@@ -18,8 +18,6 @@ from coldloop_rig.settings import Settings
 
 INPUTS: Final = "inputs"
 LOAD_COPY: Final = f"{INPUTS}/load.csv"
-BEHIND_LAST_STEP = 1200
-"""Default time that a run continues after the last step of a load file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,9 +34,9 @@ class Scenario:
 
 
 def natural_ticks(name: str, load: LoadProfile) -> int:
-    """Return the default duration of a run under the load of this name or file."""
+    """Return the default duration of a run under the load of this name or file; it ends 1200 ticks after a file's."""
     families = named_families(name)
-    return len(families) * HOUR_TICKS if families else load.times[-1] + BEHIND_LAST_STEP
+    return len(families) * HOUR_TICKS if families else load.times[-1] + 1200
 
 
 def with_copied_load(settings: Settings, profile: LoadProfile, folder: Path) -> Settings:

@@ -41,8 +41,6 @@ LONGEST_LOCKSTEP_PAUSE_S: Final = 0.01
 """Longest interval at which a rig whose time does not advance is polled, s."""
 EVENTS_S: Final = 0.25
 """Interval at which the journals are polled, s of real time."""
-LAST_LOOK_S: Final = 2.0
-"""Longest wait for the events of a run that has ended, s."""
 CONTACT_S: Final = 1.0
 """Longest time of an answer with `tolerant`, s: a stopped process must not delay the others for long."""
 PASSING: Final = frozenset({EventKind.ALARM_RAISED, EventKind.ALARM_RETURNED, EventKind.ALARM_ACKNOWLEDGED})
@@ -152,8 +150,6 @@ class SessionClient:
         for client in self.clients.values():
             client.close()
 
-    # -- a session -----------------------------------------------------------------------------------------------------
-
     async def run(self, scenario: Scenario, recorder: Recorder) -> None:
         """Start a session for the scenario and record it to its end.
 
@@ -187,13 +183,11 @@ class SessionClient:
 
     async def begin(self, scenario: Scenario, recorder: Recorder) -> None:
         """Start a session for the scenario, recorded from now on."""
-        self._events = SessionEvents(
-            {
-                service: JournalReader(client, (await client.read(JournalPage)).newest + 1)
-                for service, client in ((CONTROL, self.control), (PLANT, self.plant))
-            },
-            recorder,
-        )
+        readers = {
+            service: JournalReader(client, (await client.read(JournalPage)).newest + 1)
+            for service, client in ((CONTROL, self.control), (PLANT, self.plant))
+        }
+        self._events = SessionEvents(readers, recorder)
         session = await self.start(scenario)
         self._scenario, self._recorder = scenario, recorder
         self._samples = SampleReader(
@@ -212,9 +206,8 @@ class SessionClient:
         self.session = session
         realtime = int(scenario.realtime)
         if "optimizer_plc" in self.clients:
-            await self.optimizer.write(
-                OptimizerSession(session, realtime, scenario.factor, round(scenario.updating_period_s / self._tick_s))
-            )
+            period = round(scenario.updating_period_s / self._tick_s)
+            await self.optimizer.write(OptimizerSession(session, realtime, scenario.factor, period))
         rows = await write_table(self.plant, scenario.load)
         await self.plant.write(plant.PlantSession(session, realtime, scenario.factor, scenario.seed, rows))
         self.load = LoadStream(self.plant, session, scenario.load, sent=rows)
@@ -277,11 +270,9 @@ class SessionClient:
     async def last_look(self) -> None:
         """Read the last events; what ended the run is what is reported, not that these cannot be read."""
         with contextlib.suppress(LinkError, TimeoutError):
-            async with asyncio.timeout(LAST_LOOK_S):
+            async with asyncio.timeout(2.0):
                 await self._events.read(CONTROL)
                 await self._events.read(PLANT)
-
-    # -- in the session ----------------------------------------------------------------------------------------------
 
     async def grant(self, until: int) -> None:
         """Advance the rig to a tick, limited by the known load and by the length of the plant's history."""
@@ -473,14 +464,10 @@ class Lateness:
         """Return what was late up to a look, None where there was no answer; the largest lateness is of the session."""
         if status is not None:
             before, self._before, late = self._before, status, self._late
-            counts = zip(
-                (before.deadline_misses, before.overruns), (status.deadline_misses, status.overruns), strict=True
-            )
-            misses, overruns = (now - then if now >= then else now for then, now in counts)
-            largest = max(late.lateness_max_ms, status.lateness_max)
-            self._late = LinkStatistics(
-                late.deadline_misses + misses, late.overruns + overruns, largest, status.lateness_p99
-            )
+            pairs = (before.deadline_misses, status.deadline_misses), (before.overruns, status.overruns)
+            misses, overruns = (now - then if now >= then else now for then, now in pairs)
+            largest, total = max(late.lateness_max_ms, status.lateness_max), late.deadline_misses + misses
+            self._late = LinkStatistics(total, late.overruns + overruns, largest, status.lateness_p99)
         return self._late
 
 

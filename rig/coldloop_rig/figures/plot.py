@@ -432,7 +432,6 @@ def _draw_comparison(runs: Sequence[RunFolder], labels: Sequence[str]) -> Figure
 
 PAGE_TICKS: Final = 20_000
 """A longer trace is reduced, so that the page stays small and quick."""
-MOST_EVENTS: Final = 500
 
 
 def run_page(folder: Path) -> str:
@@ -456,7 +455,7 @@ def run_page(folder: Path) -> str:
         manifest=manifest,
         summary=run.summary,
         events=run.events(),
-        most=MOST_EVENTS,
+        most=500,
         versions={name: manifest[name] for name in ("coldloop", "python", "platform")} | manifest["dependencies"],
         reduced=manifest["recorded_ticks"] > PAGE_TICKS,
         library=get_plotlyjs(),
@@ -472,21 +471,30 @@ def _shown(value: object) -> str:
 
 def _plots(run: RunFolder) -> str:
     """Return the curves as an HTML element."""
+    from plotly.graph_objects import Scattergl  # noqa: PLC0415 an extra
     from plotly.subplots import make_subplots  # noqa: PLC0415 an extra
 
     process, labels = run.process, labels_of(run.process)
-    curves = run.series([*labels], PAGE_TICKS)
+    curves, edges = run.series([*labels], PAGE_TICKS), edges_of(run.configuration, process)
     scale_s, unit = time_unit(curves["time_s"])
     figure = make_subplots(rows=len(labels), cols=1, shared_xaxes=True, vertical_spacing=0.02)
     for row, (name, label) in enumerate(labels.items(), start=1):
-        _add_curve(figure, row, curves, name, process)
-        figure.update_yaxes(title_text=label, row=row, col=1)
-    for name, (low, high) in edges_of(run.configuration, process).items():  # far ones are outside the view
-        row = [*labels].index(name) + 1
-        figure.add_hrect(y0=low, y1=high, fillcolor=BAND, opacity=0.2, line_width=0, row=row, col=1)
-        for edge in (low, high):
-            figure.add_hline(y=edge, line={"color": ACCENT, "width": 1, "dash": "dash"}, row=row, col=1)
-        figure.update_yaxes(range=view_with_limits(curves[name], (low, high)), row=row, col=1)
+        values, axis = curves[name].astype("float32"), dict[str, Any]()
+        if name == "stage_cost" and spans_a_decade(values):
+            values, axis = values.clip(min=LEAST_COST), {"type": "log", "exponentformat": "power", "dtick": 2}
+        elif name == "tau_u_s":
+            axis = {"range": (0, process.sampling_period_s + 0.3)}
+        else:  # edges that are far from the curve are outside the view
+            axis = {"range": view_with_limits(curves[name], edges[name]) if name in edges else view(values)}
+        line = {"color": INK, "width": 1.2, "shape": "hv" if name in (process.load.column, "tau_u_s") else "linear"}
+        curve = Scattergl(x=curves["time_s"] / scale_s, y=values, name=name, mode="lines", line=line)
+        figure.add_trace(curve, row=row, col=1)
+        figure.update_yaxes(**axis, title_text=label, row=row, col=1)
+        if name in edges:
+            low, high = edges[name]
+            figure.add_hrect(y0=low, y1=high, fillcolor=BAND, opacity=0.2, line_width=0, row=row, col=1)
+            for edge in (low, high):
+                figure.add_hline(y=edge, line={"color": ACCENT, "width": 1, "dash": "dash"}, row=row, col=1)
     if len(curves["time_s"]):
         for begin, end in alarm_times(run.events(), scale_s, float(curves["time_s"][-1]) / scale_s):
             figure.add_vrect(x0=begin, x1=end, fillcolor="#b3261e", opacity=0.12, line_width=0)
@@ -498,21 +506,3 @@ def _plots(run: RunFolder) -> str:
     )  # fmt: skip
     html: str = figure.to_html(full_html=False, include_plotlyjs=False, config={"displaylogo": False})
     return html
-
-
-def _add_curve(figure: Any, row: int, curves: Curves, name: str, process: Process) -> None:  # noqa: ANN401 plotly has no types
-    from plotly.graph_objects import Scattergl  # noqa: PLC0415 an extra
-
-    shape = "hv" if name in (process.load.column, "tau_u_s") else "linear"
-    line = {"color": INK, "width": 1.2, "shape": shape}
-    values = curves[name].astype("float32")
-    if name == "stage_cost" and spans_a_decade(values):
-        values = values.clip(min=LEAST_COST)
-        figure.update_yaxes(type="log", exponentformat="power", dtick=2, row=row, col=1)
-    elif name == "tau_u_s":
-        figure.update_yaxes(range=(0, process.sampling_period_s + 0.3), row=row, col=1)
-    else:
-        figure.update_yaxes(range=view(values), row=row, col=1)
-    scale_s, _ = time_unit(curves["time_s"])
-    curve = Scattergl(x=curves["time_s"] / scale_s, y=values, name=name, mode="lines", line=line)
-    figure.add_trace(curve, row=row, col=1)

@@ -77,20 +77,17 @@ class RecordedPage:
             text = EventText(row["kind"], row["subject"], row["cause"], value, row["unit"], row["who"])
             entries.append(JournalEntry(row["service"], row["number"], row["boot"], row["utc"], row["tick"], text))
         self.events: Sequence[JournalEntry] = sorted(entries, key=lambda entry: entry.tick)
-        settings = self._read_settings()
+        copy = folder.manifest["inputs"].get("model", {}).get("file")
+        read = {key: value for key, value in folder.configuration.items() if key.split(".")[0] in SECTIONS}
+        read["model.file"] = str(folder.held(copy)) if copy else "cold-box"
+        options: Mapping[str, tuple[object, str]] = {key: (value, "manifest") for key, value in read.items()}
+        settings = load_configuration(OptimizerSettings, environment={}, options=options).settings
         program, limits = settings.optimizer_plc.program, settings.limits
         budget = PlcBudget(program.budget, make_solver(program).tau_1_s)
         rule, times = make_rule(program, budget, round(program.updating_period_s / self.process.tick_s)), budget.times
         self.rule = rule.status._replace(slots=times.slots, preparation=times.preparation, iteration=times.iteration)
         bands = program.design.output_low, program.design.output_high
         self.limits = OperatingLimits(*bands, limits.low, limits.high, limits.rate)
-
-    def _read_settings(self) -> OptimizerSettings:
-        values = {key: value for key, value in self._folder.configuration.items() if key.split(".")[0] in SECTIONS}
-        copy = self._folder.manifest["inputs"].get("model", {}).get("file")
-        values["model.file"] = str(self._folder.held(copy)) if copy else "cold-box"
-        options: Mapping[str, tuple[object, str]] = {key: (value, "manifest") for key, value in values.items()}
-        return load_configuration(OptimizerSettings, environment={}, options=options).settings
 
     def frame(self, tick: int) -> ReplayFrame | None:
         """Return one tick; None if it is missing in the recording."""

@@ -34,8 +34,6 @@ from coldloop_rig.interruption import INTERRUPTION
 T = TypeVar("T", bound=tuple[Any, ...])
 MOST_BYTES: Final = 65536
 """Size of a file about a rig, at most."""
-STATE, STARTED = 0, 19
-"""Places in /proc/PID/stat, counted behind the name of the program."""
 DEFAULT_PORTS: Final = (PLANT_PORT, CONTROL_PORT, OPTIMIZER_PORT)
 STATE_FILE: Final = "rig.json"
 """File from which `coldloop down`, `status` and `set` know a running rig: process, ports, certificates."""
@@ -43,8 +41,6 @@ LOCK_FILE: Final = "lock"
 """Locked by the process of a rig while it runs."""
 LOOK_UP_S: Final = 0.05
 """Interval at which the process of a rig is polled, s."""
-ANSWER_S: Final = 5.0
-"""Longest time of a connection to a port of this machine, s."""
 _HOLDER: Final = "a rig in containers, or another program (ss -ltnp names it): end it, or give another --port-base"
 
 
@@ -155,9 +151,9 @@ def identity_of(pid: int) -> str | None:
     except OSError:
         return None
     fields = status.rpartition(b")")[2].split()  # the name before may have anything in it
-    if fields[STATE] in (b"Z", b"X"):  # has ended, and its parent has not noticed
+    if fields[0] in (b"Z", b"X"):  # its state: has ended, and its parent has not noticed
         return None
-    return f"{boot} {int(fields[STARTED])}"
+    return f"{boot} {int(fields[19])}"
 
 
 def parsed_as(kind: type[T], text: str, writer: str, *, strict: bool = False) -> T:
@@ -238,14 +234,6 @@ class RunningRig(NamedTuple):
         """Process of the rig itself."""
         return ServiceProcess(self.pid, self.identity)
 
-    @property
-    def place(self) -> str:
-        """Options that select this rig."""
-        return f"--port-base {self.ports[0]} (process {self.pid})"
-
-
-# -- where they keep their state ---------------------------------------------------------------------------------------
-
 
 def state_folder(first_port: int) -> Path:
     """Return where a rig on these ports keeps its state and its logs."""
@@ -303,7 +291,8 @@ def find_rig(first_port: int | None) -> RunningRig | None:
         return running_rig(first_port)
     found = rigs_up()
     if len(found) > 1:
-        raise UsageError(f"{len(found)} rigs are up: choose one of {', '.join(rig.place for rig in found)}")
+        places = ", ".join(f"--port-base {rig.ports[0]} (process {rig.pid})" for rig in found)
+        raise UsageError(f"{len(found)} rigs are up: choose one of {places}")
     return found[0] if found else None
 
 
@@ -358,9 +347,6 @@ def _holder(first_port: int) -> str:
     return f"a rig is being started here: wait for it, or end it (process {number})"
 
 
-# -- ports -------------------------------------------------------------------------------------------------------------
-
-
 def ports_from(base: int | None) -> tuple[int, ...]:
     """Return three ports in a row, or the usual ones."""
     return DEFAULT_PORTS if base is None else (base, base + 1, base + 2)
@@ -389,15 +375,12 @@ def require_listener(port: int) -> None:
         UsageError: No rig was started here, and there is none in containers either.
     """
     try:
-        socket.create_connection(("127.0.0.1", port), ANSWER_S).close()
+        socket.create_connection(("127.0.0.1", port), timeout=5.0).close()
     except OSError:
         raise UsageError(
             f"no rig is up: none was started here, and nothing listens on port {port}; `coldloop up` starts one, --rig "
             "says where another one is"
         ) from None
-
-
-# -- start, end and faults ---------------------------------------------------------------------------------------------
 
 
 def detached(ports: Sequence[int], lock: int) -> int:

@@ -114,9 +114,8 @@ async def _control(client: CommandClient) -> ControlStatus:
         for i, row in enumerate(rows)
         if row.state not in QUIET
     )
-    return ControlStatus(
-        await client.read(LadderStatus), await client.read(Operator), (await client.read(ProcessNow)).y, alarms
-    )
+    y = (await client.read(ProcessNow)).y
+    return ControlStatus(await client.read(LadderStatus), await client.read(Operator), y, alarms)
 
 
 def _pace(plant: PlantStatus) -> str:

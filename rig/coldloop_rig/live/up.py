@@ -45,8 +45,6 @@ TAKEN_S: Final = 10.0
 OPERATOR: Final = "operator"
 LOOK_S: Final = 0.5
 """Interval at which the load known to the plant, and a restarted service, are polled, s."""
-LOOKING: Final = (PlantLinkState.SEARCHING, PlantLinkState.JOINING)
-"""A control PLC without a session is looking for the one that it has retained."""
 
 
 class Cut(NamedTuple):
@@ -355,7 +353,8 @@ class UpRig:
         Not yet, while the control PLC is looking for the one that it has retained.
         """
         async with self._sessions:
-            looking = (await rig.control.read(PlantLinkStatus)).state in LOOKING
+            state = (await rig.control.read(PlantLinkStatus)).state
+            looking = state in (PlantLinkState.SEARCHING, PlantLinkState.JOINING)
             plant, control = (await rig.plant.read(Identity)).session, (await rig.control.read(Identity)).session
             if plant == control != 0:
                 return True

@@ -37,10 +37,6 @@ __all__ = ["LiveRig", "NamedRegisters", "Rigs", "up"]
 T = TypeVar("T")
 LOOK_S: Final = 0.01
 """Interval at which the plant's tick is polled, s of real time."""
-END_S: Final = 1.0
-"""Longest time from a closed connection until the end of its process is known, s."""
-FEED_S: Final = 0.5
-"""Interval at which the load known to the plant is polled in a session in real time, s."""
 
 
 class BackgroundLoop:
@@ -185,9 +181,8 @@ class LiveRig:
         self._scenario = make_scenario(settings)
         self._folder = folder
         self._links: wiring.Links = wiring.fault_injection("links")(str(settings.plant.seed))
-        self._services = LocalServices(
-            wiring.retaining(settings, folder, always=True), folder / "logs", links=self._links
-        )
+        retained = wiring.retaining(settings, folder, always=True)
+        self._services = LocalServices(retained, folder / "logs", links=self._links)
         self.endpoints: wiring.RigEndpoints = self._services.endpoints
         """Endpoints of the services."""
         self._loop = BackgroundLoop()
@@ -202,8 +197,6 @@ class LiveRig:
             for service, register_map, endpoint in zip(wiring.SERVICES, maps, self.endpoints, strict=True)
         )
         self._injector = wiring.fault_injection("injector")(self._services, self._links, self._clients["plant"], folder)
-
-    # -- time ----------------------------------------------------------------------------------------------------------
 
     @property
     def time_s(self) -> float:
@@ -280,8 +273,6 @@ class LiveRig:
         except PeerUnreachableError:
             return None
 
-    # -- faults --------------------------------------------------------------------------------------------------------
-
     @contextmanager
     def fault(self, kind: str, **parameters: object) -> Iterator[None]:
         """Inject a fault during the context; at its end, wait until stopped services answer again.
@@ -308,15 +299,13 @@ class LiveRig:
             raise UsageError(f"unknown service '{service}'; choose from {', '.join(wiring.SERVICES)}")
         return self._services.log(service)
 
-    # -- start and end -------------------------------------------------------------------------------------------------
-
     def _call(self, work: Coroutine[Any, Any, T]) -> T:
         services = self._services
         try:
             return self._loop.call(services.during(work))
         except PeerUnreachableError:
             if len(services.processes) == len(wiring.SERVICES):  # none was stopped on purpose: has one ended?
-                self._loop.call(services.during(asyncio.sleep(END_S)))
+                self._loop.call(services.during(asyncio.sleep(1.0)))  # the end of its process may be known later
             raise
 
     async def _start(self) -> None:
@@ -325,7 +314,7 @@ class LiveRig:
         await self._links.connect()
         await self._services.during(self._driver.start(self._scenario))
         if self._scenario.realtime:
-            feed = self._driver.hold(FEED_S, lambda _: None)  # a plant that is away on purpose is looked at again
+            feed = self._driver.hold(0.5, lambda _: None)  # a plant that is away on purpose is looked at again
             self._stack.callback(asyncio.create_task(feed, name="load of the session").cancel)
 
     def _stop(self) -> None:

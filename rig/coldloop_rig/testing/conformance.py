@@ -71,12 +71,11 @@ def rule_requirements(make: Callable[[Sequence[int]], OutsideDecision]) -> list[
     def case(ladder: Sequence[int]) -> dict[str, object]:
         rule, twin = make(ladder), make(ladder)
         decided = session(rule, ladder)
+        after_step = getattr(rule, "after_interruption", rule.first)
         return {
             "begins with the number of a period": is_q(decided[0], ladder),
             "decides numbers of periods, 1 to their count": all(is_q(q, ladder) for q in decided[1:]),
-            "has the number of a period after a load step": is_q(
-                getattr(rule, "after_interruption", rule.first)(), ladder
-            ),
+            "has the number of a period after a load step": is_q(after_step(), ladder),
             "decides the same from the same observations": decided == session(twin, ladder),
             "begins a session as if there had been none before": decided == session(make(ladder), ladder),
         }

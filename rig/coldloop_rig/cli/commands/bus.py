@@ -131,7 +131,6 @@ class _CsvFile:
         self._events = 0
 
     def write(self, events: "Sequence[Event]") -> None:
-        """Append events."""
         from coldloop.service.journal import describe, utc_text
 
         present = self._path.exists()

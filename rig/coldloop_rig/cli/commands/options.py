@@ -290,9 +290,7 @@ def configuration(options: argparse.Namespace) -> "Configuration[Settings]":
 
     given: Mapping[str, Any] = vars(options)
     site = _tls_site(given["tls"]) if given.get("tls") is not None else {}
-    keys = {
-        key: (given[name], f"--{name.replace('_', '-')}") for name, key in KEYS.items() if given.get(name) is not None
-    }
+    keys = {key: (given[n], f"--{n.replace('_', '-')}") for n, key in KEYS.items() if given.get(n) is not None}
     assignments = [*options.assignments, *given.get("further_assignments", ())]
     own = site | process_setting(options.assignments) | keys
     effective = load_configuration(Settings, file=options.config, assignments=assignments, options=own)
@@ -312,10 +310,10 @@ def operator_settings(options: argparse.Namespace) -> "OperatorSettings":
     from coldloop.config import load_configuration
     from coldloop_rig.cosim.wiring import OTHERS, OperatorSettings
 
-    assignments = [*options.assignments, *vars(options).get("further_assignments", ())]
-    site = process_setting(assignments) | (_tls_site(options.tls) if options.tls is not None else {})
+    given = [*options.assignments, *vars(options).get("further_assignments", ())]
+    site = process_setting(given) | (_tls_site(options.tls) if options.tls is not None else {})
     effective = load_configuration(
-        OperatorSettings, file=options.config, assignments=assignments, options=site, others=OTHERS
+        OperatorSettings, file=options.config, assignments=given, options=site, others=OTHERS
     )
     for key, source in effective.sources.items():
         if source.startswith("--set") and not (key.startswith(("limits", "rig")) or key.endswith(".word_order")):
@@ -323,14 +321,16 @@ def operator_settings(options: argparse.Namespace) -> "OperatorSettings":
     return effective.settings
 
 
-def refuse_ineffective(effective: "Configuration[Settings]", keys: Mapping[str, str]) -> None:
+def refuse_ineffective(effective: "Configuration[Settings]", place: str, more: Mapping[str, str] | None = None) -> None:
     """Refuse values that the command replaces by its own; a file and the environment may repeat the default.
 
     Raises:
-        UsageError: One of the dotted keys was set; the message has what to do instead, the value of the key in `keys`.
+        UsageError: A place of a service, the autostart or a dotted key of `more` was set; the message has what to do
+            instead: `place`, or the value of the key.
     """
     from coldloop.config import DEFAULT, flattened
 
+    keys = {**dict.fromkeys(PLACES, place), "session.autostart": "it begins a session", **(more or {})}
     usual = flattened(effective.usual().model_dump(mode="json"))
     for key, value, source in effective.effective():
         if key in keys and (source.startswith("--") or (source != DEFAULT and value != usual.get(key))):

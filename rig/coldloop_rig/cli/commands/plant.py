@@ -173,13 +173,14 @@ def execute_model(options: argparse.Namespace) -> int:
     if options.out is not None:
         require_regular_file(options.out)
     settings = common.configuration(options).settings
+    design = settings.optimizer_plc.program.design
     in_use = settings.model.file
     whole = settings.plant.kind is PlantKind.REFRIGERATOR
     plant = kind_named(PlantKind.REFRIGERATOR).read_plant_file(options.plant, settings.limits, whole=whole)
     if options.out is not None and options.plant is not None and options.out.resolve() == options.plant.resolve():
         raise UsageError(f"{options.out}: is the plant file; name another one with --out")
     try:
-        model, text, box = describe_model(in_use, plant, settings.optimizer_plc.program.design, settings.plant.station)
+        model, text, box = describe_model(in_use, plant, design, settings.plant.station)
     except NoEquilibriumError as error:
         raise UsageError(f"{options.plant or 'the reference plant'}: {error}") from None
     sys.stdout.write(text)
@@ -187,9 +188,7 @@ def execute_model(options: argparse.Namespace) -> int:
         sys.stdout.write(_saved(model, options.out))
     sys.stdout.flush()
     if options.plant is not None:  # a long search
-        sys.stdout.write(
-            held_line(box, plant.operating_point.level_pct, settings.optimizer_plc.program.design, settings.limits)
-        )
+        sys.stdout.write(held_line(box, plant.operating_point.level_pct, design, settings.limits))
     load(in_use)
     return 0
 
@@ -278,33 +277,30 @@ def execute_budget(options: argparse.Namespace) -> int:
         raise UsageError("--load: says whether an adaptive period pays on a PLC; name one with --plc")
     if options.took and not options.export:
         raise UsageError("--took: is of an export's self-test; name its folder with --export")
-    sys.stdout.write(fitted(_budget_text(options), width()))
-    return 0
-
-
-def _budget_text(options: argparse.Namespace) -> str:
     from coldloop_rig.cli.listings import key_listing
     from coldloop_rig.plc_sizing.plc import PlcProfile, find_profile, shipped_profiles
 
     if options.list:
-        return aligned([(name, find_profile(name).name) for name in shipped_profiles()])
-    if options.keys:
-        return key_listing(PlcProfile)
-    if options.export:
+        text = aligned([(name, find_profile(name).name) for name in shipped_profiles()])
+    elif options.keys:
+        text = key_listing(PlcProfile)
+    elif options.export:
         from coldloop_rig.plc_sizing.plc import cost_text, profile_of, read_cost
 
         cost = read_cost(options.export)
-        if options.took:
-            return profile_of(cost, options.took)
-        return cost_text(cost, find_profile(options.plc) if options.plc else None)
-    if options.certify:
+        plc = find_profile(options.plc) if options.plc and not options.took else None
+        text = profile_of(cost, options.took) if options.took else cost_text(cost, plc)
+    elif options.certify:
         from coldloop_rig.plc_sizing.intervals import certification_table
 
         if any(value is not None for value in (options.power, options.plc, options.period)):
             raise UsageError("--certify: uses the configured PLC; leave out --power, --plc and --updating-period")
         settings = common.configuration(options).settings
-        return certification_table(settings, options.certify, options.tolerance, options.confidence)
-    return _budget_tables(options)
+        text = certification_table(settings, options.certify, options.tolerance, options.confidence)
+    else:
+        text = _budget_tables(options)
+    sys.stdout.write(fitted(text, width()))
+    return 0
 
 
 def _budget_tables(options: argparse.Namespace) -> str:

@@ -52,9 +52,7 @@ def execute_up(options: argparse.Namespace) -> int:
     from coldloop_rig.runs.running import check_certificates, remarks
 
     effective = common.configuration(options)
-    common.refuse_ineffective(
-        effective, {**dict.fromkeys(common.PLACES, "give --port-base"), "session.autostart": "it begins a session"}
-    )
+    common.refuse_ineffective(effective, "give --port-base")
     check_certificates(effective.settings)
     told = [] if options.without else remarks(effective)
     optimizer = common.exported(options.optimizer, effective.settings)

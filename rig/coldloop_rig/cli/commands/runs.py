@@ -69,9 +69,7 @@ def _run_job(options: argparse.Namespace) -> "Job":
             Endpoint(host=end.host, port=end.port, tls=settings.rig.tls, timeout_s=QUIET_S) for end in options.attach
         ]
         return Job(as_attached(effective, ends), scenario, Way.ATTACHED, tuple(ends))
-    common.refuse_ineffective(
-        effective, {**dict.fromkeys(common.PLACES, common.OWN_PORTS), "session.autostart": "it begins a session"}
-    )
+    common.refuse_ineffective(effective, common.OWN_PORTS)
     if options.in_process:
         return Job(effective, scenario, Way.IN_PROCESS)
     check_certificates(settings)

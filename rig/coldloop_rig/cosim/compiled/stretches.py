@@ -1,7 +1,7 @@
 """Does stretches of ticks in compiled loops, on behalf of the three programs."""
 
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,9 +18,6 @@ from coldloop_plant.program import PlantProgram
 from coldloop_rig.cosim.compiled import loops, records
 from coldloop_rig.cosim.compiled.plants import CompiledPlant
 from coldloop_rig.results.recording import NO_STATION, STATION_COLUMNS, SampleBlock
-
-SHORTEST: Final = 6
-"""Ticks to an updating instant below which the programs are as quick."""
 
 
 class Stretch(NamedTuple):
@@ -83,8 +80,8 @@ class CompiledStretches:
         first, instant = program.tick, program.player.next_update_tick
         if first < self._pause_until or not program.is_ordinary:
             return None
-        if not self._updates_too and (program.awaiting_sequence or instant - first < SHORTEST):
-            return None
+        if not self._updates_too and (program.awaiting_sequence or instant - first < 6):
+            return None  # fewer ticks to the updating instant are as quick in the programs
         until = int(min(until, (first // records.BLOCK_TICKS + 1) * records.BLOCK_TICKS, program.alarms.next_report))
         for slot, sequence in enumerate(program.player.sequences):
             if sequence is not None:
