@@ -235,7 +235,7 @@ def test_modes_are_told_stretch_by_stretch() -> None:
     store = TrendStore(COLD_BOX, 3600)
     for tick, mode in enumerate([1, 1, 1, 3, 3, 1]):
         store.add(process(tick), mode)
-    assert [(one.start, one.end, one.mode) for one in store.modes(0, 10)] == [
+    assert [(one.start, one.end, one.value) for one in store.modes(0, 10)] == [
         (0, 0.75, 1),
         (0.75, 1.25, 3),
         (1.25, 1.25, 1),
