@@ -83,7 +83,6 @@ class OdeExport(tree.Export):
         return self._filled("problem.c", body)
 
     def _golden(self, vectors: Sequence[GoldenVector]) -> dict[str, str]:
-        """Return the files of the golden vectors: inputs and results of all in a row."""
         stacked = {
             **{name: np.array([getattr(each.problem, name) for each in vectors]) for name in PER_PROBLEM},
             "guess": np.array([each.guess for each in vectors]),
@@ -160,7 +159,6 @@ class OptimizerExport(tree.Export):
                 "stack, arrays and numbers": max(stack(each, 4) for each in self.kernels.entries)}  # fmt: skip
 
     def _constants(self) -> dict[str, str]:
-        """Return the parts of the files of constants."""
         kernels, initial = self.kernels, self._initial
         tables = {
             f"OF_{of.upper()}": ",\n".join(f"    {text}" for name, text in initial.items() if name.startswith(f"{of}["))

@@ -122,11 +122,10 @@ class Printer(tree.TreePrinter):
         self._constant = {each.name for each in function.parameters if each.name not in function.written}
         unused = [f"    (void){identifier(each.name)};" for each in function.parameters
                   if each.name not in function.used]  # fmt: skip
-        body = "".join(f"{line}\n" for line in (*unused, *self.body(function.body)))
+        body = "".join(f"{line}\n" for line in (*unused, *self._body(function.body)))
         return f"/* {tree.place_of(function.source)} */\n{storage}{self.signature(function)} {{\n{body}}}\n"
 
-    def statement(self, statement: tree.Statement) -> Iterator[str]:  # noqa: C901, PLR0912 one case a statement
-        """Yield the lines of a statement."""
+    def _statement(self, statement: tree.Statement) -> Iterator[str]:  # noqa: C901, PLR0912 one case a statement
         match statement:
             case tree.Declare(variable, value):
                 name, kind = identifier(variable.name), variable.type
@@ -161,16 +160,16 @@ class Printer(tree.TreePrinter):
                     yield f"const int32_t stop_{self._loops} = {end};"
                     end = f"stop_{self._loops}"
                 sign, change = ("<", f"{name} += {step}") if step > 0 else (">", f"{name} -= {-step}")
-                yield from self.nested(f"for (int32_t {name} = {first}; {name} {sign} {end}; {change}) {{", body, "}")
+                yield from self._nested(f"for (int32_t {name} = {first}; {name} {sign} {end}; {change}) {{", body, "}")
             case tree.While(condition, body):
-                yield from self.nested(f"while ({self._bare(condition)}) {{", body, "}")
+                yield from self._nested(f"while ({self._bare(condition)}) {{", body, "}")
             case tree.If():
                 head, other = "if", tuple[tree.Statement, ...]((statement,))
                 while len(other) == 1 and isinstance(other[0], tree.If):
                     yield f"{head} ({self._bare(other[0].condition)}) {{"
-                    yield from self.body(other[0].body)
+                    yield from self._body(other[0].body)
                     head, other = "} else if", other[0].other
-                yield from self.nested("} else {", other, "}") if other else "}"
+                yield from self._nested("} else {", other, "}") if other else "}"
             case tree.Return(value):
                 yield f"return {self._bare(value)};" if value else "return;"
 
@@ -178,8 +177,7 @@ class Printer(tree.TreePrinter):
         """Return the index of an element in its array."""
         return bare(super().place(element))
 
-    def other(self, expression: Expression) -> str:  # noqa: PLR0911 one case a kind of expression
-        """Return a name, a part of something, a choice, a conversion or a call."""
+    def _other(self, expression: Expression) -> str:  # noqa: PLR0911 one case a kind of expression
         match expression:
             case tree.Field(_, record, name):
                 pointed = isinstance(record, Name) and record not in self._made
@@ -200,7 +198,6 @@ class Printer(tree.TreePrinter):
         return identifier(expression.name)
 
     def _bare(self, expression: Expression) -> str:
-        """Return an expression that stands alone."""
         return bare(self.expression(expression))
 
     def _call(self, function: Function, arguments: tuple[Expression, ...], results_from: int) -> str:

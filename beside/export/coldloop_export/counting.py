@@ -108,11 +108,10 @@ class _Printer(tree.TreePrinter):
         numbers = "".join(f"{each.name}, " for each in function.results if isinstance(each.type, Kind))
         self._end = f"return ({numbers})"
         yield f"def {function.name}({', '.join(each.name for each in (*function.parameters, *arrays))}):"
-        yield from self.body(function.body)
+        yield from self._body(function.body)
         yield f"    {self._end}"
 
-    def statement(self, statement: Statement) -> Iterator[str]:  # noqa: C901 one case a statement
-        """Yield the lines of a statement."""
+    def _statement(self, statement: Statement) -> Iterator[str]:  # noqa: C901 one case a statement
         if count := operations_in(statement):
             yield f"_n[0] += {count}"
         match statement:
@@ -138,13 +137,13 @@ class _Printer(tree.TreePrinter):
                 yield f"{to}{function.name}({self._listed(passed)})"
             case For(variable, start, stop, step, body):
                 yield f"for {variable.name} in range({self._listed((start, stop))}, {step}):"
-                yield from self.body(body)
+                yield from self._body(body)
             case tree.While(condition, body):
                 yield f"while {self._conditional(condition)}:"
-                yield from self.body(body)
+                yield from self._body(body)
             case tree.If(condition, body, other):
-                yield from self.nested(f"if {self.expression(condition)}:", body, "    pass")
-                yield from self.nested("else:", other, "    pass")
+                yield from self._nested(f"if {self.expression(condition)}:", body, "    pass")
+                yield from self._nested("else:", other, "    pass")
             case Return(value):
                 yield f"return {self.expression(value)}" if value else self._end
 
@@ -337,7 +336,6 @@ def counted_longest(kernels: GuardKernels) -> int:
 
 
 def _guard_state(limits: Limits) -> GuardState:
-    """Return a state of the output guard whose rows are arrays."""
     state = beginning(limits, limits.low)
     for name in ("applied", "anchor", "coming", "moves", "before"):
         setattr(state, name, np.array(getattr(state, name)))

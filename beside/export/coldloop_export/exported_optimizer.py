@@ -155,7 +155,7 @@ def manifest_of(settings: Settings, texts: Mapping[str, str], cost: Mapping[str,
 
 def _identity(settings: Settings) -> dict[str, Any]:
     shown = selected(settings, SHOWN)
-    del shown["program.updating_period_s"]  # the session's
+    del shown["optimizer_plc.program.updating_period_s"]  # the session's
     return {
         "model_digest": load_model(settings.model.file).digest,
         "register_maps": [each.digest for each in maps_of(settings.process)[1:]],

@@ -53,7 +53,6 @@ class Source:
             raise self.refusal(node, why)
 
     def _assigned(self) -> tuple[set[str], set[str]]:
-        """Return the variables, and those that are assigned in one place."""
         names = [node.id for node in ast.walk(self.definition) if isinstance(node, ast.Name)
                  and isinstance(node.ctx, ast.Store)]  # fmt: skip
         parameters = {argument.arg for argument in self.definition.args.args}

@@ -68,8 +68,8 @@ def export_plc(
         UsageError: The folder is not empty or cannot be written to, or no input moves in so many ticks.
     """
     refuse_taken(folder)
-    if score:
-        require_compiler()
+    if score and not (shutil.which("gcc") and shutil.which("readelf")):
+        raise UsageError("--score: needs gcc and readelf: on Debian, install gcc")
     if not settings.process.forecasts:
         golden.refuse(settings.optimizer_plc.program)
     texts = solver(target, golden.paper_settings(settings.model.file), ticks, profile)
@@ -286,12 +286,6 @@ class Flips(TypedDict):
     padding: dict[str, list[int]]
     """Bytes of padding in which a change was missed, by table: they lie between the members of a structure, and no code
 reads them."""
-
-
-def require_compiler() -> None:
-    """Check that programs can be compiled and looked into. Raises UsageError if there is no gcc, or no readelf."""
-    if not (shutil.which("gcc") and shutil.which("readelf")):
-        raise UsageError("--score: needs gcc and readelf: on Debian, install gcc")
 
 
 def scored(texts: Mapping[str, str]) -> dict[str, dict[str, Flips]]:

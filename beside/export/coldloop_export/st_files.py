@@ -19,7 +19,7 @@ from coldloop.process.declaration import Process
 from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Acknowledgement, Plan, SequenceHeader, SequenceRow, Update
 from coldloop.registers.declaration import Block as RegisterBlock
-from coldloop.registers.declaration import Register, RegisterMap
+from coldloop.registers.declaration import RegisterMap
 from coldloop_control_plc.output_limits import beginning
 from coldloop_export import golden, st_printer, tree
 from coldloop_export.golden import PER_PROBLEM, Array, GoldenCall, GoldenVector, OptimizerKernels, arrays_in, leaves
@@ -89,7 +89,6 @@ class StructuredTextExport(tree.Export):
         }
 
     def _golden(self, number: int, vector: GoldenVector) -> str:
-        """Return the block that copies a golden vector to where the self-test has it."""
         arrays = arrays_in(vector)
         kinds = {name: self.printer.array_type(scalar_of(values), values.size) for name, values in arrays.items()}
         constants = {
@@ -184,7 +183,6 @@ class OptimizerText(tree.Export):
         self.constants = Constants({path: values for path, values in constants.items() if path in used}, self.printer)
 
     def _clearing(self) -> Block:
-        """Return the block that makes the state zero."""
         body = tuple(zeroed(Name(kind, dotted(path))) if isinstance(kind, ArrayType)
                      else tree.Assign(Name(kind, dotted(path)), Literal(kind, 0)) for path, kind in self.state.items()
                      if path not in {FIXED_TICKS, JOBS})  # fmt: skip
@@ -234,7 +232,6 @@ class OptimizerText(tree.Export):
         return {**arrays, "sums": np.array(sums, np.int32)[:, None]}
 
     def _pages(self) -> Iterator[str]:
-        """Yield the blocks that copy a golden update to where the self-test has it."""
         arrays, length = self._arrays, self._page_length
         for number, first in enumerate(range(0, len(self.golden), length)):
             part = {name: values[first : first + length] for name, values in arrays.items()}
@@ -387,13 +384,11 @@ class GuardText(tree.Export):
         })  # fmt: skip
 
     def _passed(self, block: Block, variables: dict[str, str]) -> str:
-        """Return the arguments of a call in the interface."""
         names = interface_names(block, self.printer.type)
         return ", ".join(f"{names[each]} := {variables.get(each.name, each.name)}"
                          for each in (*block.inputs, *block.shared))  # fmt: skip
 
     def _value(self, block: Block) -> str:
-        """Return the name of the output that is a function's value."""
         return interface_names(block, self.printer.type)[Name(Kind.BOOL, VALUE)]
 
     def _self_test(self) -> str:
@@ -436,22 +431,12 @@ def rows(block: RegisterBlock) -> Iterator[tuple[str, ...]]:
     for name, registers in groupby(block.registers(), lambda each: each.name.partition(".")[0]):
         listed = list(registers)
         last = listed[-1].address + listed[-1].kind.words - 1
+        units = {each.unit for each in listed}
+        array = f", `[0]` to `[{len(listed) - 1}]`" if len(listed) > 1 else ""
+        variable = OTHERS.get((block.name, name), f"`{INSTANCES[block.record]}.{name}`{array}")
         yield (block.name, f"{listed[0].address} to {last}" if last > listed[0].address else str(last),
-               listed[0].kind.label, units(listed), name, variable(block, name, len(listed)))  # fmt: skip
-
-
-def variable(block: RegisterBlock, name: str, length: int) -> str:
-    """Return the variable of a field."""
-    if name in {"crc", "model_digest"}:
-        return "of the client"
-    array = f", `[0]` to `[{length - 1}]`" if length > 1 else ""
-    return OTHERS.get((block.name, name), f"`{INSTANCES[block.record]}.{name}`{array}")
-
-
-def units(registers: list[Register]) -> str:
-    """Return the unit of all of them, if they have one."""
-    found = {each.unit for each in registers}
-    return found.pop() if len(found) == 1 else ""
+               listed[0].kind.label, units.pop() if len(units) == 1 else "", name,
+               "of the client" if name in {"crc", "model_digest"} else variable)  # fmt: skip
 
 
 # -- PLCopen XML -------------------------------------------------------------------------------------------------------
@@ -522,7 +507,6 @@ def _pou(found: re.Match[str]) -> ET.Element:
 
 
 def _variables(tag: str, declared: str, *, constant: bool, **attributes: str) -> ET.Element:
-    """Return declarations as a list of variables."""
     listed = ET.Element(tag, attributes | ({"constant": "true"} if constant else {}))
     for name, kind, value, note in _DECLARATION.findall(declared):
         variable = ET.SubElement(listed, "variable", name=name)
@@ -539,7 +523,6 @@ def _type(name: str) -> ET.Element:
 
 
 def _value(text: str) -> ET.Element:
-    """Return a number, or an array of numbers."""
     if not text.startswith("["):
         return ET.Element("simpleValue", value=text)
     array = ET.Element("arrayValue")
@@ -566,5 +549,4 @@ def _configuration(text: str) -> ET.Element:
 
 
 def _write(element: ET.Element, text: str) -> None:
-    """Write text into an element as a paragraph."""
     ET.SubElement(element, "p", xmlns=XHTML).text = text

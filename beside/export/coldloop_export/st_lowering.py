@@ -57,16 +57,6 @@ def dotted(path: Path) -> str:
     return ".".join(path)
 
 
-def located(kind: tree.Type, path: Path) -> Place:
-    """Return the value at a path."""
-    if isinstance(kind, tree.RecordType):
-        return Record(path)
-    if isinstance(kind, tree.RowsType):
-        return Rows(path, kind.length)
-    name = Name(kind, dotted(path))
-    return Part(name, ZERO) if isinstance(kind, ArrayType) else name
-
-
 def member(entry: Entry, kind: Kind, name: str) -> Name | Element:
     """Return a number of a record of numbers."""
     rows, path = entry.rows, dotted((*entry.rows.path, name))
@@ -80,8 +70,13 @@ def part_of(place: Place, name: str, kind: tree.Type) -> Place:
     match place:
         case Made(parts):
             return dict(parts)[name]
+        case Record(path) if isinstance(kind, tree.RecordType):
+            return Record((*path, name))
+        case Record(path) if isinstance(kind, tree.RowsType):
+            return Rows((*path, name), kind.length)
         case Record(path):
-            return located(kind, (*path, name))
+            named = Name(kind, dotted((*path, name)))
+            return Part(named, ZERO) if isinstance(kind, ArrayType) else named
         case Entry((path, length), at) if isinstance(kind, tree.RecordType):
             return Entry(Rows((*path, name), length), at)
         case Entry() if isinstance(kind, Kind):

@@ -249,9 +249,10 @@ class Steps:
         count = self._at_once(statements)
         done = self.pausing.charged(statements[:count])
         rest = statements[count:]
+        decided = operations_in(rest[0].condition) if rest and isinstance(rest[0], If) else 0
         if not rest:
             leading: tuple[Statement, ...] = (goto(after),)
-        elif self._is_at_once(rest[0]) or (count and self._decided(statements[: count + 1]) > PIECE):
+        elif self._is_at_once(rest[0]) or (count and self.pausing.bound(statements[:count]) + decided > PIECE):
             leading = (goto(self.entry(rest, after)),)
         else:
             leading = tuple(self._cut(rest[0], rest[1:], after))
@@ -270,11 +271,6 @@ class Steps:
             if bound > PIECE or not self._is_at_once(statement):
                 return place
         return len(statements)
-
-    def _decided(self, statements: Sequence[Statement]) -> float:
-        """Return the operations of a piece up to the decision that is the last of the statements, if it is one."""
-        decision = operations_in(statements[-1].condition) if isinstance(statements[-1], If) else 0
-        return self.pausing.bound(statements[:-1]) + decision
 
     def _is_at_once(self, statement: Statement) -> bool:
         return not may_return(statement) and self.pausing.bound((statement,)) <= PIECE

@@ -178,7 +178,7 @@ class StructuredTextPrinter(tree.TreePrinter):
         outputs = self._declared([*block.outputs, *(each for each in block.variables if each.name in notes)])
         outside = {global_name(path): self.type(self.globals[path]) for path in block.constants}
         variables = self._declared([each for each in block.variables if each.name not in notes])
-        body = [*self.body(block.body)]
+        body = [*self._body(block.body)]
         variables |= {self._instance(each): block_name(each) for each in block.called}
         if self._uses_literals:
             outside[TABLE] = f"{TABLE}_table"
@@ -190,11 +190,8 @@ class StructuredTextPrinter(tree.TreePrinter):
         ])  # fmt: skip
 
     def _declared(self, names: Iterable[Name]) -> dict[str, str]:
-        return {self._local(each): self.type(each.type) + self._noted(each) for each in names}
-
-    def _noted(self, name: Name) -> str:
-        note = self._notes.get(name.name)
-        return f" (* {note} *)" if note else ""
+        notes = {name: f" (* {note} *)" for name, note in self._notes.items()}
+        return {self._local(each): self.type(each.type) + notes.get(each.name, "") for each in names}
 
     def _local(self, name: Name) -> str:
         """Return the name of a variable; those of one name and type are one variable."""
@@ -203,8 +200,7 @@ class StructuredTextPrinter(tree.TreePrinter):
     def _instance(self, block: Block) -> str:
         return self._names(block, f"do_{block.name}")
 
-    def statement(self, statement: Statement) -> Iterator[str]:  # noqa: C901 one case a statement
-        """Yield the lines of a statement."""
+    def _statement(self, statement: Statement) -> Iterator[str]:  # noqa: C901 one case a statement
         match statement:
             case tree.Assign(target, value):
                 yield f"{self.expression(target)} := {self.expression(value)};"
@@ -216,30 +212,29 @@ class StructuredTextPrinter(tree.TreePrinter):
                 paused = interface_names(call.block, self.type)[busy]
                 yield f"IF (NOT {self._instance(call.block)}.{paused}) THEN"
                 yield from ("    " + line for line in self._taken(call))
-                yield from self.body(following)
+                yield from self._body(following)
                 yield "END_IF;"
             case tree.Switch(number, cases):
                 yield f"CASE {self._local(number)} OF"
                 for case, body in cases:
                     yield f"    {case}:"
-                    yield from (f"    {line}" for line in self.body(body))
+                    yield from (f"    {line}" for line in self._body(body))
                 yield "END_CASE;"
             case tree.Count(variable, first, last, step, body):
                 by = f" BY {step}" if step != 1 else ""
                 bounds = f"{self.expression(first)} TO {self.expression(last)}{by}"
-                yield from self.nested(f"FOR {self._local(variable)} := {bounds} DO", body, "END_FOR;")
+                yield from self._nested(f"FOR {self._local(variable)} := {bounds} DO", body, "END_FOR;")
             case tree.While(condition, body):
-                yield from self.nested(f"WHILE {self.expression(condition)} DO", body, "END_WHILE;")
+                yield from self._nested(f"WHILE {self.expression(condition)} DO", body, "END_WHILE;")
             case tree.If(condition, body, other):
-                yield from self.nested(f"IF {self.expression(condition)} THEN", body, "ELSE" if other else "END_IF;")
+                yield from self._nested(f"IF {self.expression(condition)} THEN", body, "ELSE" if other else "END_IF;")
                 if other:
-                    yield from self.body(other)
+                    yield from self._body(other)
                     yield "END_IF;"
             case tree.Return():
                 yield "RETURN;"
 
     def _call(self, call: Call) -> Iterator[str]:
-        """Yield a call with its arguments by name, and the assignments of what it puts out."""
         instance, inside = self._instance(call.block), interface_names(call.block, self.type)
         passed = [f"{inside[each]} := {self.expression(value)}" for each, value in call.arguments]
         yield f"{instance}({'' if passed else ');'}"
@@ -247,12 +242,10 @@ class StructuredTextPrinter(tree.TreePrinter):
         yield from self._taken(call)
 
     def _taken(self, call: Call) -> Iterator[str]:
-        """Yield the assignments of what a call puts out."""
         instance, inside = self._instance(call.block), interface_names(call.block, self.type)
         yield from (f"{self._local(variable)} := {instance}.{inside[output]};" for variable, output in call.results)
 
-    def other(self, expression: tree.Expression) -> str:
-        """Return a name or a conversion."""
+    def _other(self, expression: tree.Expression) -> str:
         match expression:
             case Name(_, name):
                 path = tuple(name.split("."))
@@ -342,7 +335,6 @@ class Constants:
                                                         for values in self.values.values())]  # fmt: skip
 
     def _sizes(self) -> list[int]:
-        """Return the bytes of each one; first those of the literals."""
         return self._weighed(4 if self.printer.single else 8, 4)
 
     def bytes(self) -> int:
@@ -410,7 +402,6 @@ class Constants:
         }  # fmt: skip
 
     def _item(self, part: int, name: str, values: Array | None) -> str:
-        """Return the case of the self-test that reads an element of a constant."""
         pad = " " * 20
         if values is not None and values.dtype.kind == "b":
             read = f"IF {name} THEN\n{pad}    item := 1;\n{pad}ELSE\n{pad}    item := 0;\n{pad}END_IF;"

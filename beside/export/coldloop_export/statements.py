@@ -100,7 +100,6 @@ class KernelReader(CallReader):
         return statements
 
     def _several(self, target: ast.expr, value: ast.Call, kernel: Kernel) -> list[Statement]:
-        """Return the call of a kernel whose results go where they are to."""
         function, arguments = self.call(value, kernel)
         if function.value:
             if isinstance(target, ast.Tuple):
@@ -130,7 +129,6 @@ class KernelReader(CallReader):
         return []
 
     def _choice(self, target: ast.Name, value: ast.IfExp) -> list[Statement]:
-        """Return the decision between two new arrays; nothing where it is between numbers."""
         other = self.read(value.orelse) if isinstance(value.orelse, ast.Call) else None
         if not isinstance(other, Elementwise):
             return []

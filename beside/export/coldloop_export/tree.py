@@ -450,22 +450,20 @@ class TreePrinter:
         """Return a number with a point such that it is read back with the same bits."""
         raise NotImplementedError
 
-    def statement(self, statement: Statement) -> Iterator[str]:
-        """Yield the lines of a statement."""
+    def _statement(self, statement: Statement) -> Iterator[str]:
         raise NotImplementedError
 
-    def body(self, statements: Iterable[Statement]) -> Iterator[str]:
+    def _body(self, statements: Iterable[Statement]) -> Iterator[str]:
         """Yield the lines of statements, indented."""
         for statement in statements:
-            yield from (f"    {line}" for line in self.statement(statement))
+            yield from (f"    {line}" for line in self._statement(statement))
 
-    def nested(self, head: str, statements: Iterable[Statement], end: str) -> Iterator[str]:
-        """Yield the lines of statements between two others."""
+    def _nested(self, head: str, statements: Iterable[Statement], end: str) -> Iterator[str]:
         yield head
-        yield from self.body(statements)
+        yield from self._body(statements)
         yield end
 
-    def other(self, expression: Expression) -> str:
+    def _other(self, expression: Expression) -> str:
         """Return an expression that is not the same in every language."""
         raise NotImplementedError
 
@@ -483,7 +481,7 @@ class TreePrinter:
             case Operation(_, operator, operands):
                 kind = self.kinds[operands[0].type]  # type: ignore[index]
                 return spelt(self.operators, operator, map(self.expression, operands), kind=kind)
-        return self.other(expression)
+        return self._other(expression)
 
     def literal(self, value: float) -> str:
         """Return the element of the table that has this value."""

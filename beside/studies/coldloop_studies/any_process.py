@@ -78,7 +78,6 @@ def _variant_run(load: Load, variant: Variant) -> request.RunRequest:
 
 
 def _variants_figure(variants: tuple[Variant, ...], ratios: list[intervals.Interval], by_draw: Array) -> Figure:
-    """Draw a row for each variant: its mean with the interval, and each draw."""
     label = "geometric mean, 95 % interval"
     rows = {variant.name: ratio for variant, ratio in zip(variants[1:], ratios[1:], strict=True)}
     height_in = 1.2 + 0.35 * len(rows)

@@ -32,7 +32,6 @@ def _classical_runs(load: Load) -> dict[str, RunRequest]:
 
 
 def _classical(found: study.Found[str]) -> StudyResult:
-    """Compare closed-loop costs and bands."""
     result = StudyResult(("load", "case", "J_BF", "L1 outside (%)", "T5 outside (%)"), [], {})
     table = []
     for load, runs in found:
@@ -307,7 +306,6 @@ COLUMNS: Final = (
 
 
 def _robustness(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-    """Say what controllers hold; compare costs of policies with those of a fixed period."""
     result = StudyResult(COLUMNS, [], {})
     runs: dict[tuple[str, str], list[Indicators]] = {}
     for condition, name, load, request in _cases(options):

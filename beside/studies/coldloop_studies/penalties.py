@@ -248,7 +248,6 @@ def _penalties_requests(options: StudyOptions) -> list[RunRequest]:
 
 
 def _penalties(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-    """Compare the variants with the lowest cost, with converged qpOASES and with the paper's points."""
     found = paired_sums(options, outcomes)
     loops = {
         variant: np.array([outcomes[closed(load, variant)].indicators.J_BF for load in _closed_loads(options)])

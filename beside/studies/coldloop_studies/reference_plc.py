@@ -36,7 +36,6 @@ SIZES: Final = operations.dense_sizes(N, 94, 21)
 
 
 def _cholesky(_options: StudyOptions, _outcomes: Outcomes) -> StudyResult:
-    """Fit the curve and count."""
     times = reference.cholesky_times()
     curve = reference.reference_curve()
     here = np.array([_seconds_here(int(n)) for n in times.size])
@@ -110,7 +109,6 @@ def _remark(curve: reference.SpeedCurve, error: float) -> str:
 
 
 def _iterations(curve: reference.SpeedCurve) -> str:
-    """Return a table of iterations in 5 s against power."""
     tau = {
         "ODE (slot of 0.25 s)": 0.25,
         "ODE (counted dense)": _counted_s(curve, operations.ode(SIZES, ACTIVE.mean)),
@@ -146,7 +144,6 @@ INPUTS: Final = {"CV155": "%", "NCR22_A": "W", "CV156": "%"}
 
 
 def _single_precision(found: Found[str]) -> StudyResult:
-    """Compare costs and inputs."""
     result = StudyResult(("load", "J_BF double", "J_BF single", *(f"largest difference of {name} ({unit})"
                           for name, unit in INPUTS.items())), [], {})  # fmt: skip
     for load, runs in found:

@@ -35,7 +35,6 @@ COUPLING_SHOWN: Final = {"load": "load (W)", "P12": "HP (bar)", "P11": "LP (bar)
 
 
 def _coupling(found: Found[str]) -> StudyResult:
-    """Compare closed-loop costs, bands, updating periods and what the pressures do."""
     result = StudyResult(COUPLING_COLUMNS, [], {}, always_shown=True)
     for load, runs in found:
         alone, *_ = runs.values()
@@ -116,7 +115,6 @@ SHOWN: Final = {
 
 
 def _disturbances(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-    """Tabulate bands, pressures, modes and alarms of each run."""
     result = StudyResult(COLUMNS, [], {}, always_shown=True)
     for name, event in CASES.items():
         for load in _loads(event, options):
@@ -144,7 +142,6 @@ def _loads(event: Case, options: StudyOptions) -> list[Load]:
 
 
 def _runs(event: Case, load: Load) -> dict[tuple[str, str], RunRequest]:
-    """Return the run of each driver with each control of the station."""
     return {
         (driver, station): load.request(0.0, REFRIGERATOR, *event[1], *driving, *control, trace_ticks=TRACE_TICKS)
         for driver, driving in DRIVERS.items() for station, control in STATION.items()

@@ -292,7 +292,6 @@ def _comparison_requests(options: StudyOptions) -> list[RunRequest]:
 
 @np.errstate(divide="ignore", invalid="ignore")  # under a load that never steps nothing costs anything
 def _comparison(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-    """Compare costs with those of converged qpOASES, with the lowest there are, and with the paper's."""
     powers = np.array(_paper_powers(options))
     paired = open_loop(options, outcomes)
     tables: list[Table] = [paired.table(draw) for draw in range(len(paired.loads))]

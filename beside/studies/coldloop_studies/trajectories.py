@@ -269,7 +269,6 @@ COLUMNS: Final = ("load", "solver", "tau_u (s)", "E", "D", "share of load steps 
 
 
 def _trade_off(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-    """Average E and D over the events of each run."""
     periods = _periods(options)
     result = StudyResult(COLUMNS, [], {})
     curves: dict[str, list[list[tuple[float, float]]]] = {solver: [] for solver in SOLVERS}

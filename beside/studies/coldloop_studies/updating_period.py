@@ -79,7 +79,6 @@ def _updating_period_requests(options: StudyOptions) -> list[RunRequest]:
 
 
 def _updating_period(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-    """Rank fixed periods and rules in each hour."""
     result = StudyResult(COLUMNS, [], {})
     hours: dict[str, _Hour] = {}
     for load in loads(options, *options.hours):
@@ -158,7 +157,6 @@ class _Hour(NamedTuple):
 
 
 def _judge(result: StudyResult, which: str, hours: Mapping[str, _Hour]) -> None:
-    """Compute what the claims are judged by, over these hours."""
     some = list(hours.values())
     values = result.values
     grids = {"1 to 5 s": [h.nine() for h in some]}
