@@ -158,15 +158,11 @@ class Wiring:
     inputs: Sequence[str]
     outputs: Sequence[str]
     load: str | None
-    disturbances: Sequence[str]
-    """Others than the load."""
-    states: Sequence[str]
-    """Variables that are its states, if it shows them."""
-    start: Mapping[str, float]
-    """Start values of variables."""
+    disturbances: Sequence[str]  # Others than the load
+    states: Sequence[str]  # Variables that are its states, if it shows them
+    start: Mapping[str, float]  # Start values of variables
     steps_per_tick: int
-    rest_ticks: int = 0
-    """Ticks from its start until it rests at the operating point."""
+    rest_ticks: int = 0  # Ticks from its start until it rests at the operating point
 
 
 class FmuSimulation:

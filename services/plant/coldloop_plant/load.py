@@ -87,14 +87,12 @@ def telegraph(family: LoadFamily, mean_w: float) -> LoadProfile:
 
 def concatenated(hours: list[LoadProfile]) -> LoadProfile:
     """Return one-hour profiles one after the other."""
-    times: list[int] = []
-    watts: list[float] = []
+    steps: list[tuple[int, float]] = []
     for hour, profile in enumerate(hours):
         for time, load in zip(profile.times, profile.watts, strict=True):
-            if not watts or load != watts[-1]:
-                times.append(hour * HOUR_TICKS + time)
-                watts.append(load)
-    return LoadProfile(tuple(times), tuple(watts))
+            if not steps or load != steps[-1][1]:
+                steps.append((hour * HOUR_TICKS + time, load))
+    return LoadProfile(*zip(*steps, strict=True))
 
 
 def named_families(name: str) -> list[LoadFamily] | None:

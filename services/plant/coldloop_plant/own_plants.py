@@ -296,12 +296,9 @@ NAME: Final = r"[A-Za-z][A-Za-z0-9_]{0,31}"  # Pattern of the name of a signal o
 class Equations(Protocol):
     """Equations of a plant's class: dx/dt = f(x, u, w) and y = h(x, u, w), in physical units and seconds."""
 
-    states: Mapping[str, str]
-    """Name and unit of each state, in order."""
-    guess: Sequence[float]
-    """Start of the search for the operating point."""
-    steps_per_tick: int
-    """Steps of the integration in a tick."""
+    states: Mapping[str, str]  # Name and unit of each state, in order
+    guess: Sequence[float]  # Start of the search for the operating point
+    steps_per_tick: int  # Steps of the integration in a tick
 
     def derivatives(self, x: RealArray, u: RealArray, w: float | RealArray) -> RealArray | Sequence[float]:
         """Return dx/dt."""

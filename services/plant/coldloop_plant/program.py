@@ -29,10 +29,8 @@ class MeasurementNoise:
         ValueError: not one standard deviation and one bias per output, or one that is negative or not finite.
     """
 
-    deviations: tuple[float, ...]
-    """Standard deviation of each output, in its unit; shape (outputs,)."""
-    seed: int
-    """Seed of the PCG64 generator, 0 or more."""
+    deviations: tuple[float, ...]  # Standard deviation of each output, in its unit; shape (outputs,)
+    seed: int  # Seed of the PCG64 generator, 0 or more
     biases: tuple[float, ...] = ()
     """Bias of each output: what its reading shows too much, in its unit; shape (outputs,), or none."""
 

@@ -131,17 +131,13 @@ class RetainedPlantState(BaseModel, frozen=True, extra="forbid"):
     events: Annotated[int, Field(ge=0, lt=2**31)]
     generation: Annotated[int, Field(ge=1, lt=2**32)]
     holder: Count
-    session: Count
-    """0: none yet; the other fields are as configured."""
+    session: Count  # 0: none yet; the other fields are as configured
     pace: TimeBase
-    watchdog: Annotated[int, Field(ge=0, lt=2**16)]
-    """Its time-out, in ticks."""
-    times: tuple[Annotated[int, Field(ge=0, le=LAST_TICK)], ...]
-    """Ticks of the load's steps."""
+    watchdog: Annotated[int, Field(ge=0, lt=2**16)]  # Its time-out, in ticks
+    times: tuple[Annotated[int, Field(ge=0, le=LAST_TICK)], ...]  # Ticks of the load's steps
     watts: tuple[float, ...]
     seed: Count
-    program: dict[str, Any]
-    """Argument of `PlantProgram.resume`."""
+    program: dict[str, Any]  # Argument of `PlantProgram.resume`
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
