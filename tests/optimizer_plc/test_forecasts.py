@@ -17,7 +17,7 @@ from coldloop_optimizer_plc.qp.problem import condense, interpolation
 from coldloop_optimizer_plc.settings import ControlDesign, ProgramSettings
 
 DESIGN = ControlDesign()
-WEIGHTS = interpolation(DESIGN.decision_instants, np.arange(1.0, DESIGN.horizon + 1))
+WEIGHTS = interpolation(np.array(DESIGN.decision_instants, float), np.arange(1.0, DESIGN.horizon + 1))
 PARTS = (1, 3)
 """Last samples of two parts: of 5 s, and of 10 s."""
 

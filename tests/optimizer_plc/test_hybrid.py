@@ -15,7 +15,6 @@ from coldloop_optimizer_plc.solvers import (
     Answer,
     HybridMethod,
     Solver,
-    allowed_in,
     in_slots,
     is_far,
     iterations_in,
@@ -92,20 +91,20 @@ SLOT, INTERIOR = picoseconds(0.25), picoseconds(0.17)
 
 
 def test_iterations_never_take_longer_than_their_slots() -> None:
-    assert [iterations_in(slots, SLOT, INTERIOR) for slots in (0, 1, 2, 3, 4, 9, 19)] == [0, 1, 2, 4, 5, 13, 27]
-    assert [iterations_in(slots, SLOT, SLOT) for slots in range(25)] == list(range(25))
-    assert all(iterations_in(slots, SLOT, INTERIOR) * 0.17 <= slots * 0.25 + 1e-9 for slots in range(200))
+    assert iterations_in(np.array([0, 1, 2, 3, 4, 9, 19]), SLOT, INTERIOR).tolist() == [0, 1, 2, 4, 5, 13, 27]
+    assert iterations_in(np.arange(25), SLOT, SLOT).tolist() == list(range(25))
+    assert (iterations_in(np.arange(200), SLOT, INTERIOR) * 0.17 <= np.arange(200) * 0.25 + 1e-9).all()
 
 
 def test_a_time_that_is_no_decimal_fits_as_often_as_it_should() -> None:
-    assert iterations_in(1, picoseconds(1 / 3), picoseconds(1 / 6)) == 2
-    assert iterations_in(3, picoseconds(0.7), picoseconds(2.1)) == 1
+    assert iterations_in(np.array([1]), picoseconds(1 / 3), picoseconds(1 / 6)) == 2
+    assert iterations_in(np.array([3]), picoseconds(0.7), picoseconds(2.1)) == 1
     assert slots_begun(3, picoseconds(2.1), picoseconds(0.7)) == 1
 
 
 def passed(iterations: list[int], slots: list[int], tau_1_ps: int = INTERIOR) -> list[int]:
     """Return how many of the slots pass when a solver does so many iterations in them."""
-    allowed = allowed_in(np.array(slots), SLOT, tau_1_ps)
+    allowed = iterations_in(np.array(slots), SLOT, tau_1_ps)
     nothing = np.empty(0)
     answer = Answer(0.0, nothing, nothing, np.minimum(iterations, allowed), nothing)
     return in_slots(answer, np.array(slots), allowed, SLOT, tau_1_ps).iterations.tolist()
@@ -121,7 +120,7 @@ def test_slots_pass_as_long_as_there_is_something_to_do() -> None:
 
 @pytest.mark.usefixtures("compiles")
 def test_what_is_left_of_a_slot_counts_for_the_next_one() -> None:
-    allowed = allowed_in(np.arange(5), SLOT, INTERIOR)
+    allowed = iterations_in(np.arange(5), SLOT, INTERIOR)
     assert np.diff(allowed).tolist() == [1, 1, 2, 1]
     assert passed([99] * 5, [0, 1, 2, 3, 4]) == [0, 1, 2, 3, 4]
 

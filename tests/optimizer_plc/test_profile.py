@@ -31,7 +31,7 @@ def test_a_shifted_knot_reads_the_old_profile_later_and_the_last_value_behind_th
 
 
 def test_a_profile_is_constant_before_its_first_knot_and_meets_each_knot() -> None:
-    W = interpolation((3, 5, 9), np.array([1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 9.0, 12.0]))
+    W = interpolation(np.array([3.0, 5.0, 9.0]), np.array([1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 9.0, 12.0]))
     assert W.tolist() == [
         [1, 0, 0],
         [1, 0, 0],

@@ -207,8 +207,7 @@ def _by_quantity(settings: ProcessSettings, what: str, numbers: Sequence[float])
 
 
 def _members(names: tuple[str, ...], process: Process) -> list[str]:
-    groups = groups_of(process)
-    return [member for name in names for member in groups.get(name, (name,))]
+    return [member for name in names for member in groups_of(process).get(name, (name,))]
 
 
 SLOT_S = 0.25
@@ -232,20 +231,17 @@ class PlcBudget:
     def __init__(self, settings: BudgetSettings, tau_1_s: float) -> None:
         process = settings.process
         slots_s = settings.preparation_slots * (SLOT_S * process.share("preparation"))
+        self.longest_ticks = process.ticks_per_sample
+        """Longest updating period, a sampling period."""
         self.times = ComputingTimes(
             slots_s / settings.power, settings.preparation_s / settings.power, tau_1_s / settings.power,
-            process.tick_s, process.ticks_per_sample,
+            process.tick_s, self.longest_ticks,
         )  # fmt: skip
 
     @cached_property
     def ladder(self) -> tuple[int, ...]:
         """Updating periods that a rule chooses from, in ticks; q is the number of one, from 1."""
         return self.times.ladder()
-
-    @property
-    def longest_ticks(self) -> int:
-        """Longest updating period, a sampling period."""
-        return self.times.longest_ticks
 
     def q(self, ticks: int) -> int:
         """Return the number of the longest period of the ladder that is no longer than so many ticks; at least 1."""
@@ -275,11 +271,17 @@ class PlcBudget:
         return self.answer_after_s(1) <= ticks * self.times.tick_s
 
 
-class OdeSettings(ProcessSettings):
-    """Settings of the ODE-based solver."""
+class SolverSettings(ProcessSettings):
+    """Settings of a solver."""
 
     alpha: PositiveFloat = PENALTY_WEIGHT
-    """Penalty weight."""
+    """Weight of broken rows (paper, equation of the penalised cost); qpOASES, OSQP and DAQP know no penalty, and have
+    their answers judged with it."""
+
+
+class OdeSettings(SolverSettings):
+    """Settings of the ODE-based solver."""
+
     cost_scale: Annotated[float, Field(gt=0, le=1.0)] = 1e-4
     """The flow is that of cost_scale * J: the rule for the first step size is not scale invariant."""
     tolerance: PositiveFloat = 1.0
@@ -298,21 +300,17 @@ class OdeSettings(ProcessSettings):
     """Time of an iteration at P = 1, s (paper, section IV-D)."""
 
 
-class QpoasesSettings(ProcessSettings):
+class QpoasesSettings(SolverSettings):
     """Settings of throttled qpOASES."""
 
-    alpha: PositiveFloat = PENALTY_WEIGHT
-    """Weight that its answers are judged with; qpOASES itself knows no penalty."""
     tau_1_s: PositiveFloat = declared(lambda process: 0.475 * process.share("qpoases"))
     """120 us a recalculation, slowed down by 4000 (paper, section VI), are 0.48 s; with a slot of 0.25 s for the
     preparation the paper's 10 iterations in 5 s at P = 1 need this."""
 
 
-class OsqpSettings(ProcessSettings):
+class OsqpSettings(SolverSettings):
     """Settings of OSQP."""
 
-    alpha: PositiveFloat = PENALTY_WEIGHT
-    """Weight that its answers are judged with; not OSQP's relaxation."""
     rho: PositiveFloat = 10.0
     """Step size of the multipliers: with less, truncated answers are worse, with more, convergence is slower."""
     relaxation: Annotated[float, Field(ge=0.1, lt=2.0)] = 1.6
@@ -321,22 +319,18 @@ class OsqpSettings(ProcessSettings):
     """25,763 operations, dense, at 0.529 Mflop/s (`docs/budget.md`)."""
 
 
-class FastGradientSettings(ProcessSettings):
+class FastGradientSettings(SolverSettings):
     """Settings of the fast gradient method."""
 
-    alpha: PositiveFloat = PENALTY_WEIGHT
-    """Weight of broken rows (paper, equation of the penalised cost)."""
     adaptive_restart: bool = True
     """Whether the momentum is dropped when it points uphill."""
     tau_1_s: PositiveFloat = declared(lambda process: 0.03 * process.share("fast-gradient"))
     """14,811 operations, dense, at 0.529 Mflop/s are 0.028 s (`docs/budget.md`)."""
 
 
-class DaqpSettings(ProcessSettings):
+class DaqpSettings(SolverSettings):
     """Settings of DAQP."""
 
-    alpha: PositiveFloat = PENALTY_WEIGHT
-    """Weight that its answers are judged with; DAQP itself knows no penalty."""
     primal_tolerance: PositiveFloat = 1e-9
     """Violation of a row up to which it counts as kept."""
     tau_1_s: PositiveFloat = declared(lambda process: 4.75 * process.share("daqp"))
@@ -372,11 +366,7 @@ class Part(StrEnum):
 
 
 def made(part: Part, name: str, *given: object) -> Any:  # noqa: ANN401 the caller knows its protocol
-    """Return what the entry point of this name makes of what it is given.
-
-    Raises:
-        ConfigurationError: There is none, or it cannot be made.
-    """
+    """Return what the entry point of this name makes of what it is given, or raise as `loaded` does."""
     with in_its_name(part, name, "cannot be made: "):
         return loaded(part, name)(*given)
 
@@ -404,11 +394,9 @@ def in_its_name(part: Part, name: str, what: str = "") -> AbstractContextManager
     return foreign(called, "the optimiser ends here: mend it, or choose another", kind=ConfigurationError)
 
 
-class InteriorPointSettings(ProcessSettings):
+class InteriorPointSettings(SolverSettings):
     """Settings of the interior-point method."""
 
-    alpha: PositiveFloat = PENALTY_WEIGHT
-    """Weight of broken rows, as that of the ODE-based solver."""
     first_mu: PositiveFloat = 3.0
     """mu that the guess is put on the central path for, as a share of its J over the number of rows and variables: a
     guess that costs much is far from the optimum, and needs a path that begins far from the bounds."""

@@ -206,18 +206,24 @@ def take_update(c: Constants, rule: UpdatingRule, starts: Starts, m: OptimizerSt
 
 @kernel
 def follow(c: Constants, m: OptimizerState, latched: Latched) -> int:
-    """Find out what is played from an update on, and end the period before.
+    """Find out what is played from an update on, and end the period before, with all that led to an answer of none.
 
     Returns the q of the next one, `BY_THE_RULE`, `FIRST` or `AFTER_A_STEP`.
     """
     now, u, real = m.numbers[0], latched.u - c.estimator.u0, m.u.dtype.type
-    failed = now.solved and m.sent.numbers[0].length == 0
+    played, sent = m.playing.numbers[0], m.sent.numbers[0]
+    failed = now.solved and sent.length == 0
     if failed:
-        forget_failure(m)
+        now.sequences = max(now.sequences, sent.number)
+        now.guessed_before = now.delivered_before = real(np.inf)
+        now.planned = now.solved = False
+        m.rule[:] = real(0.0)
     elapsed = latched.tick - now.tick if now.planned else 0
     known = now.planned or latched.tick == 0  # a session begins at the operating point
-    if not (known and 0 <= elapsed <= LONGEST_GAP_TICKS and knows_what_is_played(m, latched.playing)):
-        begin_again(c, m, latched, u, failed and m.playing.numbers[0].number == latched.playing)
+    ours = played.length == 0 or played.number == latched.playing  # or the control PLC has begun none
+    ours = ours or (sent.length > 0 and sent.number == latched.playing)
+    if not (known and 0 <= elapsed <= LONGEST_GAP_TICKS and ours):
+        begin_again(c, m, latched, u, failed and played.number == latched.playing)
     elif 0 < elapsed != now.ticks:
         scheme.predict_played(c, m, elapsed)
     interrupted = now.planned and 0 < elapsed < now.ticks and 0 < c.load_step < abs(latched.load - now.load)
@@ -226,8 +232,8 @@ def follow(c: Constants, m: OptimizerState, latched: Latched) -> int:
     m.u[:] = u
     m.belief.predicted[m.belief.predicted.shape[0] - latched.ahead.shape[0] :] = latched.ahead
     if now.solved:
-        now.guessed_before, now.delivered_before = m.sent.numbers[0].hot_start, m.sent.numbers[0].delivered
-        now.sequences, now.solved = max(now.sequences, m.sent.numbers[0].number), False
+        now.guessed_before, now.delivered_before = sent.hot_start, sent.delivered
+        now.sequences, now.solved = max(now.sequences, sent.number), False
     now.efficiency = now.mismatch = now.contraction = real(1.0)  # nothing is known of how the period went
     now.gamma = real(0.0)
     if not now.planned:
@@ -235,24 +241,6 @@ def follow(c: Constants, m: OptimizerState, latched: Latched) -> int:
     if interrupted:
         return AFTER_A_STEP
     return BY_THE_RULE if in_time else now.q
-
-
-@kernel
-def forget_failure(m: OptimizerState) -> None:
-    """Forget all that led to an answer that was none: the next update is one without a past."""
-    now, real = m.numbers[0], m.u.dtype.type
-    now.sequences = max(now.sequences, m.sent.numbers[0].number)
-    now.guessed_before = now.delivered_before = real(np.inf)
-    now.planned = now.solved = False
-    m.rule[:] = real(0.0)
-
-
-@kernel
-def knows_what_is_played(m: OptimizerState, number: int) -> bool:
-    """Return whether the control PLC plays something of ours, or has not begun to."""
-    played, sent = m.playing.numbers[0], m.sent.numbers[0]
-    known: bool = played.length == 0 or played.number == number or (sent.length > 0 and sent.number == number)
-    return known
 
 
 @kernel

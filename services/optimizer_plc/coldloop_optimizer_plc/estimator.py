@@ -246,22 +246,18 @@ def check_detectability(prediction: PredictionModel) -> None:
     )
 
 
-def state_walks(prediction: PredictionModel, settings: EstimatorSettings) -> list[float]:
-    """Return the process noise of each state of the plant's model."""
+def walks_of(prediction: PredictionModel, settings: EstimatorSettings) -> Array:
+    """Return the process noise of the states, the constants among them, and of the load mismatch, shape (n + 1,)."""
     by_unit = {
         "Pa": settings.pressure_noise_pa, "m3": settings.volume_noise_m3, "K": settings.temperature_noise_k,
         "kg": settings.mass_noise_kg, "kg/s": settings.flow_noise_kg_s, "bar s": settings.integral_noise_bar_s,
     }  # fmt: skip
     units, states = prediction.model.state_units, prediction.process.states
     declared = [state.walk for state in states] + [None] * (len(units) - len(states))
-    return [by_unit[unit] if walk is None else walk for walk, unit in zip(declared, units, strict=True)]
-
-
-def walks_of(prediction: PredictionModel, settings: EstimatorSettings) -> Array:
-    """Return the process noise of the states, the constants among them, and of the load mismatch, shape (n + 1,)."""
+    of_states = [by_unit[unit] if walk is None else walk for walk, unit in zip(declared, units, strict=True)]
     constants = np.array([settings.disturbance_walk * one for one in settings.sensors] + [*settings.input_walk])
     chosen = constants[list(prediction.disturbances)]
-    return np.array([*state_walks(prediction, settings), *chosen, settings.load_walk_w])
+    return np.array([*of_states, *chosen, settings.load_walk_w])
 
 
 def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -> StationaryGains:

@@ -79,7 +79,7 @@ class OptimizerProgram:
                 "optimizer_plc.program.design: the problem at the operating point has no finite answer; where a mode"
                 " grows the horizon may be too long: shorten decision_instants"
             )
-        self.prediction()
+        self.predictor()()
         self.answered(late=False)
         self.plan(first._replace(update=1, tick=planned.next_update_tick, playing=sequence.header.number))
 
@@ -199,7 +199,7 @@ class OptimizerProgram:
         """Return what computes the expected result of the last profile, also after later updates."""
         header, sent = self.state.sent.numbers[0], self.state.sent
         if not header["length"]:
-            raise RuntimeError("call solve before prediction")
+            raise RuntimeError("call solve before predictor")
         update, first_tick, z = int(self.state.numbers[0]["update"]), int(header["first_tick"]), sent.z.copy()
         at = QpParameters(sent.x.copy(), header["w"], sent.u_before.copy())
 
@@ -212,10 +212,6 @@ class OptimizerProgram:
             return registers.Prediction(update, first_tick, y, u)
 
         return predict
-
-    def prediction(self) -> registers.Prediction:
-        """Return what the last profile is expected to lead to."""
-        return self.predictor()()
 
     def model_deviation(self) -> registers.ModelDeviation:
         """Return how the plant differs from the model, as the filter has estimated it at the last update."""

@@ -26,43 +26,38 @@ MEMORY: Final = 1
 
 
 class Observation(NamedTuple):
-    """Observation at t_{k+1} of the period that ends there; costs are positive (Assumption 1 of the paper)."""
+    """Observation at t_{k+1} of the period that ends there; costs are positive (Assumption 1 of the paper).
+
+    q is q(t_k), the number of the period in the ladder, period_s is t_{k+1} - t_k. effective_before is J_k, p(t_k) at
+    the state reached at t_k; effective is J_{k+1}, p(t_{k+1}) at the state reached at t_{k+1}. At the state predicted
+    for t_{k+1}, hot_start is J+_k, of the shifted profile, last_but_one that after all iterations but one, and
+    delivered Ĵ_{k+1}, after all iterations.
+    """
 
     q: int
-    """q(t_k), the number of the period in the ladder."""
     iterations: int
-    """Number of iterations in the period: for the increments per iteration."""
     period_s: float
-    """t_{k+1} - t_k."""
     effective_before: float
-    """J_k: p(t_k) at the state reached at t_k."""
     hot_start: float
-    """J+_k: the shifted profile at the state predicted for t_{k+1}."""
     last_but_one: float
-    """J after all iterations but one, at the predicted state."""
     delivered: float
-    """Ĵ_{k+1}: after all iterations, at the predicted state."""
     effective: float
-    """J_{k+1}: p(t_{k+1}) at the state reached at t_{k+1}."""
 
 
 class Assessment(NamedTuple):
-    """The quantities of Algorithm 1. `gamma` is the gradient whose sign decides; n are iterations, the paper's q."""
+    """The quantities of Algorithm 1. `gamma` is the gradient whose sign decides; n are iterations, the paper's q.
+
+    Efficiency is E^r, mismatch D^r, contraction K^r = E^r D^r; the increments are those of D^r, E^r, K^r and t_r over
+    Delta n, the last one infinite at K^r = 1, where the response time is.
+    """
 
     efficiency: float
-    """E^r."""
     mismatch: float
-    """D^r."""
     contraction: float
-    """K^r = E^r D^r."""
     mismatch_increment: float
-    """Delta D^r / Delta n."""
     efficiency_increment: float
-    """Delta E^r / Delta n."""
     contraction_increment: float
-    """Delta K^r / Delta n."""
     response_increment: float
-    """Delta t_r / Delta n; infinite at K^r = 1, where the response time is."""
     gamma: float
 
 

@@ -140,31 +140,20 @@ def predicted_indicators(
     outputs = maps.resting.copy()
     add_transposed_product(maps.of_z, z, outputs)
     add_transposed_product(maps.of_x, x, outputs)
-    j_cst = violation_cost(outputs, maps.of_w, w, maps.bands)
-    slackless = z.copy()
+    zero, count, slackless = z.dtype.type(0.0), maps.bands.shape[1], z.copy()
+    j_cst = zero
+    for first in range(0, outputs.shape[0], count):
+        for band in range(count):
+            y = outputs[first + band] + maps.of_w[first + band] * w
+            miss = max(y - maps.bands[1, band], zero) + max(maps.bands[0, band] - y, zero)
+            j_cst += maps.bands[2, band] * miss * miss
     for i in range(n_inputs, z.shape[0]):
-        slackless[i] = z.dtype.type(0.0)
+        slackless[i] = zero
     j_dev = quadratic_cost(qp.Phi, qp.phi, slackless) + qp.constant
-    excess, violation = row_excess(qp, z), z.dtype.type(0.0)
+    excess, violation = row_excess(qp, z), zero
     for r in range(excess.shape[0]):
         violation = max(violation, excess[r] / maps.row_gains[r])
     return ProfileCosts(j_dev, j_cst, violation)
-
-
-@kernel
-def violation_cost(outputs: Array, through_w: Array, w: float, bands: Array) -> float:
-    """Return the weighted squares of what outputs + through_w w miss their bands by.
-
-    Outputs (b N) are the b that have a band, in turn; bands (3, b) are low, high and weight.
-    """
-    zero, count = outputs.dtype.type(0.0), bands.shape[1]
-    total = zero
-    for first in range(0, outputs.shape[0], count):
-        for band in range(count):
-            y = outputs[first + band] + through_w[first + band] * w
-            miss = max(y - bands[1, band], zero) + max(bands[0, band] - y, zero)
-            total += bands[2, band] * miss * miss
-    return total
 
 
 CONTACT = 1e-7

@@ -39,14 +39,15 @@ def rounded(value: T, real: Real) -> T:
 
 
 class Columns(NamedTuple):
-    """A constant matrix A (n, k), stored so that A x is a sum of columns, the zeros at their ends left out."""
+    """A constant matrix A (n, k), stored so that A x is a sum of columns, the zeros at their ends left out.
+
+    transposed (k, n) has the columns of A as rows; first and end (k,) are the indices of the first element of each
+    column that is not zero, and of the one behind the last.
+    """
 
     transposed: Array
-    """Shape (k, n), the columns of A as rows."""
     first: Indices
-    """Index of the first element of each column that is not zero, shape (k,)."""
     end: Indices
-    """And the one behind the last, shape (k,)."""
 
 
 def by_columns(A: Array) -> Columns:

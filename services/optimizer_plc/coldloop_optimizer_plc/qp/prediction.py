@@ -46,17 +46,17 @@ class Transition(NamedTuple):
 
 
 class Ahead(NamedTuple):
-    """A state that stands for how much a disturbance will differ, in some samples of the horizon, from what it is."""
+    """A state that stands for how much a disturbance will differ, in some samples of the horizon, from what it is.
+
+    It has a place among the states; samples first to last are counted from 1. states (n,) and outputs (n_y,) are
+    changed by one unit of it in a sample.
+    """
 
     place: int
-    """Among the states."""
     first: int
-    """Sample, counted from 1."""
     last: int
     states: Array
-    """Change of the states by one unit of it in a sample, shape (n,)."""
     outputs: Array
-    """The same of the outputs, shape (n_y,)."""
 
 
 class PredictionModel:
@@ -242,46 +242,43 @@ another machine."""
 
 
 class Rest(NamedTuple):
-    """Values at rest with the level at its operating point, by the scaled inputs."""
+    """Values at rest with the level at its operating point, by the scaled inputs, without disturbances.
+
+    states (3, n_x + 1) are those and the load held, temperature (3,) that of the turbine's outlet.
+    """
 
     states: Array
-    """States and load held: as a map of the inputs, shape (3, n_x + 1). Disturbances are none."""
     temperature: Array
-    """Temperature of the turbine's outlet, shape (3,)."""
 
 
 class TargetSearch(NamedTuple):
-    """Constants of the search for targets, in the on-line floating-point type."""
+    """Constants of the search for targets, in the on-line floating-point type.
+
+    followed: whether there is a target other than the operating point. limited: whether it is known what can be held.
+    of_load: 1 where the load counts, 0 where only its mismatch does. held (3,): load that an input holds, W. cheapest
+    (3,): inputs that hold a W at the least cost. plane (3, 2): inputs that hold nothing, orthonormal in what they cost.
+    rows (4, 2): the inputs and the turbine's outlet on that plane. temperature (3,): of that outlet, by the inputs.
+    low, high (4,): bounds of inputs and outlet. margin: how far inside its band the rows of the outlet are, K.
+    constants (4,): indices of the states that are the biases of inputs and outlet, -1 is none. scale (4,): of these
+    biases, input_scale and 1. tolerance: for the violation of a bound. feed: index of the input that fills the bath;
+    kernels are shared by processes, and have no places of theirs in them.
+    """
 
     followed: bool
-    """Whether there is a target other than the operating point."""
     limited: bool
-    """Whether it is known what can be held."""
     of_load: float
-    """1 where the load counts, 0 where only its mismatch does."""
     held: Array
-    """Load that an input holds, W, shape (3,)."""
     cheapest: Array
-    """Inputs that hold a W at the least cost, shape (3,)."""
     plane: Array
-    """Inputs that hold nothing, orthonormal in what they cost, shape (3, 2)."""
     rows: Array
-    """The inputs and the turbine's outlet on that plane, shape (4, 2)."""
     temperature: Array
-    """Shape (3,)."""
     low: Array
-    """Low bounds of inputs and the turbine's outlet, shape (4,)."""
     high: Array
     margin: float
-    """How far inside its band the rows of the turbine's outlet are, K."""
     constants: NDArray[np.int64]
-    """Indices of the states that are the biases of inputs and the turbine's outlet, shape (4,); -1 is none."""
     scale: Array
-    """Scales of these biases: input_scale and 1, shape (4,)."""
     tolerance: float
-    """Tolerance for the violation of a bound."""
     feed: int
-    """Index of the input that fills the bath; kernels are shared by processes, and have no places of theirs in them."""
 
 
 def rest_of(prediction: PredictionModel, design: ControlDesign, bath: Bath) -> Rest:

@@ -20,19 +20,30 @@ from coldloop_optimizer_plc.qp.prediction import PredictionModel, rest_of, state
 from coldloop_optimizer_plc.settings import ControlDesign, PenaltySettings, Target
 
 
-def interpolation(knots: tuple[int, ...], at: Array) -> Array:
-    """Return the matrix (len(at), len(knots)) whose product with the knots' values is the profile at `at`."""
-    positions = np.asarray(knots, dtype=float)
-    clamped = np.clip(np.asarray(at, dtype=float), positions[0], positions[-1])
-    weights = np.zeros((len(clamped), len(positions)))
-    for row, position in enumerate(clamped):
-        right = min(int(np.searchsorted(positions, position, side="right")), len(positions) - 1)
+@kernel
+def interpolation(knots: Array, at: Array) -> Array:
+    """Return the matrix (instants, knots) whose product with the knots' values is the profile `at` some instants.
+
+    It has the floating-point type of the knots. Before the first knot and behind the last one values hold.
+    """
+    one, last = knots.dtype.type(1.0), knots.shape[0] - 1
+    weights = np.zeros((at.shape[0], last + 1), knots.dtype)
+    for row in range(at.shape[0]):
+        position, right = min(max(at[row], knots[0]), knots[last]), 0
+        while right < last and knots[right] <= position:
+            right += 1
         left = max(right - 1, 0)
-        span = positions[right] - positions[left]
-        share = (position - positions[left]) / span if span > 0 else 0.0
-        weights[row, left] += 1.0 - share
+        span = knots[right] - knots[left]
+        share = (position - knots[left]) / span if span > 0 else knots.dtype.type(0.0)
+        weights[row, left] += one - share
         weights[row, right] += share
     return weights
+
+
+@kernel
+def shift(knots: Array, periods: float) -> Array:
+    """Return the matrix that shifts a profile by `periods` sampling periods: the standard hot start."""
+    return interpolation(knots, knots + periods)
 
 
 @kernel
@@ -52,26 +63,6 @@ def shifted(S: Array, z: Array, n_inputs: int) -> Array:
                         result[start + width * new + i] += S[new, old] * z[start + width * old + i]
         start += width * knots
     return result
-
-
-@kernel
-def shift(knots: Array, periods: float) -> Array:
-    """Return the matrix that shifts a profile by `periods` sampling periods: the standard hot start.
-
-    It has the floating-point type of the knots. The value behind the horizon is the last knot's.
-    """
-    one, last = knots.dtype.type(1.0), knots.shape[0] - 1
-    S = np.zeros((last + 1, last + 1), knots.dtype)
-    for new in range(last + 1):
-        position, right = min(max(knots[new] + periods, knots[0]), knots[last]), 0
-        while right < last and knots[right] <= position:
-            right += 1
-        left = max(right - 1, 0)
-        span = knots[right] - knots[left]
-        share = (position - knots[left]) / span if span > 0 else knots.dtype.type(0.0)
-        S[new, left] += one - share
-        S[new, right] += share
-    return S
 
 
 @kernel
@@ -103,19 +94,16 @@ def write_inputs(weights: Array, z: Array, scale: Array, u0: Array, rate: Array,
 class Condensed(NamedTuple):
     """J_0 = z' Phi z + (phi_map' s)' z + s' constant_map s, and the constrained outputs of the N samples.
 
-    J_0 is about the state at rest and the inputs that keep it there under the estimated disturbances.
+    J_0 is about the state at rest and the inputs that keep it there under the estimated disturbances. Phi (n, n) has
+    the weights of the slacks; phi_map (n_x + 1, n), constant_map (n_x + 1, n_x + 1). outputs_z (N, bands, n) and
+    outputs_s (N, bands, n_x + 1) give the outputs with a band at the end of each sample, as deviations.
     """
 
     Phi: Array
-    """Shape (n, n), with the weights of the slacks."""
     phi_map: Array
-    """Shape (n_x + 1, n)."""
     constant_map: Array
-    """Shape (n_x + 1, n_x + 1)."""
     outputs_z: Array
-    """Outputs with a band at the end of each sample, as deviations, shape (N, bands, n)."""
     outputs_s: Array
-    """Shape (N, bands, n_x + 1)."""
 
 
 def condense(prediction: PredictionModel, design: ControlDesign, weights: Array) -> Condensed:
@@ -169,33 +157,31 @@ def transposed(M: Array) -> Array:
 
 
 class OutputMaps(NamedTuple):
-    """Maps from a profile and the parameters to the constrained outputs over the horizon of N samples."""
+    """Maps from a profile and the parameters to the b outputs with a band in turn, over the horizon of N samples.
+
+    resting (b N,) are those at the operating point; of_z (n, b N), of_x (n_x, b N), of_w (b N,). bands (3, b) are low,
+    high and weight of each, row_gains (m,) the factors that the rows of Gamma were multiplied by.
+    """
 
     resting: Array
-    """The b outputs with a band in turn at the operating point, shape (b N,)."""
     of_z: Array
-    """Shape (n, b N)."""
     of_x: Array
-    """Shape (n_x, b N)."""
     of_w: Array
-    """Shape (b N,)."""
     bands: Array
-    """Low, high and weight of each, shape (3, b)."""
     row_gains: Array
-    """Factors that the rows of Gamma were multiplied by, shape (m,)."""
 
 
 class Rows(NamedTuple):
-    """Rows of Gamma z <= gamma, multiplied by gains."""
+    """Rows of Gamma z <= gamma, Gamma (rows, n), multiplied by gains (rows,): 1 for the output of the larger rho.
+
+    bounds (rows,) are gamma at the operating point, with no input before; moved (n_x + 1 or inputs, rows) is its
+    derivative with respect to s = (x, w), or to the input before.
+    """
 
     Gamma: Array
-    """Shape (rows, n)."""
     bounds: Array
-    """gamma at the operating point, with no input before, shape (rows,)."""
     moved: Array
-    """Derivative of gamma with respect to s = (x, w), or to the input before, shape (n_x + 1 or inputs, rows)."""
     gains: Array
-    """Shape (rows,): 1 for the output of the larger rho."""
 
 
 def output_rows(condensed: Condensed, design: ControlDesign, weights: Array, y0: Array) -> Rows:
@@ -251,29 +237,27 @@ def rate_rows(design: ControlDesign, limits: InputLimits, penalties: PenaltySett
 
 
 class Maps(NamedTuple):
-    """Maps from the parameters to an instance; the state and the load are stacked as s = (x, w)."""
+    """Maps from the parameters to an instance; the state and the load are stacked as s = (x, w).
+
+    phi (n_s, n), constant (n_s, n_s), outputs (n_s, 56), rate_before (3, 38). rate_first is 1.0 for the rows of the
+    interval before the first knot; first_rate are the rates of the inputs, scaled, where they bound the first knot as a
+    box, infinite where they do not. rest (3, n_s) is s at rest by the target, scaled inputs, holding (3, n) 2 Phi times
+    a profile that holds an input: (0, n_s) and (0, n) where the target is the operating point.
+    """
 
     phi: Array
-    """Shape (n_s, n)."""
     constant: Array
-    """Shape (n_s, n_s)."""
     outputs: Array
-    """Shape (n_s, 56)."""
     output_bounds: Array
     rate_bounds: Array
     rate_first: Array
-    """1.0 for the rows of the interval before the first knot."""
     rate_before: Array
-    """Shape (3, 38)."""
     low: Array
     high: Array
     first_rate: Array
-    """Rates of the inputs, scaled, where they bound the first knot as a box; infinite where they do not."""
     input_scale: Array
     rest: Array
-    """s at rest by the target, scaled inputs, shape (3, n_s); (0, n_s) where the target is the operating point."""
     holding: Array
-    """2 Phi times a profile that holds an input, shape (3, n), or (0, n)."""
 
 
 @kernel
@@ -351,16 +335,17 @@ class QuadraticProblem(NamedTuple):
 
 
 class QpParameters(NamedTuple):
-    """Parameters of an instance, as deviations from the operating point."""
+    """Parameters of an instance, as deviations from the operating point.
+
+    u_before is applied just before the first knot takes effect; the ticks elapsed since the update before matter when
+    the rate limit follows them. The cost is about the target, scaled inputs, shape (3,); None is the operating point.
+    """
 
     x: Array
     w: float
     u_before: Array
-    """Input applied just before the first knot takes effect."""
     elapsed_ticks: int = LONG_AGO
-    """Time since the update before; matters when the rate limit follows the elapsed time."""
     target: Array | None = None
-    """Scaled inputs, shape (3,), that the cost is about; None is the operating point."""
 
 
 class PredictiveProblem:
@@ -388,7 +373,8 @@ class PredictiveProblem:
         self.size = (design.n_inputs + design.n_slacks) * self.n_knots
         self._real = real
         self._n_constrained = len(prediction.constrained)
-        weights = interpolation(design.decision_instants, np.arange(1.0, design.horizon + 1))
+        instants, ticks = np.array(design.decision_instants, DOUBLE), range(self.longest_ticks + 1)
+        weights = interpolation(instants, np.arange(1.0, design.horizon + 1))
         y0 = prediction.model.y0[list(prediction.constrained)]
         condensed = condense(prediction, design, weights)
         outputs, rates = output_rows(condensed, design, weights, y0), rate_rows(design, limits, penalties)
@@ -413,7 +399,6 @@ class PredictiveProblem:
             stacked[:, n_states], np.array([design.output_low, design.output_high, design.violation_weight]),
             np.concatenate([outputs.gains, rates.gains]),
         )  # fmt: skip
-        instants, ticks = np.array(design.decision_instants, DOUBLE), range(self.longest_ticks + 1)
         self.maps, self.predicted = rounded(maps, real), rounded(predicted, real)
         self.Phi, self.Gamma = rounded(condensed.Phi, real), rounded(np.vstack([outputs.Gamma, rates.Gamma]), real)
         self.knots, self.knots_to_samples = rounded(instants, real), rounded(weights, real)

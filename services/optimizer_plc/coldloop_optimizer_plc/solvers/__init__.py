@@ -41,18 +41,18 @@ ROUNDING = 1_000_000_000
 
 
 class HybridMethod(NamedTuple):
-    """Constants of the solver, the same for all problems."""
+    """Constants of the solver, the same for all problems; J has `floor` besides the constant of the problem.
+
+    slot_ps, ode_ps, interior_point_ps: a slot, and tau_1 of each of the two solvers.
+    """
 
     ode: ode.OdeMethod
     interior_point: interior_point.InteriorPointMethod
     switch: float
     floor: float
-    """Constant that J has besides that of the problem."""
     slot_ps: int
     ode_ps: int
-    """tau_1 of the ODE-based solver."""
     interior_point_ps: int
-    """tau_1 of the interior-point solver."""
 
 
 def hybrid_solver(settings: ProgramSettings) -> KernelSolver:
@@ -83,8 +83,8 @@ def is_far(switch: float, guessed: float, before: interface.Costs) -> bool:
 
 
 @kernel
-def iterations_in(slots: int, slot_ps: int, tau_1_ps: int) -> int:
-    """Return the iterations of `tau_1_ps` that fit into the time of some slots."""
+def iterations_in(slots: Counts, slot_ps: int, tau_1_ps: int) -> Counts:
+    """Return the iterations of `tau_1_ps` that fit into the time of each number of slots, shape (k,)."""
     return (slots * slot_ps + tau_1_ps // ROUNDING) // tau_1_ps
 
 
@@ -92,15 +92,6 @@ def iterations_in(slots: int, slot_ps: int, tau_1_ps: int) -> int:
 def slots_begun(iterations: int, slot_ps: int, tau_1_ps: int) -> int:
     """Return the slots that so many iterations need, the last one begun."""
     return -((slot_ps // ROUNDING - iterations * tau_1_ps) // slot_ps)
-
-
-@kernel
-def allowed_in(slots: Counts, slot_ps: int, tau_1_ps: int) -> Counts:
-    """Return the iterations that fit into each number of slots, shape (k,)."""
-    allowed = np.empty_like(slots)
-    for k in range(slots.shape[0]):
-        allowed[k] = iterations_in(slots[k], slot_ps, tau_1_ps)
-    return allowed
 
 
 @kernel
@@ -122,10 +113,10 @@ def solve_hybrid(
     """Return the answer of the chosen solver after each number of slots."""
     z, guessed, dt = ode.warm_start(c.ode.matrices, qp, guess, c.ode.flow)
     if is_far(c.switch, max(guessed + (qp.constant + c.floor), c.floor), before):
-        allowed = allowed_in(counts, c.slot_ps, c.interior_point_ps)
+        allowed = iterations_in(counts, c.slot_ps, c.interior_point_ps)
         answer = interior_point.solve(c.interior_point, qp, guess, allowed, before)
         return in_slots(answer, counts, allowed, c.slot_ps, c.interior_point_ps)
-    allowed = allowed_in(counts, c.slot_ps, c.ode_ps)
+    allowed = iterations_in(counts, c.slot_ps, c.ode_ps)
     answer = ode.follow(c.ode, qp, z, guessed, dt, allowed)
     return in_slots(answer, counts, allowed, c.slot_ps, c.ode_ps)
 

@@ -28,20 +28,17 @@ BOUND_MARGIN = 1.02
 
 
 class Momentum(NamedTuple):
-    """State of an iteration besides z."""
+    """State of an iteration besides z: the point (n,) at which the gradient is taken, and Nesterov's t_k (1,)."""
 
     extrapolated: Array
-    """Point at which the gradient is taken, shape (n,)."""
     t: Array
-    """Nesterov's sequence t_k, shape (1,)."""
 
 
 class FastGradientMethod(NamedTuple):
-    """Constants of the solver, the same for all problems."""
+    """Constants of the solver, the same for all problems; step sizes have shape (n,)."""
 
     matrices: Matrices
     steps: Array
-    """Step sizes, shape (n,)."""
     alpha: float
     adaptive_restart: bool
 

@@ -23,28 +23,25 @@ from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 
 
 class Costs(NamedTuple):
-    """Costs of the problem before, with constant and floor; infinite where there was none."""
+    """J+ of the guess and Jhat of the answer of the problem before, with constant and floor; infinite if none was."""
 
     guessed: float
-    """J+, of the guess."""
     delivered: float
-    """Jhat, of the answer."""
 
 
 class Answer(NamedTuple):
-    """Answer of a solver to a problem, after each of k counts of iterations; costs are without the constant."""
+    """Answer of a solver to a problem, after each of k counts of iterations.
+
+    guessed is the augmented cost of the guess inside the box, costs (k,) are those of the points (k, n) that would be
+    delivered, all without the constant. iterations (k,) were done, fewer than allowed when more would change nothing.
+    multipliers (m,) are those of the rows at the last point; (0,) of a penalty method, where they follow from it.
+    """
 
     guessed: float
-    """Augmented cost of the guess inside the box."""
     points: Array
-    """Points that would be delivered, shape (k, n)."""
     costs: Array
-    """Augmented costs of the points, shape (k,)."""
     iterations: NDArray[np.int64]
-    """Iterations done, shape (k,): fewer than allowed when more would change nothing."""
     multipliers: Array
-    """Multipliers of the rows at the last point, shape (m,); (0,) of a penalty method, whose multipliers follow from
-    the point."""
 
     @property
     def z(self) -> Array:

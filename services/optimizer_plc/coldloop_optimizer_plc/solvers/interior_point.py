@@ -37,45 +37,40 @@ FINEST = 100.0
 
 
 class Structure(NamedTuple):
-    """The constant matrices, variables in the order of elimination."""
+    """The constant matrices, variables in their order of elimination, which is `order` (n,).
+
+    The hessian is 2 Phi (n, n); columns (m, n) are those of each row of Gamma (m, n) that are not zero, rising, and -1.
+    """
 
     order: Indices
-    """Variables of the problem in the order of elimination, shape (n,)."""
     hessian: Array
-    """2 Phi, shape (n, n)."""
     Gamma: Array
-    """Shape (m, n)."""
     columns: Indices
-    """Columns of each row of Gamma that are not zero, rising, filled up with -1, shape (m, at most n)."""
 
 
 class Point(NamedTuple):
-    """Iterate of the method, in the order of elimination."""
+    """Iterate z (n,) in the order of elimination; multipliers of rows (m,) and bounds (n,), 0 where there is none."""
 
     z: Array
-    """Shape (n,)."""
     rows: Array
-    """Multipliers of the rows, shape (m,)."""
     low: Array
-    """Multipliers of the lower bounds, shape (n,)."""
     high: Array
-    """Multipliers of the upper bounds, shape (n,); 0 where there is none."""
 
 
 class InteriorPointMethod(NamedTuple):
-    """Constants of the solver, the same for all problems, in their floating-point type."""
+    """Constants of the solver, the same for all problems, in their floating-point type.
+
+    softness: of the rows, 1 / (2 alpha). size: number of variables and rows. finest: least mu worth a step.
+    """
 
     structure: Structure
     alpha: float
     softness: float
-    """Softness of the rows, 1 / (2 alpha)."""
     first_mu: float
     least_mu: float
     margin: float
     size: float
-    """Number of variables and rows."""
     finest: float
-    """mu below which there is nothing left to win."""
 
 
 def method_of(settings: InteriorPointSettings, problem: QuadraticProblem) -> InteriorPointMethod:
@@ -130,31 +125,6 @@ def add_columns(constant: Structure, weights: Array, result: Array) -> None:
 
 
 @kernel
-def descend(
-    c: InteriorPointMethod, qp: QuadraticProblem, point: Point, best: Array, rows: Array, cost: float, count: int
-) -> tuple[int, float, Point]:
-    """Take `count` steps from a point, or fewer once the products are as small as rounding.
-
-    `best` (n,), its cost and its multipliers `rows` (m,) are those of the cheapest point so far. Returns how many
-    steps were taken, the cost of `best`, and the point reached.
-    """
-    order = c.structure.order
-    phi, low, high = qp.phi[order], qp.low[order], qp.high[order]
-    for done in range(count):
-        point, moved = step(c.structure, phi, qp.gamma, low, high, point, c.softness, c.finest)
-        if not moved:
-            return done, cost, point
-        z = np.empty_like(best)
-        for i in range(z.shape[0]):
-            z[order[i]] = point.z[i]
-        reached = augmented_cost(qp, z, c.alpha)
-        if reached < cost:
-            cost = reached
-            best[:], rows[:] = z, point.rows
-    return count, cost, point
-
-
-@kernel
 def near(
     constant: Structure, gamma: Array, low: Array, high: Array, guess: Array, softness: float, mu: float, margin: float
 ) -> Point:  # fmt: skip
@@ -180,14 +150,11 @@ def near(
 
 
 class Distances(NamedTuple):
-    """How far a point is from what it must not cross; all positive. The softness of rows is 1 / (2 alpha)."""
+    """How far a point is from rows, w (m,), and bounds (n,), infinite where there is none: all are positive."""
 
     rows: Array
-    """w, shape (m,)."""
     low: Array
-    """Shape (n,)."""
     high: Array
-    """Shape (n,); infinite where there is no bound."""
 
 
 @kernel
@@ -346,11 +313,19 @@ def solve(
     guessed = augmented_cost(qp, best, c.alpha)
     mu = best.dtype.type(max(c.least_mu, c.first_mu / c.size * (guessed + qp.constant)))
     point = near(c.structure, qp.gamma, qp.low[order], qp.high[order], best[order], c.softness, mu, c.margin)
+    phi, low, high = qp.phi[order], qp.low[order], qp.high[order]
     points, costs = np.empty((counts.shape[0], best.shape[0]), best.dtype), np.empty(counts.shape[0], best.dtype)
-    iterations = np.empty_like(counts)
-    cost, done = guessed, 0
+    iterations, z = np.empty_like(counts), best.copy()
+    cost, done, moved = guessed, 0, True
     for k in range(counts.shape[0]):
-        more, cost, point = descend(c, qp, point, best, rows, cost, counts[k] - done)
-        done += more
+        while moved and done < counts[k]:
+            point, moved = step(c.structure, phi, qp.gamma, low, high, point, c.softness, c.finest)
+            if moved:
+                done += 1
+                z[order] = point.z
+                reached = augmented_cost(qp, z, c.alpha)
+                if reached < cost:
+                    cost = reached
+                    best[:], rows[:] = z, point.rows
         points[k], costs[k], iterations[k] = best, cost, done
     return Answer(guessed, points, costs, iterations, rows)

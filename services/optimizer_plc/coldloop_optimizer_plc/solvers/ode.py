@@ -33,7 +33,11 @@ STALLED_STEPS = 20
 
 
 class Flow(NamedTuple):
-    """Constants of the integration."""
+    """Constants of the integration: those of `OdeSettings`, and two more.
+
+    box: penalty weight of the box. longest: step size that is never exceeded, far below the largest number there is,
+    so that its products stay finite.
+    """
 
     alpha: float
     cost_scale: float
@@ -41,11 +45,9 @@ class Flow(NamedTuple):
     growth: float
     rejection: float
     box: float
-    """Penalty weight of the box."""
     look_ahead_rows: bool
     hold_at_bounds: bool
     longest: float
-    """Step size that is never exceeded, far below the largest number there is: its products stay finite."""
 
 
 def flow_in(settings: OdeSettings, penalties: PenaltySettings | None, real: Real) -> Flow:
