@@ -192,11 +192,10 @@ def fast_gradient_step(Phi: NDArray[np.float64], Gamma: NDArray[np.float64], gam
         counted(Phi), counted(np.ones(n)), counted(Gamma), counted(gamma), np.full(n, -1e9), np.full(n, 1e9), 0.0
     )
     z = counted(np.zeros(n))
-    momentum = fast_gradient.Momentum(z.copy(), counted(np.ones(1)))
     constant, steps = costs.matrices_of(qp), counted(np.full(n, 1e-6))
     Counted.done = 0
     method = fast_gradient.FastGradientMethod(constant, steps, Counted(1.0), adaptive_restart=True)  # type: ignore[arg-type]
-    fast_gradient.descend(method, qp, z, momentum, 1)
+    fast_gradient.descend(method, qp, z, z.copy(), counted(np.ones(1)), 1)
     return Counted.done
 
 

@@ -30,13 +30,12 @@ def signals_of(process: Process) -> tuple[str, ...]:
 
 
 def groups_of(process: Process) -> dict[str, tuple[str, ...]]:
-    """Return what `estimator.disturbances` calls all outputs, or inputs, that may have a bias.
+    """Return what `estimator.disturbances` calls all outputs, or inputs, that may have a bias: not L1, nor the heater.
 
-    Of the cold box no sensor tells a bias of L1 from liquid helium, nor one of the heater from the load.
+    No sensor of the cold box tells a bias of these from liquid helium, or from the load.
     """
-    return {
-        "outputs": process.constants, "inputs": tuple(one.name for one in process.inputs if one.has_constant)
-    }  # fmt: skip
+    inputs = tuple(one.name for one in process.inputs if one.has_constant)
+    return {"outputs": process.constants, "inputs": inputs}
 
 
 class Arithmetic(StrEnum):
@@ -372,11 +371,7 @@ def made(part: Part, name: str, *given: object) -> Any:  # noqa: ANN401 the call
 
 
 def loaded(part: Part, name: str) -> Any:  # noqa: ANN401 as above
-    """Return what the entry point of this name points at, a class or a function.
-
-    Raises:
-        ConfigurationError: There is none, or it cannot be imported.
-    """
+    """Return the class or function of an entry point; ConfigurationError: there is none, or it cannot be imported."""
     group = f"coldloop.{part}s"
     there = entry_points(group=group)
     if name not in there.names:

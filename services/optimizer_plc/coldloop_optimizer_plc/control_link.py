@@ -57,18 +57,12 @@ _PAUSES_S: Final = {_S.SEARCHING: 0.2, _S.OTHER_MASTER: 1.0, _S.WRONG_MODEL: 1.0
 
 
 class ControlLink:
-    """State and counters of the link; its changes are events of the journal.
-
-    Args:
-        holder: Number that this optimiser has given itself, 1 to 0xFFFFFFFF.
-        journal: Takes the events.
-        noted: Called after every event.
-    """
+    """State and counters of the link; its changes are events of the journal, and `noted` is called after each."""
 
     def __init__(self, holder: int, journal: Journal, noted: Callable[[], object]) -> None:
         self.state = _S.SEARCHING
         self.holder = holder
-        """Number that this optimiser has given itself."""
+        """Number that this optimiser has given itself, 1 to 0xFFFFFFFF."""
         self._counts = dict.fromkeys(("breaks", "damaged", "rejected", "interrupted"), 0)
         self._journal = journal
         self._tell = noted
@@ -111,8 +105,6 @@ class ControlLink:
             state = _S.OTHER_MASTER
         self._set(state, breaks=int(self.state in _UP), damaged=int(isinstance(error, DamagedAnswerError)))
 
-    # -- when to try again, and when to say so -------------------------------------------------------------------------
-
     def pause_s(self, now: float) -> float:
         """Return the real time from `now`, s, until the next attempt may begin."""
         return max(0.0, self._attempted_at + _PAUSES_S.get(self.state, 0.0) - now)
@@ -125,8 +117,6 @@ class ControlLink:
             self._logged_at.clear()
         self._logged_at[reason] = now
         return True
-
-    # -- transitions ---------------------------------------------------------------------------------------------------
 
     def go(self, state: ControlLinkState, **counts: int) -> None:
         """Go to a state that may follow, and add to counters: `rejected` sequences, computations `interrupted`."""
@@ -150,17 +140,8 @@ class ControlClient:
     """The control PLC, as the optimiser uses it.
 
     Every request raises `LinkError` when the link fails, and `RequestRefusedError` with code 6 when another optimiser
-    holds the lease.
-
-    Args:
-        register_map: Of the control PLC, for the process.
-        endpoint: Where it is.
-        link: Counts damaged answers, and of the steps of an introduction.
-        model_digest: Of our model.
-        model_name: Of our model, for messages.
-
-    Raises:
-        ConfigurationError: The files for TLS cannot be used.
+    holds the lease, the constructor ConfigurationError if the files for TLS cannot be used. The link counts damaged
+    answers; the name of our model is for messages.
     """
 
     def __init__(
@@ -184,23 +165,13 @@ class ControlClient:
         self._client.close()
 
     def reload_certificates(self) -> None:
-        """Start over with the present files for TLS: they may have been renewed.
-
-        Raises:
-            ConfigurationError: They cannot be used.
-        """
+        """Start over with the present files for TLS, which may be new ones; ConfigurationError: they cannot be used."""
         if self._endpoint.tls is not None:
             self._client.close()
             self._client = RegisterClient.at(self._map, self._endpoint)
 
-    # -- who is there --------------------------------------------------------------------------------------------------
-
     async def introduce(self) -> None:
-        """Connect, send our number and the digest of our model, and check that the control PLC has the same model.
-
-        Raises:
-            ModelFileError: It has another.
-        """
+        """Connect, send our number and our model's digest; ModelFileError: the control PLC has another model."""
         await self._client.connect(0.0)
         self._link.answered()
         if self._link.state is ControlLinkState.WRONG_MODEL:  # a heartbeat would keep the right optimiser out
@@ -239,8 +210,6 @@ class ControlClient:
         except ValueError:
             return None
 
-    # -- updates -------------------------------------------------------------------------------------------------------
-
     async def next_update(self, wanted: registers.AwaitUpdate) -> registers.Update:
         """Wait for an update; after `LONGEST_WAIT_S` return the last one there was, or an empty one."""
         patience_s = self._endpoint.timeout_s + LONGEST_WAIT_S
@@ -262,14 +231,10 @@ class ControlClient:
         """Give a sign of life; return which update is the newest."""
         return await self._again(lambda: self._client.exchange(self._heartbeat(), registers.LatchedUpdate))
 
-    # -- sequences -----------------------------------------------------------------------------------------------------
-
     async def deliver(self, sequence: InputSequence, plan: registers.Plan | None = None) -> registers.Verdict:
-        """Send a sequence, the header that commits it last; return the verdict of the control PLC.
+        """Send the answer to an update, the header that commits it last; return the verdict of the control PLC.
 
-        Args:
-            sequence: The answer to an update.
-            plan: Its updating period, where it has not been sent: it goes first, in the same segment.
+        A plan, its updating period where that has not been sent, goes first, in the same segment.
         """
         for attempt in range(1, ATTEMPTS + 1):
             answer = await self._again(lambda: self._commit(sequence, plan))
@@ -298,8 +263,6 @@ class ControlClient:
         answer = await self._again(lambda: self._client.read(registers.Acknowledgement))
         known = answer.number == sequence.header.number and answer.verdict in registers.Verdict.__members__.values()
         return registers.Verdict(answer.verdict) if known else None
-
-    # -- again ---------------------------------------------------------------------------------------------------------
 
     async def _again(self, request: Callable[[], Awaitable[T]]) -> T:
         """Make a request; a connection opened since the introduction introduces itself and tries again."""

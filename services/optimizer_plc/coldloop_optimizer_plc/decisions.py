@@ -132,8 +132,9 @@ def judge_played(c: Constants, m: OptimizerState, load: float, y: Array) -> floa
     now, played, real = m.numbers[0], m.playing.numbers[0], m.belief.x.dtype.type
     w = m.belief.numbers[0].w
     now.suspects = suspects_of(m.belief.readings)
-    if scheme.stands(c.turbine, y):
-        now.suspects += c.turbine.bit
+    turbine = c.turbine  # which stands; a reading that is NaN does not say so
+    if y[turbine.speed] < turbine.slow and y[turbine.before] < turbine.ratio * y[turbine.behind]:
+        now.suspects += turbine.bit
     idle = scheme.idle_valve(c.turbine, now.suspects)
     at = m.u[max(idle, 0)] / c.input_scale[max(idle, 0)]
     now.most_open = limit_of_feed(c, m, y)

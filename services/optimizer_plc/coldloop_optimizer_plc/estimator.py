@@ -87,8 +87,7 @@ def estimator_of(
 ) -> Estimator:  # fmt: skip
     """Return the estimator that the settings name; without `plausibility` whatever sensors show is plausible.
 
-    Raises:
-        ConfigurationError: The simulated state is used, and is not that of the model.
+    Raises ConfigurationError if the simulated state is used, and is not that of the model.
     """
     kalman = settings.kind is EstimatorKind.KALMAN
     check_detectability(prediction)
@@ -216,16 +215,14 @@ def predict(c: Estimator, belief: Belief, u: Array, ticks: int) -> None:
         A, B, F = c.steps.A[step - 1], c.steps.B[step - 1], c.steps.F[step - 1]
         belief.predicted[:] = la.respond(A, B, F, belief.predicted, u, b.w)
         if belief.apart.watch[0].age_s >= 0.0:
-            check.predict_apart(A, B, F, belief, u)
+            for which in range(belief.apart.x.shape[0]):
+                w = b.w - b.mismatch + belief.apart.mismatch[which]
+                belief.apart.predicted[which] = la.respond(A, B, F, belief.apart.predicted[which], u, w)
         ticks -= step
 
 
 def check_detectability(prediction: PredictionModel) -> None:
-    """Check that the measurements tell the disturbances from the states and from the load (Hautus' test at 1).
-
-    Raises:
-        ConfigurationError: They do not.
-    """
+    """Raise a ConfigurationError unless disturbances are observable beside states and load (Hautus' test at 1)."""
     if not prediction.disturbances:
         return
     n, step = prediction.n_estimated, prediction.sample
@@ -263,8 +260,7 @@ def walks_of(prediction: PredictionModel, settings: EstimatorSettings) -> Array:
 def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -> StationaryGains:
     """Return what the Kalman filter corrects with after every updating period; what is forecast it leaves alone.
 
-    Raises:
-        ConfigurationError: There is none for a period.
+    Raises ConfigurationError if there is none for a period.
     """
     nx = prediction.n_estimated
     C = np.ascontiguousarray(np.hstack([prediction.C[:, :nx], prediction.G]))
@@ -300,20 +296,10 @@ def gains_after(
 ) -> Array:  # fmt: skip
     """Return the stationary gains, transposed, beside the inverse covariances, shape (steps, n_y, n + 1 + n_y).
 
-    A recursion begins at the covariance of the period before, which has been checked.
-
-    Args:
-        steps: A (n, n) and F (n,) over so many ticks.
-        C: Outputs by states and load mismatch, shape (n_y, n + 1).
-        drift: Standard deviations of the process noise in a sampling period, shape (n + 1,).
-        sensors: Standard deviations of the measurements, shape (n_y,).
-        of_time: The latter are those of a mean over a sampling period.
-        periods: Steps of the Riccati recursion at most.
-        tick_s: Length of a tick, s.
-        sampling_period_s: That of the model, s.
-
-    Raises:
-        ConfigurationError: The recursion does not converge.
+    A recursion of so many `periods` at most begins at the covariance of the period before, which has been checked.
+    Raises ConfigurationError if it does not converge. `steps` are A (n, n) and F (n,) over so many ticks; C is that of
+    states and load mismatch, shape (n_y, n + 1). Standard deviations are `drift` (n + 1,), of the process noise in a
+    sampling period, and `sensors` (n_y,), of a measurement or, where `of_time`, of a mean over a sampling period.
     """
     P, n, found = np.diag(100.0 * drift**2), len(drift) - 1, []
     for ticks, (step, load) in steps.items():
@@ -338,7 +324,8 @@ def _converged(A: Array, C: Array, process: Array, sensors: Array, P: Array, per
         gain = stationary_gain(A, C, process, sensors, P, periods)
         if not np.isfinite(gain).all():
             return None
-        if is_stationary(A, C, process, sensors, P) and errors_decay(A, C, gain):
+        largest = np.abs(np.linalg.eigvals(A - gain @ (C @ A))).max()  # no error grows; one that none sees may stay
+        if is_stationary(A, C, process, sensors, P) and largest <= 1.0 + GROWTH:
             return gain
     return None
 
@@ -360,11 +347,6 @@ def _shown(A: Array, C: Array, process: Array, sensors: Array, P: Array) -> tupl
     before = A @ P @ A.T + np.diag(process)
     shown = before @ C.T
     return shown, np.sqrt(np.outer(np.diag(before), np.diag(C @ shown) + sensors))
-
-
-def errors_decay(A: Array, C: Array, gain: Array) -> bool:
-    """Return whether no error of the estimate grows with this gain (n, n_y); one that no sensor shows may stay."""
-    return bool(np.abs(np.linalg.eigvals(A - gain @ (C @ A))).max() <= 1.0 + GROWTH)
 
 
 def inverse_covariance(A: Array, C: Array, process: Array, sensors: Array, P: Array) -> Array:
@@ -402,8 +384,7 @@ def _measure(P: Array, C: Array, sensor: float, output: int, column: Array) -> N
 def stationary_gain(A: Array, C: Array, process: Array, sensors: Array, P: Array, periods: int) -> Array:
     """Return the stationary gain (n, n_y) by the Riccati recursion from P, which ends as the stationary covariance.
 
-    `process` (n) and `sensors` (n_y) are variances. Sensors are independent, so measurements are taken one after the
-    other and no matrix is inverted.
+    `process` (n) and `sensors` (n_y) are variances; independent measurements are taken in turn, nothing is inverted.
     """
     n, m = A.shape[0], C.shape[0]
     columns = np.zeros((m, n))
@@ -425,8 +406,7 @@ def stationary_gain(A: Array, C: Array, process: Array, sensors: Array, P: Array
 def _keep_symmetric(P: Array) -> None:
     """Average mirrored elements of P that rounding has driven apart by more than `ASYMMETRY`.
 
-    No measurement takes off what is antisymmetric, so a mode that grows multiplies it in each step, and the gain would
-    soon be that of no covariance.
+    No measurement reduces the antisymmetric part: a mode that grows would multiply it until P is no covariance.
     """
     for i in range(P.shape[0]):
         for j in range(i):
@@ -465,9 +445,6 @@ def _joint_gain(columns: Array, C: Array) -> Array:
         for i in range(n):
             gain[i, source] = x[i]
     return gain
-
-
-# -- estimators of others ----------------------------------------------------------------------------------------------
 
 
 class PlantModel(NamedTuple):
@@ -528,8 +505,7 @@ class OutsideEstimator:
     def correct(self, c: Estimator, belief: Belief, u_before: Array, load: float, y: Array) -> None:
         """Take a measurement (u_before (m,), load, y (n_y,), in physical units), as `estimator.correct` does.
 
-        Raises:
-            ConfigurationError: The estimator raises, or returns something else than a state and a number.
+        Raises ConfigurationError if the estimator raises, or returns something else than a state and a number.
         """
         b, predicted = belief.numbers[0], belief.predicted[: self._n_states]
         known = load - c.w0 if c.load_known else 0.0

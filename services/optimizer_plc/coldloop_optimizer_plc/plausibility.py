@@ -154,43 +154,29 @@ def imputed(innovation: Array, inverse_covariance: Array) -> Array:
     J_MM e_M = -J_MO e_O, with the inverse covariance J (n_y, n_y): the gain for all outputs then corrects as that for
     the others alone. Without any it is zero.
     """
-    n, real, missing = innovation.size, innovation.dtype.type, 0
+    n, real, missing, one = innovation.size, innovation.dtype.type, 0, 0
     M, mean = np.zeros((n, n), innovation.dtype), np.zeros(n, innovation.dtype)
-    finite = np.isfinite(innovation)
     for i in range(n):
-        if not finite[i]:
-            missing += 1
-    if missing == 1:  # most often; what follows would find the same, bit by bit
-        impute_one(innovation, inverse_covariance, mean)
-        return mean
-    for i in range(n):
-        if finite[i]:
+        if np.isfinite(innovation[i]):
             M[i, i], mean[i] = real(1.0), innovation[i]
         else:
+            missing, one = missing + 1, i
+    if missing == 1:  # most often; what follows would find the same, bit by bit
+        for j in range(n):
+            if j != one:
+                mean[one] -= inverse_covariance[one, j] * innovation[j]
+        pivot = np.sqrt(inverse_covariance[one, one])
+        mean[one] = mean[one] / pivot / pivot
+        return mean
+    for i in range(n):
+        if not np.isfinite(innovation[i]):
             for j in range(n):
-                if finite[j]:
+                if np.isfinite(innovation[j]):
                     mean[i] -= inverse_covariance[i, j] * innovation[j]
                 else:
                     M[i, j] = inverse_covariance[i, j]
     la.cholesky_solve(M, la.cholesky(M), mean)
     return mean
-
-
-@kernel
-def impute_one(innovation: Array, inverse_covariance: Array, mean: Array) -> None:
-    """Write what `imputed` returns where one element is not finite into `mean` (n_y,)."""
-    missing = 0
-    for i in range(mean.size):
-        if np.isfinite(innovation[i]):
-            mean[i] = innovation[i]
-        else:
-            missing = i
-    total = innovation.dtype.type(0.0)
-    for j in range(mean.size):
-        if j != missing:
-            total -= inverse_covariance[missing, j] * innovation[j]
-    pivot = np.sqrt(inverse_covariance[missing, missing])
-    mean[missing] = total / pivot / pivot
 
 
 @kernel
@@ -487,14 +473,6 @@ def correct_apart(
     a.mismatch[which] += correction[belief.x.size]
     should: float = expected[p.watched]
     return should
-
-
-@kernel
-def predict_apart(A: Array, B: Array, F: Array, belief: Any, u: Array) -> None:  # noqa: ANN401 a belief
-    """Predict over a step (A, B, F, transposed) under the input deviation u (3,), with the load that is measured."""
-    b, a = belief.numbers[0], belief.apart
-    for which in range(a.x.shape[0]):
-        a.predicted[which] = la.respond(A, B, F, a.predicted[which], u, b.w - b.mismatch + a.mismatch[which])
 
 
 @kernel

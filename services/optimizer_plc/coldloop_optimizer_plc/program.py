@@ -86,9 +86,7 @@ class OptimizerProgram:
     def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
         """Forget everything and begin a session at the operating point.
 
-        Args:
-            updating_period_s: Fixed updating period; 0 is adaptive.
-            rule: Decides adaptive periods instead of the rule that the settings name.
+        The updating period is fixed or, 0, adaptive: by a rule, or that of the settings.
         """
         fixed_ticks = round(updating_period_s / self.process.tick_s)
         self.constants = self.constants._replace(fixed_ticks=fixed_ticks)
@@ -257,9 +255,7 @@ class OptimizerProgram:
 class Forecasts:
     """Forecasts over plant time. Only their changes count: how large a disturbance is now is measured or estimated.
 
-    Args:
-        process: With its forecasts.
-        ends: Last samples of the parts of the horizon, rising.
+    Last samples of the parts of the horizon are its `ends`, rising.
     """
 
     def __init__(self, process: Process, ends: Sequence[int]) -> None:

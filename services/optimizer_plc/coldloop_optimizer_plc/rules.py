@@ -22,9 +22,6 @@ MEMORY: Final = 1
 """Numbers that a rule may remember from one period to the next, in an array that begins with zeros."""
 
 
-# -- what rules decide by: section II of the paper ---------------------------------------------------------------------
-
-
 class Observation(NamedTuple):
     """Observation at t_{k+1} of the period that ends there; costs are positive (Assumption 1 of the paper).
 
@@ -80,9 +77,6 @@ def assess(observation: Observation) -> Assessment:
 assessed = kernel(assess)
 
 
-# -- what a rule is ----------------------------------------------------------------------------------------------------
-
-
 class UpdatingRule(Protocol):
     """Parameters of a rule; a kernel is registered for their type."""
 
@@ -101,8 +95,6 @@ class UpdatingRule(Protocol):
 Decision = Callable[[Any, Array, Observation, Assessment], int]
 DECISIONS: Final[Implementations[Decision]] = Implementations("decide_by")
 """The kernel of each rule."""
-
-
 decides_by = DECISIONS.register
 """Decorator of the kernel that decides by rules of a class."""
 
@@ -116,9 +108,6 @@ def decide_by(rule: Any, memory: Array, observation: Observation, assessment: As
 def _decide_by(rule: Any, memory: Any, observation: Any, assessment: Any) -> Any:  # noqa: ANN401, ARG001 types of numba
     decide = DECISIONS[rule.instance_class]
     return lambda rule, memory, observation, assessment: decide(rule, memory, observation, assessment)  # noqa: PLW0108
-
-
-# -- the rules ---------------------------------------------------------------------------------------------------------
 
 
 FIXED_PERIOD: Final = int(UpdatingRuleKind.FIXED)
@@ -222,11 +211,7 @@ class OutsideRule:
         return self._asked("after_interruption", "first", otherwise=self._most)
 
     def decide(self, o: Observation, a: Assessment) -> int:
-        """Return q(t_{k+1}).
-
-        Raises:
-            ConfigurationError: The rule raises, or returns no number.
-        """
+        """Return q(t_{k+1}); a ConfigurationError is that the rule raises, or returns no number."""
         return self._asked("decide", given=(o, a), otherwise=o.q)
 
     def _asked(self, *names: str, given: Sequence[object] = (), otherwise: int) -> int:
@@ -244,16 +229,9 @@ def decide_outside(rule: OutsideRule, memory: Array, o: Observation, a: Assessme
 
 
 def make_rule(settings: ProgramSettings, budget: PlcBudget, fixed_ticks: int, real: Real = DOUBLE) -> UpdatingRule:
-    """Return the rule that the settings name.
+    """Return the rule that the settings name, for a fixed updating period or, 0, adaptive ones, and the type of costs.
 
-    Args:
-        settings: Of the program.
-        budget: Knows the q of a fixed period.
-        fixed_ticks: Fixed updating period; 0 is adaptive.
-        real: Floating-point type of the costs.
-
-    Raises:
-        ConfigurationError: There is no such rule, or it cannot be made.
+    Raises ConfigurationError if there is no such rule, or it cannot be made.
     """
     if settings.outside.rule and not fixed_ticks:
         return OutsideRule(settings.outside.rule, budget)

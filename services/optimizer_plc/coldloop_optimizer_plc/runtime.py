@@ -53,16 +53,7 @@ NO_UPDATE: Final = registers.Optimization(*(0,) * len(registers.Optimization._fi
 
 
 class OptimizerPublication:
-    """Registers and journal of the optimiser PLC.
-
-    Args:
-        register_map: Of this service, for the process.
-        order: Word order of the registers.
-        budget: Decides which updating periods can be asked for in real time.
-        limits: Bands, bounds and rates of the problem.
-        model_digest: Of our model.
-        holder: Number that this optimiser gives itself.
-    """
+    """Registers and journal of the optimiser PLC; the budget decides which periods can be asked for in real time."""
 
     def __init__(
         self, register_map: RegisterMap, order: WordOrder, budget: PlcBudget, limits: registers.OperatingLimits,
@@ -133,8 +124,6 @@ class OptimizerPublication:
         asked = self.bank.get(registers.OptimizerSession)
         return asked if asked.session == session else None
 
-    # -- what is shown -------------------------------------------------------------------------------------------------
-
     def session_started(self, session: int, pace: TimeBase, rule: registers.UpdatingRuleStatus) -> None:
         """Show that a session has begun."""
         who = self._asked_by if self.asked_for(session) is not None else ""
@@ -191,15 +180,9 @@ class _Answer(NamedTuple):
 
 
 class OptimizerPlc:
-    """Connects the program to the registers and to the control PLC.
+    """Connects the program, which `program` makes, to the registers and to the control PLC.
 
-    Args:
-        settings: Of this service.
-        program: Makes the program.
-
-    Raises:
-        ConfigurationError: The files for TLS cannot be used.
-        ModelFileError: The model file cannot be used.
+    Raises ConfigurationError or ModelFileError if the files for TLS, or the model file, cannot be used.
     """
 
     def __init__(self, settings: OptimizerSettings, program: MakeProgram = OptimizerProgram) -> None:
@@ -226,13 +209,10 @@ class OptimizerPlc:
         """Disconnect from the control PLC."""
         self._control.close()
 
-    # -- the link ------------------------------------------------------------------------------------------------------
-
     async def run(self) -> None:
         """Serve one update after the other until cancelled; a control PLC that is absent or lost is looked for.
 
-        Raises:
-            ModelFileError: The first control PLC that was found runs another model.
+        Raises ModelFileError if the first one that was found runs another model.
         """
         while True:
             await asyncio.sleep(self._link.pause_s(time.monotonic()))
@@ -282,8 +262,6 @@ class OptimizerPlc:
         else:
             self._link.go(ControlLinkState.DELIVERING)
             await self._conclude(answer.update, verdict)
-
-    # -- updates -------------------------------------------------------------------------------------------------------
 
     async def _serve_updates(self) -> None:
         while True:
@@ -357,8 +335,10 @@ class OptimizerPlc:
         self.publication.optimised(update.tick, self._program.report(verdict))
         if verdict is Verdict.ACCEPTED:
             self.publication.predicted(self._program.predictor())
-        # a plan that came too late: this update leads to no other, unless a load step has led to one
-        unplanned = verdict is Verdict.WRONG_UPDATE and not await self._is_superseded(update)
+        unplanned = verdict is Verdict.WRONG_UPDATE
+        if unplanned:  # a plan that came too late: this update leads to no other, unless a load step has led to one
+            newest = await self._control.newest()
+            unplanned = newest.session == update.session and newest.update <= update.update
         # late once is late for ever with updates that have been waiting: begin again with a fresh one
         begin_again = unplanned or verdict is Verdict.LATE
         if begin_again or verdict is Verdict.ACCEPTED:
@@ -381,11 +361,6 @@ class OptimizerPlc:
             if stepped or newest.session != answer.update.session:
                 return False
         return True
-
-    async def _is_superseded(self, update: Update) -> bool:
-        """Return whether the control PLC has latched another update since, and give it a sign of life."""
-        newest = await self._control.newest()
-        return newest.session != update.session or newest.update > update.update
 
 
 async def serve(settings: OptimizerSettings, program: MakeProgram = OptimizerProgram) -> None:

@@ -63,13 +63,6 @@ def turbine_watch(process: Process, y0: Array) -> TurbineWatch:
 
 
 @kernel
-def stands(c: TurbineWatch, y: Array) -> bool:
-    """Return whether outputs (n_y,) say that the turbine stands; a reading that is NaN does not count."""
-    slow: bool = y[c.speed] < c.slow and y[c.before] < c.ratio * y[c.behind]
-    return slow
-
-
-@kernel
 def idle_valve(c: TurbineWatch, suspects: int) -> int:
     """Return the input that has no effect by the mask of suspects, or -1."""
     return c.valve if suspects >= c.bit else -1

@@ -85,13 +85,10 @@ class PredictionModel:
             self.transitions[ticks] = self.transitions[ticks - 1].then(tick)
 
     def with_disturbances(self, signals: Sequence[int]) -> "PredictionModel":
-        """Return this model with a constant disturbance of each of these signals as a further state.
+        """Return this model with a constant disturbance of each of these signals, outputs and then inputs, as a state.
 
         With as many as outputs, predictions have no offset at rest (Pannocchia and Rawlings 2003). Costs and rows
         follow from the states.
-
-        Args:
-            signals: Outputs, counted from 0, and then inputs, counted on from there.
         """
         if not signals:
             return self
@@ -121,9 +118,7 @@ class PredictionModel:
     def with_forecasts(self, sources: Sequence[int], ends: Sequence[int]) -> "PredictionModel":
         """Return this model with the changes that are forecast of disturbances as further states.
 
-        Args:
-            sources: States that are disturbances; -1 is the load.
-            ends: Last samples of the parts of the horizon that each has a state for, rising.
+        `sources` are states, -1 is the load; each has a state for each part of the horizon, with last samples `ends`.
         """
         if not sources:
             return self

@@ -189,21 +189,14 @@ def output_rows(condensed: Condensed, design: ControlDesign, weights: Array, y0:
 
     `weights` (N, knots) are those of the knots, `y0` the outputs at rest.
     """
-    rho = np.array(design.violation_weight)
-    rows, states, bounds, gains = [], [], [], []
-    for instant in design.constraint_instants:
-        slack_of_z = slack_map(weights[instant - 1], design)
-        for output in range(len(rho)):
-            y_z, y_s = condensed.outputs_z[instant - 1][output], condensed.outputs_s[instant - 1][output]
-            margin = design.band_margin[output]
-            low = design.output_low[output] + margin - y0[output]
-            high = design.output_high[output] - margin - y0[output]
-            rows += [-y_z - slack_of_z[2 * output], y_z - slack_of_z[2 * output + 1]]
-            states += [y_s, -y_s]
-            bounds += [-low, high]
-            gains += 2 * [np.sqrt(rho[output] / rho.max())]
-    gain = np.array(gains)
-    return Rows(np.array(rows) * gain[:, None], np.array(bounds) * gain, (np.array(states) * gain[:, None]).T, gain)
+    rho, places, y0 = np.array(design.violation_weight), np.array(design.constraint_instants) - 1, np.asarray(y0)
+    slacks = np.array([slack_map(weights[place], design) for place in places])
+    y_z, y_s, margin = condensed.outputs_z[places], condensed.outputs_s[places], np.array(design.band_margin)
+    ends = np.array([-(design.output_low + margin - y0), design.output_high - margin - y0])
+    rows = np.stack([-y_z - slacks[:, ::2], y_z - slacks[:, 1::2]], axis=2).reshape(-1, y_z.shape[-1])
+    states = np.stack([y_s, -y_s], axis=2).reshape(-1, y_s.shape[-1])
+    gain = np.tile(np.repeat(np.sqrt(rho / rho.max()), 2), len(places))
+    return Rows(rows * gain[:, None], np.tile(ends.T.ravel(), len(places)) * gain, (states * gain[:, None]).T, gain)
 
 
 def rate_rows(design: ControlDesign, limits: InputLimits, penalties: PenaltySettings) -> Rows:
@@ -351,10 +344,8 @@ class QpParameters(NamedTuple):
 class PredictiveProblem:
     """Builds instances of the QP for one design and one prediction model.
 
-    Penalties scale the rows: a problem that is solved exactly is the same whatever they are.
-
-    Sizes: of the cold box n = 7 decision instants x 7 = 49 variables; m = 56 output rows and 38 rate rows with the
-    paper's instants.
+    Penalties scale the rows: a problem that is solved exactly is the same whatever they are. Of the cold box, with the
+    paper's instants, n = 7 decision instants x 7 = 49 variables, m = 56 output rows and 38 rate rows.
     """
 
     def __init__(
@@ -406,13 +397,10 @@ class PredictiveProblem:
         self.input_scale, self.rate = rounded(scale, real), rounded(rate, real)
         self.scaled_rate, self._u0 = rounded(rate / scale, real), rounded(u0, real)
 
-    # -- instances ---------------------------------------------------------------------------------------------------
-
     def at(self, parameters: QpParameters) -> QuadraticProblem:
         """Return the instance of the problem for these parameters.
 
-        Raises:
-            ValueError: The state is not one of this problem's model; kernels would read and write beyond it.
+        Raises ValueError if the state is not one of this problem's model: kernels would read and write beyond it.
         """
         self._check(parameters)
         share = self._share(parameters)
@@ -435,8 +423,6 @@ class PredictiveProblem:
         """Return the bytes of the constant arrays that an instance is made of: Phi, Gamma and the maps."""
         return sum(M.nbytes for M in (self.Phi, self.Gamma, *self.maps))
 
-    # -- profiles ----------------------------------------------------------------------------------------------------
-
     def shifted(self, z: Array, ticks: int) -> Array:
         """Return the profile z shifted by `ticks` ticks."""
         if ticks <= self.longest_ticks:
@@ -445,9 +431,8 @@ class PredictiveProblem:
 
     def within_first_rate(self, z: Array, parameters: QpParameters) -> Array:
         """Return the profile z with its first knot within the rate of the input before it, as it can be sent."""
-        share = self._share(parameters)
         result = z.copy()
-        keep_first_rate(self.maps, self.scaled_rate, parameters.u_before, share, result)
+        keep_first_rate(self.maps, self.scaled_rate, parameters.u_before, self._share(parameters), result)
         return result
 
     def inputs(self, z: Array, samples: int) -> Array:

@@ -27,13 +27,6 @@ BOUND_MARGIN = 1.02
 """Margin on the largest eigenvalue, which power iteration approaches from below."""
 
 
-class Momentum(NamedTuple):
-    """State of an iteration besides z: the point (n,) at which the gradient is taken, and Nesterov's t_k (1,)."""
-
-    extrapolated: Array
-    t: Array
-
-
 class FastGradientMethod(NamedTuple):
     """Constants of the solver, the same for all problems; step sizes have shape (n,)."""
 
@@ -96,11 +89,10 @@ def step_sizes(Phi: Array, Gamma: Array, alpha: float) -> Array:
 
 
 @kernel
-def descend(c: FastGradientMethod, qp: QuadraticProblem, z: Array, momentum: Momentum, count: int) -> None:
-    """Move z and its momentum by `count` iterations."""
+def descend(c: FastGradientMethod, qp: QuadraticProblem, z: Array, point: Array, t: Array, count: int) -> None:
+    """Move z, the point (n,) at which the gradient is taken, and Nesterov's t_k (1,) by `count` iterations."""
     n, half, one, four = z.shape[0], z.dtype.type(0.5), z.dtype.type(1), z.dtype.type(4)
-    point, t, slope, moved = momentum.extrapolated, momentum.t, np.empty_like(z), np.empty_like(z)
-    active = np.empty_like(qp.gamma)
+    slope, moved, active = np.empty_like(z), np.empty_like(z), np.empty_like(qp.gamma)
     for _ in range(count):
         gradient(c.matrices, qp, point, excess_by_columns(c.matrices, qp, point), c.alpha, slope, active)
         uphill = z.dtype.type(0)
@@ -126,11 +118,11 @@ def solve(
     z = np.empty_like(guess)
     for i in range(z.shape[0]):
         z[i] = min(max(guess[i], qp.low[i]), qp.high[i])
-    guessed, momentum = augmented_cost(qp, z, c.alpha), Momentum(z.copy(), np.ones_like(z[:1]))
+    guessed, point, t = augmented_cost(qp, z, c.alpha), z.copy(), np.ones_like(z[:1])
     points, costs = np.empty((counts.shape[0], z.shape[0]), z.dtype), np.empty(counts.shape[0], z.dtype)
     done = 0
     for k in range(counts.shape[0]):
-        descend(c, qp, z, momentum, counts[k] - done)
+        descend(c, qp, z, point, t, counts[k] - done)
         done = counts[k]
         points[k], costs[k] = z, augmented_cost(qp, z, c.alpha)
     return Answer(guessed, points, costs, counts.copy(), np.empty(0, z.dtype))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.intrinsics import Implementations
 from coldloop_optimizer_plc.computing_settings import OutsideSettings, Part, in_its_name, made
-from coldloop_optimizer_plc.qp.costs import Solution, augmented_cost, judge
+from coldloop_optimizer_plc.qp.costs import augmented_cost
 from coldloop_optimizer_plc.qp.linear_algebra import Array
 from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 
@@ -84,19 +84,53 @@ def collected(
     return Answer(costs[0], np.array(points), np.array(costs[1:]), np.array(iterations), multipliers)
 
 
+CONTACT = 1e-7
+"""Distance within which a variable touches its bound: the precision of the exact solvers."""
+
+
+class Solution(NamedTuple):
+    """A profile z (n,), judged for min J_0(z) = z' Phi z + z' phi under Gamma z <= gamma and low <= z <= high.
+
+    Costs are without the problem's constant: base_cost J_0, and cost J_0 + alpha sum max(Gamma z - gamma, 0)^2.
+    multipliers lambda (m,) are those of the rows, >= 0. violation: largest violated row, in the scaled units of the
+    rows; primal_residual: that of a row or of the box; dual_residual: largest component of the Lagrangian's gradient
+    that no bound of the box holds up; gap: complementarity, |lambda' (Gamma z - gamma)|. At an optimum both residuals
+    and the gap are zero; a minimiser of the augmented cost J keeps a primal residual, and a gap of twice its penalty.
+    """
+
+    z: Array
+    multipliers: Array
+    base_cost: float
+    cost: float
+    violation: float
+    primal_residual: float
+    dual_residual: float
+    gap: float
+
+
 def judged(problem: QuadraticProblem, answer: Answer, alpha: float) -> Solution:
-    """Return the last point of an answer with its residuals."""
-    z, multipliers = answer.z, answer.multipliers
+    """Return the last point of an answer with its residuals; multipliers of the box are the best there are."""
+    z, multipliers, excess = answer.z, answer.multipliers, problem.Gamma @ answer.z - problem.gamma
     if not multipliers.size:  # those of a penalty method
-        multipliers = 2.0 * alpha * np.maximum(problem.Gamma @ z - problem.gamma, 0.0)
-    return judge(problem, z, alpha, multipliers)
+        multipliers = 2.0 * alpha * np.maximum(excess, 0.0)
+    violation = float(np.max(excess, initial=0.0))
+    outside = float(np.max(np.maximum(problem.low - z, z - problem.high), initial=0.0))
+    base_cost = float(z @ problem.Phi @ z + problem.phi @ z)
+    slope = 2.0 * problem.Phi @ z + problem.phi + problem.Gamma.T @ multipliers
+    at_low, at_high = z <= problem.low + CONTACT, z >= problem.high - CONTACT
+    stationarity = np.where(at_low, np.minimum(slope, 0.0), slope)
+    stationarity = np.where(at_high, np.maximum(stationarity, 0.0), stationarity)
+    return Solution(
+        z=z, multipliers=multipliers, base_cost=base_cost,
+        cost=base_cost + alpha * float(np.sum(np.maximum(excess, 0.0) ** 2)), violation=violation,
+        primal_residual=max(violation, outside), dual_residual=float(np.max(np.abs(stationarity), initial=0.0)),
+        gap=abs(float(multipliers @ excess)),
+    )  # fmt: skip
 
 
 Kernel = Callable[[Any, QuadraticProblem, Array, NDArray[np.int64], Costs], Answer]
 KERNELS: Final[Implementations[Kernel]] = Implementations("solve_by")
 """The kernel of each method."""
-
-
 solves_by = KERNELS.register
 """Decorator of the kernel that solves problems by a method."""
 
@@ -113,13 +147,9 @@ def _solve_by(method: Any, qp: Any, guess: Any, counts: Any, before: Any) -> Any
 
 
 class KernelSolver:
-    """A solver of our own.
+    """A solver of our own, whose method `method_of` makes for problems with the matrices of one.
 
-    Args:
-        method_of: Makes the method for problems with the matrices of this one.
-        alpha: Penalty weight.
-        tau_1_s: Time of an iteration.
-        floor: Constant that J has besides that of the problem.
+    It has a penalty weight alpha and the time of an iteration; J has `floor` besides the constant of the problem.
     """
 
     def __init__(
@@ -181,8 +211,7 @@ class OutsideSolver:
     def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
         """Return the answer after each count; a point that is no profile, or not finite, is as good as the guess.
 
-        Raises:
-            ConfigurationError: The method raises, or returns something else than a point and a count.
+        Raises ConfigurationError if the method raises, or returns something else than a point and a count.
         """
         guess = np.clip(guess, problem.low, problem.high)
         answers = [self._point(problem, guess, int(count)) for count in counts]

@@ -69,11 +69,11 @@ class OdeMethod(NamedTuple):
 
 def ode_solver(settings: OdeSettings, penalties: PenaltySettings | None = None) -> KernelSolver:
     """Return the solver, which keeps nothing from one problem to the next."""
-
-    def method(problem: QuadraticProblem) -> OdeMethod:
-        return OdeMethod(matrices_of(problem), flow_in(settings, penalties, problem.phi.dtype.type))
-
-    return KernelSolver(method, settings.alpha, settings.tau_1_s)
+    return KernelSolver(
+        lambda problem: OdeMethod(matrices_of(problem), flow_in(settings, penalties, problem.phi.dtype.type)),
+        settings.alpha,
+        settings.tau_1_s,
+    )
 
 
 @kernel
