@@ -153,10 +153,8 @@ class ControlClient:
         )
         self._rows_with_header = (MAX_READ_WRITE_WORDS - header) // row
         """Rows that fit into one request with the header that commits them: 18 of three inputs."""
-        self._endpoint = endpoint
-        self._link = link
-        self._model_digest = model_digest
-        self._model_name = model_name
+        self._endpoint, self._link = endpoint, link
+        self._model_digest, self._model_name = model_digest, model_name
         self._client = RegisterClient.at(self._map, endpoint)
         self._beats = 0
 

@@ -14,14 +14,6 @@ from coldloop.errors import ConfigurationError
 from coldloop.kernels.compiled import kept, kernel
 from coldloop_optimizer_plc import computing_settings as computing
 from coldloop_optimizer_plc import plausibility as check
-from coldloop_optimizer_plc.computing_settings import (
-    EstimatorKind,
-    EstimatorSettings,
-    NoiseReference,
-    PlausibilitySettings,
-    signals_of,
-)
-from coldloop_optimizer_plc.plausibility import Apart, Plausibility
 from coldloop_optimizer_plc.qp import linear_algebra as la
 from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Array, Real
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, Transition
@@ -61,7 +53,7 @@ class Estimator(NamedTuple):
     kalman: bool
     load_known: bool
     stationary: StationaryGains
-    plausible: Plausibility
+    plausible: check.Plausibility
 
 
 class Belief(NamedTuple):
@@ -78,20 +70,20 @@ class Belief(NamedTuple):
     predicted: Array
     surprise: Array
     readings: Any
-    apart: Apart
+    apart: check.Apart
 
 
 def estimator_of(
-    prediction: PredictionModel, settings: EstimatorSettings, real: Real = DOUBLE,
-    plausibility: PlausibilitySettings | None = None,
+    prediction: PredictionModel, settings: computing.EstimatorSettings, real: Real = DOUBLE,
+    plausibility: computing.PlausibilitySettings | None = None,
 ) -> Estimator:  # fmt: skip
     """Return the estimator that the settings name; without `plausibility` whatever sensors show is plausible.
 
     Raises ConfigurationError if the simulated state is used, and is not that of the model.
     """
-    kalman = settings.kind is EstimatorKind.KALMAN
+    kalman = settings.kind is computing.EstimatorKind.KALMAN
     check_detectability(prediction)
-    process, plausible = prediction.process, plausibility or PlausibilitySettings()
+    process, plausible = prediction.process, plausibility or computing.PlausibilitySettings()
     if not kalman and prediction.n_states > len(process.states):
         raise ConfigurationError(
             "optimizer_plc.program.estimator.kind=state-feedback: the model has more states than the plant reports; "
@@ -236,14 +228,14 @@ def check_detectability(prediction: PredictionModel) -> None:
     if sizes[-1] > UNDETECTABLE:
         return
     shares = np.abs(directions[-1][n - len(prediction.disturbances) : n])
-    worst = signals_of(prediction.process)[prediction.disturbances[int(np.argmax(shares))]]
+    worst = computing.signals_of(prediction.process)[prediction.disturbances[int(np.argmax(shares))]]
     raise ConfigurationError(
         f"optimizer_plc.program.estimator.disturbances: no sensor tells a constant error of {worst} from the plant's"
         " state, the load and the other errors: leave it out"
     )
 
 
-def walks_of(prediction: PredictionModel, settings: EstimatorSettings) -> Array:
+def walks_of(prediction: PredictionModel, settings: computing.EstimatorSettings) -> Array:
     """Return the process noise of the states, the constants among them, and of the load mismatch, shape (n + 1,)."""
     by_unit = {
         "Pa": settings.pressure_noise_pa, "m3": settings.volume_noise_m3, "K": settings.temperature_noise_k,
@@ -257,7 +249,7 @@ def walks_of(prediction: PredictionModel, settings: EstimatorSettings) -> Array:
     return np.array([*of_states, *chosen, settings.load_walk_w])
 
 
-def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -> StationaryGains:
+def stationary_gains(prediction: PredictionModel, settings: computing.EstimatorSettings) -> StationaryGains:
     """Return what the Kalman filter corrects with after every updating period; what is forecast it leaves alone.
 
     Raises ConfigurationError if there is none for a period.
@@ -265,7 +257,7 @@ def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -
     nx = prediction.n_estimated
     C = np.ascontiguousarray(np.hstack([prediction.C[:, :nx], prediction.G]))
     steps = {ticks: (step.A[:nx, :nx], step.F[:nx, 0]) for ticks, step in prediction.transitions.items()}
-    of_time = settings.noise_reference is NoiseReference.TIME
+    of_time = settings.noise_reference is computing.NoiseReference.TIME
     drift, sensors = walks_of(prediction, settings), np.array(settings.sensors)
     process = prediction.process
     found = kept(
@@ -495,7 +487,7 @@ class OutsideCorrection(Protocol):
 class OutsideEstimator:
     """One of these: what it returns is checked; what is no estimate, or not finite, leaves the prediction as it is."""
 
-    def __init__(self, name: str, prediction: PredictionModel, settings: EstimatorSettings) -> None:
+    def __init__(self, name: str, prediction: PredictionModel, settings: computing.EstimatorSettings) -> None:
         self.name = name
         self._n_states = prediction.n_estimated
         self._estimator: OutsideCorrection = computing.made(
@@ -519,7 +511,7 @@ class OutsideEstimator:
         b["w"] = known + b["mismatch"]
 
 
-def plant_model(prediction: PredictionModel, settings: EstimatorSettings) -> PlantModel:
+def plant_model(prediction: PredictionModel, settings: computing.EstimatorSettings) -> PlantModel:
     """Return what an outside estimator is given of the model: copies, which it may change."""
     n, step, process = prediction.n_estimated, prediction.transitions[1], prediction.process
     A, B, F = step.A[:n, :n].copy(), step.B[:n].copy(), step.F[:n].copy()

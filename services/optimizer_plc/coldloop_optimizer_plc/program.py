@@ -109,8 +109,6 @@ class OptimizerProgram:
             entry = self._entries[kernel] = entry_of(kernel, *arguments)
         return entry(*arguments)
 
-    # -- steps (4), (5) and (2): at an updating instant ---------------------------------------------------------------
-
     def plan(self, update: Update) -> Plan:
         """Take the update latched at t_i and decide the updating period that begins there."""
         c, m = self.constants, self.state
@@ -151,8 +149,6 @@ class OptimizerProgram:
         (python_of(decisions.begin_period) or decisions.begin_period)(c, self.rule, m, wanted, latched)
         return load_step
 
-    # -- step (3): during the updating period -------------------------------------------------------------------------
-
     def answer_after_s(self) -> float:
         """Return the plant time from the instant of the last `plan` until the PLC has computed its answer."""
         return self.budget.answer_after_s(self._iterations)
@@ -190,8 +186,6 @@ class OptimizerProgram:
     def answered(self, *, late: bool) -> None:
         """Note how an answer came."""
         self._run(decisions.note_answer, self.state, late)
-
-    # -- diagnostics --------------------------------------------------------------------------------------------------
 
     def predictor(self) -> Callable[[], registers.Prediction]:
         """Return what computes the expected result of the last profile, also after later updates."""

@@ -268,7 +268,8 @@ class OptimizerPlc:
             asked_at = time.monotonic()
             update = await self._control.next_update(self._wanted)
             arrived_at = time.monotonic()
-            if self._is_news(update):
+            is_awaited = self._wanted is FRESH_UPDATE or update.update >= self._wanted.update
+            if update.session and (update.session != self._session or is_awaited):  # no old one, for want of another
                 self._wanted = FRESH_UPDATE  # should the link be lost before this one is planned
                 await self._answer(update, arrived_at)
                 continue
@@ -277,14 +278,6 @@ class OptimizerPlc:
                 self._wanted = FRESH_UPDATE
             if arrived_at - asked_at < SHORTEST_WAIT_S:
                 await asyncio.sleep(SHORTEST_WAIT_S)
-
-    def _is_news(self, update: Update) -> bool:
-        """Distinguish an awaited update from the old one that the control PLC returns when nothing happens."""
-        if not update.session:
-            return False
-        if update.session != self._session:
-            return True
-        return self._wanted is FRESH_UPDATE or update.update >= self._wanted.update
 
     async def _start(self, session: int) -> None:
         """Begin a session, or begin it anew: at the pace that it has by now, with the period that is asked for."""

@@ -20,7 +20,6 @@ from coldloop_optimizer_plc.qp import problem as problems
 from coldloop_optimizer_plc.qp.costs import predicted_indicators
 from coldloop_optimizer_plc.qp.linear_algebra import Array, Real, rounded
 from coldloop_optimizer_plc.qp.prediction import TargetSearch
-from coldloop_optimizer_plc.qp.problem import Maps, OutputMaps, PredictiveProblem, QuadraticProblem
 from coldloop_optimizer_plc.rules import MEMORY
 from coldloop_optimizer_plc.settings import ProgramSettings, RuleName
 from coldloop_optimizer_plc.solvers.interface import Answer, Costs, solve_by
@@ -152,14 +151,14 @@ class Constants(NamedTuple):
     target: TargetSearch
     Phi: Array
     Gamma: Array
-    maps: Maps
+    maps: problems.Maps
     shifts: Array
     """Shape (ticks + 1, knots, knots)."""
     knots: Array
     """Decision instants, shape (knots,)."""
     rest: Array
     """`rest_map`."""
-    predicted: OutputMaps
+    predicted: problems.OutputMaps
     weights: Array
     """Weights of the knots in each sample, shape (horizon, knots)."""
     input_scale: Array
@@ -206,8 +205,8 @@ class Constants(NamedTuple):
 
 
 def constants_of(
-    estimator: Estimator, problem: PredictiveProblem, target: TargetSearch, alpha: float, settings: ProgramSettings,
-    budget: PlcBudget, rest: Array,
+    estimator: Estimator, problem: problems.PredictiveProblem, target: TargetSearch, alpha: float,
+    settings: ProgramSettings, budget: PlcBudget, rest: Array,
 ) -> Constants:  # fmt: skip
     """Return the constants of a session with adaptive periods."""
     process, every, end = settings.process, range(budget.longest_ticks + 1), settings.cold_end
@@ -260,7 +259,7 @@ def with_floor(cost: float, constant: float, floor: float) -> float:
 @kernel
 def problem_at(
     c: Constants, x: Array, w: float, u_before: Array, share: float, target: Array, most_open: float, idle: int
-) -> QuadraticProblem:  # fmt: skip
+) -> problems.QuadraticProblem:  # fmt: skip
     """Return the instance of the problem at a state, a load and the input before, about a target.
 
     With a limit of the feed; all are deviations. The input that is `idle`, unless it is -1, stays where it is.
@@ -274,7 +273,7 @@ def problem_at(
         for i in range(idle, c.n_inputs, u_before.shape[0]):
             low[i] = max(held - real(ROOM), c.maps.low[i])
             high[i] = min(held + real(ROOM), c.maps.high[i])
-    return QuadraticProblem(c.Phi, phi, c.Gamma, gamma, low, high, constant)
+    return problems.QuadraticProblem(c.Phi, phi, c.Gamma, gamma, low, high, constant)
 
 
 @kernel
@@ -315,7 +314,7 @@ def same_inputs(one: NDArray[np.float32], other: NDArray[np.float32]) -> bool:
 
 
 @kernel
-def pose(c: Constants, m: OptimizerState) -> tuple[QuadraticProblem, Array]:
+def pose(c: Constants, m: OptimizerState) -> tuple[problems.QuadraticProblem, Array]:
     """Predict the state at t_{k+1}; return the problem there and the guess, the shifted profile."""
     ticks, sent = m.numbers[0].ticks, m.sent
     sent.u_before[:] = predict_played(c, m, ticks)
@@ -342,7 +341,7 @@ def is_answer(m: OptimizerState) -> bool:
 
 
 @kernel
-def deliver(c: Constants, m: OptimizerState, qp: QuadraticProblem, answer: Answer) -> None:
+def deliver(c: Constants, m: OptimizerState, qp: problems.QuadraticProblem, answer: Answer) -> None:
     """Make the sequence of an answer after q - 1 and q iterations, and judge its profile.
 
     There are no rows where it is none (`is_answer`).

@@ -27,7 +27,6 @@ from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop.service.monitoring import MetricsSettings, TelemetrySettings
 from coldloop.session import SessionSettings
 from coldloop_optimizer_plc import computing_settings as computing
-from coldloop_optimizer_plc.computing_settings import Arithmetic, EstimatorKind
 
 Instants = Annotated[tuple[int, ...], AfterValidator(rising_instants)]
 FURTHEST_SCALE: Final = 100.0
@@ -117,10 +116,10 @@ class ControlDesign(ProcessSettings):
             raise ValueError("target: a process without a bath has only operating-point")
         if self.constraint_instants[-1] > self.horizon:
             raise ValueError("constraint_instants end behind the last of decision_instants, which is the horizon")
-        if any(low >= high for low, high in zip(self.output_low, self.output_high, strict=True)):
+        bands = list(zip(self.output_low, self.output_high, self.band_margin, strict=True))
+        if any(low >= high for low, high, _ in bands):
             raise ValueError("each output_low must be below its output_high")
-        widths = (high - low for low, high in zip(self.output_low, self.output_high, strict=True))
-        if any(not 0.0 <= margin <= width / 2.0 for margin, width in zip(self.band_margin, widths, strict=True)):
+        if any(not 0.0 <= margin <= (high - low) / 2.0 for low, high, margin in bands):
             raise ValueError(
                 "each band_margin, that of the preset too, must be at least 0 and at most half of its band"
             )
@@ -233,6 +232,8 @@ LARGEST: Final = 1e18
 """Largest number in the program's settings."""
 WITH_ALPHA: Final = ("ode", "qpoases", "osqp", "fast_gradient", "interior_point", "daqp", "outside")
 """Sections that have a weight of broken constraints."""
+ALPHAS: Final = tuple(f"{name}.alpha" for name in WITH_ALPHA)
+"""The weight of broken constraints, by solver: keys of `optimizer_plc.program` that follow from the penalties."""
 
 
 class SolverName(StrEnum):
@@ -308,7 +309,7 @@ class AdaptiveSettings(BaseModel, frozen=True, extra="forbid"):
 
 def left_out(key: str, estimator: computing.EstimatorSettings) -> str:
     """Return why this estimator cannot have a preset's value of a key of `optimizer_plc.program`; empty: it can."""
-    if estimator.kind is EstimatorKind.STATE_FEEDBACK and key.startswith(("estimator.", "plausibility.")):
+    if estimator.kind is computing.EstimatorKind.STATE_FEEDBACK and key.startswith(("estimator.", "plausibility.")):
         return "state-feedback estimates nothing"
     return ""
 
@@ -317,7 +318,7 @@ class ProgramSettings(ProcessSettings, validate_default=True):
     """Settings of the optimiser's program."""
 
     solver: SolverName = SolverName.ODE
-    arithmetic: Arithmetic = Arithmetic.FLOAT64
+    arithmetic: computing.Arithmetic = computing.Arithmetic.FLOAT64
     """Floating-point type of all that is computed on line; the PLC of the paper has float32 only."""
     updating_period_s: Annotated[float, per.within(lambda process: (0, process.sampling_period_s))] = ADAPTIVE
     """Fixed updating period, a multiple of 0.25 s; 0 is adaptive."""
@@ -357,9 +358,13 @@ class ProgramSettings(ProcessSettings, validate_default=True):
     outside: computing.OutsideSettings = computing.OutsideSettings()
     """Solver, rule and estimator of somebody else's, used instead of ours."""
 
-    decides: ClassVar[Mapping[str, tuple[str, ...]]] = {}
-    """Keys that follow from other settings, by the key that decides, for `coldloop.config`; filled in below, from the
-    fields."""
+    decides: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "preset": (*OF_PRESETS, *ALPHAS),
+        "estimator.kind": ("estimator.disturbances",),
+        "estimator.load_known": ("estimator.load_walk_w",),
+        **dict.fromkeys(OF_ALPHA, ALPHAS),
+    }
+    """Keys that follow from other settings, by the key that decides, for `coldloop.config`."""
 
     @pydantic.field_validator("updating_period_s")
     @classmethod
@@ -438,9 +443,7 @@ class ProgramSettings(ProcessSettings, validate_default=True):
     @property
     def iteration_s(self) -> float:
         """Time of an iteration of the solver in use, at P = 1."""
-        if self.outside.solver:
-            return self.outside.tau_1_s
-        return self.iteration_of(self.solver)
+        return self.outside.tau_1_s if self.outside.solver else self.iteration_of(self.solver)
 
     def iteration_of(self, solver: SolverName) -> float:
         """Return the time of an iteration of a solver at P = 1, s."""
@@ -454,23 +457,13 @@ class ProgramSettings(ProcessSettings, validate_default=True):
             raise ValueError("interrupting_load_step_w needs a load that is measured, estimator.load_known = true")
         if self.solver is SolverName.HYBRID and self.ode.alpha != self.interior_point.alpha:
             raise ValueError("hybrid needs one cost for both of its solvers: set ode.alpha = interior_point.alpha")
-        if self.arithmetic is Arithmetic.FLOAT32 and self.outside.names:
+        if self.arithmetic is computing.Arithmetic.FLOAT32 and self.outside.names:
             raise ValueError(f"{', '.join(self.outside.names)}: what is not ours computes in double precision")
-        if self.arithmetic is Arithmetic.FLOAT32 and self.solver not in SINGLE_PRECISION_SOLVERS:
+        if self.arithmetic is computing.Arithmetic.FLOAT32 and self.solver not in SINGLE_PRECISION_SOLVERS:
             raise ValueError(
                 f"{self.solver} computes in double precision; choose one of {', '.join(SINGLE_PRECISION_SOLVERS)}"
             )
         return self
-
-
-ALPHAS: Final = tuple(f"{name}.alpha" for name in WITH_ALPHA)
-"""The weight of broken constraints, by solver: keys of `optimizer_plc.program` that follow from the penalties."""
-ProgramSettings.decides = {
-    "preset": (*OF_PRESETS, *ALPHAS),
-    "estimator.kind": ("estimator.disturbances",),
-    "estimator.load_known": ("estimator.load_walk_w",),
-    **dict.fromkeys(OF_ALPHA, ALPHAS),
-}
 
 
 class OptimizerServer(ServerSettings):

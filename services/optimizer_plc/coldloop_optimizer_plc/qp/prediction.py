@@ -200,10 +200,7 @@ def rest_map(prediction: PredictionModel, real: Real = DOUBLE) -> Array:
     It is one of the inputs, of the load, and of the level where there is a bath. There it integrates: any rests, and
     with the inputs and the load that are given only one mismatch lets it. Elsewhere there is no mismatch at rest, and
     where the states do not rest they are those that move least. What inputs and load do not move, as disturbances
-    beside the load, is 0 at rest.
-
-    Raises:
-        ConfigurationError: With another model, none does.
+    beside the load, is 0 at rest. Raises ConfigurationError if, with another model, none does.
     """
     n = len(prediction.model.x0)
     A, B, F = (M[:n] for M in prediction.sample)

@@ -169,11 +169,7 @@ class _Chain:
 
 @cache
 def load_casadi() -> ModuleType:
-    """Import CasADi, which is large and optional.
-
-    Raises:
-        ConfigurationError: It is not installed, or has no qpOASES.
-    """
+    """Import CasADi, large and optional; raises ConfigurationError if it is not installed, or has no qpOASES."""
     try:
         casadi = importlib.import_module("casadi")
     except ImportError:
@@ -296,11 +292,7 @@ def softened(qp: QuadraticProblem, alpha: float) -> SoftProblem:
 
 
 class Library(ABC):
-    """An `OutsideMethod` by a library, which is imported when the solver is made.
-
-    Raises:
-        ConfigurationError: The library is not installed.
-    """
+    """An `OutsideMethod` by a library, imported when it is made; raises ConfigurationError if it is not installed."""
 
     name: ClassVar[str]
     """Name of the module, of the extra and of the entry point."""
