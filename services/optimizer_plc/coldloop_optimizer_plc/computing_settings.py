@@ -187,9 +187,8 @@ class PlausibilitySettings(ProcessSettings):
     @property
     def spans(self) -> tuple[tuple[float, float], ...]:
         """Within which predictions each output is judged."""
-        return tuple(
-            self.level_span if output.quantity == "level" else (-1e30, 1e30) for output in self.process.outputs
-        )
+        spans = {"level": self.level_span}
+        return tuple(spans.get(output.quantity, (-1e30, 1e30)) for output in self.process.outputs)
 
     @property
     def allowances(self) -> tuple[float, ...]:
@@ -236,6 +235,8 @@ class PlcBudget:
             slots_s / settings.power, settings.preparation_s / settings.power, tau_1_s / settings.power,
             process.tick_s, self.longest_ticks,
         )  # fmt: skip
+        self.iterations = self.times.iterations
+        """Iterations that fit into an updating period of so many ticks; at least one is always done."""
 
     @cached_property
     def ladder(self) -> tuple[int, ...]:
@@ -245,10 +246,6 @@ class PlcBudget:
     def q(self, ticks: int) -> int:
         """Return the number of the longest period of the ladder that is no longer than so many ticks; at least 1."""
         return max(1, bisect_right(self.ladder, ticks))
-
-    def iterations(self, ticks: int) -> int:
-        """Return the iterations that fit into an updating period of `ticks` ticks; at least one is always done."""
-        return self.times.iterations(ticks)
 
     def answer_after_s(self, iterations: int) -> float:
         """Return the plant time from an updating instant to the end of its computation, in seconds."""

@@ -28,10 +28,8 @@ from coldloop.session import TimeBase
 
 T = TypeVar("T")
 
-REPEAT_S: Final = 10.0
-"""The same reason is logged at most once in this real time."""
-MOST_REASONS: Final = 32
-"""Different reasons that are remembered for that."""
+REPEAT_S: Final = 10.0  # the same reason is logged at most once in this real time
+MOST_REASONS: Final = 32  # different reasons that are remembered for that
 ATTEMPTS: Final = 3
 """Attempts of a request whose data arrive damaged: on the way there (exception 03, bad CRC), or back."""
 ILLEGAL_VALUE: Final = 3

@@ -20,17 +20,14 @@ from coldloop_optimizer_plc.qp.problem import hold, shift, shifted
 from coldloop_optimizer_plc.rules import Assessment, Observation, UpdatingRule, assessed, decide_by
 from coldloop_optimizer_plc.scheme import Constants, OptimizerState
 
-BY_THE_RULE: Final = 0
-"""The q that `plan` is given when the rule is to decide it."""
+BY_THE_RULE: Final = 0  # the q of a period whose length the rule is to decide
 PROVEN: Final = 8
 """Answers in time, one after the other, after which the next is tried with half of what is allowed for late ones: where
 some ticks are needed for good, one answer in nine is late."""
 LONGEST_GAP_TICKS: Final = 4 * SEQUENCE_ROWS
 """After a longer time without an update nothing is predicted from the last one."""
-FIRST: Final = -1
-"""Sentinel for q: there is none before a first period."""
-AFTER_A_STEP: Final = -2
-"""Sentinel for q: the period begins with a load step."""
+FIRST: Final = -1  # sentinel for q: there is none before a first period
+AFTER_A_STEP: Final = -2  # sentinel for q: the period begins with a load step
 
 
 class Latched(NamedTuple):

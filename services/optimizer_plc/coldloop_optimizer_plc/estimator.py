@@ -18,10 +18,8 @@ from coldloop_optimizer_plc.qp import linear_algebra as la
 from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Array, Real
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, Transition
 
-MEMORY_TICKS: Final = 240
-"""A minute of the cold box."""
-UNDETECTABLE: Final = 1e-9
-"""Relative size of a direction that no measurement sees."""
+MEMORY_TICKS: Final = 240  # a minute of the cold box
+UNDETECTABLE: Final = 1e-9  # relative size of a direction that no measurement sees
 
 
 class StationaryGains(NamedTuple):

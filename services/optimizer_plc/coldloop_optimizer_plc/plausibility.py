@@ -24,18 +24,12 @@ from coldloop_optimizer_plc.qp import linear_algebra as la
 from coldloop_optimizer_plc.qp.linear_algebra import Array, Real
 from coldloop_optimizer_plc.qp.prediction import PredictionModel, Transition
 
-USED: Final = 0
-"""A reading is used by the filter."""
-MISSING: Final = 1
-"""The reading is NaN: the control PLC has masked it."""
-SUSPECT: Final = 2
-"""It contradicts prediction and other readings, and is left out."""
-STUCK: Final = 3
-"""The same of one that shows nothing but its noise while the prediction moves (`watch`)."""
-FORGETTING: Final = 0.1
-"""Share of the time without a spike that is taken off the time with one."""
-RESTART, LONGEST_WATCH = 0.5, 10.0
-"""Times to the restart and of the longest watch, in multiples of `settled_s`."""
+USED: Final = 0  # a reading is used by the filter
+MISSING: Final = 1  # the reading is NaN: the control PLC has masked it
+SUSPECT: Final = 2  # it contradicts prediction and other readings, and is left out
+STUCK: Final = 3  # the same of one that shows nothing but its noise while the prediction moves (`watch`)
+FORGETTING: Final = 0.1  # share of the time without a spike that is taken off the time with one
+RESTART, LONGEST_WATCH = 0.5, 10.0  # times to the restart and of the longest watch, in multiples of `settled_s`
 READING: Final = (
     ("state", "i8"), ("since_s", "real"), ("agreed_s", "real"), ("jump", "real"), ("jumped_to", "real"),
     ("difference", "real"), ("spikes_s", "real"),
@@ -358,8 +352,7 @@ def suspects_of(readings: Any) -> int:  # noqa: ANN401 records
 
 YOUNGER: Final = 0
 OLDER: Final = 1
-NONE: Final = -1.0
-"""Age of predictions that have not begun."""
+NONE: Final = -1.0  # age of predictions that have not begun
 WATCH: Final = (
     "age_s", "shown", "unchanged_s", "count", "mean", "spread", "weight_s", "when_s", "span", "expected", "movement",
     "trend",

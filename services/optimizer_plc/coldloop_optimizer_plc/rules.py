@@ -18,8 +18,7 @@ from coldloop_optimizer_plc.computing_settings import Part, PlcBudget, in_its_na
 from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Array, Real
 from coldloop_optimizer_plc.settings import ProgramSettings, RuleName
 
-MEMORY: Final = 1
-"""Numbers that a rule may remember from one period to the next, in an array that begins with zeros."""
+MEMORY: Final = 1  # numbers that a rule may remember from one period to the next, in an array that begins with zeros
 
 
 class Observation(NamedTuple):
@@ -93,10 +92,8 @@ class UpdatingRule(Protocol):
 
 
 Decision = Callable[[Any, Array, Observation, Assessment], int]
-DECISIONS: Final[Implementations[Decision]] = Implementations("decide_by")
-"""The kernel of each rule."""
-decides_by = DECISIONS.register
-"""Decorator of the kernel that decides by rules of a class."""
+DECISIONS: Final[Implementations[Decision]] = Implementations("decide_by")  # the kernel of each rule
+decides_by = DECISIONS.register  # decorator of the kernel that decides by rules of a class
 
 
 def decide_by(rule: Any, memory: Array, observation: Observation, assessment: Assessment) -> int:  # noqa: ANN401
@@ -130,22 +127,14 @@ class Rule(NamedTuple):
     (`docs/updating-period.md`). The last three parameters have the floating-point type of the costs.
     """
 
-    kind: int
-    """An `UpdatingRuleKind`."""
-    first: int
-    """q(t_0), and that of a period which begins with a load step: what was learnt before says nothing of it."""
-    low: int
-    """Least q."""
-    high: int
-    """Largest q."""
-    delta: int = 0
-    """Step of Algorithm 1."""
-    band: float = 0.0
-    """Usual sizes of |ln K| up to which it says nothing."""
-    least: float = 0.0
-    """Least usual size, where it begins."""
-    change: float = 0.0
-    """Share by which the usual size changes in a period."""
+    kind: int  # an `UpdatingRuleKind`
+    first: int  # q(t_0), and that of a period which begins with a load step: what was learnt before says nothing of it
+    low: int  # least q
+    high: int  # largest q
+    delta: int = 0  # step of Algorithm 1
+    band: float = 0.0  # usual sizes of |ln K| up to which it says nothing
+    least: float = 0.0  # least usual size, where it begins
+    change: float = 0.0  # share by which the usual size changes in a period
 
     @property
     def status(self) -> UpdatingRuleStatus:

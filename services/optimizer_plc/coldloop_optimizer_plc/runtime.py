@@ -39,16 +39,13 @@ MakeProgram: TypeAlias = Callable[[LtiModel, ProgramSettings, InputLimits], Opti
 
 LOOK_OUT_TICKS: Final = 1 / 8
 """Plant time between two looks for a load step in real time: the new computation begins so much later."""
-HEARTBEAT_TICKS: Final = 4
-"""Plant time between two heartbeats while an answer is computed."""
+HEARTBEAT_TICKS: Final = 4  # plant time between two heartbeats while an answer is computed
 SHORTEST_PAUSE_S: Final = 0.001
 """Real time between two such requests, however high the factor: others want to be served too."""
-LONGEST_PAUSE_S: Final = 1.0
-"""Lower limit of it at low factors: a new session does not wait for an obsolete answer."""
+LONGEST_PAUSE_S: Final = 1.0  # lower limit of it at low factors: a new session does not wait for an obsolete answer
 SHORTEST_WAIT_S: Final = 0.02
 """An answer without a new update that comes sooner, in real time, is followed by a pause: it should have waited."""
-FRESH_UPDATE: Final = AwaitUpdate(session=0, update=0)
-"""Asks for a fresh update, whatever the session."""
+FRESH_UPDATE: Final = AwaitUpdate(session=0, update=0)  # asks for a fresh update, whatever the session
 NO_UPDATE: Final = registers.Optimization(*(0,) * len(registers.Optimization._fields))
 
 
@@ -170,13 +167,10 @@ class _Answer(NamedTuple):
 
     update: Update
     sequence: InputSequence
-    ready: float
-    """Time at which the PLC would have computed it, on the monotonic clock, s."""
+    ready: float  # time at which the PLC would have computed it, on the monotonic clock, s
     plan: Plan
-    planned: bool
-    """The control PLC has the plan: in real time it is sent at once, in lock-step with the sequence."""
-    resumed: bool = False
-    """The link has been lost since it was computed."""
+    planned: bool  # the control PLC has the plan: in real time it is sent at once, in lock-step with the sequence
+    resumed: bool = False  # the link has been lost since it was computed
 
 
 class OptimizerPlc:

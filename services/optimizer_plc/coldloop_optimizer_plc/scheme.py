@@ -24,14 +24,12 @@ from coldloop_optimizer_plc.rules import MEMORY
 from coldloop_optimizer_plc.settings import ProgramSettings, RuleName
 from coldloop_optimizer_plc.solvers.interface import Answer, Costs, solve_by
 
-SLOW: Final = 0.05
-"""Share of the turbine's speed at the operating point below which it may stand."""
+SLOW: Final = 0.05  # share of the turbine's speed at the operating point below which it may stand
 STANDSTILL_RATIO: Final = 1.1
 """Ratio of the pressures before and behind its nozzle, below which nothing flows; it is some ten in operation."""
 ROOM: Final = 1e-3
 """Between a bound and an input that is held, scaled: methods of the interior need some. Sequences hold it exactly."""
-MOST_BITS: Final = 31
-"""Largest number of bits of the mask of suspects in an exported optimiser."""
+MOST_BITS: Final = 31  # largest number of bits of the mask of suspects in an exported optimiser
 
 
 class TurbineWatch(NamedTuple):
@@ -140,8 +138,7 @@ def empty_state(n_states: int, n_inputs: int, n_outputs: int, size: int, real: R
     )  # fmt: skip
 
 
-LARGEST: Final = 1e38
-"""Largest number that registers carry, in single precision."""
+LARGEST: Final = 1e38  # largest number that registers carry, in single precision
 
 
 class Constants(NamedTuple):
@@ -152,30 +149,21 @@ class Constants(NamedTuple):
     Phi: Array
     Gamma: Array
     maps: problems.Maps
-    shifts: Array
-    """Shape (ticks + 1, knots, knots)."""
-    knots: Array
-    """Decision instants, shape (knots,)."""
-    rest: Array
-    """`rest_map`."""
+    shifts: Array  # shape (ticks + 1, knots, knots)
+    knots: Array  # decision instants, shape (knots,)
+    rest: Array  # `rest_map`
     predicted: problems.OutputMaps
-    weights: Array
-    """Weights of the knots in each sample, shape (horizon, knots)."""
+    weights: Array  # weights of the knots in each sample, shape (horizon, knots)
     input_scale: Array
     rate: Array
-    scaled_rate: Array
-    """Over `input_scale`, shape (3,)."""
-    rate_shares: Array
-    """Share of the rate limit after 0, 1, ... ticks, shape (ticks + 1,)."""
+    scaled_rate: Array  # over `input_scale`, shape (3,)
+    rate_shares: Array  # share of the rate limit after 0, 1, ... ticks, shape (ticks + 1,)
     n_inputs: int
     alpha: float
-    floor: float
-    """Constant added to J."""
+    floor: float  # constant added to J
     least_load: float
-    largest_load: float
-    """Least and largest load that can be held."""
-    reserve: float
-    """Reserve kept below the largest load that the model holds."""
+    largest_load: float  # least and largest load that can be held
+    reserve: float  # reserve kept below the largest load that the model holds
     least_load_error: float
     """Taken off the model's least load with the turbine's outlet in its band: it is too high until the bias
     of that has followed."""
@@ -185,21 +173,15 @@ class Constants(NamedTuple):
     time constant with which the limit of the feed follows that."""
     level: int
     temperature: int
-    feed_temperature: int
-    """Outputs that are level and temperature of the bath, and the temperature before its feed."""
+    feed_temperature: int  # outputs that are level and temperature of the bath, and the temperature before its feed
     opening_per_k: float
-    opening_from: float
-    """A deviation, %."""
+    opening_from: float  # a deviation, %
     turbine: TurbineWatch
-    load_step: float
-    """Change of the load at which an updating period is interrupted; 0 is never."""
+    load_step: float  # change of the load at which an updating period is interrupted; 0 is never
     sequence_ticks: int
-    fixed_ticks: int
-    """Fixed updating period; 0 is adaptive."""
-    most: int
-    """Largest q, that of the longest period."""
-    periods: NDArray[np.int64]
-    """Updating period in ticks for each q, shape (most + 1,); there is no q = 0."""
+    fixed_ticks: int  # fixed updating period; 0 is adaptive
+    most: int  # largest q, that of the longest period
+    periods: NDArray[np.int64]  # updating period in ticks for each q, shape (most + 1,); there is no q = 0
     fitting: NDArray[np.int64]
     """Iterations that fit into each number of ticks up to the longest period, a sampling period; shape (ticks + 1,)."""
 

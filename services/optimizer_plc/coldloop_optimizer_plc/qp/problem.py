@@ -311,8 +311,7 @@ def instance(
     return phi, gamma, low, high, constant
 
 
-LONG_AGO: Final = 2**15
-"""Ticks, more than any sampling period has."""
+LONG_AGO: Final = 2**15  # ticks, more than any sampling period has
 
 
 class QuadraticProblem(NamedTuple):

@@ -23,8 +23,7 @@ from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.interface import Answer, Costs, KernelSolver, solves_by
 
 POWER_ITERATIONS = 200
-BOUND_MARGIN = 1.02
-"""Margin on the largest eigenvalue, which power iteration approaches from below."""
+BOUND_MARGIN = 1.02  # margin on the largest eigenvalue, which power iteration approaches from below
 
 
 class FastGradientMethod(NamedTuple):

@@ -84,8 +84,7 @@ def collected(
     return Answer(costs[0], np.array(points), np.array(costs[1:]), np.array(iterations), multipliers)
 
 
-CONTACT = 1e-7
-"""Distance within which a variable touches its bound: the precision of the exact solvers."""
+CONTACT = 1e-7  # distance within which a variable touches its bound: the precision of the exact solvers
 
 
 class Solution(NamedTuple):
@@ -129,10 +128,8 @@ def judged(problem: QuadraticProblem, answer: Answer, alpha: float) -> Solution:
 
 
 Kernel = Callable[[Any, QuadraticProblem, Array, NDArray[np.int64], Costs], Answer]
-KERNELS: Final[Implementations[Kernel]] = Implementations("solve_by")
-"""The kernel of each method."""
-solves_by = KERNELS.register
-"""Decorator of the kernel that solves problems by a method."""
+KERNELS: Final[Implementations[Kernel]] = Implementations("solve_by")  # the kernel of each method
+solves_by = KERNELS.register  # decorator of the kernel that solves problems by a method
 
 
 def solve_by(method: Any, qp: QuadraticProblem, guess: Array, counts: NDArray[np.int64], before: Costs) -> Answer:  # noqa: ANN401

@@ -30,10 +30,8 @@ from coldloop_optimizer_plc.solvers.interface import Answer, Costs, KernelSolver
 
 Indices = NDArray[np.int64]
 
-SHORT_OF = 0.99
-"""Share of the way to the first bound that a step goes."""
-FINEST = 100.0
-"""mu, in units of the rounding error of 1, below which there is nothing left to win."""
+SHORT_OF = 0.99  # share of the way to the first bound that a step goes
+FINEST = 100.0  # mu, in units of the rounding error of 1, below which there is nothing left to win
 
 
 class Structure(NamedTuple):

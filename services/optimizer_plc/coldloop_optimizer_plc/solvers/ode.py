@@ -20,16 +20,13 @@ from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.settings import PenaltySettings
 from coldloop_optimizer_plc.solvers.interface import Answer, Costs, KernelSolver, solves_by
 
-G = 2.0 - np.sqrt(2.0)
-"""gamma of TR-BDF2: with this value both stages have the same matrix."""
+G = 2.0 - np.sqrt(2.0)  # gamma of TR-BDF2: with this value both stages have the same matrix
 C1 = 1.0 / (G * (2.0 - G))
 C0 = (1.0 - G) ** 2 * C1
 D = G / 2.0
 ERROR_CONSTANT = (-3.0 * G * G + 4.0 * G - 2.0) / (12.0 * (2.0 - G))
-STATIONARITY = 1e-6
-"""A step that lowers J by no more than this share of |J| has stalled."""
-STALLED_STEPS = 20
-"""Stalled steps in a row after which z counts as stationary."""
+STATIONARITY = 1e-6  # a step that lowers J by no more than this share of |J| has stalled
+STALLED_STEPS = 20  # stalled steps in a row after which z counts as stationary
 
 
 class Flow(NamedTuple):

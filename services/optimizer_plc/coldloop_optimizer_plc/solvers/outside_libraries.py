@@ -33,8 +33,7 @@ from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.solvers.interface import Answer, collected
 
 SOLVED, ON_THE_WAY = "SOLVER_RET_SUCCESS", "SOLVER_RET_LIMITED"
-FIRST_SOLVE_LIMIT = 10_000
-"""Steps after which the first problem of a chain is given up; it takes some tens."""
+FIRST_SOLVE_LIMIT = 10_000  # steps after which the first problem of a chain is given up; it takes some tens
 
 
 def are_numbers(problem: QuadraticProblem) -> bool:
@@ -185,8 +184,7 @@ def load_casadi() -> ModuleType:
     return casadi
 
 
-NEVER = 1e-15
-"""Tolerance that does not end the iterations: they are counted."""
+NEVER = 1e-15  # tolerance that does not end the iterations: they are counted
 
 
 class OsqpSolver(BorrowedSolver[OsqpSettings]):
@@ -266,8 +264,7 @@ class DaqpSolver(BorrowedSolver[DaqpSettings]):
 
 
 UNBOUNDED: Final = 1e30
-TOLERANCE: Final = 1e-9
-"""Absolute and relative, of all residuals."""
+TOLERANCE: Final = 1e-9  # absolute and relative, of all residuals
 
 
 class SoftProblem(NamedTuple):
