@@ -74,8 +74,7 @@ def factor_pattern(pattern: Pattern) -> Pattern:
     for k in range(len(filled)):
         row = k + np.flatnonzero(filled[k, k:])
         filled[np.ix_(row, row)] = True
-    upper: Pattern = np.triu(filled)
-    return upper
+    return np.asarray(np.triu(filled))
 
 
 def inverse_pattern(upper: Pattern) -> Pattern:

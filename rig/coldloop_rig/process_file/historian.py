@@ -214,8 +214,7 @@ def _seconds(stamps: Frame, lines: Frame, table: Table, request: Request, said: 
         of = "" if zoned.any() or request.zone else ", of an unknown zone"
         said.append(f"times      {dates.min()} to {dates.max()}{of}")
         found = (dates - dates.min()).dt.total_seconds()
-    seconds: Array = stamps.map(dict(zip(texts, found, strict=True))).to_numpy(float)
-    return seconds
+    return np.asarray(stamps.map(dict(zip(texts, found, strict=True))), float)
 
 
 def _unit_s(numbers: Array, table: Table) -> float:
@@ -266,8 +265,7 @@ def _held(at: Array, values: Array, grid: Array, period_s: float) -> Array:
     edges = np.append(grid, grid[-1] + period_s)
     times = np.append(at, max(at[-1], edges[-1]) + period_s)
     areas = np.concatenate([[0.0], np.cumsum(values * np.diff(times))])
-    held: Array = np.diff(np.interp(edges, times, areas)) / period_s
-    return held
+    return np.asarray(np.diff(np.interp(edges, times, areas)) / period_s)
 
 
 def _averaged(at: Array, values: Array, grid: Array, period_s: float) -> Array:

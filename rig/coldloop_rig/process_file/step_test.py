@@ -56,7 +56,13 @@ def identified(record: Record, order: int = 0) -> Identified:
     """
     y_mean, y_scale = record.outputs.mean(axis=0), record.outputs.std(axis=0)
     u_scale = record.inputs.std(axis=0)
-    _check_moves(record, u_scale)
+    for name, deviation, mean in zip(record.input_names, u_scale, record.inputs.mean(axis=0), strict=True):
+        if deviation <= 1e-9 * max(1.0, abs(mean)):
+            raise UsageError(f"{record.where}: {name} never moves; step it too, or what it does cannot be told")
+    related = np.atleast_2d(np.corrcoef(record.inputs.T)) - np.eye(len(u_scale))
+    if np.abs(related).max() > TOGETHER:
+        one, other = (record.input_names[k] for k in np.unravel_index(np.abs(related).argmax(), related.shape))
+        raise UsageError(f"{record.where}: {one} and {other} move together; step one after the other")
     y_scale = np.maximum(y_scale, 1e-12 * np.maximum(1.0, np.abs(y_mean)))
     u, y = (record.inputs - record.operating) / u_scale, (record.outputs - y_mean) / y_scale
     pieces = [np.arange(len(u))[piece] for piece in record.pieces]
@@ -92,16 +98,6 @@ def simulated(A: Array, B: Array, C: Array, D: Array, record: Record) -> Array:
     free = np.delete(responses, np.s_[q : q + n * m], axis=2) / scale[:, np.newaxis]
     unknowns = np.linalg.lstsq(free.reshape(-1, free.shape[2]), (left / scale).ravel())[0]
     return np.asarray(record.outputs - left + scale * (free @ unknowns))
-
-
-def _check_moves(record: Record, deviations: Array) -> None:
-    for name, deviation, mean in zip(record.input_names, deviations, record.inputs.mean(axis=0), strict=True):
-        if deviation <= 1e-9 * max(1.0, abs(mean)):
-            raise UsageError(f"{record.where}: {name} never moves; step it too, or what it does cannot be told")
-    related = np.atleast_2d(np.corrcoef(record.inputs.T)) - np.eye(len(deviations))
-    if np.abs(related).max() > TOGETHER:
-        one, other = (record.input_names[k] for k in np.unravel_index(np.abs(related).argmax(), related.shape))
-        raise UsageError(f"{record.where}: {one} and {other} move together; step one after the other")
 
 
 def _past(record: Record, rows: int) -> int:
@@ -236,9 +232,8 @@ PIECE: Final = "piece"
 """Column whose number changes where a record has a gap."""
 POOR: Final = 0.5  # share of an output's variation, explained of the data held back, below which a model is no good
 UNLIKE: Final = 0.3
-"""Rms error of a plant on a record of it, over the deviation of the output, from which on it is told, ..."""
-FAR: Final = 3.0
-"""... if it is so many times that of the model found in the record."""
+"""Rms error of a plant on a record of it, over the deviation of the output, from which on it is told."""
+FAR: Final = 3.0  # least of that error over that of the model found in the record
 EVEN: Final = 0.01  # largest deviation of an interval from the others, over their length
 
 
