@@ -245,8 +245,8 @@ class ColdBoxProgram(PlantProgram):
         return evaluated(self._x, self._u, w, self.box, load_helium())[1]
 
     def _step(self, w: float) -> tuple[RealArray, RealArray]:
-        x, y = self._x.copy(), np.empty(OUTPUTS)
-        advance_program_tick(x, self._slope, self._held, np.append(self._u, w), y, self._box, self._helium)
+        x, y, acting = self._x.copy(), np.empty(OUTPUTS), np.array((*self._u.tolist(), w))
+        advance_program_tick(x, self._slope, self._held, acting, y, self._box, self._helium)
         return x, y
 
 
