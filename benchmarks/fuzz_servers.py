@@ -26,7 +26,7 @@ from pathlib import Path
 
 from coldloop.config import load_configuration
 from coldloop.modbus.settings import TlsSettings
-from coldloop.modbus.tls import client_context
+from coldloop.modbus.tls import tls_context
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers import maps_of
 from coldloop.registers.common import STATISTICS_BLOCK
@@ -228,7 +228,7 @@ def certificates(folder: Path) -> list[ssl.SSLContext]:
     """Return what clients of each kind connect with."""
     files = [(folder / f"{name}.crt", folder / f"{name}.key") for name in CLIENTS]
     ca = folder / "ca.crt"
-    return [client_context(TlsSettings(certificate=certificate, key=key, ca=ca), "fuzz") for certificate, key in files]
+    return [tls_context(TlsSettings(certificate=certificate, key=key, ca=ca), "fuzz") for certificate, key in files]
 
 
 def text_of(log: Path) -> str:

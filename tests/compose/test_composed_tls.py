@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.modbus.settings import TlsSettings
-from coldloop.modbus.tls import client_context
+from coldloop.modbus.tls import tls_context
 from coldloop.registers.plant import Actuators, LoadStep
 from tests.compose.browser import assert_an_operator_changes_the_load
 from tests.harness.records import PLANT_MAP
@@ -32,7 +32,7 @@ def function_of_answer(rig: "ComposedRig", tls: TlsSettings, request: bytes) -> 
     """Return the function code that the plant answers a request with."""
     with (
         socket.create_connection(("127.0.0.1", rig.plant), 5) as plain,
-        client_context(tls, "test").wrap_socket(plain, server_hostname="127.0.0.1") as connection,
+        tls_context(tls, "test").wrap_socket(plain, server_hostname="127.0.0.1") as connection,
     ):
         connection.sendall(struct.pack(">HHHB", 1, 0, len(request) + 1, 255) + request)
         return connection.makefile("rb").read(8)[7]

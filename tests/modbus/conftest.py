@@ -18,7 +18,7 @@ from coldloop.modbus.connection import Connection, RefusalLog, Turns
 from coldloop.modbus.requests import RequestHandler
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, OnWrite, ServerSettings
 from coldloop.modbus.settings import TlsSettings
-from coldloop.modbus.tls import client_context
+from coldloop.modbus.tls import tls_context
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity
@@ -203,7 +203,7 @@ class Pki:
 
     def client(self, role: str | None) -> ssl.SSLContext:
         name = f"client-{role}"[:20]
-        return client_context(self.keep(name, self.authority.issue_client(name, role)), name)
+        return tls_context(self.keep(name, self.authority.issue_client(name, role)), name)
 
 
 @pytest.fixture(scope="session")

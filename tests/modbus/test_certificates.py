@@ -1,5 +1,6 @@
 """Certificates that have expired or have been revoked: what still starts, who is warned, and who is refused."""
 
+import ssl
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +13,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from coldloop.errors import ConfigurationError, PeerUnreachableError, UntrustedPeerError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.settings import Endpoint, TlsSettings
-from coldloop.modbus.tls import first_expiry, server_context
+from coldloop.modbus.tls import first_expiry, tls_context
 from coldloop_rig.cli.certificates import Authority, Pair, revoked_now
 from tests.harness.records import CONTROL_MAP
 
@@ -109,7 +110,7 @@ def test_days_left_are_those_of_whatever_expires_first(pki: "Pki", tmp_path: Pat
 def test_a_certificate_that_expires_within_the_days_of_the_warning_is_logged(
     pki: "Pki", caplog: pytest.LogCaptureFixture, warn_days: float, lines: int
 ) -> None:
-    server_context(pki.server.model_copy(update={"warn_days": warn_days}), "plant.server.tls")
+    tls_context(pki.server.model_copy(update={"warn_days": warn_days}), "plant.server.tls", ssl.PROTOCOL_TLS_SERVER)
     assert len(caplog.messages) == lines
     assert all(" expires on 20" in line for line in caplog.messages)
 
@@ -178,5 +179,5 @@ def bad_list(pki: "Pki", case: str) -> Path:
 def test_a_list_that_cannot_be_used_is_told_in_one_line(pki: "Pki", case: str, message: str) -> None:
     tls = pki.server.model_copy(update={"crl": bad_list(pki, case)})
     with pytest.raises(ConfigurationError, match=rf"^plant.server.tls: crl .*{case}.crl: {message}") as refusal:
-        server_context(tls, "plant.server.tls")
+        tls_context(tls, "plant.server.tls", ssl.PROTOCOL_TLS_SERVER)
     assert "\n" not in str(refusal.value)

@@ -22,7 +22,6 @@ from coldloop.process.sections import Range
 from coldloop.process.settings import ProcessSettings, declared, settings_process, stretched, within
 from coldloop.registers import safety
 from coldloop.registers.common import EventKind
-from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmPriority, AlarmState
 from coldloop.service.journal import Journal
 from coldloop_control_plc.output_limits import Numbers
@@ -295,8 +294,6 @@ class AlarmPanel(AlarmConditions):
         self.changes = 0
         """Rises with every change, so that who shows the alarms knows when to."""
 
-    # -- time ----------------------------------------------------------------------------------------------------------
-
     @property
     def now(self) -> int:
         """Tick of plant time, noted with what happens.
@@ -324,8 +321,6 @@ class AlarmPanel(AlarmConditions):
         for kind in self._shelved():
             if self.now >= self.rows[kind].shelved_until:
                 self._step(kind, EventKind.ALARM_UNSHELVED)
-
-    # -- conditions ----------------------------------------------------------------------------------------------------
 
     def report(self, kind: int, *, condition: bool, cause: int = 0, value: float = 0.0) -> None:
         """Report the condition of an alarm and its cause; a new cause raises the alarm again, whatever the value."""
@@ -449,80 +444,3 @@ class AlarmPanel(AlarmConditions):
         found = [i for i, row in enumerate(self.rows) if row.state == AlarmState.SHELVED]
         self._may_be_shelved = bool(found)
         return found
-
-
-SENSORS: Final = {AlarmKind.SENSOR_BAD: 1, AlarmKind.SENSOR_SUSPECT: 2}
-"""Alarms of sensors, and the cause of their events."""
-OPTIMIZER_DRIVES: Final = (Mode.MPC, Mode.REST)
-"""Modes in which the optimiser's sequences are played."""
-
-
-class ScanSummary(NamedTuple):
-    """Conditions of one scan that its alarms depend on, beside those of bands."""
-
-    mode: int
-    cause: int
-    late: bool
-    """The rest of a sequence is being played."""
-    optimizer: bool
-    """The optimiser's heartbeat is present."""
-    short: bool
-    """The load is above what can be held, ..."""
-    idle: bool
-    """... or below what is needed."""
-    bad: int
-    """Bit i is set when output i is substituted."""
-    suspects: int
-    """Outputs that the optimiser does without: bit i is output i; then inputs that have no effect."""
-
-
-class ProcessAlarms:
-    """Raises and returns the alarms of a panel that depend on the process, with so many outputs, and on the ladder.
-
-    Sensors that became bad or good are noted in the journal.
-    """
-
-    def __init__(self, panel: AlarmPanel, journal: Journal, outputs: int) -> None:
-        self._panel = panel
-        self._journal = journal
-        self._outputs = outputs
-        self._before: dict[AlarmKind, frozenset[int]] = dict.fromkeys(SENSORS, frozenset())
-        self.reported: ScanSummary | None = None
-
-    def watch(self, tick: int, scan: ScanSummary, shortage: float) -> None:
-        """Look at everything after the scan of a tick.
-
-        `shortage`: what the load is above what can be held, in W; negative: below what is needed.
-        """
-        for kind in self._panel.constants.bands:
-            if self._panel.since[kind] != NOT:
-                self._panel.settle(kind)
-        if scan == self.reported and not self._panel.reports:
-            return
-        self.reported, report = scan, self._panel.report
-        mode, cause = scan.mode, scan.cause
-        fallen = mode != Mode.MPC and cause not in (Cause.SESSION_STARTED, Cause.OPERATOR, Cause.COOL_DOWN)
-        report(AlarmKind.MODE, condition=fallen, cause=cause)
-        exhausted = mode != Mode.MPC and cause in (Cause.SEQUENCE_EXHAUSTED, Cause.HOLD_EXPIRED)
-        report(AlarmKind.SEQUENCE_EXHAUSTED, condition=exhausted)
-        report(AlarmKind.SEQUENCE_LATE, condition=scan.late)
-        report(AlarmKind.OPTIMIZER_LOST, condition=not scan.optimizer)
-        short = safety.CapacityCause.of(shortage if mode == Mode.MPC else 0.0)
-        report(AlarmKind.CAPACITY, condition=bool(short), cause=short, value=abs(shortage))
-        self._watch_sensors(tick, AlarmKind.SENSOR_BAD, scan.bad)
-        suspects = scan.suspects if mode in OPTIMIZER_DRIVES else 0
-        self._watch_sensors(tick, AlarmKind.SENSOR_SUSPECT, suspects & ~(-1 << self._outputs))
-        idle = suspects >> self._outputs
-        first = (idle & -idle).bit_length() - 1
-        report(AlarmKind.INPUT_WITHOUT_EFFECT, condition=bool(idle), cause=max(0, first))
-
-    def _watch_sensors(self, tick: int, kind: AlarmKind, bits: int) -> None:
-        """Note each sensor that became bad, suspect or good, and raise the alarm; its cause is the newest one."""
-        found = frozenset(output for output in range(self._outputs) if bits >> output & 1)
-        before, self._before[kind] = self._before[kind], found
-        for output in sorted(found ^ before):
-            self._journal.note(tick, EventKind.SENSOR, output, SENSORS[kind] if output in found else 0)
-        for output in sorted(found - before):
-            self._panel.raised(kind, output)
-        if not found:
-            self._panel.returned(kind)

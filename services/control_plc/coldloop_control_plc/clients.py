@@ -131,12 +131,8 @@ class ControlPublication:
 
 LONGEST_WAIT_S: Final = 1.0
 """Longest time that a read of the latch waits for an update; the optimiser then asks again."""
-UNWATCHED_S: Final = 10.0
-"""Silence that ends the lease of the optimiser where its watchdog is off, in real time."""
 SECOND_OPTIMIZER: Final = 1
 """Cause of the alarm SECOND_WRITER."""
-TRACKED: Final = 1e-4
-"""Setpoints that an operator writes back as they were read have not been changed."""
 
 
 class Clients:
@@ -173,13 +169,11 @@ class Clients:
         bank.put_sealed(registers.Plan(0, 0))
         bank.judged_by(self._judge_pace, SessionPace)
 
-    # -- judged before anything is stored ------------------------------------------------------------------------------
-
     def _silence_s(self) -> float:
         """Return the silence, in real time, after which another optimiser may write."""
         pace, watchdog = self._sessions.pace, self._program.watchdog
         if not watchdog.time:
-            return UNWATCHED_S
+            return 10.0  # where its watchdog is off
         return watchdog.time * self._tick_s / (pace.factor if pace.realtime else 1.0)
 
     def _judge_optimizer(self, record: tuple[object, ...], _row: int, caller: Caller) -> None:
@@ -204,8 +198,6 @@ class Clients:
             asked.of(self._program.session if self._sessions.running else 0)
         except ValueError as error:
             raise IllegalValueError(f"pace: {error}") from None
-
-    # -- done ----------------------------------------------------------------------------------------------------------
 
     def begin(self) -> None:
         """Show nothing of the session before: a session begins."""
@@ -259,7 +251,6 @@ class Clients:
         return None
 
     def _command(self, block: Block, caller: Caller) -> None:
-        """Do what an operator has written, and note who it was."""
         command, who = self._bank.get(block.record), caller.name
         program, watchdog = self._program, self._program.watchdog
         match command:
@@ -294,7 +285,7 @@ class Clients:
         if operator.mode != before.mode:
             self._note(EventKind.OPERATOR_MODE, operator.mode, who)
         for place, (value, last) in enumerate(zip(operator.u, before.u, strict=True)):
-            if abs(value - last) > TRACKED:
+            if abs(value - last) > 1e-4:  # those that are written back as they were read have not been changed
                 self._note(EventKind.SETPOINT, place, who, value=value)
         self._program.operate(operator)
 

@@ -18,21 +18,15 @@ from coldloop.safety.writers import Inputs
 class Numbers(Protocol):
     """Numbers in a row: a tuple or a list here, an array where the arithmetic is compiled."""
 
-    def __getitem__(self, place: int, /) -> float:
-        """Return the number at a place."""
-
-    def __len__(self) -> int:
-        """Return how many there are."""
-
-    def __iter__(self) -> Iterator[float]:
-        """Return them in turn."""
+    def __getitem__(self, place: int, /) -> float: ...
+    def __len__(self) -> int: ...
+    def __iter__(self) -> Iterator[float]: ...
 
 
 class Rows(Protocol):
     """Rows of numbers."""
 
-    def __getitem__(self, place: int, /) -> Numbers:
-        """Return the row at a place."""
+    def __getitem__(self, place: int, /) -> Numbers: ...
 
 
 TOLERANCE: Final = 1e-5

@@ -103,8 +103,6 @@ class PlantLink:
             self.state, self.cause, self.since, breaks, self.holder, self.generation, self.session, self.tick
         )
 
-    # -- events --------------------------------------------------------------------------------------------------------
-
     def begin(self) -> None:
         """Begin a session: read back first. What the rack applied in the one before does not matter."""
         self.generation, self._known_place = 0, None
@@ -214,8 +212,6 @@ class PlantLink:
         if self._noted is not PlantLinkState.SYNCHRONISED:
             self._note(PlantLinkState.SYNCHRONISED)
         self._return_alarms()
-
-    # -- inside --------------------------------------------------------------------------------------------------------
 
     def _forget_times(self) -> None:
         """Forget what was noted in ticks of a time base that may be another now."""

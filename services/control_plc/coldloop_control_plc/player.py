@@ -192,8 +192,6 @@ class SequencePlayer(PlayerState):
         """The sequence being played."""
         return self.sequences[self.slot] if self.lengths[self.slot] else None
 
-    # -- who else drives, and time that leaps --------------------------------------------------------------------------
-
     def dismiss(self) -> None:
         """Let nothing be played, and nothing be offered, until `invite`."""
         self.invited = self.late = False
@@ -242,8 +240,6 @@ class SequencePlayer(PlayerState):
                 table = [tuple(map(float, rows[slot][tick])) for tick in range(length)]
                 self.sequences[slot] = with_checksum(header, table)
                 self.acknowledgement = Acknowledgement(max(self.numbers), Verdict.ACCEPTED)
-
-    # -- the optimiser's side ------------------------------------------------------------------------------------------
 
     def accept_plan(self, plan: Plan, earliest: int) -> bool:
         """Take the updating period of the last update; return whether it was acceptable."""

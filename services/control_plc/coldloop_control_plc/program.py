@@ -8,7 +8,7 @@ the last word (`output_limits.py`).
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from coldloop.errors import ConfigurationError
 from coldloop.process.model_file import ModelHeader
@@ -17,12 +17,12 @@ from coldloop.registers import control_plc as registers
 from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Cause, CoolDownStep, Mode, Operator, OperatorMode, ProcessNow, Update
 from coldloop.registers.plant import Actuators, Measurement
-from coldloop.registers.safety import Alarm, AlarmKind
+from coldloop.registers.safety import Alarm, AlarmKind, CapacityCause
 from coldloop.safety.watchdog import Watchdog
 from coldloop.safety.writers import Inputs, InputSequence
 from coldloop.service.journal import Journal
 from coldloop_control_plc import scan
-from coldloop_control_plc.alarms import AlarmPanel, ProcessAlarms, ScanSummary
+from coldloop_control_plc.alarms import NOT, AlarmPanel
 from coldloop_control_plc.output_limits import OutputGuard
 from coldloop_control_plc.player import SequencePlayer, awaits_sequence, latches
 from coldloop_control_plc.sensors import NONE, SensorMonitor
@@ -33,9 +33,11 @@ SEEN = 0.1
 LOST_TICKS = 4
 """A rack that has been out of step for longer takes no new sequences: they would be played late."""
 
+SENSORS = {AlarmKind.SENSOR_BAD: 1, AlarmKind.SENSOR_SUSPECT: 2}
+"""Alarms of sensors, and the cause of their events."""
 
-@dataclass(frozen=True, slots=True)
-class OperatingPoint:
+
+class OperatingPoint(NamedTuple):
     """The model as the control PLC knows it: its inputs and outputs at rest, and its digest."""
 
     inputs: tuple[float, ...]
@@ -129,7 +131,9 @@ class ControlProgram:
         self._noted: tuple[int, int] = mode, cause
         self._noted_step = self.ladder.step
         self.watchdog.set(self.watchdog.time, tick)
-        self._process_alarms = ProcessAlarms(self.alarms, self.journal, len(point.outputs))
+        self._reported: tuple[int, ...] | None = None
+        """Conditions of the last scan whose alarms were reported."""
+        self._sensors_before: dict[AlarmKind, frozenset[int]] = dict.fromkeys(SENSORS, frozenset())
         self.alarms.now = tick
         self.scan = scan.Scan(self.guard.state, self.ladder, self.player, self.sensors, self.alarms, self.watchdog)
         self.scan_constants = scan.ScanConstants(
@@ -200,7 +204,6 @@ class ControlProgram:
         return Actuators(tick, self.guard.applied, self.session)
 
     def _note_mode(self) -> None:
-        """Note mode and cause where they have changed."""
         if self._noted != (self.ladder.mode, self.ladder.cause):
             self._noted = self.ladder.mode, self.ladder.cause
             self.journal.note(self.tick, EventKind.MODE, *self._noted)
@@ -226,18 +229,53 @@ class ControlProgram:
             latched = self.player.latch(
                 Update(self.session, 0, tick, 0, load, tuple(self._before), applied, y, measurement.x)
             )
-        self._process_alarms.watch(tick, self._summary, self.player.shortage)
+        self._report_alarms()
         self.tick += 1
         self._in_scan = False
         return latched
 
     @property
-    def _summary(self) -> ScanSummary:
+    def _conditions(self) -> tuple[int, ...]:
+        """Conditions of a scan that its alarms depend on, beside those of bands."""
         ladder, player = self.ladder, self.player
-        return ScanSummary(
-            ladder.mode, ladder.cause, player.late, self.optimizer_present, player.shortage > 0.0,
-            player.shortage < 0.0, self.bad_sensors, player.suspects,
-        )  # fmt: skip
+        short = player.shortage > 0.0, player.shortage < 0.0
+        return ladder.mode, ladder.cause, player.late, self.optimizer_present, *short, self.bad_sensors, player.suspects
+
+    def _report_alarms(self) -> None:
+        """Report the conditions of the alarms that depend on the process and on the ladder, at the end of a scan."""
+        alarms, conditions = self.alarms, self._conditions
+        for kind in alarms.constants.bands:
+            if alarms.since[kind] != NOT:
+                alarms.settle(kind)
+        if conditions == self._reported and not alarms.reports:
+            return
+        self._reported, report = conditions, alarms.report
+        player, mode, cause, outputs = self.player, self.ladder.mode, self.ladder.cause, len(self._point.outputs)
+        fallen = mode != Mode.MPC and cause not in (Cause.SESSION_STARTED, Cause.OPERATOR, Cause.COOL_DOWN)
+        report(AlarmKind.MODE, condition=fallen, cause=cause)
+        exhausted = mode != Mode.MPC and cause in (Cause.SEQUENCE_EXHAUSTED, Cause.HOLD_EXPIRED)
+        report(AlarmKind.SEQUENCE_EXHAUSTED, condition=exhausted)
+        report(AlarmKind.SEQUENCE_LATE, condition=player.late)
+        report(AlarmKind.OPTIMIZER_LOST, condition=not self.optimizer_present)
+        short = CapacityCause.of(player.shortage if mode == Mode.MPC else 0.0)
+        report(AlarmKind.CAPACITY, condition=bool(short), cause=short, value=abs(player.shortage))
+        suspects = player.suspects if mode in (Mode.MPC, Mode.REST) else 0  # the optimiser's sequences are played
+        self._report_sensors(AlarmKind.SENSOR_BAD, self.bad_sensors)
+        self._report_sensors(AlarmKind.SENSOR_SUSPECT, suspects & ~(-1 << outputs))
+        idle = suspects >> outputs
+        first = (idle & -idle).bit_length() - 1
+        report(AlarmKind.INPUT_WITHOUT_EFFECT, condition=bool(idle), cause=max(0, first))
+
+    def _report_sensors(self, kind: AlarmKind, bits: int) -> None:
+        """Note each sensor that became bad, suspect or good, and raise the alarm; its cause is the newest one."""
+        found = frozenset(output for output in range(len(self._point.outputs)) if bits >> output & 1)
+        before, self._sensors_before[kind] = self._sensors_before[kind], found
+        for output in sorted(found ^ before):
+            self.journal.note(self.tick, EventKind.SENSOR, output, SENSORS[kind] if output in found else 0)
+        for output in sorted(found - before):
+            self.alarms.raised(kind, output)
+        if not found:
+            self.alarms.returned(kind)
 
     @property
     def is_ordinary(self) -> bool:
@@ -247,7 +285,7 @@ class ControlProgram:
             self.ladder.mode == Mode.MPC
             and self.operator.mode == OperatorMode.AUTO
             and not (self.sensors.bad_count or self.sensors.is_unknown)
-            and self._process_alarms.reported == self._summary
+            and self._reported == self._conditions
             and self.optimizer_present
             and self.player.invited
             and alarms.next_report > self.tick

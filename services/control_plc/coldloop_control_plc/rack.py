@@ -106,7 +106,8 @@ class RackClock:
         self.offset = 0.0
         """Last phase error, in ticks: positive when the rack is ahead of our schedule."""
         self._rate = 0.0
-        self._skew = SkewEstimator()
+        self.skew = SkewEstimator()
+        """How much faster the rack's clock is than ours."""
         self._at = now
         self._position = PHASE
         self._begun = now
@@ -129,7 +130,7 @@ class RackClock:
         So is the skew, unless the rack is not where its clock would have taken it: then it has jumped.
         """
         if abs(position - self.position_at(at)) > LEAP:
-            self._skew = SkewEstimator()
+            self.skew = SkewEstimator()
             self._begun = at
         self._position, self._at, self.offset = position, at, 0.0
 
@@ -149,11 +150,7 @@ class RackClock:
         if step_s > 0.0:
             change = RATE_GAIN * min(max(error, -1.0), 1.0) * min(1.0, self.tick_s / step_s)
             self._rate = min(max(self._rate + change, -MAX_RATE), MAX_RATE)
-        self._skew.observe(at - self._begun, position * self.tick_s - at + self._begun, uncertainty_s)
-
-    def skew(self) -> Skew:
-        """Return how much faster the rack's clock is than ours."""
-        return self._skew.estimate()
+        self.skew.observe(at - self._begun, position * self.tick_s - at + self._begun, uncertainty_s)
 
 
 def cause_of(error: errors.LinkError) -> LinkCause:

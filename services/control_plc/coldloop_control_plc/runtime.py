@@ -39,30 +39,18 @@ from coldloop_control_plc.settings import SHOWN, ControlSettings
 
 log = logging.getLogger("coldloop.control_plc")
 
-ANSWER_TICKS: Final = 8
-"""In real time a later answer is stale: the rack is read again."""
-SHORTEST_PATIENCE_S: Final = 0.1
 LONGEST_SLEEP_S: Final = 0.25
 """In real time it is seen so often whether an operator has called meanwhile."""
 REPACED_S: Final = 0.5
 """Between two changes of the time base in real time: each reads the rack before outputs are written again."""
-KEEP_ALIVE_S: Final = 1.0
-"""While paused, the rack is asked something so often."""
 LOOK_S: Final = 0.25
-"""Real time between two looks."""
-LOOKS: Final = 8
-"""Looks without a scan between them after which scans have stopped: looks, so that a process that had no processor time
-does not take that for a fault."""
-SCANS: Final = 8
-"""Scans that are missing then, at least, where the factor is low."""
+"""Real time between two looks at the scans."""
 EXPIRES_SOON: Final = 1
 """Causes of the alarm CERTIFICATE."""
 EXPIRED: Final = 2
 UNREADABLE: Final = 3
 CERTIFICATES_S: Final = 3600.0
 """Between two looks at the certificates, in real time."""
-STATE_REFUSED: Final = 1
-"""Cause of the alarm STATE_NOT_RETAINED: at the start there was one that is not used."""
 
 
 class ControlPlc:
@@ -104,7 +92,7 @@ class ControlPlc:
         if self.sessions.kept is not None:
             self._link.starting()  # other clients must not take this for a PLC without a session
         if self._store.refused:
-            program.alarms.raised(AlarmKind.STATE_NOT_RETAINED, STATE_REFUSED)
+            program.alarms.raised(AlarmKind.STATE_NOT_RETAINED, 1)  # cause: there was one that is not used
         self.publication.safety()
 
     def close(self) -> None:
@@ -112,8 +100,6 @@ class ControlPlc:
         self._plant.close()
         self._keep()
         self._store.close()
-
-    # -- scan cycle ----------------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
         """Scan until cancelled; a rack that is not there is waited for."""
@@ -184,7 +170,7 @@ class ControlPlc:
         """Wait until an operator writes something; the connection to the rack is kept open meanwhile."""
         self.clients.changed.clear()
         try:
-            async with asyncio.timeout(KEEP_ALIVE_S):
+            async with asyncio.timeout(1.0):  # s, then the rack is asked something
                 await self.clients.changed.wait()
         except TimeoutError:
             with contextlib.suppress(LinkError):  # the rack is read when time resumes
@@ -268,7 +254,7 @@ class ControlPlc:
     def _watch_ourselves(self) -> None:
         """Raise the alarms about clock and memory, and note log lines that were lost."""
         if self.sessions.pace.realtime:
-            skew = self.publication.skew = self._clock.skew()
+            skew = self.publication.skew = self._clock.skew.estimate()
             self.publication.offset_ms = self._clock.offset * self._clock.tick_s * 1000
             limit = self._settings.control_plc.skew_alarm_ppm
             known = skew.error_ppm < limit / 4
@@ -286,7 +272,8 @@ class ControlPlc:
             pace, alarms = self.sessions.pace, self._program.alarms
             scans = self.sessions.running and pace.realtime and not pace.paused
             self._looks = self._looks + 1 if scans else 1
-            missing = self._looks > max(LOOKS, SCANS * self._clock.tick_s / LOOK_S)
+            # 8 looks, or where the factor is low 8 scans; a process that had no processor time has not looked either
+            missing = self._looks > max(8, 8 * self._clock.tick_s / LOOK_S)
             stopped = missing and not self._link.is_alarmed
             if stopped is not bool(alarms.rows[AlarmKind.SCANS_STOPPED].active):
                 alarms.report(AlarmKind.SCANS_STOPPED, condition=stopped)
@@ -318,9 +305,7 @@ class ControlPlc:
         longest = self._settings.control_plc.plant.timeout_s
         if not self.sessions.pace.realtime:
             return longest
-        return min(longest, max(SHORTEST_PATIENCE_S, ANSWER_TICKS * self._clock.tick_s))
-
-    # -- out of step ---------------------------------------------------------------------------------------------------
+        return min(longest, max(0.1, 8 * self._clock.tick_s))  # a later answer is stale: the rack is read again
 
     async def _look(self) -> None:
         """Read what the rack applies; once synchronised, resume from there."""
@@ -335,8 +320,6 @@ class ControlPlc:
                 self._program.alarms.now = min(max(self._program.tick, now), LAST_TICK)
                 self._program.alarms.pass_by()
         self.publication.safety()
-
-    # -- sessions ------------------------------------------------------------------------------------------------------
 
     def _adopt(self, reading: Measurement) -> bool:
         """Go over to the session of the rack, where that is ours to do."""

@@ -272,9 +272,9 @@ class RegisterClient:
         self._timeout_s = timeout_s
         context: ssl.SSLContext | None = None
         if tls is not None:
-            from coldloop.modbus.tls import client_context  # noqa: PLC0415 without TLS, nothing needs cryptography
+            from coldloop.modbus.tls import tls_context  # noqa: PLC0415 without TLS, nothing needs cryptography
 
-            context = client_context(tls, f"tls of the client of {register_map.service} at {host}:{port}")
+            context = tls_context(tls, f"tls of the client of {register_map.service} at {host}:{port}")
         self._secure = context is not None
         self._transport = Transport(register_map.service, host, port, timeout_s, context)
         self._turn = asyncio.Lock()
@@ -383,7 +383,6 @@ class RegisterClient:
             self._check_written(request, (await self._transact([request], block))[0], block)
 
     def _writing(self, records: Sequence[tuple[Any, ...]], start: int = 0) -> bytes:
-        """Return the PDU that writes rows of one block."""
         block, codec = self._places[type(records[0])]
         data = _encoded(block, codec, *records)
         address = block.address + start * codec.size // 2

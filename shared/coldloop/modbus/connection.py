@@ -431,12 +431,9 @@ def caller_at(host: str, name: str, access: AccessSettings) -> Caller | None:
     """Return the caller at an address, or None if the address is not allowed."""
     address = ip_address(host)
     address = getattr(address, "ipv4_mapped", None) or address  # an IPv4 client of a dual-stack socket
-    places = (
-        (Role.CONTROL, access.control), (Role.OPTIMIZER, access.optimizer), (Role.OPERATOR, access.operator),
-        (None, access.readers),
-    )  # fmt: skip
-    found = {role for role, networks in places if any(address in network for network in networks)}
-    return Caller(name, frozenset(role for role in found if role is not None)) if found else None
+    places = {Role.CONTROL: access.control, Role.OPTIMIZER: access.optimizer, Role.OPERATOR: access.operator}
+    roles = frozenset(role for role, networks in places.items() if any(address in network for network in networks))
+    return Caller(name, roles) if roles or any(address in network for network in access.readers) else None
 
 
 def caller_with(certificate: bytes, name: str) -> Caller:

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import errno
+import ssl
 from collections.abc import Callable
 from functools import partial
 from time import monotonic
@@ -109,11 +110,12 @@ class ModbusServer:
             if tls is None:
                 self._listener = await asyncio.get_running_loop().create_server(make_connection, host, port)
             else:
-                from coldloop.modbus import tls as security  # noqa: PLC0415 without TLS, nothing needs cryptography
+                from coldloop.modbus.tls import TlsListener, tls_context  # noqa: PLC0415 nothing else needs cryptography
 
-                self._listener = await security.TlsListener.at(
-                    host, port, security.server_context(tls, f"{self._service}.server.tls"),
-                    make_protocol=make_connection, limit=self._settings.connection_limit, refusals=self.refusals,
+                context = tls_context(tls, f"{self._service}.server.tls", ssl.PROTOCOL_TLS_SERVER)
+                self._listener = await TlsListener.at(
+                    host, port, context, make_protocol=make_connection, limit=self._settings.connection_limit,
+                    refusals=self.refusals,
                 )  # fmt: skip
         except OSError as error:
             reason = _REMEDIES.get(error.errno or 0, f"{error.strerror}; choose another host or port")

@@ -30,27 +30,6 @@ DAY_S: Final = 86400.0
 _logger = logging.getLogger("coldloop.modbus")
 
 
-def server_context(settings: TlsSettings, name: str) -> ssl.SSLContext:
-    """Return the context of a server that asks every client for its certificate; `name` is for messages.
-
-    Raises:
-        ConfigurationError: A file cannot be used.
-    """
-    context = _context(ssl.PROTOCOL_TLS_SERVER, settings, name)
-    context.verify_mode = ssl.CERT_REQUIRED
-    context.num_tickets = 0  # a session that is resumed would not show its certificate again
-    return context
-
-
-def client_context(settings: TlsSettings, name: str) -> ssl.SSLContext:
-    """Return the context of a client that checks the server's certificate and host name.
-
-    Raises:
-        ConfigurationError: A file cannot be used.
-    """
-    return _context(ssl.PROTOCOL_TLS_CLIENT, settings, name)
-
-
 class Expiry(NamedTuple):
     """The file that expires first, and when."""
 
@@ -77,7 +56,15 @@ def first_expiry(settings: TlsSettings, name: str = "tls") -> Expiry:
     return min(ends, key=lambda expiry: expiry.end)
 
 
-def _context(protocol: int, settings: TlsSettings, name: str) -> ssl.SSLContext:
+def tls_context(settings: TlsSettings, name: str, protocol: int = ssl.PROTOCOL_TLS_CLIENT) -> ssl.SSLContext:
+    """Return the context of a client, which checks the server's certificate and host name, or of a server.
+
+    A server (`ssl.PROTOCOL_TLS_SERVER`) asks every client for its certificate. `name`, whose the files are, is for
+    messages.
+
+    Raises:
+        ConfigurationError: A file cannot be used.
+    """
     certificate, authorities, lists = _read(settings, name)
     key = _public_key_of(settings.key, f"{name}: key")  # OpenSSL would only hint at what is wrong
     if key != certificate.public_key():
@@ -98,6 +85,7 @@ def _context(protocol: int, settings: TlsSettings, name: str) -> ssl.SSLContext:
         )
     context = ssl.SSLContext(protocol)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.verify_mode = ssl.CERT_REQUIRED
     try:
         context.load_cert_chain(settings.certificate, settings.key)
         context.load_verify_locations(settings.ca)
@@ -108,6 +96,8 @@ def _context(protocol: int, settings: TlsSettings, name: str) -> ssl.SSLContext:
     if lists:
         whole = {each.issuer for each in lists} >= {authority.subject for authority in authorities}
         context.verify_flags |= ssl.VERIFY_CRL_CHECK_CHAIN if whole else ssl.VERIFY_CRL_CHECK_LEAF
+    if protocol == ssl.PROTOCOL_TLS_SERVER:
+        context.num_tickets = 0  # a session that is resumed would not show its certificate again
     return context
 
 

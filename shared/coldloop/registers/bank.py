@@ -205,9 +205,17 @@ class RegisterBank:
             IllegalValueError: A value is out of range, half of a 32-bit value, or does not fit the rest of its record.
             BusyError: Another client holds the lease of the role.
         """
-        span = self._span(address, len(data) // 2, caller)
+        words = len(data) // 2
+        span = self._spans.get((address, words))
+        if span is None:
+            span = self._make_span(address, words, caller.roles)
+            if len(self._spans) >= MAX_SPANS:
+                self._spans.clear()
+            self._spans[address, words] = span
+        elif not span.writers <= caller.roles:
+            raise _forbidden(span.blocks, caller.roles)
         image = data
-        if span.first != address or span.end != address + len(data) // 2:  # a part of a record: the rest stays
+        if span.first != address or span.end != address + words:  # a part of a record: the rest stays
             offset = 2 * (address - span.first)
             image = bytes(self._memory[2 * span.first : 2 * address]) + data
             image += self._memory[2 * span.first + offset + len(data) : 2 * span.end]
@@ -222,17 +230,6 @@ class RegisterBank:
             judge(codec.decode(image, offset), row, caller)
         self._memory[2 * span.first : 2 * span.end] = image
         return span.blocks
-
-    def _span(self, address: int, words: int, caller: Caller) -> "_Span":
-        span = self._spans.get((address, words))
-        if span is None:
-            span = self._make_span(address, words, caller.roles)
-            if len(self._spans) >= MAX_SPANS:
-                self._spans.clear()
-            self._spans[address, words] = span
-        elif not span.writers <= caller.roles:
-            raise _forbidden(span.blocks, caller.roles)
-        return span
 
     def _make_span(self, address: int, words: int, roles: frozenset[Role]) -> "_Span":
         end = address + words

@@ -21,7 +21,6 @@ def _ahead(process: Process, samples: tuple[int, ...]) -> tuple[str, ...]:
 
 
 def _predicted(process: Process) -> reg.Field:
-    """Declare the prediction of each output that has a band."""
     fields = [
         (f"{one.name.lower()}.{time}", reg.f32(f"Predicted {one.name}", unit=one.unit))
         for one in process.banded
@@ -32,7 +31,6 @@ def _predicted(process: Process) -> reg.Field:
 
 
 def _planned(process: Process) -> reg.Field:
-    """Declare the inputs that are planned."""
     names = tuple(f"{name}.{time}" for time in _ahead(process, INPUT_SAMPLES) for name in process.input_names)
     return reg.f32("Planned input", elements=names, units=process.input_units * len(INPUT_SAMPLES))
 

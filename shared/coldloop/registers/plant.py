@@ -286,7 +286,6 @@ class ModelRangeStatus(NamedTuple):
 
 
 def _blocking(exchanger: str) -> reg.Field:
-    """Declare how fast an exchanger blocks up."""
     return reg.f32(
         f"Share of {exchanger} that blocks up in an hour; below 0 it is cleaned", unit="1/h", low=-10, high=10
     )

@@ -221,19 +221,20 @@ class RetainedStateWriter:
             self._changed.notify_all()
 
     def _write(self, state: Mapping[str, Any], number: int) -> None:
+        before, self.failed = self.failed, self._failure(state)
+        if self.failed is not None:
+            if before is None:
+                log.error("the state is not retained", extra={"reason": self.failed})
+            return
+        if before is not None:
+            log.warning("the state is retained again", extra={"file": str(self._file.path)})
+        with self._changed:
+            self._written = number
+            self._changed.notify_all()
+
+    def _failure(self, state: Mapping[str, Any]) -> str | None:
         try:
             self._file.save(state)
         except Exception as error:  # noqa: BLE001 - whatever it is, scans continue and an alarm is raised
-            self._note(str(error) or repr(error))
-        else:
-            self._note(None)
-            with self._changed:
-                self._written = number
-                self._changed.notify_all()
-
-    def _note(self, failure: str | None) -> None:
-        before, self.failed = self.failed, failure
-        if failure is not None and before is None:
-            log.error("the state is not retained", extra={"reason": failure})
-        elif failure is None and before is not None:
-            log.warning("the state is retained again", extra={"file": str(self._file.path)})
+            return str(error) or repr(error)
+        return None

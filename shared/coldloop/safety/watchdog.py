@@ -5,6 +5,27 @@ from dataclasses import dataclass
 from coldloop.registers import safety
 
 
+def remaining(watchdog: "Watchdog", tick: int) -> int:
+    """Return the ticks until it expires. It and what follows are plain Python that the rig compiles too."""
+    return min(watchdog.time, max(0, watchdog.time - (tick - watchdog.triggered)))
+
+
+def expire(watchdog: "Watchdog", tick: int) -> bool:
+    """Return whether it expires at a tick, and let it; once for each time that it does."""
+    if watchdog.time == 0 or watchdog.expired or remaining(watchdog, tick) > 0:
+        return False
+    watchdog.expired, watchdog.lowest = True, 0
+    watchdog.trips += 1
+    return True
+
+
+def trigger(watchdog: "Watchdog", tick: int) -> None:
+    """Trigger it at `tick`."""
+    watchdog.lowest = min(watchdog.lowest, remaining(watchdog, tick))
+    watchdog.triggered = tick
+    watchdog.expired = False
+
+
 @dataclass(slots=True, init=False, eq=False)
 class Watchdog:
     """Expires when it has not been triggered for `time` ticks; 0 is off. A trigger starts it again."""
@@ -26,17 +47,11 @@ class Watchdog:
         self.expired = False
         self.triggered = tick
 
-    def trigger(self, tick: int) -> None:
-        """Trigger it at `tick`."""
-        trigger(self, tick)
+    check, trigger = expire, trigger
 
     def set_back(self, tick: int) -> None:
         """Set the time back to a tick before the present one."""
         self.triggered = min(self.triggered, tick)
-
-    def check(self, tick: int) -> bool:
-        """Return whether it expires at `tick`; once for each time that it does."""
-        return expire(self, tick)
 
     def registers(self, tick: int) -> safety.WatchdogStatus:
         """Return what its registers show at `tick`."""
@@ -44,24 +59,3 @@ class Watchdog:
         state = safety.WatchdogState.EXPIRED if self.expired else running
         left = 0 if self.expired else remaining(self, tick)
         return safety.WatchdogStatus(self.time, state, left, self.lowest, self.trips & 0xFFFF)
-
-
-def remaining(watchdog: Watchdog, tick: int) -> int:
-    """Return the ticks until it expires. It and what follows are plain Python that the rig compiles too."""
-    return min(watchdog.time, max(0, watchdog.time - (tick - watchdog.triggered)))
-
-
-def expire(watchdog: Watchdog, tick: int) -> bool:
-    """Return whether it expires at a tick, and let it; once for each time that it does."""
-    if watchdog.time == 0 or watchdog.expired or remaining(watchdog, tick) > 0:
-        return False
-    watchdog.expired, watchdog.lowest = True, 0
-    watchdog.trips += 1
-    return True
-
-
-def trigger(watchdog: Watchdog, tick: int) -> None:
-    """Trigger it at `tick`."""
-    watchdog.lowest = min(watchdog.lowest, remaining(watchdog, tick))
-    watchdog.triggered = tick
-    watchdog.expired = False

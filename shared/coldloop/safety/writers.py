@@ -110,9 +110,8 @@ class WriterLease:
         number = self._holder if holder is None and same else holder or SIMPLE_CLIENT
         new = held is None or state is LeaseState.FREE or not (same or number == self._holder != SIMPLE_CLIENT)
         new = new or number != self._holder
-        if new and not (
-            self._shared and same and number == self._holder
-        ):  # after a silence the same holder keeps its connections
+        keeps = self._shared and same and number == self._holder  # its connections, also after a silence
+        if new and not keeps:
             self._others.clear()
         elif held is not None and self._closed_at is None:
             self._others[held.connection] = held
@@ -150,12 +149,10 @@ class WriterLease:
 
     def registers(self) -> LeaseStatus:
         """Return what its registers show."""
-        state = self.state
-        free = state is LeaseState.FREE or self._caller is None
-        who = "" if free or self._caller is None else self._caller.name
-        return LeaseStatus(
-            state, SIMPLE_CLIENT if free else self._holder, self.refused & 0xFFFFFFFF, to_words(who, WHO_WORDS)
-        )
+        state, held, refused = self.state, self._caller, self.refused & 0xFFFFFFFF
+        if state is LeaseState.FREE or held is None:
+            return LeaseStatus(refused=refused)
+        return LeaseStatus(state, self._holder, refused, to_words(held.name, WHO_WORDS))
 
 
 Inputs: TypeAlias = tuple[float, ...]
