@@ -15,7 +15,7 @@ from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus, Stat
 from coldloop.service.start import run_event_loop
 from coldloop_plant.kinds import own_header
 from coldloop_plant.load import find_load
-from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.cosim.networked_run import LocalServices
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.cosim.session import SessionClient
 from coldloop_rig.cosim.wiring import START_PATIENCE_S

@@ -22,11 +22,10 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.process.lti_model import load as load_model
 from coldloop.registers import maps_of
-from coldloop.registers.common import ServerStatistics
+from coldloop.registers.common import ServerStatistics, WatchdogStatus
 from coldloop.registers.control_plc import ProcessNow
-from coldloop.registers.safety import WatchdogStatus
 from coldloop_plant.load import find_load
-from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.cosim.networked_run import LocalServices
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.cosim.session import SessionClient
 from coldloop_rig.results.recording import LinkStatistics, Recorder

@@ -34,7 +34,7 @@ from coldloop.registers.declaration import RegisterMap
 from coldloop_chaos.sequencer import resident_mb
 from coldloop_rig import cli
 from coldloop_rig.cli.certificates import CLIENTS
-from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.cosim.networked_run import LocalServices
 from coldloop_rig.cosim.wiring import SERVICES
 from coldloop_rig.settings import Settings
 

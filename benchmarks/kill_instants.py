@@ -10,7 +10,7 @@ from coldloop.process.cold_box import TICK_S
 from coldloop.session import TimeMode
 from coldloop_chaos.faults import ChaosPlan, ProcessStop
 from coldloop_chaos.report import ChaosProgress, Evaluation, perform, summary_lines, write_report
-from coldloop_rig.results.folders import claim_folder
+from coldloop_rig.results.run_folder import claim_folder
 from coldloop_rig.settings import Settings
 
 IN_FLIGHT_MS = 20.0

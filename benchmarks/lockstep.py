@@ -18,7 +18,7 @@ from coldloop.process.lti_model import load
 from coldloop.registers.control_plc import Grant
 from coldloop.service.start import run_event_loop
 from coldloop_plant.load import find_load
-from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.cosim.networked_run import LocalServices
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.cosim.session import AHEAD, LONGEST_LOCKSTEP_PAUSE_S, SessionClient
 from coldloop_rig.cosim.wiring import SERVICES, ReservedPorts

@@ -18,8 +18,8 @@ from coldloop.process.lti_model import load as load_model
 from coldloop_plant.load import HOUR_TICKS, HOURS, concatenated, telegraph
 from coldloop_rig.cosim.scenario import Job
 from coldloop_rig.figures.worker import FigureProcess
-from coldloop_rig.results.folders import claim_folder
 from coldloop_rig.results.recording import SampleBlock, Sink, Way
+from coldloop_rig.results.run_folder import claim_folder
 from coldloop_rig.runs.running import make_scenario, run_into
 from coldloop_rig.settings import Settings
 

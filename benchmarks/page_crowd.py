@@ -21,7 +21,7 @@ from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.process.lti_model import load as load_model
 from coldloop_hmi.settings import HmiSettings
 from coldloop_plant.load import find_load
-from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.cosim.networked_run import LocalServices
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.cosim.session import SessionClient
 from coldloop_rig.cosim.wiring import ReservedPorts

@@ -51,7 +51,7 @@ def default_plant() -> None:
 
 def _make_plant(kind: "PlantKind", brought: "type[RefrigeratorKind] | None" = None) -> None:
     from coldloop.process.load_profile import LoadProfile  # noqa: PLC0415
-    from coldloop.process.model_file import read_header  # noqa: PLC0415
+    from coldloop.process.lti_model import read_header  # noqa: PLC0415
     from coldloop.process.settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
     from coldloop_plant.kinds import plant_maker  # noqa: PLC0415
     from coldloop_plant.settings import PlantSection  # noqa: PLC0415
@@ -139,7 +139,7 @@ def linear_models() -> None:
     from coldloop_optimizer_plc.settings import ControlDesign  # noqa: PLC0415
     from coldloop_plant.cold_box.plant_file import PlantFile  # noqa: PLC0415
     from coldloop_refrigerator.model import make_refrigerator_file  # noqa: PLC0415
-    from coldloop_rig.cli.model_listing import describe_model  # noqa: PLC0415 not in the images
+    from coldloop_rig.cli.listings import describe_model  # noqa: PLC0415 not in the images
 
     describe_model(DEFAULT_MODEL_FILE, PlantFile(), ControlDesign())
     make_refrigerator_file()

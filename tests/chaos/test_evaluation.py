@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from coldloop.process.cold_box import COLD_BOX, INPUT_NAMES, L1, OUTPUT_NAMES, STATE_NAMES, T5
-from coldloop.registers.common import Event, EventKind
+from coldloop.registers.common import AlarmKind, Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.plant import PlantSample
-from coldloop.registers.safety import AlarmKind
 from coldloop_chaos.faults import LinkCut, ProcessStop
 from coldloop_chaos.report import Evaluation, RaisedAlarm, evaluate, table
 from coldloop_chaos.sequencer import ChaosTrace, Mark

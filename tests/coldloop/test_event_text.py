@@ -7,10 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.registers.common import Event, EventKind
+from coldloop.registers.common import AlarmKind, Event, EventKind
 from coldloop.registers.control_plc import Cause, LinkCause, Mode, OperatorMode, PlantLinkState, Verdict
 from coldloop.registers.plant import SensorFaultKind
-from coldloop.registers.safety import AlarmKind
 from coldloop.service.journal import Journal, describe, log_event, utc_text
 
 

@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 
 from coldloop.registers.bank import BusyError, Caller
 from coldloop.registers.codec import to_words
-from coldloop.registers.common import WHO_WORDS
+from coldloop.registers.common import WHO_WORDS, LeaseEvent, LeaseState, LeaseStatus
 from coldloop.registers.declaration import Role
-from coldloop.registers.safety import LeaseEvent, LeaseState, LeaseStatus
 from coldloop.safety.writers import LINGER_S, SIMPLE_CLIENT, WriterLease
 
 SILENCE_S = 5.0

@@ -3,7 +3,7 @@
 import pytest
 
 from coldloop.registers.bank import ALL_ROLES, BusyError, Caller
-from coldloop.registers.safety import LeaseState
+from coldloop.registers.common import LeaseState
 from coldloop.safety.writers import LINGER_S, WriterLease
 
 NUMBER = 7

@@ -1,7 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.registers.safety import WatchdogState
+from coldloop.registers.common import WatchdogState
 from coldloop.safety.watchdog import Watchdog
 
 

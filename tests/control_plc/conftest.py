@@ -5,11 +5,11 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from coldloop.process.cold_box import L1, T5
-from coldloop.process.model_file import read_header
+from coldloop.process.lti_model import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
+from coldloop.registers.common import AlarmKind, AlarmState
 from coldloop.registers.control_plc import Acknowledgement, Plan, SequenceHeader, Update, Verdict
 from coldloop.registers.plant import Actuators, Measurement
-from coldloop.registers.safety import AlarmKind, AlarmState
 from coldloop.safety.writers import InputSequence, with_checksum
 from coldloop_control_plc.program import ControlProgram, OperatingPoint
 from coldloop_control_plc.settings import ControlSection

@@ -9,8 +9,15 @@ from pydantic import ValidationError
 
 from coldloop.process.cold_box import TICK_S
 from coldloop.registers.codec import from_words
-from coldloop.registers.common import EventKind
-from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmPriority, AlarmState
+from coldloop.registers.common import (
+    ALL_ALARMS,
+    AlarmAction,
+    AlarmCommand,
+    AlarmKind,
+    AlarmPriority,
+    AlarmState,
+    EventKind,
+)
 from coldloop.service.journal import Journal
 from coldloop_control_plc.alarms import DEFAULT_RULES, TRANSITIONS, AlarmPanel, AlarmSettings
 

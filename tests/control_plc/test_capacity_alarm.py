@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.registers.common import EventKind
+from coldloop.registers.common import Alarm, AlarmKind, CapacityCause, EventKind
 from coldloop.registers.control_plc import Mode, Operator, OperatorMode
-from coldloop.registers.safety import Alarm, AlarmKind, CapacityCause
 from tests.harness.records import Row
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.process.cold_box import COLD_BOX, LEVEL_BAND
-from coldloop.registers.safety import AlarmKind
+from coldloop.registers.common import AlarmKind
 
 if TYPE_CHECKING:
     from tests.control_plc.conftest import Bench

@@ -16,9 +16,10 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from coldloop.errors import DamagedAnswerError, LinkError, PeerUnreachableError, RequestRefusedError
 from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.model_file import read_header
+from coldloop.process.lti_model import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits, RateReference
 from coldloop.registers.bank import BusyError, Caller
+from coldloop.registers.common import LeaseState
 from coldloop.registers.control_plc import (
     Operator,
     OperatorMode,
@@ -29,7 +30,6 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.declaration import Role
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
-from coldloop.registers.safety import LeaseState
 from coldloop.safety.writers import InputSequence, WriterLease, with_checksum
 from coldloop.service.journal import Journal
 from coldloop.session import TimeBase

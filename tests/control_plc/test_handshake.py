@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.process.settings import InputLimits
+from coldloop.registers.common import AlarmKind, AlarmState
 from coldloop.registers.control_plc import Mode, Verdict
-from coldloop.registers.safety import AlarmKind, AlarmState
 from coldloop_control_plc import scan
 from coldloop_control_plc.scan import move_loops
 from tests.control_plc.conftest import HOLD_TICKS, alarm

@@ -9,10 +9,9 @@ import pytest
 
 from coldloop.process.cold_box import INPUT_NAMES, L1, OUTPUT_NAMES, T5
 from coldloop.process.settings import InputLimits
-from coldloop.registers.common import EventKind
+from coldloop.registers.common import AlarmAction, AlarmCommand, AlarmKind, AlarmState, EventKind
 from coldloop.registers.control_plc import Cause, Heartbeat, Mode, Operator, OperatorMode, Update, Verdict
 from coldloop.registers.plant import Measurement
-from coldloop.registers.safety import AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop_control_plc.program import ControlProgram
 from tests.control_plc.conftest import HOLD_TICKS, alarm, section
 from tests.harness.records import Row, as_transmitted

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.registers.codec import WordOrder, codec_of
+from coldloop.registers.common import AlarmKind
 from coldloop.registers.control_plc import Cause, Mode, Status, Verdict
-from coldloop.registers.safety import AlarmKind
 from tests.harness.records import CONTROL_MAP, Row
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ import pytest
 
 from coldloop.process.cold_box import COLD_BOX, L1, T5
 from coldloop.process.settings import InputLimits
+from coldloop.registers.common import AlarmKind
 from coldloop.registers.control_plc import LinkCause, Mode, Operator, OperatorMode, Verdict
-from coldloop.registers.safety import AlarmKind
 from coldloop.session import TimeBase
 from coldloop_control_plc.output_limits import OutputGuard
 from coldloop_control_plc.sessions import ControlStateStore, RetainedControlState

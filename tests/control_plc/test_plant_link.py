@@ -5,10 +5,9 @@ import math
 import pytest
 
 from coldloop.errors import DamagedAnswerError, LinkError, PeerUnreachableError, RequestRefusedError
-from coldloop.registers.common import EventKind
+from coldloop.registers.common import AlarmKind, EventKind
 from coldloop.registers.control_plc import LinkCause, PlantLinkState
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
-from coldloop.registers.safety import AlarmKind
 from coldloop.service.journal import Journal
 from coldloop_control_plc.alarms import AlarmPanel
 from coldloop_control_plc.plant_link import FROZEN_TICKS, PlantLink

@@ -14,14 +14,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coldloop.errors import ImplausibleAnswerError
-from coldloop.process.model_file import read_header
+from coldloop.process.lti_model import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.bank import ANYBODY, RefusedAccessError
 from coldloop.registers.codec import DomainError, codec_of
+from coldloop.registers.common import LeaseStatus
 from coldloop.registers.control_plc import LadderStatus, Operator, OperatorMode, PlantLinkState, PlantLinkStatus, Status
 from coldloop.registers.declaration import Block, Role
 from coldloop.registers.plant import Measurement
-from coldloop.registers.safety import LeaseStatus
 from coldloop.safety.writers import SIMPLE_CLIENT
 from coldloop.service.journal import Journal
 from coldloop_control_plc.plant_link import PlantLink

@@ -12,10 +12,19 @@ import pytest
 
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
 from coldloop.process.cold_box import L1, T1, T5
-from coldloop.process.model_file import read_header
+from coldloop.process.lti_model import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.bank import ANYBODY, Caller, RegisterBank
-from coldloop.registers.common import EVENT_ROWS, Event, Identity
+from coldloop.registers.common import (
+    EVENT_ROWS,
+    Alarm,
+    AlarmAction,
+    AlarmCommand,
+    AlarmKind,
+    AlarmState,
+    Event,
+    Identity,
+)
 from coldloop.registers.control_plc import (
     Cause,
     ControlSession,
@@ -29,7 +38,6 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
-from coldloop.registers.safety import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.safety.retained import RetainedFile
 from coldloop_control_plc.program import ControlProgram
 from coldloop_control_plc.runtime import EXPIRES_SOON, UNREADABLE, ControlPlc

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from coldloop.process.cold_box import COLD_BOX, L1, T5
-from coldloop.process.model_file import read_header
+from coldloop.process.lti_model import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits, RateReference
-from coldloop.registers.common import EventKind
+from coldloop.registers.common import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmState, EventKind
 from coldloop.registers.control_plc import (
     Cause,
     Heartbeat,
@@ -23,7 +23,6 @@ from coldloop.registers.control_plc import (
     Verdict,
 )
 from coldloop.registers.plant import Measurement
-from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.safety.writers import InputSequence, with_checksum
 from coldloop.session import TimeBase
 from coldloop_control_plc.program import ControlProgram, make_program

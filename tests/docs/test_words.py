@@ -6,9 +6,8 @@ from pathlib import Path
 
 from coldloop.modbus.requests import MAX_READ_WORDS
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.registers.common import MAGIC
+from coldloop.registers.common import MAGIC, AlarmKind
 from coldloop.registers.control_plc import Verdict
-from coldloop.registers.safety import AlarmKind
 from coldloop.service.journal import alarm_word
 from coldloop_control_plc.alarms import PASSING, AlarmSettings
 from tests.harness.records import CONTROL_MAP

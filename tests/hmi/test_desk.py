@@ -20,11 +20,19 @@ from coldloop.operating.commands import (
 )
 from coldloop.operating.execution import lead_ticks
 from coldloop.process.cold_box import COLD_BOX, TICK_S
-from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.common import (
+    ALL_ALARMS,
+    Alarm,
+    AlarmAction,
+    AlarmCommand,
+    AlarmKind,
+    AlarmState,
+    Identity,
+    SessionPace,
+)
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.plant import LoadAhead, LoadStatus
-from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.service.journal import Journal
 from coldloop_control_plc.alarms import AlarmPanel
 from coldloop_hmi.operator_desk import CONFIRM_WITHIN_S, CommandResult, OperatorDesk, PremisesChangedError

@@ -12,10 +12,19 @@ import pytest
 from coldloop.errors import LinkError
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, TICK_S
-from coldloop.registers.common import Event, EventKind, Identity, JournalPage, SessionPace
+from coldloop.registers.common import (
+    Alarm,
+    AlarmKind,
+    AlarmPriority,
+    AlarmState,
+    Event,
+    EventKind,
+    Identity,
+    JournalPage,
+    SessionPace,
+)
 from coldloop.registers.control_plc import LadderStatus, Mode, Plan, ProcessNow
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.safety import Alarm, AlarmKind, AlarmPriority, AlarmState
 from coldloop.service.monitoring import exposition
 from coldloop_hmi.documents import (
     MOST_MARKS,

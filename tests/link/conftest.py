@@ -12,14 +12,23 @@ import pytest
 
 from coldloop.errors import LinkError
 from coldloop.modbus.client import RegisterClient
-from coldloop.process.model_file import read_header
+from coldloop.process.lti_model import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.codec import WordOrder, codec_of
-from coldloop.registers.common import EVENT_ROWS, Event, EventKind, Identity
+from coldloop.registers.common import (
+    EVENT_ROWS,
+    Alarm,
+    AlarmKind,
+    Event,
+    EventKind,
+    Identity,
+    LeaseState,
+    LeaseStatus,
+    WatchdogTime,
+)
 from coldloop.registers.control_plc import ControlSession, Operator, OperatorMode, PlantLinkState, PlantLinkStatus
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.plant import HISTORY_ROWS, LoadStep, Measurement, PlantSample, PlantSession
-from coldloop.registers.safety import Alarm, AlarmKind, LeaseState, LeaseStatus, WatchdogTime
 from tests.harness.processes import Process, Processes
 from tests.harness.records import CONTROL_MAP, PLANT_MAP
 from tests.harness.treated_link import TreatedLink

@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
-from coldloop.process.model_file import read_header
+from coldloop.process.lti_model import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.bank import Caller, RegisterBank
-from coldloop.registers.common import Identity
+from coldloop.registers.common import AlarmKind, Identity
 from coldloop.registers.control_plc import ControlSession, Grant, LinkCause, PlantLinkState
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
-from coldloop.registers.safety import AlarmKind
 from tests.harness.records import PLANT_MAP, sealed
 from tests.harness.waiting import until
 

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.process.model_file import read_header
+from coldloop.process.lti_model import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
-from coldloop.registers.common import EventKind
+from coldloop.registers.common import AlarmKind, EventKind, WatchdogTime
 from coldloop.registers.control_plc import Cause, CoolDownStep, LadderStatus, LinkCause, Mode, PlantLinkState
 from coldloop.registers.plant import Actuators
-from coldloop.registers.safety import AlarmKind, WatchdogTime
 from coldloop.safety.retained import RetainedFile
 from coldloop_chaos.faults import Direction
 from coldloop_control_plc.sessions import OWNER

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coldloop.modbus.client import RegisterClient
-from coldloop.registers.common import EventKind, ServerStatistics
+from coldloop.registers.common import AlarmKind, EventKind, LeaseState, LeaseStatus, ServerStatistics
 from coldloop.registers.control_plc import LinkCause, PlantLinkState, PlantLinkStatus, Status
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
-from coldloop.registers.safety import AlarmKind, LeaseState, LeaseStatus
 from tests.harness.records import OPTIMIZER_MAP
 from tests.link.conftest import SAFE_STATE
 

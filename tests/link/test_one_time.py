@@ -6,9 +6,8 @@ from statistics import median
 from typing import TYPE_CHECKING
 
 from coldloop.process.cold_box import TICK_S
-from coldloop.registers.common import Identity
+from coldloop.registers.common import AlarmKind, Identity
 from coldloop.registers.plant import Actuators
-from coldloop.registers.safety import AlarmKind
 from tests.harness.records import PLANT_MAP
 
 if TYPE_CHECKING:

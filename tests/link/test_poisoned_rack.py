@@ -5,10 +5,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.registers.common import EventKind
+from coldloop.registers.common import AlarmKind, EventKind
 from coldloop.registers.control_plc import LinkCause
 from coldloop.registers.plant import Measurement
-from coldloop.registers.safety import AlarmKind
 from coldloop_chaos.faults import Direction
 from tests.harness.records import PLANT_MAP
 from tests.link.poison import Change, changed, poisons

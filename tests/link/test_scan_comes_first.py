@@ -12,10 +12,9 @@ import pytest
 
 from coldloop.modbus.settings import ServerSettings
 from coldloop.process.cold_box import L1
-from coldloop.registers.common import EventKind, Identity
+from coldloop.registers.common import EventKind, Identity, WatchdogStatus
 from coldloop.registers.control_plc import Cause, Mode, Operator, OperatorMode, Status
 from coldloop.registers.plant import SensorFault, SensorFaultKind
-from coldloop.registers.safety import WatchdogStatus
 
 if TYPE_CHECKING:
     from tests.link.conftest import Control, FieldAt, Wire, WireTo

@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.registers.codec import from_words
-from coldloop.registers.common import EventKind
+from coldloop.registers.common import EventKind, LeaseEvent, LeaseState, LeaseStatus, WatchdogTime
 from coldloop.registers.plant import OutputVerdict
-from coldloop.registers.safety import LeaseEvent, LeaseState, LeaseStatus, WatchdogTime
 
 if TYPE_CHECKING:
     from tests.plant.conftest import RackOnTheBus

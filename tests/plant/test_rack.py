@@ -7,7 +7,7 @@ import pytest
 
 from coldloop.process.cold_box import L1, T5
 from coldloop.process.declaration import LAST_TICK
-from coldloop.registers.common import EventKind, SessionPace
+from coldloop.registers.common import EventKind, SessionPace, WatchdogState, WatchdogStatus, WatchdogTime
 from coldloop.registers.plant import (
     Actuators,
     LiveLoad,
@@ -21,7 +21,6 @@ from coldloop.registers.plant import (
     SensorFault,
     SensorFaultKind,
 )
-from coldloop.registers.safety import WatchdogState, WatchdogStatus, WatchdogTime
 from tests.harness.records import sealed
 
 if TYPE_CHECKING:

@@ -16,9 +16,8 @@ from hypothesis.stateful import (
 )
 
 from coldloop.process.settings import InputLimits
-from coldloop.registers.common import EventKind
+from coldloop.registers.common import EventKind, LeaseState, LeaseStatus, WatchdogStatus, WatchdogTime
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict, PlantSession
-from coldloop.registers.safety import LeaseState, LeaseStatus, WatchdogStatus, WatchdogTime
 
 if TYPE_CHECKING:
     from tests.plant.conftest import RackClient, RackOnTheBus

@@ -5,7 +5,7 @@ import subprocess
 from pathlib import Path
 
 from coldloop_rig.cli import main
-from coldloop_rig.cli.commands.plant import EXAMPLES
+from coldloop_rig.cli.commands.runs import EXAMPLES
 from tests.harness.processes import PROGRAM_S, Processes
 
 PAGE = Path(__file__).parents[2] / "docs" / "your-plant.md"

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from coldloop.kernels.compiled import kernel
 from coldloop.kernels.intrinsics import borrowed, named, plain_tuples
-from coldloop.process.cold_box import OUTPUT_NAMES
-from coldloop.process.model_range import model_range
+from coldloop.process.cold_box import OUTPUT_NAMES, model_range
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop_plant.cold_box import OUTPUTS, ColdBox, advance, evaluated
 from coldloop_plant.cold_box.plant_file import REFERENCE
@@ -122,7 +121,7 @@ TABLES_END = {
     "P1": (0.3, 2.25), "P_mix": (0.3, 2.25), "P_turbine": (0.3, 20.0), "P11": (0.3, 2.25), "P12": (5.0, 19.0),
     "h before the turbine": (6e3, 1.6e6), "coldest cell": (2.5, 340.0), "warmest cell": (2.5, 340.0),
 }  # fmt: skip
-"""Of helium's properties, bar, J/kg and K: arguments at which `coldloop.process.model_range` has to say nothing."""
+"""Of helium's properties, bar, J/kg and K: arguments at which `coldloop.process.cold_box` has to say nothing."""
 
 
 def assert_alarmed_where_tables_end(x: RealArray, u: RealArray, v: RealArray, d: RealArray) -> None:

@@ -5,12 +5,12 @@ import math
 import pytest
 
 from coldloop.process.declaration import LAST_NUMBER, LAST_TICK
-from coldloop.process.model_file import read_header
+from coldloop.process.lti_model import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.codec import DomainError, check_record, codec_of
+from coldloop.registers.common import Alarm
 from coldloop.registers.control_plc import LatchedUpdate, Status, Update
 from coldloop.registers.plant import MAX_AGE, Measurement
-from coldloop.registers.safety import Alarm
 from tests.harness.records import CONTROL_MAP, PLANT_MAP, map_of
 
 HEADER = read_header(DEFAULT_MODEL_FILE)

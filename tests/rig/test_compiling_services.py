@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from coldloop_rig.cosim import local_services
-from coldloop_rig.cosim.local_services import show_compiling
+from coldloop_rig.cosim import networked_run
+from coldloop_rig.cosim.networked_run import show_compiling
 
 SERVES = '{"event": "serving", "port": 5020}\n'
 
@@ -18,8 +18,8 @@ def compiles(owner: str) -> str:
 
 @pytest.fixture
 def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    monkeypatch.setattr(local_services, "LOOK_S", 0.01)
-    monkeypatch.setattr(local_services, "TOGETHER_S", 0.05)
+    monkeypatch.setattr(networked_run, "LOOK_S", 0.01)
+    monkeypatch.setattr(networked_run, "TOGETHER_S", 0.05)
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     paths = [tmp_path / name for name in ("plant.log", "control_plc.log", "optimizer_plc.log")]
     for path in paths:

@@ -18,12 +18,11 @@ from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
 from coldloop.modbus.settings import AccessSettings, TlsSettings
 from coldloop.operating.observer import JournalReader
 from coldloop.registers.bank import Caller, RegisterBank
-from coldloop.registers.common import Event, EventKind, Identity, JournalQuery
+from coldloop.registers.common import AlarmKind, Event, EventKind, Identity, JournalQuery
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.declaration import Block, RegisterMap
-from coldloop.registers.safety import AlarmKind
 from coldloop.service.journal import KEPT, Journal, JournalPublication
-from coldloop_rig.cli.commands.bus import COLUMNS
+from coldloop_rig.cli.commands.rig import COLUMNS
 from tests.harness.processes import Processes
 from tests.harness.records import CONTROL_MAP, PLANT_MAP
 

@@ -17,8 +17,7 @@ from coldloop.errors import LinkError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.codec import WordOrder
-from coldloop.registers.common import Identity
-from coldloop.registers.safety import LeaseState, LeaseStatus
+from coldloop.registers.common import Identity, LeaseState, LeaseStatus
 from coldloop_export import exported_optimizer
 from coldloop_export.folder import export_plc
 from coldloop_export.golden import SINGLE

@@ -12,8 +12,7 @@ from coldloop.process.settings import SHIPPED_MODELS
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop_optimizer_plc.settings import ControlDesign
-from coldloop_rig.results.indicators import Indicators, RunEvaluation, StageCost
-from coldloop_rig.results.recording import SampleBlock
+from coldloop_rig.results.recording import Indicators, RunEvaluation, SampleBlock, StageCost
 
 DESIGN = ControlDesign()
 PRESSURE, VOLUME, FIRST_TEMPERATURE = 0, 1, 2

@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from coldloop.errors import LinkError
-from coldloop_rig.cosim.local_services import PAUSES_S, end_of, keep_up
+from coldloop_rig.cosim.networked_run import PAUSES_S, end_of, keep_up
 
 NONE = (0.0,) * len(PAUSES_S)
 
@@ -48,7 +48,7 @@ async def test_what_ends_again_and_again_is_given_up_after_five(capsys: pytest.C
 
 
 async def test_what_has_run_for_long_begins_to_count_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coldloop_rig.cosim.local_services.STEADY_S", -1.0)
+    monkeypatch.setattr("coldloop_rig.cosim.networked_run.STEADY_S", -1.0)
     process = Mortal(lives=12)
     keeping = asyncio.create_task(kept_up(process))
     await asyncio.wait_for(process.lives_on.wait(), 60.0)

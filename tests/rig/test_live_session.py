@@ -12,12 +12,11 @@ import pytest
 from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.operating.observer import JournalReader
-from coldloop.registers.common import Event, EventKind, Identity, SessionPace
+from coldloop.registers.common import AlarmKind, Event, EventKind, Identity, SessionPace, WatchdogStatus
 from coldloop.registers.control_plc import ControlSession, LadderStatus, Mode, PlantLinkState, PlantLinkStatus
 from coldloop.registers.optimizer_plc import OptimizerSession
 from coldloop.registers.plant import LiveLoad, LoadAhead, LoadStatus, LoadStep, PlantSession
-from coldloop.registers.safety import AlarmKind, WatchdogStatus
-from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.cosim.networked_run import LocalServices
 from coldloop_rig.settings import Settings
 from tests.harness.records import CONTROL_MAP, OPTIMIZER_MAP, PLANT_MAP, sealed
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from coldloop.errors import LinkError, PeerUnreachableError
-from coldloop_rig.cosim import local_services
-from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.cosim import networked_run
+from coldloop_rig.cosim.networked_run import LocalServices
 from coldloop_rig.settings import Settings
 
 
@@ -33,10 +33,10 @@ def test_a_service_that_ended_is_named_even_when_the_work_fails_with_it(tmp_path
 @pytest.mark.usefixtures("programs")
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of another process are Linux's")
 async def test_the_log_of_a_program_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(local_services, "MOST_LOG_BYTES", 100_000)
+    monkeypatch.setattr(networked_run, "MOST_LOG_BYTES", 100_000)
     endless = (sys.executable, "-c", "import os\ninput()\nwhile True: os.write(1, bytes(1000))")
     with (tmp_path / "log").open("ab") as log:
-        process = await local_services.start_program(endless, {}, log)
+        process = await networked_run.start_program(endless, {}, log)
         await process.communicate(b"\n")
     assert process.returncode
     assert 100_000 <= (tmp_path / "log").stat().st_size < 110_000

@@ -21,9 +21,8 @@ from coldloop.process.cold_box import LEVEL_BAND, OUTPUT_NAMES, T5_BAND, TICK_S,
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.settings import InputLimits
 from coldloop.registers.codec import WordOrder
-from coldloop.registers.common import MAGIC, Identity
+from coldloop.registers.common import MAGIC, Identity, LeaseState, LeaseStatus
 from coldloop.registers.control_plc import LadderStatus, Mode, Status, Verdict
-from coldloop.registers.safety import LeaseState, LeaseStatus
 from coldloop_rig import cli
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.cosim.session import SessionClient

@@ -18,7 +18,7 @@ from coldloop_plant.numeric import RealArray
 from coldloop_refrigerator.plant_file import read_plant_file
 from coldloop_rig import Simulation
 from coldloop_rig import simulate as run_in_process
-from coldloop_rig.cli.model_listing import describe_model
+from coldloop_rig.cli.listings import describe_model
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.settings import Settings
 

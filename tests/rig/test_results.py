@@ -23,9 +23,8 @@ from coldloop.text import whole_file
 from coldloop_rig import cli
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.results.columns import FILES, STATION
-from coldloop_rig.results.folders import claim_folder_of_now, write_json
-from coldloop_rig.results.indicators import evaluate
-from coldloop_rig.results.recording import LinkStatistics, Recorder, Recording
+from coldloop_rig.results.recording import LinkStatistics, Recorder, Recording, evaluate
+from coldloop_rig.results.run_folder import claim_folder_of_now, write_json
 from coldloop_rig.settings import Settings
 
 if TYPE_CHECKING:

@@ -7,10 +7,9 @@ import pytest
 from coldloop.modbus.client import RegisterClient
 from coldloop.operating.observer import UpdateReader
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.registers.common import Event, EventKind, Identity
+from coldloop.registers.common import AlarmState, Event, EventKind, Identity
 from coldloop.registers.control_plc import Status
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, Optimization
-from coldloop.registers.safety import AlarmState
 from coldloop_hmi.process_image import JournalEntry
 from coldloop_optimizer_plc.runtime import NO_UPDATE
 from coldloop_rig.cosim.session import Lateness, state_of

@@ -14,10 +14,9 @@ import pytest
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.codec import WordOrder
-from coldloop.registers.common import IDENTITY_BLOCK
+from coldloop.registers.common import IDENTITY_BLOCK, AlarmKind
 from coldloop.registers.declaration import Block, RegisterMap, f32
 from coldloop.registers.plant import Measurement
-from coldloop.registers.safety import AlarmKind
 from coldloop.service.journal import alarm_word
 from coldloop.service.monitoring import metric_name
 from coldloop_rig.cli.registers import exported, runs

@@ -8,7 +8,7 @@ from typing import Final
 import pytest
 from distributed import Client
 
-from coldloop_rig.results.indicators import Indicators
+from coldloop_rig.results.recording import Indicators
 from coldloop_studies.execution import Store, Workers, conduct
 from coldloop_studies.request import UPDATE_COLUMNS, Outcome, RunRequest, perform
 from coldloop_studies.study import RUNS, Load, Study, StudyOptions, StudyResult, draw_of

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from coldloop.process.cold_box import STATION_SIGNAL_NAMES
-from coldloop.registers.common import EventKind
+from coldloop.registers.common import AlarmKind, EventKind
 from coldloop.registers.control_plc import Mode
-from coldloop.registers.safety import AlarmKind
 from coldloop_studies.reference_plc import SLOW_DOWN, SPEED
 from coldloop_studies.refrigerator import PLANTS
 from coldloop_studies.reproduction import STUDIES

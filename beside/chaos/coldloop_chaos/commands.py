@@ -72,7 +72,7 @@ def execute_chaos(options: argparse.Namespace) -> int:
     }
     common.refuse_ineffective(effective, common.OWN_PORTS, ineffective)
     from coldloop_chaos.report import ChaosProgress, perform, plot_chaos, summary_lines, table, write_report
-    from coldloop_rig.results.folders import claim_folder, claim_folder_of_now, writing
+    from coldloop_rig.results.run_folder import claim_folder, claim_folder_of_now, writing
     from coldloop_rig.runs.running import plain_arguments
 
     out = options.out or claim_folder_of_now(Path("chaos"), plan.name)

@@ -18,9 +18,8 @@ from coldloop.config import Configuration
 from coldloop.errors import LinkError
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import load as load_model
-from coldloop.registers.common import EventKind
+from coldloop.registers.common import AlarmState, EventKind, alarm_key, alarms_of
 from coldloop.registers.control_plc import LadderStatus, Mode
-from coldloop.registers.safety import AlarmState, alarm_key, alarms_of
 from coldloop.service.journal import alarm_word
 from coldloop.text import ends_text, parsed_json, whole_file, whole_text
 from coldloop_chaos.faults import ChaosPlan
@@ -31,9 +30,8 @@ from coldloop_rig.cosim.scenario import Job
 from coldloop_rig.figures import plot
 from coldloop_rig.figures.worker import FigureProcess
 from coldloop_rig.progress import PlantTimeBar, clock, make_console
-from coldloop_rig.results.folders import write_json
-from coldloop_rig.results.indicators import excess_of
-from coldloop_rig.results.recording import Recorder, Recording, Way
+from coldloop_rig.results.recording import Recorder, Recording, Way, excess_of
+from coldloop_rig.results.run_folder import write_json
 from coldloop_rig.runs.running import run_into
 from coldloop_rig.settings import Settings
 from coldloop_rig.text_tables import aligned, markdown_table

@@ -20,16 +20,15 @@ from coldloop.process.cold_box import L1, TICK_S
 from coldloop.process.declaration import Process
 from coldloop.process.lti_model import discretise, load
 from coldloop.process.settings import settings_of
-from coldloop.registers.common import Event, EventKind, Identity
+from coldloop.registers.common import Alarm, Event, EventKind, Identity, alarms_of
 from coldloop.registers.control_plc import LadderStatus
 from coldloop.registers.plant import PlantSample, SensorFault, SensorFaultKind, Surroundings
-from coldloop.registers.safety import Alarm, alarms_of
 from coldloop_chaos import faults
 from coldloop_chaos.proxy import LinkProxies
 from coldloop_plant.cold_box.model import find_equilibrium, linearise
 from coldloop_plant.helium import load_helium
 from coldloop_plant.kinds import box_of
-from coldloop_rig.cosim import local_services, session, wiring
+from coldloop_rig.cosim import networked_run, session, wiring
 from coldloop_rig.cosim.scenario import Scenario, with_copied_load
 from coldloop_rig.results.recording import CONTROL, LinkStatistics, Recorder, Recording, Sink
 from coldloop_rig.settings import Settings
@@ -68,7 +67,7 @@ _SHOWN: Final = {"nan": SensorFaultKind.NOT_A_NUMBER, "frozen": SensorFaultKind.
 class Injector:
     """Acts on the processes, the links and the plant's sensors of one run, in whose folder is a wrong model."""
 
-    services: local_services.LocalServices
+    services: networked_run.LocalServices
     links: LinkProxies
     plant: RegisterClient
     folder: Path
@@ -291,7 +290,7 @@ class ChaosTrace(Sink):
         return Recording(load[:, 0], u, y, x, [], LinkStatistics())
 
 
-def resident_mb(services: local_services.LocalServices) -> dict[str, float]:
+def resident_mb(services: networked_run.LocalServices) -> dict[str, float]:
     """Return the resident memory of the services that run, where the system reports it (Linux)."""
     sizes = {}
     for service, process in services.processes.items():
@@ -318,7 +317,7 @@ class FaultSequencer:
     """Takes a session from fault to fault."""
 
     plan: faults.ChaosPlan
-    services: local_services.LocalServices
+    services: networked_run.LocalServices
     client: session.SessionClient
     injector: Injector
     trace: ChaosTrace
@@ -456,7 +455,7 @@ async def conduct(
     async with contextlib.AsyncExitStack() as stack:
         links = LinkProxies(str(plan.seed))
         retained = wiring.retaining(copied, folder, always=True)
-        services = await stack.enter_async_context(local_services.LocalServices(retained, folder / "logs", links=links))
+        services = await stack.enter_async_context(networked_run.LocalServices(retained, folder / "logs", links=links))
         client = session.SessionClient(services.endpoints, settings, tolerant=True)
         stack.callback(client.close)
         await services.during(client.connect(wiring.START_PATIENCE_S))

@@ -22,10 +22,8 @@ from coldloop.config import explained
 from coldloop.errors import ConfigurationError, ModelFileError
 from coldloop.kernels.cache import kernels_of
 from coldloop.kernels.intrinsics import plain_tuples
-from coldloop.process.cold_box import TICK_S
-from coldloop.process.lti_model import LtiModel
-from coldloop.process.model_file import COLD_BOX, FORMAT, ModelHeader, read_document, write_document
-from coldloop.process.model_range import present_model_range
+from coldloop.process.cold_box import TICK_S, present_model_range
+from coldloop.process.lti_model import COLD_BOX, FORMAT, LtiModel, ModelHeader, read_document, write_document
 from coldloop.registers.plant import StationAlarm, StationMode, StationSample, StationStatus, Surroundings
 from coldloop_plant import settings
 from coldloop_plant.cold_box import ColdBox, ColdBoxProgram

@@ -161,7 +161,7 @@ def execute_design(options: argparse.Namespace) -> int:
     from coldloop_rig.cli.commands.options import FIGURE_FORMATS
     from coldloop_rig.figures.plot import save_figure
     from coldloop_rig.progress import make_console
-    from coldloop_rig.results.folders import writing
+    from coldloop_rig.results.run_folder import writing
     from coldloop_studies import instants
 
     for name in options.loads:

@@ -12,7 +12,7 @@ import numpy as np
 
 from coldloop.process.cold_box import TICK_S
 from coldloop_rig.plc_sizing.intervals import Interval, interval_of_mean, mean_ratio
-from coldloop_rig.results.indicators import Indicators
+from coldloop_rig.results.recording import Indicators
 from coldloop_rig.text_tables import markdown_table
 from coldloop_studies import study
 from coldloop_studies.drawing import cost_bars, ratio_rows

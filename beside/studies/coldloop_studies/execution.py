@@ -38,7 +38,7 @@ from coldloop_optimizer_plc.solvers import make_solver
 from coldloop_rig.figures.plot import save_figure
 from coldloop_rig.interruption import INTERRUPTION
 from coldloop_rig.progress import make_console
-from coldloop_rig.results.folders import installed_version, prepare_folder, write_json, writing
+from coldloop_rig.results.run_folder import installed_version, prepare_folder, write_json, writing
 from coldloop_rig.text_tables import markdown_table
 from coldloop_studies import request as requested
 from coldloop_studies.request import Outcome, Procedure, RunRequest, decisive_digest, programs_digest

@@ -27,8 +27,7 @@ from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters, Q
 from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.results.indicators import Indicators
-from coldloop_rig.results.recording import Recorder
+from coldloop_rig.results.recording import Indicators, Recorder
 from coldloop_studies.settings import settings_of
 
 Array = NDArray[np.float64]

@@ -22,7 +22,7 @@ from coldloop.text import parsed_toml, whole_text
 from coldloop_rig.plc_sizing.intervals import Interval, geometric_mean, interval_of_mean
 from coldloop_rig.plc_sizing.operations import dense_cholesky
 from coldloop_rig.plc_sizing.plc import cholesky_times
-from coldloop_rig.results.folders import write_json, writing
+from coldloop_rig.results.run_folder import write_json, writing
 from coldloop_rig.text_tables import markdown_table
 from coldloop_studies.any_process import COMPARE, PERIODS
 from coldloop_studies.controllers import CLASSICAL, CONTEST, ROBUSTNESS

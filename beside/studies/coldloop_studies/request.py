@@ -28,13 +28,12 @@ from coldloop_optimizer_plc.solvers import make_solver
 from coldloop_plant.kinds import GROUP, NO_MISMATCH, noise_of
 from coldloop_plant.own_plants import LinearPlant
 from coldloop_plant.settings import PlantKind
-from coldloop_rig.cosim.local_services import run_on_localhost
+from coldloop_rig.cosim.networked_run import run_on_localhost
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.cosim.wiring import SERVICES
-from coldloop_rig.results.folders import installed_version
-from coldloop_rig.results.indicators import Indicators, StageCost, evaluate, has_no_answer
-from coldloop_rig.results.recording import Recorder, Recording
+from coldloop_rig.results.recording import Indicators, Recorder, Recording, StageCost, evaluate, has_no_answer
+from coldloop_rig.results.run_folder import installed_version
 from coldloop_rig.settings import Settings
 from coldloop_studies.paired_run import harsh_run, paired_indicators, paired_run, problem_sequence
 from coldloop_studies.settings import outside_digests, settings_of

@@ -139,9 +139,8 @@ GROUPS: Final = {
 COMMANDS: Final = {name: said for group in GROUPS.values() for name, said in group.items()}
 MODULE_OF: Final = {
     **dict.fromkeys(("run", "record", "rerun", "plot", "report", "compare"), "runs"),
-    **dict.fromkeys(("up", "down", "status", "set", "fault", "page"), "rig"),
-    **dict.fromkeys(("events", "certificates", "registers"), "bus"),
-    **dict.fromkeys(("new", "process", "import", "budget", "model", "identify"), "plant"),
+    **dict.fromkeys(("new", "process", "import", "budget", "model", "identify"), "runs"),
+    **dict.fromkeys(("up", "down", "status", "set", "fault", "page", "events", "certificates", "registers"), "rig"),
     **dict.fromkeys(("docs", "config", "completion"), "help"),
 }
 """Modules of `coldloop_rig.cli.commands`: `_declare_NAME` declares a command's options, `execute_NAME` does it."""

@@ -23,7 +23,7 @@ from coldloop.modbus.connection import ROLE_EXTENSION, encoded_role
 from coldloop.registers.declaration import Role
 from coldloop.text import read_bytes, replace_file, require_regular_file
 from coldloop_rig.cosim.wiring import SERVICES
-from coldloop_rig.results.folders import prepare_folder, writing
+from coldloop_rig.results.run_folder import prepare_folder, writing
 
 T = TypeVar("T")
 

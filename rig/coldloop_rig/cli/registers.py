@@ -17,9 +17,9 @@ from typing import Any, Final, NamedTuple
 from coldloop.modbus.requests import MAX_READ_WORDS
 from coldloop.modbus.settings import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
 from coldloop.process.declaration import Process
+from coldloop.registers.common import Alarm, alarms_of
 from coldloop.registers.control_plc import Operator
 from coldloop.registers.declaration import Block, Kind, Register, RegisterMap
-from coldloop.registers.safety import Alarm, alarms_of
 from coldloop.service.journal import alarm_word
 from coldloop_rig.cli.commands.options import HostPort
 from coldloop_rig.text_tables import aligned, markdown_table

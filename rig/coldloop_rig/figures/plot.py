@@ -24,9 +24,8 @@ from coldloop.process.declaration import Process
 from coldloop.process.sections import Input, Output
 from coldloop.text import axis_labels, ends_text, number_text, whole_file
 from coldloop_rig.results.columns import STATION, excess_keys
-from coldloop_rig.results.folders import writing
 from coldloop_rig.results.recording import Way
-from coldloop_rig.results.run_folder import Curves, RunFolder
+from coldloop_rig.results.run_folder import Curves, RunFolder, writing
 from coldloop_rig.text_tables import aligned
 
 Series = NDArray[np.floating]

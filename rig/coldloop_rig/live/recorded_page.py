@@ -13,11 +13,10 @@ from coldloop.config import load_configuration
 from coldloop.process.cold_box import STATION_SIGNAL_NAMES
 from coldloop.process.declaration import Process
 from coldloop.process.settings import settings_of
-from coldloop.registers.common import EventKind
+from coldloop.registers.common import Alarm, AlarmState, EventKind, alarms_of
 from coldloop.registers.control_plc import Cause, Mode, ProcessNow
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization
 from coldloop.registers.plant import SensorFaultKind, StationSample
-from coldloop.registers.safety import Alarm, AlarmState, alarms_of
 from coldloop.service.journal import EventText, alarm_cause, alarm_word
 from coldloop_control_plc.alarms import TRANSITIONS, AlarmSettings
 from coldloop_hmi.process_image import Doubts, JournalEntry

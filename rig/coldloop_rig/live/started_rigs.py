@@ -393,7 +393,7 @@ def detached(ports: Sequence[int], lock: int) -> int:
     Raises:
         ColdloopError: It has ended.
     """
-    from coldloop_rig.cosim.local_services import bound_log  # noqa: PLC0415 other commands start without it
+    from coldloop_rig.cosim.networked_run import bound_log  # noqa: PLC0415 other commands start without it
 
     folder = state_folder(ports[0])
     output = folder / "up.log"

@@ -9,11 +9,10 @@ from coldloop.errors import LinkError, PeerUnreachableError, RequestRefusedError
 from coldloop.operating.execution import Clients, CommandClient, clients_of, connected, reason_of
 from coldloop.operating.observer import last_update, read_alarms
 from coldloop.process.declaration import Process
-from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.common import AlarmState, Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode, ProcessNow
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import LoadStatus
-from coldloop.registers.safety import AlarmState
 from coldloop.service.journal import alarm_cause, alarm_word
 from coldloop.text import value_text
 from coldloop_rig.cosim.wiring import RigEndpoints, answered_in_time

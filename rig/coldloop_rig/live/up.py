@@ -30,7 +30,7 @@ from coldloop.registers.plant import Measurement
 from coldloop_hmi.settings import HmiSection, HmiSettings
 from coldloop_hmi.users import PageRole, write_user
 from coldloop_rig import PYTHON
-from coldloop_rig.cosim import local_services, wiring
+from coldloop_rig.cosim import networked_run, wiring
 from coldloop_rig.cosim.scenario import with_copied_load
 from coldloop_rig.cosim.session import SessionClient
 from coldloop_rig.live import started_rigs
@@ -84,14 +84,14 @@ class CuttableLinks:
                 try:
                     yield started_rigs.parsed_as(Cut, started_rigs.read_own(file), "`coldloop fault cut`")
                 except ValueError as error:
-                    local_services.say(f"{file}: {error}")
+                    networked_run.say(f"{file}: {error}")
                 file.unlink(missing_ok=True)
 
     async def _cut(self, cut: Cut) -> None:
         with self.proxies.cut(cut.link):
-            local_services.say(f"the {cut.link} link is cut for {cut.seconds:g} s")
+            networked_run.say(f"the {cut.link} link is cut for {cut.seconds:g} s")
             await asyncio.sleep(cut.seconds)
-        local_services.say(f"the {cut.link} link is restored")
+        networked_run.say(f"the {cut.link} link is restored")
 
 
 async def cut(first_port: int | None, link: str, seconds: float) -> None:
@@ -205,19 +205,19 @@ class PageProcess:
         if self._process is None:
             raise RuntimeError("the page was not started")
         code = await self._process.wait()
-        return f"{local_services.end_of(code, local_services.last_line(self._log))} (log: {self._log})"
+        return f"{networked_run.end_of(code, networked_run.last_line(self._log))} (log: {self._log})"
 
     async def restart(self) -> None:
         """Start it, or start it again."""
         self._log.parent.mkdir(parents=True, exist_ok=True)
         with started_rigs.new_own(self._log) as log:
-            self._process = await local_services.start_program((*PYTHON, "-m", "coldloop_hmi"), self._environment, log)
+            self._process = await networked_run.start_program((*PYTHON, "-m", "coldloop_hmi"), self._environment, log)
 
     async def __aexit__(self, *_: object) -> None:
         """End it."""
         if self._process is not None:
-            local_services.terminate(self._process)
-            await local_services.wait_for_end(self._process)
+            networked_run.terminate(self._process)
+            await networked_run.wait_for_end(self._process)
 
     async def is_served(self) -> None:
         """Wait until the page answers.
@@ -246,7 +246,7 @@ class PageProcess:
 class UpRig:
     """Starts the services, begins a session in real time, and keeps both up until it is cancelled.
 
-    A service or page that ends is started again (`cosim.local_services`), and resumes from its retained state.
+    A service or page that ends is started again (`cosim.networked_run`), and resumes from its retained state.
     `services` are those that are started; where the optimiser is not one of them, another client takes its place.
     `optimizer` is a program that is started in the place of ours.
     """
@@ -271,7 +271,7 @@ class UpRig:
         """
         links = self._links
         settings = with_copied_load(self._settings, self._scenario.load, self.folder)
-        services = local_services.LocalServices(
+        services = networked_run.LocalServices(
             settings, started_rigs.make_private(self.folder / "logs"), links=None if links is None else links.proxies,
             ports=self._ports, services=self._services, optimizer=self._optimizer,
         )  # fmt: skip
@@ -289,7 +289,7 @@ class UpRig:
                 (self.folder / started_rigs.STATE_FILE).unlink(missing_ok=True)
 
     async def _begin(
-        self, services: local_services.LocalServices, rig: SessionClient, page: PageProcess | None, *, announce: bool
+        self, services: networked_run.LocalServices, rig: SessionClient, page: PageProcess | None, *, announce: bool
     ) -> None:
         await rig.connect(wiring.START_PATIENCE_S)
         await rig.start(self._scenario)
@@ -301,22 +301,22 @@ class UpRig:
             sys.stdout.flush()
         self._write_state(services)
 
-    def _write_state(self, services: local_services.LocalServices) -> None:
+    def _write_state(self, services: networked_run.LocalServices) -> None:
         """Write which processes there are, for the commands that ask for them."""
         tls = "" if self._tls is None else str(self._tls.resolve())
         pids = {service: process.pid for service, process in services.processes.items()}
         started_rigs.RunningRig.write(self._ports, tls, pids, cuttable=self._links is not None)
 
-    async def _keep(self, services: local_services.LocalServices, rig: SessionClient, page: PageProcess | None) -> None:
+    async def _keep(self, services: networked_run.LocalServices, rig: SessionClient, page: PageProcess | None) -> None:
         def unwritten(error: LinkError) -> None:
             if not isinstance(error, PeerUnreachableError):  # else the plant is being started again
-                local_services.say(f"the rest of the load is not written: {error}")
+                networked_run.say(f"the rest of the load is not written: {error}")
 
         async def keep_page(page: PageProcess) -> None:
             try:
-                await local_services.keep_up("the page", page.ended, page.restart)
+                await networked_run.keep_up("the page", page.ended, page.restart)
             except LinkError as error:  # the rig keeps running without it
-                local_services.say(str(error))
+                networked_run.say(str(error))
 
         work = [rig.hold(LOOK_S, unwritten), *(self._keep_service(services, each, rig) for each in self._services)]
         if page is not None:
@@ -331,12 +331,12 @@ class UpRig:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _keep_service(self, services: local_services.LocalServices, service: str, rig: SessionClient) -> None:
+    async def _keep_service(self, services: networked_run.LocalServices, service: str, rig: SessionClient) -> None:
         async def restarted() -> None:
             try:
                 self._write_state(services)
             except OSError as error:  # commands cannot find this process; the rig keeps running
-                local_services.say(f"{error.filename}: {error.strerror}")
+                networked_run.say(f"{error.filename}: {error.strerror}")
             while service in wiring.RETAINING:  # the optimiser learns it from the control PLC
                 with suppress(LinkError):  # another one has ended, too
                     await rig.clients[service].connect(wiring.START_PATIENCE_S)
@@ -345,7 +345,7 @@ class UpRig:
                 await asyncio.sleep(LOOK_S)
 
         ended, restart = partial(services.exit_of, service), partial(services.start, service, may_end=True)
-        await local_services.keep_up(f"the {service} service", ended, restart, restarted)
+        await networked_run.keep_up(f"the {service} service", ended, restart, restarted)
 
     async def _goes_on(self, service: str, rig: SessionClient) -> bool:
         """Print whether the session was resumed after a restart of a service, or a new one has begun.
@@ -361,7 +361,7 @@ class UpRig:
             if plant and looking:
                 return False
             session = await rig.start(self._scenario)
-            local_services.say(f"session {session} has begun: the {service} service had no state to resume")
+            networked_run.say(f"session {session} has begun: the {service} service had no state to resume")
             return True
 
 

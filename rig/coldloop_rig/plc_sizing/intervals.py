@@ -37,8 +37,7 @@ from coldloop_plant.load import HOURS, drawn, find_load
 from coldloop_rig.cosim.one_process import OneProcessRig, run_ideal_loop
 from coldloop_rig.cosim.scenario import Scenario, natural_ticks
 from coldloop_rig.progress import make_console
-from coldloop_rig.results.indicators import evaluate
-from coldloop_rig.results.recording import Recorder
+from coldloop_rig.results.recording import Recorder, evaluate
 from coldloop_rig.settings import Settings
 from coldloop_rig.text_tables import aligned
 

@@ -21,16 +21,15 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from coldloop.errors import ResultsError, UsageError
+from coldloop.process.cold_box import recorded_model_range
 from coldloop.process.declaration import Process
-from coldloop.process.model_range import recorded_model_range
 from coldloop.registers.common import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import SensorFaultKind
 from coldloop.service.journal import describe, utc_text
 from coldloop_rig.results.columns import EVENTS, STATION, TRACE, UPDATES, RunFile, files_of, number_array, text_array
-from coldloop_rig.results.indicators import StageCost
-from coldloop_rig.results.recording import PLANT, SampleBlock, Sink, joined
+from coldloop_rig.results.recording import PLANT, SampleBlock, Sink, StageCost, joined
 
 RESERVED_BYTES: Final = 24 * 1024**2
 """A row group of the trace (9 MB), the index of 1,000 h (4 MB), the summary and the figures."""

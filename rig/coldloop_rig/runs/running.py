@@ -26,7 +26,7 @@ from coldloop.config import Configuration, load_configuration
 from coldloop.errors import ColdloopError, ResultsError, UsageError, printable
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.model_file import read_document
+from coldloop.process.lti_model import read_document
 from coldloop.process.settings import SHIPPED_MODELS
 from coldloop.registers.plant import PlantSample
 from coldloop.session import TimeMode
@@ -41,7 +41,7 @@ from coldloop_rig.cosim.scenario import INPUTS, LOAD_COPY, Job, Scenario, StopRe
 from coldloop_rig.figures.worker import FigureProcess
 from coldloop_rig.interruption import INTERRUPTION
 from coldloop_rig.plc_sizing.holding import digits_last_s, shortest_period_s, waiting
-from coldloop_rig.results import columns, file_sinks, folders, indicators, recording, run_folder
+from coldloop_rig.results import columns, file_sinks, recording, run_folder
 from coldloop_rig.settings import Settings
 
 MODEL_COPY: Final = f"{INPUTS}/model.json"
@@ -109,7 +109,7 @@ def _first_manifest(
         "format": columns.FORMAT, "complete": False, "reason": "the run has not ended, or its process was killed",
         "started_utc": _now_utc(), "ended_utc": None,
         "coldloop": __version__, "python": platform.python_version(), "platform": platform.platform(),
-        "dependencies": {name: folders.installed_version(name) for name in DEPENDENCIES},
+        "dependencies": {name: run_folder.installed_version(name) for name in DEPENDENCIES},
         "command": sys.argv[1:], "arguments": dict(arguments), "way": way, "ticks": ticks, "recorded_ticks": 0,
         "configuration": configured, "inputs": dict(inputs),
         "hashes": {
@@ -149,7 +149,7 @@ class RunFiles:
                 raise UsageError(f"{file}: the run replaces what is in {folder}; name another --out")
         model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
         process, self.folder = settings.process, folder
-        self._evaluation = indicators.RunEvaluation(model, design)
+        self._evaluation = recording.RunEvaluation(model, design)
         self._discard()
         self._reserve = file_sinks.DiskReserve(folder)
         self._realtime = scenario.realtime
@@ -157,11 +157,11 @@ class RunFiles:
             failed.callback(self._reserve.close)
             inputs = _copy_inputs(settings, scenario.load, folder)
             self._manifest = _first_manifest(effective, scenario.ticks, inputs, way, arguments)
-            folders.write_json(folder / "manifest.json", self._manifest)
+            run_folder.write_json(folder / "manifest.json", self._manifest)
             is_whole = settings.plant.kind is PlantKind.REFRIGERATOR
-            folders.write_json(folder / "schema.json", columns.schema_document(process, station=is_whole))
+            run_folder.write_json(folder / "schema.json", columns.schema_document(process, station=is_whole))
             made = folder, self._reserve, process
-            trace = file_sinks.TraceSink(folder, self._reserve, indicators.StageCost(model, design))
+            trace = file_sinks.TraceSink(folder, self._reserve, recording.StageCost(model, design))
             files: list[recording.Sink] = [trace, file_sinks.UpdatesSink(*made), file_sinks.EventsSink(*made)]
             files += [file_sinks.StationSink(*made)] if is_whole else []
             failed.pop_all()
@@ -191,8 +191,8 @@ class RunFiles:
         hashes = {**self._manifest["hashes"], "trace_sha256": self._evaluation.trace_sha256}
         ended = {"complete": reason is None, "reason": reason, "ended_utc": _now_utc(), "recorded_ticks": recorded}
         try:
-            folders.write_json(self.folder / "manifest.json", {**self._manifest, **ended, "hashes": hashes})
-            folders.write_json(self.folder / "summary.json", summary)
+            run_folder.write_json(self.folder / "manifest.json", {**self._manifest, **ended, "hashes": hashes})
+            run_folder.write_json(self.folder / "summary.json", summary)
             figure.draw(self.folder)
         except (OSError, ColdloopError) as of_files:
             error = error or of_files
@@ -208,7 +208,7 @@ class RunFiles:
 
 
 def summary_of(
-    evaluation: indicators.RunEvaluation, recorder: recording.Recorder, *, realtime: bool, reason: str | None
+    evaluation: recording.RunEvaluation, recorder: recording.Recorder, *, realtime: bool, reason: str | None
 ) -> dict[str, Any]:
     """Return the summary of a run; without a reason it is complete. What does not exist is None.
 
@@ -354,11 +354,11 @@ def _repeated_trace(effective: Configuration[Settings], scenario: Scenario, out:
     process = effective.settings.process
     with RunProgress(scenario.ticks, process) as progress, FigureProcess(["png"]) as figure:
         if out is not None:
-            folders.claim_folder(out, force=force)
+            run_folder.claim_folder(out, force=force)
             summary = run_into(out, Job(effective, scenario, recording.Way.IN_PROCESS), {}, figure, [progress])
             return str(summary["trace_sha256"])
         settings = effective.settings
-        evaluation = indicators.RunEvaluation(load_model(settings.model.file), settings.optimizer_plc.program.design)
+        evaluation = recording.RunEvaluation(load_model(settings.model.file), settings.optimizer_plc.program.design)
         recorder = recording.Recorder(scenario.ticks, [evaluation, progress])
         OneProcessRig(settings).run(scenario, recorder)
         recorder.close()
@@ -369,7 +369,7 @@ def _differences(manifest: Mapping[str, Any], run: run_folder.RunFolder, trace: 
     lines = [f"another trace: {trace} instead of {manifest['hashes']['trace_sha256']}"]
     if manifest["coldloop"] != __version__:
         lines.append(f"coldloop {__version__} instead of {manifest['coldloop']}")
-    versions = ((name, folders.installed_version(name)) for name in DEPENDENCIES)
+    versions = ((name, run_folder.installed_version(name)) for name in DEPENDENCIES)
     recorded = {name: manifest["dependencies"].get(name, "absent") for name in DEPENDENCIES}
     lines += [f"{name} {now} instead of {recorded[name]}" for name, now in versions if now != recorded[name]]
     if misses := run.summary["deadline_misses"]:

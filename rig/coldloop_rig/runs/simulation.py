@@ -27,8 +27,7 @@ from coldloop.registers.common import Event
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.figures import plot
 from coldloop_rig.results.file_sinks import DrivingHistory, events_table, station_table, trace_table, updates_table
-from coldloop_rig.results.indicators import RunEvaluation, StageCost
-from coldloop_rig.results.recording import MemorySink, Recorder, Recording
+from coldloop_rig.results.recording import MemorySink, Recorder, Recording, RunEvaluation, StageCost
 from coldloop_rig.results.run_folder import batch_series, units_of
 from coldloop_rig.runs.running import certificate, enforced, make_scenario, summary_of, too_slow
 from coldloop_rig.settings import Period, Settings, configured

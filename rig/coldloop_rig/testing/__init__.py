@@ -27,7 +27,7 @@ from coldloop.registers import maps_of
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap
 from coldloop_rig.cosim import wiring
-from coldloop_rig.cosim.local_services import LocalServices
+from coldloop_rig.cosim.networked_run import LocalServices
 from coldloop_rig.cosim.session import SessionClient
 from coldloop_rig.runs.running import check_certificates, make_scenario
 from coldloop_rig.settings import Period, Settings, configured

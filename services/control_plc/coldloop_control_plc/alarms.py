@@ -20,9 +20,8 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, FiniteFl
 from coldloop.process.declaration import Process
 from coldloop.process.sections import Range
 from coldloop.process.settings import ProcessSettings, declared, settings_process, stretched, within
-from coldloop.registers import safety
-from coldloop.registers.common import EventKind
-from coldloop.registers.safety import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmPriority, AlarmState
+from coldloop.registers import common
+from coldloop.registers.common import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmPriority, AlarmState, EventKind
 from coldloop.service.journal import Journal
 from coldloop_control_plc.output_limits import Numbers
 
@@ -75,7 +74,7 @@ DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
 
 def _known_name(name: str) -> str:
     process = settings_process()
-    known = [safety.alarm_key(alarm, process) for alarm in safety.alarms_of(process)]
+    known = [common.alarm_key(alarm, process) for alarm in common.alarms_of(process)]
     if name.lower() not in known:
         raise ValueError(f"unknown alarm '{name}'; choose from {', '.join(known)}")
     return name.lower()
@@ -153,14 +152,14 @@ class AlarmSettings(ProcessSettings):
 
     def rule(self, alarm: int) -> AlarmRule:
         """Return how an alarm is treated."""
-        is_band = alarm in safety.band_alarms(self.process)
+        is_band = alarm in common.band_alarms(self.process)
         default = DEFAULT_RULES[AlarmKind.FIRST_BAND if is_band else AlarmKind(alarm)]
         if alarm == AlarmKind.CAPACITY:
             stretch = self.process.stretch
             default = AlarmRule(default.priority, default.on_delay_s * stretch, default.off_delay_s * stretch)
         if is_band:
             default = default._replace(on_delay_s=self.band_delay_s)
-        return self.rules.get(safety.alarm_key(alarm, self.process), RuleSettings()).changed(default)
+        return self.rules.get(common.alarm_key(alarm, self.process), RuleSettings()).changed(default)
 
     def shelving_ticks(self, asked_s: int) -> int:
         """Return how long an alarm is shelved when so many seconds are asked for; 0 asks for the default."""
@@ -275,13 +274,13 @@ class AlarmPanel(AlarmConditions):
         process = settings.process
         self._journal = journal
         self._settings = settings
-        self._rules = [settings.rule(alarm) for alarm in safety.alarms_of(process)]
+        self._rules = [settings.rule(alarm) for alarm in common.alarms_of(process)]
         super().__init__(active=[False for _ in self._rules], since=[NOT for _ in self._rules])
         low, high = zip(*settings.bands.values(), strict=True) if settings.bands else ((), ())
         self.constants = AlarmConstants(
             [settings.ticks(rule.on_delay_s) for rule in self._rules],
             [settings.ticks(rule.off_delay_s) for rule in self._rules],
-            [int(each) for each in safety.band_alarms(process)], process.controlled, low, high, process.dead_bands,
+            [int(each) for each in common.band_alarms(process)], process.controlled, low, high, process.dead_bands,
         )  # fmt: skip
         self.reports: dict[int, tuple[int, float]] = {}
         """Last reported cause and value of alarms that are about to follow their condition, without those of bands."""
@@ -395,7 +394,7 @@ class AlarmPanel(AlarmConditions):
         ticks = self._settings.shelving_ticks(command.time)
         until, time_s = min(self.now + ticks, 0xFFFFFFFF), ticks * self._settings.process.tick_s
         for kind in range(len(self.rows)):
-            if command.alarm not in (kind, safety.ALL_ALARMS):
+            if command.alarm not in (kind, common.ALL_ALARMS):
                 continue
             if event is not EventKind.ALARM_SHELVED:
                 self._step(kind, event, who=who)

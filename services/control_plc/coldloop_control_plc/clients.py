@@ -9,9 +9,20 @@ from typing import Final
 from coldloop.process.settings import InputLimits
 from coldloop.registers import control_plc as registers
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
-from coldloop.registers.common import EventKind, Identity, JournalQuery, ServiceState, SessionPace, pace_subject
+from coldloop.registers.common import (
+    AlarmCommand,
+    AlarmKind,
+    AlarmState,
+    EventKind,
+    Identity,
+    JournalQuery,
+    LeaseEvent,
+    ServiceState,
+    SessionPace,
+    WatchdogTime,
+    pace_subject,
+)
 from coldloop.registers.declaration import Block, Role
-from coldloop.registers.safety import AlarmCommand, AlarmKind, AlarmState, LeaseEvent, WatchdogTime
 from coldloop.safety.writers import InputSequence, WriterLease
 from coldloop.service.journal import JournalPublication, alarm_word, log_event
 from coldloop.session import LatenessRecord, TimeBase

@@ -11,10 +11,9 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
-from coldloop.registers.common import EventKind
+from coldloop.registers.common import AlarmKind, EventKind
 from coldloop.registers.control_plc import LinkCause, PlantLinkState, PlantLinkStatus
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
-from coldloop.registers.safety import AlarmKind
 from coldloop.service.journal import Journal
 from coldloop_control_plc.alarms import AlarmPanel
 

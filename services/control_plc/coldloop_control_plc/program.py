@@ -11,13 +11,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from coldloop.errors import ConfigurationError
-from coldloop.process.model_file import ModelHeader
+from coldloop.process.lti_model import ModelHeader
 from coldloop.process.settings import InputLimits
 from coldloop.registers import control_plc as registers
-from coldloop.registers.common import EventKind
+from coldloop.registers.common import Alarm, AlarmKind, CapacityCause, EventKind
 from coldloop.registers.control_plc import Cause, CoolDownStep, Mode, Operator, OperatorMode, ProcessNow, Update
 from coldloop.registers.plant import Actuators, Measurement
-from coldloop.registers.safety import Alarm, AlarmKind, CapacityCause
 from coldloop.safety.watchdog import Watchdog
 from coldloop.safety.writers import Inputs, InputSequence
 from coldloop.service.journal import Journal

@@ -18,9 +18,9 @@ from typing import Final, NamedTuple
 from coldloop import errors
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.declaration import LAST_TICK
+from coldloop.registers.common import LeaseState, LeaseStatus
 from coldloop.registers.control_plc import LinkCause, PlantLinkState, Update
 from coldloop.registers.plant import Actuators, Measurement
-from coldloop.registers.safety import LeaseState, LeaseStatus
 from coldloop_control_plc.plant_link import PlantLink
 from coldloop_control_plc.program import ControlProgram
 

@@ -20,13 +20,12 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.modbus.settings import TlsSettings
 from coldloop.process.declaration import LAST_TICK
-from coldloop.process.model_file import read_header
+from coldloop.process.lti_model import read_header
 from coldloop.registers import maps_of
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.common import EventKind, SessionPace, publish_configuration
+from coldloop.registers.common import AlarmKind, EventKind, SessionPace, WatchdogTime, publish_configuration
 from coldloop.registers.control_plc import ControlSession
 from coldloop.registers.plant import Measurement
-from coldloop.registers.safety import AlarmKind, WatchdogTime
 from coldloop.service.monitoring import MetricsServer, Telemetry
 from coldloop.service.start import SERVING, dropped
 from coldloop.session import TimeBase

@@ -19,9 +19,8 @@ from coldloop.process.declaration import LAST_NUMBER, LAST_TICK, Process
 from coldloop.process.settings import ProcessSettings, settings_of
 from coldloop.registers import control_plc
 from coldloop.registers.codec import check_record
-from coldloop.registers.common import SessionPace
+from coldloop.registers.common import Alarm, SessionPace, alarms_of
 from coldloop.registers.plant import Measurement
-from coldloop.registers.safety import Alarm, alarms_of
 from coldloop.safety.retained import RetainedFile, RetainedStateError, RetainedStateWriter
 from coldloop.safety.writers import InputSequence, checksum
 from coldloop.session import SessionSettings, TimeBase, TimeMode

@@ -18,8 +18,8 @@ from coldloop import __version__
 from coldloop.process.declaration import Process
 from coldloop.process.sections import Output, Range
 from coldloop.registers import codec, common, control_plc, declaration, optimizer_plc, plant
+from coldloop.registers.common import AlarmAction, AlarmPriority, AlarmState
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, Prediction
-from coldloop.registers.safety import AlarmAction, AlarmPriority, AlarmState
 from coldloop.service.journal import alarm_cause, alarm_word, flag_words
 from coldloop.service.monitoring import block_families, build_family, gauge
 from coldloop.text import finite_json

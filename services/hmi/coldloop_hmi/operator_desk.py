@@ -15,7 +15,7 @@ from aiohttp import web
 from coldloop.errors import LinkError, UsageError
 from coldloop.modbus.settings import Endpoint
 from coldloop.operating import commands, execution
-from coldloop.registers import common, plant, safety
+from coldloop.registers import common, plant
 from coldloop.registers.control_plc import LadderStatus, Mode, Operator, OperatorMode
 from coldloop.text import parsed_json, value_text
 from coldloop_hmi.documents import encoded
@@ -153,7 +153,7 @@ class OperatorDesk:
         """Return what a command means at present, beyond its own words."""
         pace, load = self._model.record("plant", common.SessionPace), self._model.record("plant", plant.LoadStatus)
         shelved_s = 0
-        if isinstance(command, commands.TreatAlarm) and command.action == safety.AlarmAction.SHELVE:
+        if isinstance(command, commands.TreatAlarm) and command.action == common.AlarmAction.SHELVE:
             shelved_s = command.time_s
         if shelved_s and pace and pace.session:
             if not pace.realtime:

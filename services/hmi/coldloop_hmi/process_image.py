@@ -16,7 +16,7 @@ from typing import Any, Final, Generic, NamedTuple, TypeVar, cast
 
 from coldloop.process.cold_box import STATION_SIGNAL_NAMES
 from coldloop.process.declaration import Process
-from coldloop.registers import codec, common, declaration, maps_of, plant, safety
+from coldloop.registers import codec, common, declaration, maps_of, plant
 from coldloop.registers.control_plc import LadderStatus, Mode, Plan, ProcessNow
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Prediction, UpdatingRuleStatus
 from coldloop.service.journal import EventText, describe, utc_text
@@ -330,7 +330,7 @@ class Model:
         self.trends = TrendStore(process, kept_s)
         self.updates: deque[Optimization] = deque(maxlen=UPDATES_KEPT)
         self.predictions: deque[Prediction] = deque(maxlen=PREDICTIONS_KEPT)
-        self.alarms: list[safety.Alarm] = []
+        self.alarms: list[common.Alarm] = []
         self.events: deque[JournalEntry] = deque(maxlen=EVENTS_KEPT)
         self.events_told = 0
         """Events so far; the last ones are in `events`."""
@@ -396,7 +396,7 @@ class Model:
         if tick != source.tick:
             source.tick, source.moved = tick, self.now()
 
-    def put_alarms(self, rows: list[safety.Alarm]) -> None:
+    def put_alarms(self, rows: list[common.Alarm]) -> None:
         """Take the rows of the alarms."""
         if rows != self.alarms:
             self.alarms = rows

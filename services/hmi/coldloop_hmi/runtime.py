@@ -23,7 +23,7 @@ from coldloop.operating.observer import JournalReader, UpdateReader, read_alarms
 from coldloop.process.cold_box import STATION_VALVE_NAMES
 from coldloop.process.declaration import Process
 from coldloop.registers import common, control_plc, optimizer_plc, plant
-from coldloop.registers.safety import Alarm
+from coldloop.registers.common import Alarm
 from coldloop_hmi.documents import KIND, REFRIGERATOR
 from coldloop_hmi.guard import refusal
 from coldloop_hmi.operator_desk import OperatorDesk

@@ -19,15 +19,23 @@ from coldloop.errors import ColdloopError
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.model_file import ModelHeader
+from coldloop.process.lti_model import ModelHeader
 from coldloop.registers import common
 from coldloop.registers import plant as registers
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, Judge, RegisterBank
 from coldloop.registers.codec import DomainError, check_record
-from coldloop.registers.common import EventKind, Identity, JournalQuery, SessionPace
+from coldloop.registers.common import (
+    EventKind,
+    Identity,
+    JournalQuery,
+    LeaseEvent,
+    LeaseStatus,
+    SessionPace,
+    WatchdogStatus,
+    WatchdogTime,
+)
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import Actuators, LiveLoad, LoadAhead, LoadStep, PlantSession, Surroundings
-from coldloop.registers.safety import LeaseEvent, LeaseStatus, WatchdogStatus, WatchdogTime
 from coldloop.safety.retained import RetainedFile, RetainedStateError
 from coldloop.safety.writers import WriterLease
 from coldloop.service.journal import Journal, JournalPublication, log_event

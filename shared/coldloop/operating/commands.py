@@ -8,8 +8,8 @@ from coldloop.errors import LoadFileError, UsageError
 from coldloop.process.declaration import LAST_TICK, Process
 from coldloop.process.load_profile import LoadProfile, load_profile_of
 from coldloop.process.settings import ProcessSettings, one_of, settings_of, settings_process, within
+from coldloop.registers.common import ALL_ALARMS, AlarmAction, alarms_of
 from coldloop.registers.plant import SensorFaultKind
-from coldloop.registers.safety import ALL_ALARMS, AlarmAction, alarms_of
 from coldloop.service.journal import alarm_word
 from coldloop.text import value_text
 

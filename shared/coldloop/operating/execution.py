@@ -18,9 +18,17 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.registers import Maps, maps_of
 from coldloop.registers import plant as registers
 from coldloop.registers.codec import sealed
-from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.common import (
+    ALL_ALARMS,
+    Alarm,
+    AlarmAction,
+    AlarmCommand,
+    AlarmState,
+    Identity,
+    SessionPace,
+    alarms_of,
+)
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
-from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmState, alarms_of
 from coldloop.service.journal import alarm_word
 from coldloop.text import value_text
 

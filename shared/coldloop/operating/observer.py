@@ -11,11 +11,20 @@ from typing import Final, Protocol, TypeVar
 
 from coldloop.errors import LinkError, RequestRefusedError
 from coldloop.modbus.client import REQUESTS_AT_ONCE, RegisterClient
-from coldloop.registers.common import EVENT_ROWS, QUERY_ROWS, Event, Identity, JournalAnswer, JournalPage, JournalQuery
+from coldloop.registers.common import (
+    EVENT_ROWS,
+    QUERY_ROWS,
+    Alarm,
+    Event,
+    Identity,
+    JournalAnswer,
+    JournalPage,
+    JournalQuery,
+    alarms_of,
+)
 from coldloop.registers.optimizer_plc import HISTORY_ROWS as UPDATE_ROWS
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import HISTORY_ROWS, STATION_ROWS, PlantSample, StationSample
-from coldloop.registers.safety import Alarm, alarms_of
 from coldloop.service.journal import ANY_SUBJECT
 
 R = TypeVar("R", bound=tuple[object, ...])

@@ -21,7 +21,7 @@ from pydantic_core.core_schema import no_info_after_validator_function
 
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
-from coldloop.process.model_file import declared_process, read_document
+from coldloop.process.lti_model import declared_process, read_document
 
 _DATA: Final = Path(__file__).parent / "data"
 SHIPPED_MODELS: Final = {"cold-box": _DATA / "cold_box_model.json", "refrigerator": _DATA / "refrigerator_model.json"}

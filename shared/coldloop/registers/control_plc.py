@@ -5,10 +5,21 @@ from typing import Annotated, Final, NamedTuple
 
 from coldloop.process.declaration import LAST_NUMBER, LAST_TICK, Process
 from coldloop.registers import declaration as reg
-from coldloop.registers.common import IDENTITY_BLOCK, LAST_BLOCKS, STATISTICS_BLOCK, SessionPace, TimeBaseKind
+from coldloop.registers.common import (
+    IDENTITY_BLOCK,
+    LAST_BLOCKS,
+    STATISTICS_BLOCK,
+    Alarm,
+    AlarmCommand,
+    LeaseStatus,
+    SessionPace,
+    TimeBaseKind,
+    WatchdogStatus,
+    WatchdogTime,
+    alarms_of,
+)
 from coldloop.registers.declaration import Block, Numbers, RegisterMap, Role, Worded
 from coldloop.registers.plant import MAX_STATE
-from coldloop.registers.safety import Alarm, AlarmCommand, LeaseStatus, WatchdogStatus, WatchdogTime, alarms_of
 
 SEQUENCE_ROWS: Final = 240
 

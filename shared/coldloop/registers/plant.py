@@ -9,9 +9,17 @@ from typing import Annotated, Final, NamedTuple
 from coldloop.process.cold_box import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, STATION_VALVE_NAMES
 from coldloop.process.declaration import LAST_TICK, Process
 from coldloop.registers import declaration as reg
-from coldloop.registers.common import IDENTITY_BLOCK, LAST_BLOCKS, STATISTICS_BLOCK, SessionPace, TimeBaseKind
+from coldloop.registers.common import (
+    IDENTITY_BLOCK,
+    LAST_BLOCKS,
+    STATISTICS_BLOCK,
+    LeaseStatus,
+    SessionPace,
+    TimeBaseKind,
+    WatchdogStatus,
+    WatchdogTime,
+)
 from coldloop.registers.declaration import Block, Numbers, RegisterMap, Role, Worded
-from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 
 HISTORY_ROWS: Final = 256
 STATION_ROWS: Final = 128

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from coldloop.registers import safety
+from coldloop.registers import common
 
 
 def remaining(watchdog: "Watchdog", tick: int) -> int:
@@ -53,9 +53,9 @@ class Watchdog:
         """Set the time back to a tick before the present one."""
         self.triggered = min(self.triggered, tick)
 
-    def registers(self, tick: int) -> safety.WatchdogStatus:
+    def registers(self, tick: int) -> common.WatchdogStatus:
         """Return what its registers show at `tick`."""
-        running = safety.WatchdogState.RUNNING if self.time else safety.WatchdogState.OFF
-        state = safety.WatchdogState.EXPIRED if self.expired else running
+        running = common.WatchdogState.RUNNING if self.time else common.WatchdogState.OFF
+        state = common.WatchdogState.EXPIRED if self.expired else running
         left = 0 if self.expired else remaining(self, tick)
-        return safety.WatchdogStatus(self.time, state, left, self.lowest, self.trips & 0xFFFF)
+        return common.WatchdogStatus(self.time, state, left, self.lowest, self.trips & 0xFFFF)

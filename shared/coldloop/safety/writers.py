@@ -20,10 +20,9 @@ from typing import Final, NamedTuple, TypeAlias
 
 from coldloop.registers.bank import BusyError, Caller
 from coldloop.registers.codec import codec_of, to_words
-from coldloop.registers.common import WHO_WORDS
+from coldloop.registers.common import WHO_WORDS, LeaseEvent, LeaseState, LeaseStatus
 from coldloop.registers.control_plc import SequenceHeader
 from coldloop.registers.declaration import Block
-from coldloop.registers.safety import LeaseEvent, LeaseState, LeaseStatus
 
 LINGER_S: Final = 1.0
 """For how long, in real time, a holder whose connection has closed keeps its lease."""

@@ -22,10 +22,9 @@ from coldloop.process.declaration import Process
 from coldloop.registers import common, control_plc
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.codec import from_words, to_words
-from coldloop.registers.common import Event, EventKind, TimeBaseKind
+from coldloop.registers.common import AlarmKind, CapacityCause, Event, EventKind, LeaseEvent, TimeBaseKind, band_alarms
 from coldloop.registers.declaration import Worded
 from coldloop.registers.plant import SensorFaultKind, StationAlarm, StationMode, Surroundings
-from coldloop.registers.safety import AlarmKind, CapacityCause, LeaseEvent, band_alarms
 
 KEPT: Final = 10_000
 """Events kept in memory."""

@@ -20,15 +20,14 @@ from coldloop.process.cold_box import STATION_SIGNAL_NAMES
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.model_file import read_header
+from coldloop.process.lti_model import read_header
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop_plant.load import find_load
 from coldloop_plant.program import PlantProgram
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.process_file.making import made_from
-from coldloop_rig.results.indicators import Indicators, RunEvaluation
-from coldloop_rig.results.recording import CONTROL, PLANT, MemorySink, Recorder
+from coldloop_rig.results.recording import CONTROL, PLANT, Indicators, MemorySink, Recorder, RunEvaluation
 from coldloop_rig.settings import Settings
 from tests.harness.configurations import lively
 from tests.harness.process_configurations import load_of_shares

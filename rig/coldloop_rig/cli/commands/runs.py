@@ -1,4 +1,4 @@
-"""Commands about a run: done, recorded, repeated, drawn, compared."""
+"""Commands about runs (done, recorded, repeated, drawn, compared), and about the plant, its model and its controller."""
 
 import argparse
 import sys
@@ -14,6 +14,19 @@ from coldloop_rig.cli.commands import options as common
 if TYPE_CHECKING:
     from coldloop_rig.cosim.scenario import Job
     from coldloop_rig.figures.worker import FigureProcess
+import math
+from functools import partial
+from importlib.metadata import entry_points
+from importlib.resources import files
+from typing import TYPE_CHECKING, Final
+
+from coldloop.text import require_regular_file, whole_text
+from coldloop_rig.text_tables import aligned, fitted, width
+
+if TYPE_CHECKING:
+    from coldloop.process.lti_model import LtiModel
+    from coldloop_optimizer_plc.qp.problem import PredictiveProblem
+    from coldloop_rig.settings import Settings
 
 
 def _declare_run(parser: argparse.ArgumentParser) -> None:
@@ -82,8 +95,8 @@ def _do(job: "Job", options: argparse.Namespace, figure: "FigureProcess") -> int
     Raises:
         ColdloopError: It is not complete; what was recorded is in the folder.
     """
-    from coldloop_rig.results.folders import claim_folder, claim_folder_of_now
     from coldloop_rig.results.recording import Way
+    from coldloop_rig.results.run_folder import claim_folder, claim_folder_of_now
     from coldloop_rig.runs.running import plain_arguments, remarks, run_into
 
     told = [] if job.way in (Way.RECORDED, Way.ATTACHED) else remarks(job.effective)  # remarks are for a PLC of ours
@@ -183,7 +196,7 @@ def _declare_plot(parser: argparse.ArgumentParser) -> None:
 def execute_plot(options: argparse.Namespace) -> int:
     """The figure of a recorded run again, as PNG, PDF or SVG."""
     from coldloop_rig.figures.plot import plot_run
-    from coldloop_rig.results.folders import writing
+    from coldloop_rig.results.run_folder import writing
 
     with writing(options.run, "the figure was not written"):
         paths = plot_run(options.run, options.figures)
@@ -201,7 +214,7 @@ def execute_report(options: argparse.Namespace) -> int:
     """One HTML page of a recorded run, with interactive plots, alarms and settings."""
     from coldloop.text import require_regular_file, whole_text
     from coldloop_rig.figures.plot import run_page
-    from coldloop_rig.results.folders import writing
+    from coldloop_rig.results.run_folder import writing
 
     path: Path = options.out or options.run / "report.html"
     require_regular_file(path)
@@ -233,3 +246,327 @@ def execute_compare(options: argparse.Namespace) -> int:
         raise UsageError(f"{options.out}: exists; name another figure with --out, or overwrite with --force")
     sys.stdout.write(compare(options.runs, options.out))
     return 0
+
+
+FILES: Final = ("process.toml", "my_plant.py")
+INSTALLED: Final = Path(__file__).parents[2] / "examples"
+"""Folder of the examples in a wheel; a clone has them beside the packages."""
+EXAMPLES: Final = (
+    "cool_down", "efficient_refrigerator", "optimiser_by_registers", "optimiser_with_do_mpc", "outside_package",
+    "quadruple_tank", "smaller_turbine", "wood_berry",
+)  # fmt: skip
+
+
+def _declare_new(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type="into", metavar="FOLDER", help="a new folder, or one without such files")
+    parser.add_argument("--example", choices=EXAMPLES, metavar="NAME",
+                        help=f"the files of an example instead: {', '.join(EXAMPLES)}")  # fmt: skip
+
+
+def execute_new(options: argparse.Namespace) -> int:
+    """A folder with a process file and a plant to begin with, commented, or with an example."""
+    folder: Path = options.folder
+    if options.example is None:
+        place = files("coldloop_rig.process_file") / "template"
+        texts = {name: (place / f"{name}.txt").read_text(encoding="utf-8") for name in FILES}
+    else:
+        examples = INSTALLED if INSTALLED.is_dir() else Path(__file__).parents[4] / "examples"
+        name = options.example
+        found = sorted(file for file in examples.rglob("*.*") if name in (file.parent.name, file.name[: len(name)]))
+        texts = {file.name: file.read_text(encoding="utf-8") for file in found if file.suffix != ".pyc"}
+        if not texts:
+            raise UsageError(
+                f"--example {name}: this installation has no examples; they are in the wheel and in a clone"
+            )
+    present = next((name for name in texts if (folder / name).exists()), None)
+    if present is not None:
+        raise UsageError(f"{folder / present}: is there already; name another folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in texts.items():
+            whole_text(folder / name, text)
+    except OSError as error:
+        raise UsageError(f"{folder}: {error.strerror}; name a folder that can be written to") from None
+    begin = "" if options.example else f"; now coldloop process {folder / FILES[0]}"
+    sys.stdout.write(f"{folder}: {', '.join(texts)}{begin}\n")
+    return 0
+
+
+def _declare_process(parser: argparse.ArgumentParser) -> None:
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("file", type="read", nargs="?", metavar="FILE", help="process file (TOML)")
+    what.add_argument("--keys", action="store_true", help="list the keys of process files, as Markdown")
+    parser.add_argument("--out", type="write", metavar="MODEL",
+                        help="write the model file; then --process MODEL, or the key model.file")  # fmt: skip
+    parser.add_argument("--limit", type=common.positive_count, default=300, metavar="SECONDS",
+                        help="how long its plant may take, in a process of its own (default: 300)")  # fmt: skip
+
+
+def execute_process(options: argparse.Namespace) -> int:
+    """A process file checked, linearised and judged, and made into the model file of all programs."""
+    from coldloop.process.declaration import Process
+    from coldloop_rig.cli.listings import key_listing
+    from coldloop_rig.process_file.judgement import described
+    from coldloop_rig.process_file.making import made_from
+    from coldloop_rig.process_file.reading import text_of_child
+
+    out: Path | None = options.out
+    if options.keys:
+        if out is not None:
+            raise UsageError("--out: writes the model of a process file; name that file, and leave out --keys")
+        sys.stdout.write(key_listing(Process))
+        return 0
+    if out is not None:
+        require_regular_file(out)
+        if out.resolve() == options.file.resolve():
+            raise UsageError(f"{out}: is the process file; name another one with --out")
+
+    def work() -> str:
+        made = made_from(options.file)
+        return described(made) if out is None else f"{described(made)}{_saved(made.model, out)}"
+
+    sys.stdout.write(fitted(text_of_child(options.file, work, options.limit), width()))
+    return 0
+
+
+def _saved(model: "LtiModel", out: Path) -> str:
+    """Write a model file; return the line that says so."""
+    try:
+        model.save(out)
+    except OSError as error:
+        raise UsageError(f"{out}: {error.strerror}; name a file that can be written with --out") from None
+    return f"written to {out}\n"
+
+
+def _declare_import(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("export", type="read", metavar="RECORD", help="text file of a historian or a spreadsheet")
+    add("--inputs", nargs="+", required=True, metavar="NAME",
+        help="inputs, load, other disturbances, which hold between readings; others are outputs")  # fmt: skip
+    add("--map", action="append", default=[], metavar="TAG=NAME",
+        help="name of a tag in the record; other tags are then left out; TAG=time_s: column of time")  # fmt: skip
+    add("--zone", metavar="ZONE", help="of times without one, as in Europe/Berlin")
+    add("--good", nargs="+", default=[], metavar="TEXT",
+        help="what a quality says of good readings, beside good, ok and such words, and 192 to 255")  # fmt: skip
+    add("--every", type=float, metavar="SECONDS", help="between rows (default: as usual between an output's readings)")
+    add("--gap", type=float, metavar="SECONDS", help="without a reading that cuts the record (default: 5 rows)")
+    add("--out", type="write", required=True, metavar="FILE", help="the record to write")
+
+
+def execute_import(options: argparse.Namespace) -> int:
+    """A historian's export made into a record for `plant.step_test`; says what it assumed and dropped.
+
+    It reads a line for each time or for each reading; commas, semicolons or tabs; dates, or seconds from any start.
+    Inputs hold between readings, outputs are averaged, and gaps cut the record into pieces.
+    """
+    from zoneinfo import available_timezones
+
+    from coldloop_rig.process_file.historian import Request, record_of
+    from coldloop_rig.results.run_folder import writing
+
+    out: Path = options.out
+    require_regular_file(out)
+    if out.resolve() == options.export.resolve():
+        raise UsageError(f"{out}: is the export; name another file with --out")
+    names = dict(each.rpartition("=")[::2] for each in options.map)
+    if "" in {*names, *names.values()} or len({*names.values()}) < len(options.map):
+        raise UsageError("--map: write --map TAG=NAME, with another name for each tag")
+    if not all(given is None or 0.0 < given < float("inf") for given in (options.every, options.gap)):
+        raise UsageError("--every and --gap: a number of seconds above 0")
+    if options.zone is not None and options.zone not in available_timezones():
+        raise UsageError(f"--zone {options.zone}: no such zone; write one as in Europe/Berlin, or UTC")
+    inputs, good = tuple(options.inputs), tuple(options.good)
+    request = Request(options.export, names, inputs, options.zone, good, options.every, options.gap)
+    text, said = record_of(request)
+    with writing(out):
+        whole_text(out, text)
+    sys.stdout.write("".join(f"{line}\n" for line in (*said, f"written    to {out}")))
+    return 0
+
+
+def _declare_model(parser: argparse.ArgumentParser) -> None:
+    add_configuration_options(parser)
+    parser.add_argument("--plant", type="read", metavar="FILE", help="plant file (TOML): parameters of another plant")
+    parser.add_argument("--out", type="write", metavar="FILE", help="write the model file, for model.file")
+
+
+def execute_model(options: argparse.Namespace) -> int:
+    """The plant at its operating point, and its linear model as both PLCs run it."""
+    from coldloop.process.lti_model import load
+    from coldloop_plant.equilibrium import NoEquilibriumError
+    from coldloop_plant.kinds import kind_named
+    from coldloop_plant.settings import PlantKind
+    from coldloop_rig.cli.listings import describe_model, held_line
+
+    if options.out is not None:
+        require_regular_file(options.out)
+    settings = common.configuration(options).settings
+    design = settings.optimizer_plc.program.design
+    in_use = settings.model.file
+    whole = settings.plant.kind is PlantKind.REFRIGERATOR
+    plant = kind_named(PlantKind.REFRIGERATOR).read_plant_file(options.plant, settings.limits, whole=whole)
+    if options.out is not None and options.plant is not None and options.out.resolve() == options.plant.resolve():
+        raise UsageError(f"{options.out}: is the plant file; name another one with --out")
+    try:
+        model, text, box = describe_model(in_use, plant, design, settings.plant.station)
+    except NoEquilibriumError as error:
+        raise UsageError(f"{options.plant or 'the reference plant'}: {error}") from None
+    sys.stdout.write(text)
+    if options.out is not None:
+        sys.stdout.write(_saved(model, options.out))
+    sys.stdout.flush()
+    if options.plant is not None:  # a long search
+        sys.stdout.write(held_line(box, plant.operating_point.level_pct, design, settings.limits))
+    load(in_use)
+    return 0
+
+
+def _declare_identify(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type="folder", metavar="RUN", help="folder of a run, of half an hour or more")
+    parser.add_argument("--model", type="read", metavar="FILE", help="model file (default: that of the run)")
+    parser.add_argument("--out", type="write", metavar="FILE",
+                        help="write the model with these factors, to be looked at, if it predicts better")  # fmt: skip
+
+
+def execute_identify(options: argparse.Namespace) -> int:
+    """The factors on the prediction model's gains with which it predicts what a run has measured.
+
+    They are fitted on the first half of the record and judged on the second. The model of a run is never changed.
+    """
+    from coldloop.process.lti_model import load
+    from coldloop_rig.results.run_folder import RunFolder, writing
+    from coldloop_rig.runs.identification import describe, identify, note_of, read_record, scaled
+    from coldloop_rig.runs.running import MODEL_COPY
+
+    out: Path | None = options.out
+    if out is not None:
+        require_regular_file(out)
+        if out.exists():
+            raise UsageError(f"{out}: exists; name another file with --out")
+    run = RunFolder(options.run)
+    model = load(options.model or run.held(MODEL_COPY))
+    found = identify(model, read_record(run, model))
+    sys.stdout.write(describe(model, found))
+    if out is None:
+        return 0
+    if not found.fitted:
+        raise UsageError(f"{out}: not written: no factor can be told from this record; name a run that moves more")
+    if not found.improved:
+        raise UsageError(f"{out}: not written: with these factors the half held back is predicted no better")
+    with writing(out):
+        scaled(model, found.factors, note_of(run, model, found)).save(out)
+    sys.stdout.write(
+        f"written to {out}, to be looked at: nothing uses it before a configuration names it, for all three services:\n"
+        f"    coldloop run --set model.file={out}\n"
+    )
+    return 0
+
+
+USUAL_SCENARIOS: Final = 100
+
+
+def _declare_budget(parser: argparse.ArgumentParser) -> None:
+    add_configuration_options(parser)
+    power = partial(common.positive_number, sys.float_info.max, "a positive number")
+    percent = partial(common.positive_number, math.nextafter(100.0, 0.0), "a percentage above 0 and below 100")
+    speed = parser.add_mutually_exclusive_group()
+    speed.add_argument("--power", type=power, metavar="P",
+                       help="one power relative to the paper's PLC (default: as configured)")  # fmt: skip
+    speed.add_argument("--plc", type="name", metavar="PLC",
+                       help="a PLC instead: a profile (TOML) or one that is shipped, and a sentence that says whether "
+                       "the controller runs there; --list names them")  # fmt: skip
+    add = parser.add_argument
+    add("--export", type="folder", metavar="FOLDER",
+        help="what an export for a PLC costs: operations of its calls and bytes; with --plc also times there, and what"
+        " does not fit")  # fmt: skip
+    add("--took", type=power, metavar="US",
+        help="with --export: a PLC took so many microseconds for the iterations of the solver's self-test; prints its"
+        " profile")  # fmt: skip
+    add("--list", action="store_true", help="list the shipped PLCs")
+    add("--keys", action="store_true", help="list the keys of a PLC's profile, as Markdown")
+    add("--load", type="name", dest="loads", nargs="+", metavar="LOAD", default=[],
+        help="with --plc: whether an adaptive updating period pays there under these loads, against --updating-period "
+        "or the best fixed one")  # fmt: skip
+    add("--updating-period", dest="period", type=common.fixed_updating_period, metavar="SECONDS",
+        help="one updating period (default: a fifth, a half and all of a sampling period)")  # fmt: skip
+    add("--certify", type=common.positive_count, nargs="?", const=USUAL_SCENARIOS, metavar="N",
+        help="how many iterations are enough, by N sampled scenarios, with its confidence "
+        f"(default: {USUAL_SCENARIOS})")  # fmt: skip
+    add("--tolerance", type=percent, default=5.0, metavar="PERCENT",
+        help="with --certify: enough is within this of the optimum (default: 5)")  # fmt: skip
+    add("--confidence", type=percent, default=99.9, metavar="PERCENT",
+        help="with --certify: of the bounds (default: 99.9)")  # fmt: skip
+
+
+def execute_budget(options: argparse.Namespace) -> int:
+    """What a PLC can do in an updating period, and whether its memory holds the problem."""
+    if options.loads and options.plc is None:
+        raise UsageError("--load: says whether an adaptive period pays on a PLC; name one with --plc")
+    if options.took and not options.export:
+        raise UsageError("--took: is of an export's self-test; name its folder with --export")
+    from coldloop_rig.cli.listings import key_listing
+    from coldloop_rig.plc_sizing.plc import PlcProfile, find_profile, shipped_profiles
+
+    if options.list:
+        text = aligned([(name, find_profile(name).name) for name in shipped_profiles()])
+    elif options.keys:
+        text = key_listing(PlcProfile)
+    elif options.export:
+        from coldloop_rig.plc_sizing.plc import cost_text, profile_of, read_cost
+
+        cost = read_cost(options.export)
+        plc = find_profile(options.plc) if options.plc and not options.took else None
+        text = profile_of(cost, options.took) if options.took else cost_text(cost, plc)
+    elif options.certify:
+        from coldloop_rig.plc_sizing.intervals import certification_table
+
+        if any(value is not None for value in (options.power, options.plc, options.period)):
+            raise UsageError("--certify: uses the configured PLC; leave out --power, --plc and --updating-period")
+        settings = common.configuration(options).settings
+        text = certification_table(settings, options.certify, options.tolerance, options.confidence)
+    else:
+        text = _budget_tables(options)
+    sys.stdout.write(fitted(text, width()))
+    return 0
+
+
+def _budget_tables(options: argparse.Namespace) -> str:
+    from coldloop_rig.plc_sizing.budget import budget_tables, plc_tables, with_power
+    from coldloop_rig.plc_sizing.intervals import adaptive_gain
+    from coldloop_rig.plc_sizing.plc import find_profile
+    from coldloop_rig.progress import make_console
+    from coldloop_rig.runs.running import certificate
+
+    if len(set(options.loads)) < len(options.loads):
+        raise UsageError("--load: a load is named twice; two of the same are no evidence")
+    for name in options.loads:
+        common.check_load(name)
+    profile = None if options.plc is None else find_profile(options.plc)
+    settings = common.configuration(options).settings
+
+    def costs(there: "Settings") -> str:
+        if not options.loads:
+            return ""
+        with make_console().status("") as status:
+            return adaptive_gain(
+                there, options.loads, options.period, lambda done, of: status.update(f"{done} of {of} runs")
+            )
+
+    def executed(problem: "PredictiveProblem") -> str:
+        counters = entry_points(group="coldloop.counters", name="ode")
+        if not counters:
+            return ""
+        counter = counters["ode"].load()(problem, settings.optimizer_plc.program)
+        return (
+            f"ode as exported, an iteration a call, executed: {counter.unconstrained():,} operations with no row "
+            f"active, {counter.worst():,} in the worst case (every row active, a bound cuts the step)\n"
+        )
+
+    if profile is not None:
+        return plc_tables(
+            settings, options.period, profile, lambda there: f"{certificate(there)}\n{costs(there)}".strip()
+        )
+    if options.power is not None:
+        settings = with_power(settings, options.power)
+    held, tables = certificate(settings), budget_tables(settings, options.period, executed)
+    return f"{held}\n\n{tables}" if held else tables

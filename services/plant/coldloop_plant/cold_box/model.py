@@ -13,9 +13,19 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from coldloop.process.cold_box import COLD_BOX, OUTPUT_NAMES, STATE_NAMES, STATE_UNITS, T5, ModelRange
+from coldloop.process.cold_box import (
+    COLD_BOX,
+    COLDEST_CELLS_K,
+    OUTPUT_NAMES,
+    SATURATION_BAR,
+    STATE_NAMES,
+    STATE_UNITS,
+    T5,
+    WARMEST_CELL_K,
+    ModelRange,
+    model_range,
+)
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.model_range import COLDEST_CELLS_K, SATURATION_BAR, WARMEST_CELL_K, model_range
 from coldloop_plant import equilibrium
 from coldloop_plant.cold_box import ColdBox, advance, evaluated, streams
 from coldloop_plant.cold_box.plant_file import OPERATING_INPUTS, OPERATING_LEVEL, REFERENCE, PlantFile

@@ -11,8 +11,8 @@ from pydantic import Field, model_validator
 from pydantic.fields import FieldInfo
 
 from coldloop.process import sections
-from coldloop.process.model_file import COLD_BOX
-from coldloop.process.model_range import SATURATION_BAR, SUPPLY_BAR
+from coldloop.process.cold_box import SATURATION_BAR, SUPPLY_BAR
+from coldloop.process.lti_model import COLD_BOX
 from coldloop_plant.cold_box import CELLS, ColdBox
 from coldloop_plant.components.expansion import ReturnLine, Turbine, Valve
 from coldloop_plant.components.heat_exchanger import HeatExchanger
